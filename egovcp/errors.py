@@ -1,0 +1,53 @@
+"""The errors a user can cause, and the exit code that each ends a command with.
+
+A message says what was found, what was expected, where, and what to do.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class EgovcpError(Exception):
+    """Root of all errors that a user can cause. ``exit_code`` ends the command."""
+
+    exit_code = 1
+
+
+class UsageError(EgovcpError):
+    """A flag or an argument is wrong."""
+
+    exit_code = 2
+
+
+class DataError(EgovcpError):
+    """A dataset is missing, damaged, of another schema, or cannot be mixed."""
+
+    exit_code = 3
+
+
+class ArtefactError(EgovcpError):
+    """A policy artefact is missing, tampered with, or of another spec."""
+
+    exit_code = 4
+
+
+class EnvironmentFailure(EgovcpError):
+    """Disk, permissions, network, device, port: the surroundings fail."""
+
+    exit_code = 5
+
+
+class SafetyStop(EgovcpError):
+    """The robot was stopped for safety."""
+
+    exit_code = 6
+
+
+def suggest(name: str, valid: Iterable[str]) -> str:
+    """``"; did you mean 'ball'? Choose from: arch, ball, wall"`` for an unknown ``name``."""
+    choices = sorted(valid)
+    near = difflib.get_close_matches(name, choices, n=1)
+    hint = f" did you mean {near[0]!r}?" if near else ""
+    return f";{hint} choose from: {', '.join(choices)}"

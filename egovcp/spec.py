@@ -1,0 +1,176 @@
+"""The single source of names, shapes, units and clock rates that every part shares.
+
+Axis letters used in shape comments throughout the code:
+
+    B batch (episodes, environments or sequences)    T time (planner ticks)
+    H depth rows (48)                                W depth columns (64)
+    S proprioceptive state (74)                      A action (7)
+    J joints (29)                                    M candidate plans
+    N planning horizon                               P physics steps
+
+Units are SI (metres, radians, seconds) unless a name says otherwise. Frames: a
+suffix ``_w`` is the world, ``_b`` the pelvis *heading* frame (origin at the pelvis,
+x forward, y left, z up, rotated by yaw only).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+SPEC_VERSION: Final = 1
+
+# --- clock -----------------------------------------------------------------------
+PLANNER_HZ: Final = 25
+CONTROLLER_HZ: Final = 50
+PHYSICS_DT: Final = 0.005  # s
+CONTROLLER_TICKS_PER_PLAN: Final = CONTROLLER_HZ // PLANNER_HZ  # 2
+PHYSICS_STEPS_PER_CONTROLLER_TICK: Final = round(1 / (CONTROLLER_HZ * PHYSICS_DT))  # 4
+PLANNER_DT: Final = 1.0 / PLANNER_HZ  # s
+
+# --- tasks -----------------------------------------------------------------------
+TASKS: Final = ("ball", "wall", "arch")
+
+# --- depth -----------------------------------------------------------------------
+DEPTH_ROWS: Final = 48
+DEPTH_COLS: Final = 64
+DEPTH_MIN_M: Final = 0.28  # a D435i sees nothing nearer: closer surfaces read 0
+DEPTH_MAX_M: Final = 5.0  # farther surfaces read 0 (invalid)
+
+# --- robot -----------------------------------------------------------------------
+JOINT_NAMES: Final = (
+    "left_hip_pitch_joint",
+    "left_hip_roll_joint",
+    "left_hip_yaw_joint",
+    "left_knee_joint",
+    "left_ankle_pitch_joint",
+    "left_ankle_roll_joint",
+    "right_hip_pitch_joint",
+    "right_hip_roll_joint",
+    "right_hip_yaw_joint",
+    "right_knee_joint",
+    "right_ankle_pitch_joint",
+    "right_ankle_roll_joint",
+    "waist_yaw_joint",
+    "waist_roll_joint",
+    "waist_pitch_joint",
+    "left_shoulder_pitch_joint",
+    "left_shoulder_roll_joint",
+    "left_shoulder_yaw_joint",
+    "left_elbow_joint",
+    "left_wrist_roll_joint",
+    "left_wrist_pitch_joint",
+    "left_wrist_yaw_joint",
+    "right_shoulder_pitch_joint",
+    "right_shoulder_roll_joint",
+    "right_shoulder_yaw_joint",
+    "right_elbow_joint",
+    "right_wrist_roll_joint",
+    "right_wrist_pitch_joint",
+    "right_wrist_yaw_joint",
+)
+NUM_JOINTS: Final = len(JOINT_NAMES)
+
+# --- proprioception: the layout of ``observation.state`` ---------------------------
+STATE_SLICES: Final = {
+    "angular_velocity": slice(0, 3),  # rad/s, pelvis IMU frame
+    "projected_gravity": slice(3, 6),  # unit vector, pelvis IMU frame; upright = (0, 0, -1)
+    "command_velocity": slice(6, 9),  # vx, vy (m/s), yaw rate (rad/s), heading frame
+    "command_hands": slice(9, 15),  # left xyz, right xyz (m), heading frame
+    "command_height": slice(15, 16),  # m, pelvis above ground
+    "joint_position": slice(16, 45),  # rad, JOINT_NAMES order
+    "joint_velocity": slice(45, 74),  # rad/s, JOINT_NAMES order
+}
+STATE_DIM: Final = 74
+COMMAND_SLICE: Final = slice(6, 16)  # velocity 3, hands 6, height 1
+COMMAND_DIM: Final = 10
+
+STATE_NAMES: Final = (
+    *(f"angular_velocity.{a}" for a in "xyz"),
+    *(f"projected_gravity.{a}" for a in "xyz"),
+    "command.vx",
+    "command.vy",
+    "command.yaw_rate",
+    *(f"command.left_hand.{a}" for a in "xyz"),
+    *(f"command.right_hand.{a}" for a in "xyz"),
+    "command.height",
+    *(f"{name}.pos" for name in JOINT_NAMES),
+    *(f"{name}.vel" for name in JOINT_NAMES),
+)
+
+# --- action ----------------------------------------------------------------------
+ACTION_NAMES: Final = (
+    *(f"left_hand.{a}" for a in "xyz"),
+    *(f"right_hand.{a}" for a in "xyz"),
+    "height",
+)
+ACTION_DIM: Final = 7
+ACTION_ETA: Final = 0.32  # random-walk step of the paper (section III-B), box units per tick
+ACTION_RATE_LIMIT: Final = 0.32  # box units per planner tick; same in collection and deployment
+
+
+@dataclass(frozen=True)
+class ActionBox:
+    """The box that a normalised action in [-1, 1]^7 spans, in SI units.
+
+    The map is affine on each side of the neutral pose, so that 0 *is* the neutral
+    pose (hands at rest, standing tall) although the box reaches much farther one way
+    than the other: -1 -> ``low``, 0 -> ``neutral``, +1 -> ``high``.
+    """
+
+    low: tuple[float, ...]
+    neutral: tuple[float, ...]
+    high: tuple[float, ...]
+
+    def to_metric(self, action: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Normalised action ``(..., 7)`` in [-1, 1] -> metres ``(..., 7)``."""
+        a = np.asarray(action, dtype=np.float64)
+        low, mid, high = (np.asarray(v) for v in (self.low, self.neutral, self.high))
+        return mid + np.where(a < 0, a * (mid - low), a * (high - mid))
+
+    def to_normalised(self, metric: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Metres ``(..., 7)`` -> normalised action ``(..., 7)``; the inverse of ``to_metric``."""
+        m = np.asarray(metric, dtype=np.float64)
+        low, mid, high = (np.asarray(v) for v in (self.low, self.neutral, self.high))
+        d = m - mid
+        return np.where(d < 0, d / (mid - low), d / (high - mid))
+
+
+#: Hand targets (palm sites) in the pelvis heading frame, then pelvis height above ground.
+ACTION_BOX: Final = ActionBox(
+    low=(0.05, -0.05, -0.15, 0.05, -0.40, -0.15, 0.52),
+    neutral=(0.18, 0.20, 0.00, 0.18, -0.20, 0.00, 0.74),
+    high=(0.55, 0.40, 0.50, 0.55, 0.05, 0.50, 0.76),
+)
+
+# --- LeRobot feature names ---------------------------------------------------------
+DEPTH_KEY: Final = "observation.images.ego_depth"
+STATE_KEY: Final = "observation.state"
+ACTION_KEY: Final = "action"
+REWARD_KEY: Final = "next.reward"
+DONE_KEY: Final = "next.done"
+SUCCESS_KEY: Final = "next.success"
+TRUNCATED_KEY: Final = "next.truncated"
+
+#: LeRobot feature descriptions of the columns egovcp adds to the standard ones.
+FEATURES: Final[dict[str, dict[str, object]]] = {
+    DEPTH_KEY: {
+        "dtype": "image",
+        "shape": (DEPTH_ROWS, DEPTH_COLS, 1),
+        "names": ["height", "width", "channels"],
+        "info": {"is_depth_map": True},
+    },
+    STATE_KEY: {"dtype": "float32", "shape": (STATE_DIM,), "names": list(STATE_NAMES)},
+    ACTION_KEY: {"dtype": "float32", "shape": (ACTION_DIM,), "names": list(ACTION_NAMES)},
+    REWARD_KEY: {"dtype": "float32", "shape": (1,), "names": None},
+    DONE_KEY: {"dtype": "bool", "shape": (1,), "names": None},
+    SUCCESS_KEY: {"dtype": "bool", "shape": (1,), "names": None},
+    TRUNCATED_KEY: {"dtype": "bool", "shape": (1,), "names": None},
+}
+
+# --- returns (paper eq. 9; DESIGN of the Monte Carlo target) ------------------------
+GAMMA: Final = 0.97
+RETURN_STEPS: Final = 50
