@@ -1,0 +1,140 @@
+"""The Unitree G1 (29 joints): model file, actuator constants, gains and home pose.
+
+Actuator numbers restate ``g1_constants.py`` of the mjlab wheel (Apache-2.0),
+where Unitree's motor data are published: rotor inertias, gear stages, effort and
+velocity limits. Arrays are (J,) in the order of ``spec.JOINT_NAMES``.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.spec import JOINT_NAMES
+
+_XML: Final = Path("asset_zoo/robots/unitree_g1/xmls/g1.xml")
+
+
+def model_path() -> Path:
+    """Path of ``g1.xml`` inside the installed mjlab wheel, found without importing mjlab.
+
+    Raises:
+        EnvironmentFailure: mjlab is not installed, or its wheel lacks the model.
+    """
+    found = importlib.util.find_spec("mjlab")
+    if found is None or found.origin is None:
+        raise EnvironmentFailure(
+            "the G1 model needs the mjlab package, which is not installed here; "
+            "install egovcp with its simulator: pip install 'egovcp[sim]'"
+        )
+    path = Path(found.origin).parent / _XML
+    if not path.is_file():
+        raise EnvironmentFailure(
+            f"expected the G1 model at {path}, found no such file; "
+            "install mjlab 1.6: pip install 'mjlab>=1.6,<1.7'"
+        )
+    return path
+
+
+@dataclass(frozen=True)
+class Motor:
+    """One motor type: rotor inertias (kg m^2) of its two planetary stages, and limits."""
+
+    rotor_inertia: tuple[float, float, float]
+    gear: tuple[float, float]
+    effort_limit: float  # N m
+    velocity_limit: float  # rad/s
+
+    @property
+    def armature(self) -> float:
+        """Inertia seen at the joint, I0 (g1 g2)^2 + I1 g2^2 + I2, kg m^2."""
+        first, second = self.gear
+        i0, i1, i2 = self.rotor_inertia
+        return i0 * (first * second) ** 2 + i1 * second**2 + i2
+
+
+M5020: Final = Motor((0.139e-4, 0.017e-4, 0.169e-4), (1 + 46 / 18, 1 + 56 / 16), 25.0, 37.0)
+M7520_14: Final = Motor((0.489e-4, 0.098e-4, 0.533e-4), (4.5, 1 + 48 / 22), 88.0, 32.0)
+M7520_22: Final = Motor((0.489e-4, 0.109e-4, 0.738e-4), (4.5, 5.0), 139.0, 20.0)
+M4010: Final = Motor((0.068e-4, 0.0, 0.0), (5.0, 5.0), 5.0, 22.0)
+
+#: Joint name ending -> motor type and how many of them drive the joint. Ankles and the
+#: waist's roll and pitch are four-bar linkages with two motors, taken as 1:1.
+_MOTORS: Final[dict[str, tuple[Motor, int]]] = {
+    "hip_pitch": (M7520_14, 1),
+    "hip_roll": (M7520_22, 1),
+    "hip_yaw": (M7520_14, 1),
+    "knee": (M7520_22, 1),
+    "ankle_pitch": (M5020, 2),
+    "ankle_roll": (M5020, 2),
+    "waist_yaw": (M7520_14, 1),
+    "waist_roll": (M5020, 2),
+    "waist_pitch": (M5020, 2),
+    "shoulder_pitch": (M5020, 1),
+    "shoulder_roll": (M5020, 1),
+    "shoulder_yaw": (M5020, 1),
+    "elbow": (M5020, 1),
+    "wrist_roll": (M5020, 1),
+    "wrist_pitch": (M4010, 1),
+    "wrist_yaw": (M4010, 1),
+}
+
+#: Arm gains that replace the published 10 Hz ones (kp 14, a 1.6 Hz arm that lags 6-8 cm
+#: behind the random walk): joint name ending -> (kp N m/rad, kd N m s/rad).
+_ARM_GAINS: Final[dict[str, tuple[float, float]]] = {
+    "shoulder_pitch": (80.0, 5.0),
+    "shoulder_roll": (80.0, 5.0),
+    "shoulder_yaw": (60.0, 3.0),
+    "elbow": (60.0, 3.0),
+    "wrist_roll": (30.0, 1.5),
+    "wrist_pitch": (20.0, 1.0),
+    "wrist_yaw": (20.0, 1.0),
+}
+
+_NATURAL_FREQUENCY: Final = 10.0 * 2.0 * math.pi  # rad/s
+_DAMPING_RATIO: Final = 2.0
+
+
+def _kind(joint: str) -> str:
+    """``left_hip_pitch_joint`` -> ``hip_pitch``."""
+    return joint.removesuffix("_joint").removeprefix("left_").removeprefix("right_")
+
+
+def _per_joint(value: dict[str, float]) -> NDArray[np.float64]:
+    array = np.array([value[_kind(name)] for name in JOINT_NAMES])
+    array.setflags(write=False)
+    return array
+
+
+ARMATURE: Final = _per_joint({k: m.armature * n for k, (m, n) in _MOTORS.items()})  # kg m^2
+EFFORT_LIMIT: Final = _per_joint({k: m.effort_limit * n for k, (m, n) in _MOTORS.items()})  # N m
+VELOCITY_LIMIT: Final = _per_joint({k: m.velocity_limit for k, (m, _) in _MOTORS.items()})  # rad/s
+
+#: Published servo gains: 10 Hz natural frequency on the armature, damping ratio 2.
+PUBLISHED_STIFFNESS: Final = ARMATURE * _NATURAL_FREQUENCY**2  # N m/rad
+PUBLISHED_DAMPING: Final = 2.0 * _DAMPING_RATIO * ARMATURE * _NATURAL_FREQUENCY  # N m s/rad
+
+
+def _with_arm_gains(published: NDArray[np.float64], which: int) -> NDArray[np.float64]:
+    gains = dict(zip(map(_kind, JOINT_NAMES), published.tolist(), strict=True))
+    return _per_joint(gains | {kind: pair[which] for kind, pair in _ARM_GAINS.items()})
+
+
+#: The gains that egovcp runs: published ones in legs and waist, stiffer arms.
+STIFFNESS: Final = _with_arm_gains(PUBLISHED_STIFFNESS, 0)  # N m/rad
+DAMPING: Final = _with_arm_gains(PUBLISHED_DAMPING, 1)  # N m s/rad
+
+LEFT_LEG: Final = slice(0, 6)
+RIGHT_LEG: Final = slice(6, 12)
+LEGS: Final = slice(0, 12)
+WAIST: Final = slice(12, 15)
+LEFT_ARM: Final = slice(15, 22)
+RIGHT_ARM: Final = slice(22, 29)
+ARMS: Final = slice(15, 29)
