@@ -1,0 +1,55 @@
+"""Writes the numbers that the robot package ships: ``python -m egovcp.robot.generate``.
+
+Needs MuJoCo and SciPy (the simulator extra); the robot itself needs only the results.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from egovcp.robot.mjcf import robot_spec
+from egovcp.spec import JOINT_NAMES
+
+PACKAGE = Path(__file__).parent
+
+
+def kinematic_table(model: mujoco.MjModel) -> dict[str, Any]:
+    """Link tree, offsets, masses, joint axes and limits of the model, as plain lists."""
+    joints = [model.joint(name) for name in JOINT_NAMES]
+    links = [int(model.joint("floating_base_joint").bodyid[0])]
+    links += [int(joint.bodyid[0]) for joint in joints]
+    rest = np.zeros((len(joints), 9))
+    for row, link in zip(rest, links[1:], strict=True):
+        mujoco.mju_quat2Mat(row, model.body_quat[link])
+    return {
+        "links": [model.body(link).name for link in links],
+        "parent": [-1, *(links.index(int(model.body_parentid[link])) for link in links[1:])],
+        "offset": model.body_pos[links[1:]].tolist(),
+        "rest": rest.reshape(-1, 3, 3).tolist(),
+        "axis": [joint.axis.tolist() for joint in joints],
+        "lower": [float(joint.range[0]) for joint in joints],
+        "upper": [float(joint.range[1]) for joint in joints],
+        "mass": model.body_mass[links].tolist(),
+        "com": model.body_ipos[links].tolist(),
+        "palm": [model.site(f"{side}_palm").pos.tolist() for side in ("left", "right")],
+    }
+
+
+def write_kinematics(path: Path) -> None:
+    """Write ``g1_kinematics.json``."""
+    table = kinematic_table(robot_spec().compile())
+    path.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
+
+
+def main() -> None:
+    """Regenerate every table in place."""
+    write_kinematics(PACKAGE / "g1_kinematics.json")
+
+
+if __name__ == "__main__":
+    main()

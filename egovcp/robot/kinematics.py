@@ -1,0 +1,166 @@
+"""Forward kinematics of the G1 in numpy, batched over robots; needs no MuJoCo.
+
+Every joint is a hinge at its link's origin, so a link's pose follows from its parent's:
+
+    R_i = R_p R0_i exp([a_i] q_i)        p_i = p_p + R_p r_i
+
+With K = [a] (cross-product matrix), exp(K q) = 1 + sin q K + (1 - cos q) K^2, hence the
+three constant matrices per joint below. The constants come from ``g1_kinematics.json``,
+which ``python -m egovcp.robot.generate`` writes from the model.
+"""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+from importlib import resources
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.spec import STATE_SLICES
+
+Array = NDArray[np.float64]
+
+_TABLE: Final = json.loads(
+    resources.files("egovcp.robot").joinpath("g1_kinematics.json").read_text(encoding="utf-8")
+)
+#: The pelvis and the child link of each joint, in JOINT_NAMES order: link i+1 is moved by joint i.
+LINK_NAMES: Final[tuple[str, ...]] = tuple(_TABLE["links"])
+NUM_LINKS: Final = len(LINK_NAMES)
+PARENT: Final[tuple[int, ...]] = tuple(_TABLE["parent"])
+LINK_MASS: Final[Array] = np.array(_TABLE["mass"])  # (L,) kg
+LINK_COM: Final[Array] = np.array(_TABLE["com"])  # (L, 3) m, link frame
+JOINT_AXIS: Final[Array] = np.array(_TABLE["axis"])  # (J, 3) child link frame
+JOINT_LOWER: Final[Array] = np.array(_TABLE["lower"])  # (J,) rad
+JOINT_UPPER: Final[Array] = np.array(_TABLE["upper"])  # (J,) rad
+PALM_OFFSET: Final[Array] = np.array(_TABLE["palm"])  # (2, 3) m, wrist yaw link frame, left, right
+LINK_OFFSET: Final[Array] = np.array(_TABLE["offset"])  # (J, 3) m, in the parent's frame
+
+TORSO: Final = LINK_NAMES.index("torso_link")
+_WRISTS: Final = tuple(LINK_NAMES.index(f"{side}_wrist_yaw_link") for side in ("left", "right"))
+
+
+def _rotation_constants(rest: Array, axis: Array) -> tuple[Array, Array, Array]:
+    """R0, R0 K and R0 K^2 for each joint, each (J, 3, 3)."""
+    x, y, z = axis.T
+    o = np.zeros_like(x)
+    k = np.stack([o, -z, y, z, o, -x, -y, x, o], axis=-1).reshape(-1, 3, 3)
+    return rest, rest @ k, rest @ k @ k
+
+
+_REST, _SIN, _COS = _rotation_constants(np.array(_TABLE["rest"]), JOINT_AXIS)
+
+
+def joint_rotations(joint_position: Array, joints: slice = slice(None)) -> Array:
+    """Rotation from each joint's child frame to its parent's: (..., J') -> (..., J', 3, 3)."""
+    s = np.sin(joint_position)[..., None, None]
+    c = 1.0 - np.cos(joint_position)[..., None, None]
+    out: Array = _REST[joints] + s * _SIN[joints] + c * _COS[joints]
+    return out
+
+
+def rotate(rotation: Array, vector: Array) -> Array:
+    """(..., 3, 3) times (..., 3), broadcast; the same bits for a row whatever the batch."""
+    out: Array = (
+        rotation[..., 0] * vector[..., None, 0]
+        + rotation[..., 1] * vector[..., None, 1]
+        + rotation[..., 2] * vector[..., None, 2]
+    )
+    return out
+
+
+@cache
+def _levels() -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], ...]:
+    """Links grouped by depth in the tree: (links, parents) per level, pelvis left out."""
+    depth = [0] * NUM_LINKS
+    for link in range(1, NUM_LINKS):
+        depth[link] = depth[PARENT[link]] + 1
+    levels = []
+    for level in range(1, max(depth) + 1):
+        links = np.array([i for i in range(NUM_LINKS) if depth[i] == level])
+        levels.append((links, np.array([PARENT[i] for i in links])))
+    return tuple(levels)
+
+
+def link_transforms(joint_position: Array) -> tuple[Array, Array]:
+    """(B, J) -> pelvis-relative positions (B, L, 3) and rotations (B, L, 3, 3) of all links."""
+    q = np.asarray(joint_position, dtype=np.float64)
+    local = joint_rotations(q)
+    position = np.zeros((len(q), NUM_LINKS, 3))
+    rotation = np.empty((len(q), NUM_LINKS, 3, 3))
+    rotation[:, 0] = np.eye(3)
+    for links, parents in _levels():
+        base = rotation[:, parents]
+        position[:, links] = position[:, parents] + rotate(base, LINK_OFFSET[links - 1])
+        rotation[:, links] = base @ local[:, links - 1]
+    return position, rotation
+
+
+def link_poses(joint_position: NDArray[np.floating]) -> tuple[Array, Array]:
+    """Poses of all links (``LINK_NAMES``) in the pelvis frame, for logging.
+
+    Args:
+        joint_position: (B, J) rad.
+
+    Returns:
+        positions (B, L, 3) in metres and unit quaternions wxyz (B, L, 4).
+    """
+    position, rotation = link_transforms(np.asarray(joint_position, dtype=np.float64))
+    return position, quaternion(rotation)
+
+
+def quaternion(rotation: Array) -> Array:
+    """Rotation matrices (..., 3, 3) -> unit quaternions wxyz (..., 4).
+
+    The largest of the four squared components, read off the diagonal, picks the row of
+    the symmetric matrix 4 q q^T that is normalised, so no division is by a small number.
+    """
+    m = rotation
+    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
+    wx, wy, wz = (m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1])
+    xy, xz, yz = (m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1])
+    outer = np.stack(
+        [
+            np.stack([1 + xx + yy + zz, wx, wy, wz], axis=-1),
+            np.stack([wx, 1 + xx - yy - zz, xy, xz], axis=-1),
+            np.stack([wy, xy, 1 - xx + yy - zz, yz], axis=-1),
+            np.stack([wz, xz, yz, 1 - xx - yy + zz], axis=-1),
+        ],
+        axis=-2,
+    )
+    largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
+    row = np.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
+    out: Array = row / np.sqrt(np.sum(row * row, axis=-1, keepdims=True))
+    return out
+
+
+def heading_rotation(gravity: Array) -> Array:
+    """Rotation (B, 3, 3) from the pelvis frame to the pelvis heading frame.
+
+    ``gravity`` (B, 3) is the unit gravity vector in the pelvis frame. The heading frame's
+    z is -gravity; its x is the pelvis' x made horizontal. Rows are the frame's axes. A
+    pelvis that points straight up or down has no heading; the result then stays finite.
+    """
+    up = -gravity / np.maximum(np.sqrt(np.sum(gravity**2, axis=-1, keepdims=True)), 1e-9)
+    ux, uy, uz = up[:, 0], up[:, 1], up[:, 2]
+    norm = np.maximum(np.sqrt(uy * uy + uz * uz), 1e-6)
+    forward = np.stack([norm, -ux * uy / norm, -ux * uz / norm], axis=-1)
+    left = np.stack([np.zeros_like(ux), uz / norm, -uy / norm], axis=-1)
+    return np.stack([forward, left, up], axis=1)
+
+
+def palm_positions(state: NDArray[np.floating]) -> Array:
+    """Palm sites (left, right) in the pelvis heading frame, as the robot measures them.
+
+    Args:
+        state: (B, S) observations in the layout of ``spec.STATE_SLICES``.
+
+    Returns:
+        (B, 2, 3) m.
+    """
+    s = np.asarray(state, dtype=np.float64)
+    position, rotation = link_transforms(s[:, STATE_SLICES["joint_position"]])
+    palms = position[:, _WRISTS] + rotate(rotation[:, _WRISTS], PALM_OFFSET)
+    return rotate(heading_rotation(s[:, STATE_SLICES["projected_gravity"]])[:, None], palms)
