@@ -42,7 +42,12 @@ class _Parser(ArgumentParser[Any]):
     """draccus' parser that raises `UsageError` instead of ending the process."""
 
     def known_flags(self) -> list[str]:
-        return [o for a in self.parser._actions for o in a.option_strings if o.startswith("--")]
+        return [
+            o
+            for a in self.parser._actions
+            for o in a.option_strings
+            if o.startswith("--")
+        ]
 
 
 class _TeachingHelp(argparse.ArgumentDefaultsHelpFormatter):
@@ -50,7 +55,9 @@ class _TeachingHelp(argparse.ArgumentDefaultsHelpFormatter):
         super().__init__(prog, max_help_position=44, width=110)
 
 
-def parse_config[C](config_class: type[C], argv: Sequence[str], prog: str, epilog: str = "") -> C:
+def parse_config[C](
+    config_class: type[C], argv: Sequence[str], prog: str, epilog: str = ""
+) -> C:
     """Parse dotted flags into ``config_class``; raise `UsageError` naming the flag at fault.
 
     A flag without a value is true (``--resume`` is ``--resume=true``).
@@ -68,14 +75,18 @@ def parse_config[C](config_class: type[C], argv: Sequence[str], prog: str, epilo
     for arg in args:
         flag = arg.split("=", 1)[0]
         if not flag.startswith("-"):
-            raise UsageError(f"unexpected argument {arg!r}; options are written --name=value")
+            raise UsageError(
+                f"unexpected argument {arg!r}; options are written --name=value"
+            )
         if flag not in known and flag != "-h":
             near = suggest(flag, known).split(" choose from")[0].rstrip(";")
             raise UsageError(f"unknown option {flag}{near}; see {prog} --help")
     try:
         config: C = parser.parse_args(args)
     except (DraccusException, argparse.ArgumentError, ValueError, TypeError) as error:
-        raise UsageError(f"{' '.join(str(error).split())}; see {prog} --help") from error
+        raise UsageError(
+            f"{' '.join(str(error).split())}; see {prog} --help"
+        ) from error
     except OSError as error:
         raise UsageError(f"cannot read {error.filename}: {error.strerror}") from error
     return config
@@ -91,7 +102,8 @@ def _bare_flags_are_true(argv: Sequence[str]) -> list[str]:
         else:
             out.append(arg)
     return [
-        f"{a}=true" if a.startswith("--") and "=" not in a and a != "--help" else a for a in out
+        f"{a}=true" if a.startswith("--") and "=" not in a and a != "--help" else a
+        for a in out
     ]
 
 
@@ -106,9 +118,13 @@ def run_command[C](
     """Parse ``argv``, call ``run`` and return the exit code; one line on an error."""
     args = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in args
-    epilog = (epilog + "\n" if epilog else "") + "--debug prints the traceback of an error."
+    epilog = (
+        epilog + "\n" if epilog else ""
+    ) + "--debug prints the traceback of an error."
     try:
-        config = parse_config(config_class, [a for a in args if a != "--debug"], prog, epilog)
+        config = parse_config(
+            config_class, [a for a in args if a != "--debug"], prog, epilog
+        )
         run(config)
     except KeyboardInterrupt:
         print(f"{prog}: interrupted", file=sys.stderr)
@@ -116,7 +132,9 @@ def run_command[C](
     except OSError as error:
         if error.errno not in _ENVIRONMENT_ERRNOS:
             raise
-        failure = EnvironmentFailure(f"{error.strerror}: {error.filename or ''}".rstrip(": "))
+        failure = EnvironmentFailure(
+            f"{error.strerror}: {error.filename or ''}".rstrip(": ")
+        )
         return _report(prog, failure, debug)
     except EgovcpError as error:
         return _report(prog, error, debug)

@@ -1,0 +1,15 @@
+"""The world model: networks, recurrence and losses. Imports neither data nor a simulator."""
+
+from egovcp.model.config import PRESETS, LossConfig, WorldModelConfig
+from egovcp.model.losses import Batch, world_model_loss
+from egovcp.model.world_model import Carry, WorldModel
+
+__all__ = [
+    "PRESETS",
+    "Batch",
+    "Carry",
+    "LossConfig",
+    "WorldModel",
+    "WorldModelConfig",
+    "world_model_loss",
+]

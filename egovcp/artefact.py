@@ -1,0 +1,229 @@
+"""The policy artefact: a LeRobot ``pretrained_model`` folder that explains itself.
+
+    config.json        "type": "egovcp", network and planner configuration, features
+    model.safetensors  weights and normalisation statistics
+    manifest.json      schema version, SHA-256 of each file, data, controller, code version
+
+safetensors and JSON only: loading an artefact never executes code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import shutil
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import draccus
+from huggingface_hub import snapshot_download
+from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from egovcp import spec
+from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp.model import WorldModel, WorldModelConfig
+from egovcp.plan import PlannerConfig, Policy
+
+SCHEMA_VERSION = 1
+CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
+
+
+@dataclass(frozen=True)
+class Artefact:
+    """A loaded, validated policy."""
+
+    path: Path
+    world_model: WorldModel
+    planner: PlannerConfig
+    manifest: dict[str, Any]
+
+    @property
+    def controller_id(self) -> str:
+        """The low-level controller of the data; the policy drives no other."""
+        return str(self.manifest["controller_id"])
+
+    def make_policy(
+        self, num_envs: int = 1, seed: int = 0, planner: PlannerConfig | None = None
+    ) -> Policy:
+        """A policy for ``num_envs`` robots; ``planner`` overrides the artefact's own."""
+        return Policy(self.world_model, planner or self.planner, num_envs, seed)
+
+    def require_controller(self, controller_id: str) -> None:
+        """Raise `ArtefactError` unless the robot runs the controller of the data."""
+        if controller_id != self.controller_id:
+            raise ArtefactError(
+                f"{self.path} was trained on data of low-level controller {self.controller_id!r}, "
+                f"but the robot runs {controller_id!r}; collect data with this controller and "
+                "train again, or run the controller that the artefact names"
+            )
+
+
+def feature_spec() -> dict[str, Any]:
+    """What an artefact reads and writes: names, shapes and the action box."""
+    return {
+        "spec_version": spec.SPEC_VERSION,
+        "planner_hz": spec.PLANNER_HZ,
+        "depth": [spec.DEPTH_ROWS, spec.DEPTH_COLS],
+        "state_names": list(spec.STATE_NAMES),
+        "action_names": list(spec.ACTION_NAMES),
+        "action_box": dataclasses.asdict(spec.ACTION_BOX),
+    }
+
+
+def save_artefact(
+    path: Path, model: WorldModel, planner: PlannerConfig, provenance: dict[str, Any]
+) -> None:
+    """Write the artefact atomically: a temporary folder, then a rename.
+
+    Args:
+        path: folder to create; an older artefact there is replaced.
+        provenance: JSON-able; must hold ``controller_id`` and says which data and
+            command made the policy.
+    """
+    work = path.with_name(path.name + ".partial")
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    config = {
+        "type": "egovcp",
+        "world_model": draccus.encode(model.config),
+        "planner": draccus.encode(planner),
+        "input_features": {
+            spec.DEPTH_KEY: {
+                "type": "VISUAL",
+                "shape": [1, spec.DEPTH_ROWS, spec.DEPTH_COLS],
+            },
+            spec.STATE_KEY: {"type": "STATE", "shape": [spec.STATE_DIM]},
+        },
+        "output_features": {
+            spec.ACTION_KEY: {"type": "ACTION", "shape": [spec.ACTION_DIM]}
+        },
+    }
+    _write_json(work / CONFIG, config)
+    save_file(
+        {k: v.contiguous().cpu() for k, v in model.state_dict().items()}, work / WEIGHTS
+    )
+    manifest = {
+        "schema_version": SCHEMA_VERSION,
+        "egovcp_version": version("egovcp"),
+        "features": feature_spec(),
+        "files": {name: _sha256(work / name) for name in (CONFIG, WEIGHTS)},
+        **provenance,
+    }
+    _write_json(work / MANIFEST, manifest)
+    shutil.rmtree(path, ignore_errors=True)
+    work.rename(path)
+
+
+def load_artefact(path: str, revision: str = "") -> Artefact:
+    """Load and validate a policy from a folder or, failing that, a Hub model id.
+
+    Raises:
+        ArtefactError: missing, tampered with, or made for another feature spec.
+        EnvironmentFailure: the Hub cannot be reached.
+    """
+    folder = _locate(path, revision)
+    manifest = _read_json(folder / MANIFEST)
+    _check_manifest(folder, manifest)
+    config = _read_json(folder / CONFIG)
+    try:
+        model = WorldModel(draccus.decode(WorldModelConfig, config["world_model"]))
+        planner = draccus.decode(PlannerConfig, config["planner"])
+        model.load_state_dict(load_file(folder / WEIGHTS))
+    except (
+        KeyError,
+        RuntimeError,
+        SafetensorError,
+        draccus.utils.DraccusException,
+    ) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ArtefactError(
+            f"{folder}: weights and configuration disagree: {reason}"
+        ) from error
+    return Artefact(folder, model.eval(), planner, manifest)
+
+
+def _locate(path: str, revision: str) -> Path:
+    folder = Path(path)
+    if folder.is_dir():
+        return folder
+    if folder.exists() or path.count("/") != 1 or path.startswith((".", "/")):
+        raise ArtefactError(
+            f"no policy artefact at {path!r}: expected a folder with {CONFIG}, {WEIGHTS} and "
+            f"{MANIFEST} (a run's checkpoints/last/pretrained_model) or a Hub id 'user/name'"
+        )
+    try:
+        return Path(snapshot_download(path, revision=revision or None))
+    except (HfHubHTTPError, HFValidationError) as error:
+        reason = str(error).splitlines()[0]
+        raise ArtefactError(
+            f"{path!r} is neither a folder here nor a policy on the Hub: {reason}"
+        ) from error
+    except (OSError, ValueError) as error:
+        raise EnvironmentFailure(
+            f"{path!r} is not a folder here, and the Hub cannot be reached: "
+            f"{str(error).splitlines()[0]}"
+        ) from error
+
+
+def _check_manifest(folder: Path, manifest: dict[str, Any]) -> None:
+    found = manifest.get("schema_version")
+    if found != SCHEMA_VERSION:
+        raise ArtefactError(
+            f"{folder / MANIFEST}: schema version {found!r}, this egovcp reads "
+            f"{SCHEMA_VERSION}; install the version that made it, or train again"
+        )
+    if manifest.get("features") != feature_spec():
+        ours, theirs = feature_spec(), manifest.get("features") or {}
+        differing = [k for k in ours if theirs.get(k) != ours[k]]
+        raise ArtefactError(
+            f"{folder / MANIFEST}: made for another feature spec (differs in "
+            f"{', '.join(differing) or 'extra keys'}); train again on data of this version"
+        )
+    if not isinstance(manifest.get("controller_id"), str):
+        raise ArtefactError(
+            f"{folder / MANIFEST}: no controller_id; the file is damaged"
+        )
+    for name in (CONFIG, WEIGHTS):
+        expected, found = manifest.get("files", {}).get(name), _sha256(folder / name)
+        if found != expected:
+            raise ArtefactError(
+                f"{folder / name}: SHA-256 is {found[:12]}..., the manifest says "
+                f"{str(expected)[:12]}...; the file was changed or damaged: fetch it again"
+            )
+
+
+def _sha256(path: Path) -> str:
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise ArtefactError(
+            f"{path}: {error.strerror}; the artefact is incomplete"
+        ) from error
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ArtefactError(
+            f"{path}: {error.strerror}; not a policy artefact"
+        ) from error
+    except ValueError as error:
+        raise ArtefactError(
+            f"{path}: not valid JSON ({error}); the file is damaged"
+        ) from error
+    if not isinstance(content, dict):
+        raise ArtefactError(
+            f"{path}: expected a JSON object, found {type(content).__name__}"
+        )
+    return content
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

@@ -1,0 +1,74 @@
+"""Configuration of the world model and of its losses; every choice is one value."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from egovcp import spec
+
+
+@dataclass(frozen=True)
+class LossConfig:
+    """Weights of the terms of equations 6 to 9, and what each averages over."""
+
+    depth: float = 100.0
+    """Weight of the depth reconstruction, per pixel mean of 0.5 (x - x_hat)^2."""
+    moving: float = 30.0
+    """Extra weight of pixels that changed since the previous frame; 0: none."""
+    moving_threshold: float = 0.04
+    """Change of nearness (fraction of the depth range) that counts as moving."""
+    state: float = 1.0
+    """Weight of the proprioception reconstruction, mean over the 74 standardised values."""
+    kl_prior: float = 1.0
+    """Weight of KL(sg q || p), which pulls the prior to the posterior."""
+    kl_posterior: float = 0.1
+    """Weight of KL(q || sg p), which pulls the posterior to the prior."""
+    free_nats: float = 1.0
+    """KL below this many nats per step costs nothing."""
+    termination: float = 1.0
+    """Weight of the termination cross entropy."""
+    value: float = 1.0
+    """Weight of (Q - Monte Carlo return)^2, in units of the return's standard deviation."""
+    imagined_steps: int = 3
+    """Also regress Q on states imagined this many steps ahead of the posterior; 0: never."""
+    imagined_value: float = 1.0
+    """Weight of the value loss on imagined states."""
+
+
+@dataclass(frozen=True)
+class WorldModelConfig:
+    """Sizes of the networks (paper III-C) and the losses they are trained with."""
+
+    hidden: int = 256
+    """Size of the deterministic state h (GRU)."""
+    latent: int = 32
+    """Size of the stochastic state z (diagonal Gaussian)."""
+    units: int = 256
+    """Width of every MLP."""
+    channels: tuple[int, ...] = (16, 32, 64, 64)
+    """Channels of the depth CNN, one stride-2 layer each; the decoder mirrors them."""
+    min_std: float = 0.1
+    """Floor of the latent standard deviation."""
+    update_bias: float = -1.0
+    """Bias of the GRU's update gate: memory is kept at the start of training."""
+    depth_max_m: float = spec.DEPTH_MAX_M
+    """Depth, in metres, at which nearness is 0."""
+    loss: LossConfig = field(default_factory=LossConfig)
+    """Loss weights."""
+
+
+#: The paper's plain sum: likelihoods summed over pixels and joints, unit variances, nothing added.
+PAPER_LOSS = LossConfig(
+    depth=float(spec.DEPTH_ROWS * spec.DEPTH_COLS),
+    moving=0.0,
+    state=float(spec.STATE_DIM),
+    kl_posterior=1.0,
+    free_nats=0.0,
+    imagined_steps=0,
+)
+
+PRESETS = {
+    "default": WorldModelConfig(),
+    "paper": WorldModelConfig(loss=PAPER_LOSS),
+    "debug": WorldModelConfig(hidden=32, latent=8, units=32, channels=(4, 8, 8, 8)),
+}

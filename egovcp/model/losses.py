@@ -1,0 +1,183 @@
+"""The training objective (paper equations 6 to 9) over a batch of sequences [B, T, ...].
+
+Alignment of a row t: the model filters o_t after a_{t-1}; Q_t judges a_t against the
+Monte Carlo return from t; D judges the state that a_t has produced, (h_{t+1}, z^_{t+1}),
+because it is not conditioned on an action and the terminal observation is not stored.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from egovcp.model.config import LossConfig
+from egovcp.model.depth import nearness
+from egovcp.model.gaussian import Gaussian, kl_divergence
+from egovcp.model.world_model import Carry, WorldModel
+
+
+class Batch(NamedTuple):
+    """Sequences; what each tensor holds is fixed by `egovcp.data.stream`."""
+
+    depth: Tensor  # (B, T, 48, 64) mm, int32 or uint16-valued
+    state: Tensor  # (B, T, 74)
+    action: Tensor  # (B, T, 7)
+    prev_action: Tensor  # (B, T, 7), a_{t-1} as sent; zeros at the start of an episode
+    is_first: Tensor  # (B, T) bool
+    valid: Tensor  # (B, T) bool, False on padding
+    mc_return: Tensor  # (B, T)
+    mc_valid: Tensor  # (B, T) bool
+    terminal_next: Tensor  # (B, T) bool: a_t ended the episode in failure
+
+
+class Rollout(NamedTuple):
+    """The filtered sequence, (B, T, ...)."""
+
+    carry: Carry
+    posterior: Gaussian
+    prior: Gaussian
+    near: Tensor  # (B, T, 48, 64)
+    state: Tensor  # (B, T, 74) standardised
+
+
+def filter_sequence(
+    model: WorldModel,
+    batch: Batch,
+    carry: Carry | None = None,
+    generator: torch.Generator | None = None,
+) -> Rollout:
+    """Run the posterior over whole sequences, sampling z; `WorldModel.observe` step by step."""
+    size, length = batch.valid.shape
+    near = nearness(batch.depth.flatten(0, 1), model.config.depth_max_m)
+    state = model.standardise(batch.state)
+    embedding = model.embed_near(near, state.flatten(0, 1)).view(size, length, -1)
+    carry = model.initial(size) if carry is None else carry
+    hs: list[Tensor] = []
+    zs: list[Tensor] = []
+    posteriors: list[Gaussian] = []
+    for t in range(length):
+        h = model.advance(carry, batch.prev_action[:, t], batch.is_first[:, t])
+        posterior = model.infer(h, embedding[:, t])
+        carry = Carry(h, posterior.sample(generator))
+        hs.append(carry.h)
+        zs.append(carry.z)
+        posteriors.append(posterior)
+    h_seq = torch.stack(hs, 1)
+    means, stds = (torch.stack(s, 1) for s in zip(*posteriors, strict=True))
+    return Rollout(
+        Carry(h_seq, torch.stack(zs, 1)),
+        Gaussian(means, stds),
+        model.predict(h_seq),
+        near.view(size, length, *near.shape[1:]),
+        state,
+    )
+
+
+def world_model_loss(
+    model: WorldModel, batch: Batch, generator: torch.Generator | None = None
+) -> tuple[Tensor, dict[str, Tensor]]:
+    """Total loss of equation 6 and its terms (scalars, detached)."""
+    config = model.config.loss
+    rollout = filter_sequence(model, batch, generator=generator)
+    terms = {
+        "depth": config.depth * depth_loss(model, rollout, batch, config),
+        "state": config.state * state_loss(model, rollout, batch),
+        **kl_losses(rollout, batch.valid, config),
+        **value_and_termination_losses(model, rollout, batch, config),
+    }
+    total = torch.stack(list(terms.values())).sum()
+    return total, {f"loss/{name}": term.detach() for name, term in terms.items()}
+
+
+def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
+    """Mean of x where mask; 0 where the mask is empty."""
+    weight = mask.to(x.dtype)
+    return (x * weight).sum() / weight.sum().clamp_min(1.0)
+
+
+def depth_loss(
+    model: WorldModel, rollout: Rollout, batch: Batch, config: LossConfig
+) -> Tensor:
+    """Gaussian negative log likelihood of the image, moving pixels weighted up."""
+    image = model.decode_depth(rollout.carry.features.flatten(0, 1))
+    error = 0.5 * (image.float() - rollout.near.flatten(0, 1)).square()
+    if config.moving > 0:
+        weight = 1.0 + config.moving * moving_pixels(
+            rollout.near, config.moving_threshold
+        )
+        error = error * weight.flatten(0, 1)
+    return masked_mean(error.mean((-2, -1)), batch.valid.flatten())
+
+
+def moving_pixels(near: Tensor, threshold: float) -> Tensor:
+    """(B, T, H, W) nearness -> 1 where a pixel differs from the previous frame, else 0."""
+    change = (near[:, 1:] - near[:, :-1]).abs() > threshold
+    return F.pad(change, (0, 0, 0, 0, 1, 0)).to(near.dtype)
+
+
+def state_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
+    """Gaussian negative log likelihood of the standardised proprioception."""
+    prediction = model.decode_state(rollout.carry.features).float()
+    error = 0.5 * (prediction - rollout.state).square().mean(-1)
+    return masked_mean(error, batch.valid)
+
+
+def kl_losses(rollout: Rollout, valid: Tensor, config: LossConfig) -> dict[str, Tensor]:
+    """The two terms of equation 8, each clipped below at the free nats."""
+    q, p = rollout.posterior, rollout.prior
+    to_prior = kl_divergence(q.detach(), p).sum(-1).clamp_min(config.free_nats)
+    to_posterior = kl_divergence(q, p.detach()).sum(-1).clamp_min(config.free_nats)
+    return {
+        "kl_prior": config.kl_prior * masked_mean(to_prior, valid),
+        "kl_posterior": config.kl_posterior * masked_mean(to_posterior, valid),
+    }
+
+
+def value_and_termination_losses(
+    model: WorldModel, rollout: Rollout, batch: Batch, config: LossConfig
+) -> dict[str, Tensor]:
+    """Equations 9 and 7b, on the posterior and on states imagined from it.
+
+    The planner asks Q about imagined states, so Q learns on them as well: k steps after
+    row t the model has imagined (h_{t+k}, z^_{t+k}) from the recorded actions, and its
+    value is regressed on the return of row t + k.
+    """
+    target = (batch.mc_return - model.return_mean) / model.return_std
+    usable = batch.valid & batch.mc_valid
+    error = (model.standardised_value(rollout.carry, batch.action) - target).square()
+    losses = {"value": config.value * masked_mean(error, usable)}
+
+    carry = rollout.carry
+    length = batch.valid.shape[1]
+    imagined: list[Tensor] = []
+    for k in range(1, max(1, config.imagined_steps) + 1):
+        if k > length:
+            break
+        carry = model.imagine(carry, batch.action[:, k - 1 :])
+        if k == 1:
+            logit = model.termination_logit(carry)
+            bce = F.binary_cross_entropy_with_logits(
+                logit, batch.terminal_next.float(), reduction="none"
+            )
+            losses["termination"] = config.termination * masked_mean(bce, batch.valid)
+        carry = Carry(
+            carry.h[:, :-1], carry.z[:, :-1]
+        )  # (B, T - k): the rows that exist
+        if config.imagined_steps and k < length:
+            same_episode = _unbroken(batch, k)
+            q = model.standardised_value(carry, batch.action[:, k:])
+            error = (q - target[:, k:]).square()
+            imagined.append(masked_mean(error, usable[:, k:] & same_episode))
+    if imagined:
+        losses["imagined_value"] = config.imagined_value * torch.stack(imagined).mean()
+    return losses
+
+
+def _unbroken(batch: Batch, k: int) -> Tensor:
+    """(B, T - k): row t and row t + k are valid and of the same episode."""
+    start = batch.is_first.long().cumsum(1)
+    same = start[:, k:] == start[:, :-k]
+    return same & batch.valid[:, k:] & batch.valid[:, :-k]

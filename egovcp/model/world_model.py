@@ -1,0 +1,178 @@
+"""The ego-vision world model (paper section III-C).
+
+    h_t = f(h_{t-1}, z_{t-1}, a_{t-1})        (1)   deterministic state, GRU
+    z_t ~ q(z | h_t, o_t)                     (2)   posterior, from depth and proprioception
+    o_t ~ p(o | h_t, z_t)                     (3)   decoder
+    z^_t ~ p(z | h_t)                               prior, without the observation
+    d_t = D(h_t, z_t)                         (4)   probability of termination
+    Q_t = Q(h_t, z_t, a_t)                    (5)   surrogate value
+
+The recurrence is an explicit `Carry`: the same `observe` step serves training, filtering
+on the robot and replay; `imagine` advances it without an observation.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from egovcp import spec
+from egovcp.model.config import WorldModelConfig
+from egovcp.model.depth import nearness, network_image, to_metres
+from egovcp.model.gaussian import Gaussian
+from egovcp.model.nets import DepthDecoder, DepthEncoder, GruCell, mlp
+
+
+class Carry(NamedTuple):
+    """The model's memory: h (..., hidden) and z (..., latent)."""
+
+    h: Tensor
+    z: Tensor
+
+    @property
+    def features(self) -> Tensor:
+        return torch.cat([self.h, self.z], -1)
+
+
+class WorldModel(nn.Module):
+    """Networks, normalisation and the recurrence; the losses are in `egovcp.model.losses`."""
+
+    state_mean: Tensor
+    state_std: Tensor
+    return_mean: Tensor
+    return_std: Tensor
+    return_floor: Tensor
+
+    def __init__(self, config: WorldModelConfig) -> None:
+        super().__init__()
+        self.config = c = config
+        features = c.hidden + c.latent
+        self.encode_depth = DepthEncoder(c.channels)
+        self.encode_state = mlp(spec.STATE_DIM, c.units, c.units, 1)
+        embedding = self.encode_depth.outputs + c.units
+        self.mix = nn.Linear(c.latent + spec.ACTION_DIM, c.units, bias=False)
+        self.mix_act = nn.Sequential(nn.LayerNorm(c.units), nn.SiLU())
+        self.gru = GruCell(c.units, c.hidden, c.update_bias)
+        self.posterior = mlp(c.hidden + embedding, c.units, 2 * c.latent, 1)
+        self.prior = mlp(c.hidden, c.units, 2 * c.latent, 1)
+        self.decode_depth = DepthDecoder(features, c.channels)
+        self.decode_state = mlp(features, c.units, spec.STATE_DIM, 1)
+        self.termination_head = mlp(features, c.units, 1, 1)
+        self.value_head = mlp(features + spec.ACTION_DIM, c.units, 1, 2)
+        self._start_at_zero()
+        self.register_buffer("state_mean", torch.zeros(spec.STATE_DIM))
+        self.register_buffer("state_std", torch.ones(spec.STATE_DIM))
+        self.register_buffer("return_mean", torch.zeros(()))
+        self.register_buffer("return_std", torch.ones(()))
+        self.register_buffer("return_floor", torch.zeros(()))
+
+    def _start_at_zero(self) -> None:
+        """Value and termination start as constants, so that early plans are not random."""
+        for head in (self.value_head, self.termination_head):
+            last = head[-1]
+            assert isinstance(last, nn.Linear)
+            nn.init.zeros_(last.weight)
+            nn.init.zeros_(last.bias)
+
+    # --- observation -----------------------------------------------------------------
+    def embed(self, depth: Tensor, state: Tensor) -> Tensor:
+        """Raw depth (B, 48, 64) mm and state (B, 74) -> embedding (B, E)."""
+        return self.embed_near(
+            nearness(depth, self.config.depth_max_m), self.standardise(state)
+        )
+
+    def embed_near(self, near: Tensor, standardised: Tensor) -> Tensor:
+        """The same from nearness (B, 48, 64) and standardised state (B, 74)."""
+        image = self.encode_depth(network_image(near))
+        return torch.cat([image, self.encode_state(standardised)], -1)
+
+    def standardise(self, state: Tensor) -> Tensor:
+        """(..., 74) raw state -> zero mean, unit variance, clipped to +-10."""
+        return ((state - self.state_mean) / self.state_std).clamp(-10.0, 10.0)
+
+    # --- recurrence ------------------------------------------------------------------
+    def initial(self, batch: int) -> Carry:
+        """The carry before the first observation: zeros."""
+        reference = self.state_mean
+        return Carry(
+            reference.new_zeros(batch, self.config.hidden),
+            reference.new_zeros(batch, self.config.latent),
+        )
+
+    def transition(self, carry: Carry, action: Tensor) -> Tensor:
+        """h_{t+1} from (h_t, z_t) and a_t (B, 7); equation 1."""
+        x = self.mix_act(self.mix(torch.cat([carry.z, action], -1)))
+        h: Tensor = self.gru(x, carry.h)
+        return h
+
+    def infer(self, h: Tensor, embedding: Tensor) -> Gaussian:
+        """Posterior q(z | h, o); equation 2."""
+        return Gaussian.from_logits(
+            self.posterior(torch.cat([h, embedding], -1)), self.config.min_std
+        )
+
+    def predict(self, h: Tensor) -> Gaussian:
+        """Prior p(z | h)."""
+        return Gaussian.from_logits(self.prior(h), self.config.min_std)
+
+    def observe(
+        self,
+        carry: Carry,
+        action: Tensor,
+        depth: Tensor,
+        state: Tensor,
+        is_first: Tensor,
+    ) -> Carry:
+        """Filter one observation: a_{t-1} (B, 7) as sent, o_t, is_first (B,) -> carry at t.
+
+        Rows with ``is_first`` start from zeros and the neutral action. z is the
+        posterior mean.
+        """
+        h = self.advance(carry, action, is_first)
+        return Carry(h, self.infer(h, self.embed(depth, state)).mean)
+
+    def advance(self, carry: Carry, action: Tensor, is_first: Tensor) -> Tensor:
+        """h_t of equation 1, restarting from zeros where ``is_first`` (B,)."""
+        keep = (~is_first).to(carry.h.dtype)[:, None]
+        return self.transition(Carry(carry.h * keep, carry.z * keep), action * keep)
+
+    def imagine(self, carry: Carry, action: Tensor) -> Carry:
+        """Advance by one tick without an observation; z is the prior mean."""
+        h = self.transition(carry, action)
+        return Carry(h, self.predict(h).mean)
+
+    @staticmethod
+    def repeat(carry: Carry, times: int) -> Carry:
+        """(E, ...) -> (E * times, ...), each row repeated in place."""
+        return Carry(*(x.repeat_interleave(times, 0) for x in carry))
+
+    # --- heads -----------------------------------------------------------------------
+    def value(self, carry: Carry, action: Tensor) -> Tensor:
+        """Q(h, z, a) in units of return, (...,); equation 5."""
+        return (
+            self.standardised_value(carry, action) * self.return_std + self.return_mean
+        )
+
+    def standardised_value(self, carry: Carry, action: Tensor) -> Tensor:
+        """Q in units of the return's deviation from its mean, (...,)."""
+        q: Tensor = self.value_head(torch.cat([carry.features, action], -1))
+        return q.squeeze(-1).float()
+
+    def termination_logit(self, carry: Carry) -> Tensor:
+        """Log-odds that the episode has failed at this state, (...,); equation 4."""
+        d: Tensor = self.termination_head(carry.features)
+        return d.squeeze(-1).float()
+
+    def termination(self, carry: Carry) -> Tensor:
+        """Probability that the episode has failed at this state, (...,)."""
+        return torch.sigmoid(self.termination_logit(carry))
+
+    def decode(self, carry: Carry) -> tuple[Tensor, Tensor]:
+        """Carry (B, ...) -> depth (B, 48, 64) in metres, 0 = nothing in range; state (B, 74)."""
+        features = carry.features
+        depth = to_metres(self.decode_depth(features).float(), self.config.depth_max_m)
+        return depth, self.decode_state(
+            features
+        ).float() * self.state_std + self.state_mean

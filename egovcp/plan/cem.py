@@ -1,0 +1,184 @@
+"""Value-guided sampling MPC with the cross-entropy method (paper section III-D).
+
+    maximise  J = 1/N sum_k Q(h_{t+k}, z^_{t+k}, a_{t+k})            (equation 15)
+
+Candidates live in the action process of the data, a_k = a_{k-1} + eta * delta_k with
+delta in [-1, 1]^7 starting at the last executed action: anything else would ask Q about
+actions it never saw. The planner is pure: no I/O, no clock, no global state.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.errors import UsageError
+
+TerminationRule = Literal["paper", "shift", "survival"]
+
+
+class Dynamics[L](Protocol):
+    """What the planner needs of a world model; every method is batched over rows."""
+
+    @property
+    def return_floor(self) -> Tensor:
+        """The worst return of the data: what a failed plan is worth under rule ``shift``."""
+        ...
+
+    def repeat(self, carry: L, times: int) -> L:
+        """(E, ...) -> (E * times, ...), each row repeated in place."""
+        ...
+
+    def imagine(self, carry: L, action: Tensor) -> L:
+        """Advance by one tick under action (B, 7)."""
+        ...
+
+    def value(self, carry: L, action: Tensor) -> Tensor:
+        """Q, (B,)."""
+        ...
+
+    def termination(self, carry: L) -> Tensor:
+        """Probability that this state is a failure, (B,)."""
+        ...
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """The sampling MPC; the defaults are the paper's, 25 Hz."""
+
+    samples: int = 1024
+    """M, candidate plans per iteration."""
+    horizon: int = 4
+    """N, planner ticks."""
+    iterations: int = 3
+    """Rounds of the cross-entropy method."""
+    elites: int = 64
+    """Best candidates that the next round is fitted to."""
+    min_std: float = 0.1
+    """Floor of the sampling deviation, in units of delta."""
+    eta: float = spec.ACTION_ETA
+    """Step of the action process, box units per tick."""
+    termination_threshold: float = 0.9
+    """A candidate whose termination probability exceeds this loses its later values."""
+    termination_rule: TerminationRule = "shift"
+    """paper: later values are 0; shift: they are the data's worst return; survival: each
+    value above the worst return is weighted with the probability of being alive."""
+
+    def __post_init__(self) -> None:
+        if min(self.samples, self.horizon, self.iterations, self.elites) < 1:
+            raise UsageError(
+                "samples, horizon, iterations and elites must be at least 1"
+            )
+        if self.elites > self.samples:
+            raise UsageError(f"elites ({self.elites}) exceed samples ({self.samples})")
+
+
+class Plan(NamedTuple):
+    """The planner's answer for E robots."""
+
+    actions: Tensor  # (E, N, 7) in [-1, 1]; the first is to be executed
+    deltas: Tensor  # (E, N, 7) its steps; shifted, the warm start of the next plan
+    value: Tensor  # (E,) J of the best candidates' mean (mean over the last elites)
+    candidates: Tensor  # (E, elites, N, 7) elites of the last round, best first
+    candidate_values: Tensor  # (E, elites)
+    iterations: int
+
+
+def reflect(x: Tensor) -> Tensor:
+    """Fold values within one box length outside [-1, 1] back inside, as the data does."""
+    x = torch.where(x > 1.0, 2.0 - x, x)
+    return torch.where(x < -1.0, -2.0 - x, x)
+
+
+def walk(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
+    """Actions (B, N, 7) of the data's process from ``start`` (B, 7) by ``deltas`` (B, N, 7)."""
+    actions = []
+    action = start
+    for delta in deltas.unbind(1):
+        action = reflect(action + eta * delta)
+        actions.append(action)
+    return torch.stack(actions, 1)
+
+
+def evaluate[L](
+    model: Dynamics[L], carry: L, actions: Tensor, config: PlannerConfig
+) -> Tensor:
+    """J (B,) of action sequences (B, N, 7), each from its own row of the carry (B, ...)."""
+    horizon = actions.shape[1]
+    floor = 0.0 if config.termination_rule == "paper" else model.return_floor
+    total = torch.zeros_like(actions[:, 0, 0])
+    alive = torch.ones_like(total)
+    for k in range(horizon):
+        if k > 0:
+            carry = model.imagine(carry, actions[:, k - 1])
+        total = total + alive * (model.value(carry, actions[:, k]) - floor)
+        if k == 0 or k == horizon - 1:
+            continue  # o_t was seen alive; and nothing follows the last step
+        dead = model.termination(carry)
+        if config.termination_rule == "survival":
+            alive = alive * (1.0 - dead)
+        else:
+            alive = alive * (dead <= config.termination_threshold)
+    return total / horizon + floor
+
+
+def plan_cem[L](
+    model: Dynamics[L],
+    carry: L,
+    executed: Tensor,
+    config: PlannerConfig,
+    generator: torch.Generator,
+    warm: Tensor | None = None,
+) -> Plan:
+    """Plan for E robots from ``carry`` (E, ...), a_{t-1} = ``executed`` (E, 7).
+
+    Args:
+        warm: (E, N, 7) deltas of the previous plan, already shifted; None starts at rest.
+        generator: its draws are shared by all robots, so that a robot's plan does not
+            depend on which others it is planned with.
+    """
+    robots = executed.shape[0]
+    shape = (robots, config.horizon, spec.ACTION_DIM)
+    mean = executed.new_zeros(shape) if warm is None else warm
+    std = torch.full_like(mean, 3.0**-0.5)  # of U(-1, 1)
+    many = model.repeat(carry, config.samples)
+    start = executed.repeat_interleave(config.samples, 0)
+    for _ in range(config.iterations):
+        deltas = _sample(mean, std, config, generator)  # (E, M, N, 7)
+        actions = walk(start, deltas.flatten(0, 1), config.eta)
+        values = evaluate(model, many, actions, config).view(robots, config.samples)
+        values = values.nan_to_num(nan=-torch.inf)
+        top, index = values.topk(config.elites, dim=1)
+        elites = deltas.take_along_dim(index[:, :, None, None], 1)
+        mean, std = (
+            elites.mean(1),
+            elites.std(1, correction=0).clamp_min(config.min_std),
+        )
+    chosen = walk(executed, mean, config.eta)
+    best = walk(
+        executed.repeat_interleave(config.elites, 0), elites.flatten(0, 1), config.eta
+    )
+    best = best.view(robots, config.elites, *shape[1:])
+    return Plan(chosen, mean, top.mean(1), best, top, config.iterations)
+
+
+def _sample(
+    mean: Tensor, std: Tensor, config: PlannerConfig, generator: torch.Generator
+) -> Tensor:
+    """(E, M, N, 7) deltas; the first candidate is the mean itself, the second stands still."""
+    size = (1, config.samples, *mean.shape[1:])
+    noise = torch.randn(size, generator=generator, device=mean.device)
+    deltas = mean[:, None] + std[:, None] * noise
+    deltas[:, 0] = mean
+    if config.samples > 1:
+        deltas[:, 1] = 0.0
+    return deltas.clamp_(-1.0, 1.0)
+
+
+def shift(deltas: Tensor) -> Tensor:
+    """Drop the executed first step (E, N, 7) and stand still at the end: the warm start."""
+    return torch.cat([deltas[:, 1:], torch.zeros_like(deltas[:, :1])], 1)

@@ -1,0 +1,123 @@
+"""The world model as a policy: filter an observation, plan, report what was imagined."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.model import Carry, WorldModel
+from egovcp.plan.cem import PlannerConfig, plan_cem, shift
+
+type Array = NDArray[np.float32]
+
+
+class PolicyStep(NamedTuple):
+    """What the policy decided for E robots, as numpy arrays."""
+
+    action: Array  # (E, 7) in [-1, 1]
+    plan: Array  # (E, N, 7)
+    value: Array  # (E,) J of the plan
+    termination: Array  # (E,) probability at the filtered state
+    candidates: Array  # (E, elites, N, 7), best first
+    candidate_values: Array  # (E, elites)
+    iterations: int
+
+
+class Policy:
+    """Filters and plans for E robots in step; call `act`, then `advance`, once a tick.
+
+    The recurrence advances with the action that was actually sent, so `advance` must be
+    told what the safety layer made of the planned one.
+    """
+
+    def __init__(
+        self, model: WorldModel, config: PlannerConfig, num_envs: int, seed: int = 0
+    ) -> None:
+        self.model = model.eval()
+        self.config = config
+        self.num_envs = num_envs
+        self._seed = seed
+        self.reset()
+
+    def reset(self, rows: NDArray[np.intp] | None = None) -> None:
+        """Forget the past of ``rows`` (None: of all, and restart the random stream)."""
+        if rows is None:
+            self._carry = self.model.initial(self.num_envs)
+            self._sent = torch.zeros(self.num_envs, spec.ACTION_DIM)
+            self._first = torch.ones(self.num_envs, dtype=torch.bool)
+            self._warm = torch.zeros(
+                self.num_envs, self.config.horizon, spec.ACTION_DIM
+            )
+            self._generator = torch.Generator().manual_seed(self._seed)
+            return
+        index = torch.as_tensor(rows)
+        self._first[index] = True
+        self._sent[index] = 0.0
+        self._warm[index] = 0.0
+
+    @torch.no_grad()
+    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+        """Depth (E, 48, 64) mm and state (E, 74) -> the plan from here."""
+        self._carry = self.model.observe(
+            self._carry,
+            self._sent,
+            torch.from_numpy(depth.astype(np.int32)),
+            torch.as_tensor(state, dtype=torch.float32),
+            self._first,
+        )
+        self._first = torch.zeros_like(self._first)
+        plan = plan_cem(
+            self.model,
+            self._carry,
+            self._sent,
+            self.config,
+            self._generator,
+            self._warm,
+        )
+        self._warm = shift(plan.deltas)
+        return PolicyStep(
+            plan.actions[:, 0].numpy(),
+            plan.actions.numpy(),
+            plan.value.numpy(),
+            self.model.termination(self._carry).numpy(),
+            plan.candidates.numpy(),
+            plan.candidate_values.numpy(),
+            plan.iterations,
+        )
+
+    def advance(self, sent: NDArray[np.floating]) -> None:
+        """Tell the recurrence which action (E, 7) was really sent."""
+        self._sent = torch.as_tensor(sent, dtype=torch.float32).clone()
+
+    @property
+    def carry(self) -> Carry:
+        """The filtered state, for probes and logs."""
+        return self._carry
+
+    @torch.no_grad()
+    def reconstruct(self) -> Array:
+        """Depth (E, 48, 64) in metres decoded from the filtered state; 0 = nothing there."""
+        return _numpy(self.model.decode(self._carry)[0])
+
+    @torch.no_grad()
+    def imagine(self, plan: NDArray[np.floating], horizon: int) -> Array:
+        """Depth (E, horizon, 48, 64), metres, imagined under ``plan`` (E, N, 7).
+
+        Beyond the plan's end its last action is held.
+        """
+        actions = torch.as_tensor(plan, dtype=torch.float32)
+        carry, frames = self._carry, []
+        for k in range(horizon):
+            carry = self.model.imagine(carry, actions[:, min(k, actions.shape[1] - 1)])
+            frames.append(self.model.decode(carry)[0])
+        return _numpy(torch.stack(frames, 1))
+
+
+def _numpy(x: Tensor) -> Array:
+    array: Array = x.numpy()
+    return array
