@@ -129,14 +129,16 @@ class ActionBox:
         """Normalised action ``(..., 7)`` in [-1, 1] -> metres ``(..., 7)``."""
         a = np.asarray(action, dtype=np.float64)
         low, mid, high = (np.asarray(v) for v in (self.low, self.neutral, self.high))
-        return mid + np.where(a < 0, a * (mid - low), a * (high - mid))
+        metric: NDArray[np.float64] = mid + np.where(a < 0, a * (mid - low), a * (high - mid))
+        return metric
 
     def to_normalised(self, metric: NDArray[np.floating]) -> NDArray[np.float64]:
         """Metres ``(..., 7)`` -> normalised action ``(..., 7)``; the inverse of ``to_metric``."""
         m = np.asarray(metric, dtype=np.float64)
         low, mid, high = (np.asarray(v) for v in (self.low, self.neutral, self.high))
         d = m - mid
-        return np.where(d < 0, d / (mid - low), d / (high - mid))
+        action: NDArray[np.float64] = np.where(d < 0, d / (mid - low), d / (high - mid))
+        return action
 
 
 #: Hand targets (palm sites) in the pelvis heading frame, then pelvis height above ground.
@@ -164,7 +166,11 @@ FEATURES: Final[dict[str, dict[str, object]]] = {
         "info": {"is_depth_map": True},
     },
     STATE_KEY: {"dtype": "float32", "shape": (STATE_DIM,), "names": list(STATE_NAMES)},
-    ACTION_KEY: {"dtype": "float32", "shape": (ACTION_DIM,), "names": list(ACTION_NAMES)},
+    ACTION_KEY: {
+        "dtype": "float32",
+        "shape": (ACTION_DIM,),
+        "names": list(ACTION_NAMES),
+    },
     REWARD_KEY: {"dtype": "float32", "shape": (1,), "names": None},
     DONE_KEY: {"dtype": "bool", "shape": (1,), "names": None},
     SUCCESS_KEY: {"dtype": "bool", "shape": (1,), "names": None},

@@ -1,0 +1,63 @@
+"""The walls of the house: who may import whom."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = {
+    "egovcp": ROOT / "egovcp",
+    "egovcp_collect": ROOT / "collect" / "egovcp_collect",
+    "egovcp_train": ROOT / "train" / "egovcp_train",
+    "egovcp_deploy": ROOT / "deploy" / "egovcp_deploy",
+}
+
+#: Part of the library -> what it must not import, anywhere in its files.
+FORBIDDEN = {
+    "egovcp/model": ("egovcp.data", "egovcp.sim", "egovcp.plan", "egovcp.log", "mujoco", "lerobot"),
+    "egovcp/plan": ("egovcp.data", "egovcp.sim", "egovcp.log", "mujoco", "lerobot", "logging"),
+    "egovcp/robot": ("egovcp.sim", "egovcp.data", "egovcp.model", "egovcp.plan", "egovcp.log"),
+    "egovcp/sim": ("egovcp.data", "egovcp.model", "egovcp.plan", "egovcp.log", "torch"),
+    "egovcp/data": ("egovcp.sim", "egovcp.model", "egovcp.plan", "egovcp.log", "mujoco"),
+    "egovcp/log": ("egovcp.data", "egovcp.sim", "egovcp.plan", "egovcp.model"),
+}
+
+
+def imports(path: Path) -> set[str]:
+    """Every module that the file imports, at any depth of its code."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return found
+
+
+def violations(folder: Path, forbidden: tuple[str, ...]) -> list[str]:
+    return [
+        f"{path.relative_to(ROOT)} imports {module}"
+        for path in sorted(folder.rglob("*.py"))
+        for module in sorted(imports(path))
+        if any(module == name or module.startswith(f"{name}.") for name in forbidden)
+    ]
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_applications_import_only_the_library(package: str) -> None:
+    others = tuple(name for name in PACKAGES if name not in (package, "egovcp"))
+    assert violations(PACKAGES[package], others) == []
+
+
+@pytest.mark.parametrize("part", FORBIDDEN)
+def test_arrows_inside_the_library_point_one_way(part: str) -> None:
+    assert any((ROOT / part).glob("*.py"))
+    assert violations(ROOT / part, FORBIDDEN[part]) == []
+
+
+def test_a_violation_would_be_found(tmp_path: Path) -> None:
+    (tmp_path / "bad.py").write_text("def f():\n    from egovcp.sim import env\n")
+    assert imports(tmp_path / "bad.py") == {"egovcp.sim.env"}

@@ -1,0 +1,69 @@
+"""Checkpoints in LeRobot's layout, complete or absent, never half-written.
+
+checkpoints/000500/pretrained_model/   the policy artefact (averaged weights)
+checkpoints/000500/training_state/     raw weights, optimiser, random streams, data position
+checkpoints/last -> 000500
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import shutil
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from egovcp.errors import ArtefactError
+
+STATE_FILE = "state.pt"
+
+
+def checkpoint_dir(output_dir: Path, step: int) -> Path:
+    return output_dir / "checkpoints" / f"{step:06d}"
+
+
+def finish_checkpoint(partial: Path, state: dict[str, Any]) -> Path:
+    """Add the training state to ``partial`` (NNNNNN.partial), publish it, point ``last`` at it."""
+    folder = partial / "training_state"
+    folder.mkdir(parents=True)
+    with (folder / STATE_FILE).open("wb") as file:
+        torch.save(state, file)
+        file.flush()
+        os.fsync(file.fileno())
+    final = partial.with_suffix("")
+    shutil.rmtree(final, ignore_errors=True)
+    partial.rename(final)
+    link = final.parent / "last.new"
+    link.unlink(missing_ok=True)
+    link.symlink_to(final.name)
+    link.replace(final.parent / "last")
+    return final
+
+
+def begin_checkpoint(output_dir: Path, step: int) -> Path:
+    """An empty NNNNNN.partial folder to fill; leftovers of a killed run are removed."""
+    partial = checkpoint_dir(output_dir, step).with_suffix(".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    partial.mkdir(parents=True)
+    return partial
+
+
+def load_training_state(output_dir: Path) -> dict[str, Any]:
+    """Training state of the last complete checkpoint.
+
+    Raises:
+        ArtefactError: there is none, or it cannot be read.
+    """
+    path = output_dir / "checkpoints" / "last" / "training_state" / STATE_FILE
+    if not path.is_file():
+        raise ArtefactError(
+            f"{output_dir}: no checkpoint to resume from (expected "
+            f"{path.relative_to(output_dir)}); start without --resume in a new folder"
+        )
+    try:
+        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
+        raise ArtefactError(f"{path}: cannot be read ({str(error).splitlines()[0]})") from error
+    return state

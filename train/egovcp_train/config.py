@@ -1,0 +1,90 @@
+"""The options of ``egovcp-train``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from egovcp.cli import DatasetConfig
+from egovcp.model import WorldModelConfig
+from egovcp.plan import PlannerConfig
+
+
+@dataclass(frozen=True)
+class OptimizerConfig:
+    """AdamW with linear warm-up and cosine decay to a tenth."""
+
+    lr: float = 1e-3
+    """Peak learning rate."""
+    weight_decay: float = 1e-3
+    """Decoupled weight decay."""
+    warmup_steps: int = 100
+    """Steps of linear warm-up."""
+    grad_clip: float = 10.0
+    """Largest gradient norm."""
+    ema: float = 0.995
+    """Decay of the averaged weights that are evaluated and shipped; 0: no averaging."""
+
+
+@dataclass(frozen=True)
+class SamplingConfig:
+    """Which windows of which episodes make a batch."""
+
+    length: int = 24
+    """Ticks per window."""
+    burn_in: int = 0
+    """Leading ticks of a window that only fill the memory and are not trained on."""
+    event_fraction: float = 0.0
+    """Share of windows that are placed around events instead of anywhere."""
+    mirror: bool = True
+    """Left-right mirror half of the windows (the robot is symmetric)."""
+    full_returns: bool = True
+    """Train Q only on returns that the time limit does not cut short; false: the paper's."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Train the ego-vision world model from a LeRobot dataset and write a policy artefact.
+
+    The dataset comes from disk (--dataset.root) or from the Hub (--dataset.repo_id).
+    Checkpoints follow LeRobot's layout: OUTPUT_DIR/checkpoints/last/pretrained_model is the
+    artefact for egovcp-deploy.
+    """
+
+    output_dir: str
+    """Folder of the run; must not exist unless --resume."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """Dataset to train on."""
+    preset: Literal["default", "paper", "debug"] = "default"
+    """Starting point of the --policy options."""
+    policy: WorldModelConfig = field(default_factory=WorldModelConfig)
+    """World model and losses."""
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    """Planner settings stored in the artefact."""
+    sampling: SamplingConfig = field(default_factory=SamplingConfig)
+    """Batches."""
+    optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
+    """Optimiser."""
+    steps: int = 20_000
+    """Gradient steps."""
+    max_minutes: float = 0.0
+    """Wall-clock limit in minutes after which the run ends early, its learning rate decayed on
+    the clock; 0: none. A run under a limit is not repeatable step for step."""
+    batch_size: int = 32
+    """Windows per gradient step."""
+    seed: int = 0
+    """Seed of initialisation, batches and sampling."""
+    resume: bool = False
+    """Continue the run in output_dir from its last checkpoint."""
+    log_freq: int = 50
+    """Steps between TensorBoard records."""
+    eval_freq: int = 500
+    """Steps between evaluations on held-out episodes; 0: only at the end."""
+    save_freq: int = 1000
+    """Steps between checkpoints; one is always written at the end."""
+    threads: int = 0
+    """CPU threads; 0: all cores."""
+    device: str = "auto"
+    """cpu, cuda, or auto (cuda if there is one)."""
+    tensorboard: bool = True
+    """Write TensorBoard records to OUTPUT_DIR/tensorboard."""

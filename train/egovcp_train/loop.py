@@ -1,0 +1,104 @@
+"""The training loop: one optimiser step, averaging of weights, schedule, bookkeeping."""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from egovcp.errors import DataError
+from egovcp.model import Batch, WorldModel, world_model_loss
+from egovcp_train.config import OptimizerConfig
+
+
+class Learner:
+    """Model, averaged model, optimiser and the random stream of the latent noise."""
+
+    def __init__(self, model: WorldModel, config: OptimizerConfig, seed: int) -> None:
+        self.model = model
+        self.config = config
+        self.averaged = copy.deepcopy(model).requires_grad_(False)
+        self.optimizer = torch.optim.AdamW(
+            model.parameters(), lr=config.lr, weight_decay=config.weight_decay, eps=1e-8
+        )
+        device = model.state_mean.device
+        self.generator = torch.Generator(device=device).manual_seed(seed)
+        self.step = 0
+        self._not_finite = 0
+
+    def update(self, batch: Batch, progress: float) -> dict[str, Tensor]:
+        """One gradient step at ``progress`` in [0, 1] of the run; returns scalar metrics."""
+        self.model.train()
+        for group in self.optimizer.param_groups:
+            group["lr"] = self.learning_rate(progress)
+        loss, metrics = world_model_loss(self.model, batch, self.generator)
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()  # type: ignore[no-untyped-call]
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
+        if self._finite(norm):
+            self.optimizer.step()
+            self._average()
+        self.step += 1
+        return {**metrics, "loss/total": loss.detach(), "grad_norm": norm}
+
+    def learning_rate(self, progress: float) -> float:
+        """Linear warm-up, then cosine decay to a tenth of the peak."""
+        warm = min(1.0, (self.step + 1) / max(1, self.config.warmup_steps))
+        cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
+        return self.config.lr * warm * (0.1 + 0.9 * cosine)
+
+    def _finite(self, norm: Tensor) -> bool:
+        """Skip a step whose gradient is not finite; give up at the third in a row."""
+        if torch.isfinite(norm):
+            self._not_finite = 0
+            return True
+        self._not_finite += 1
+        if self._not_finite >= 3:
+            raise DataError(
+                f"the loss was not finite for 3 steps in a row (step {self.step}); the last good "
+                "checkpoint is kept: check the dataset, or lower --optimizer.lr"
+            )
+        return False
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
+        for mean, value in zip(self.averaged.parameters(), self.model.parameters(), strict=True):
+            mean.lerp_(value, 1 - decay)
+
+    def state_dict(self) -> dict[str, object]:
+        return {
+            "step": self.step,
+            "model": self.model.state_dict(),
+            "averaged": self.averaged.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, object]) -> None:
+        self.step = state["step"]  # type: ignore[assignment]
+        self.model.load_state_dict(state["model"])  # type: ignore[arg-type]
+        self.averaged.load_state_dict(state["averaged"])  # type: ignore[arg-type]
+        self.optimizer.load_state_dict(state["optimizer"])  # type: ignore[arg-type]
+        self.generator.set_state(state["generator"])  # type: ignore[arg-type]
+
+
+class Budget:
+    """How far the run has come: by steps, or by the clock where that ends first."""
+
+    def __init__(
+        self, steps: int, max_minutes: float, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self.steps, self.seconds, self._clock = steps, 60 * max_minutes, clock
+        self._start = clock()
+
+    def progress(self, step: int) -> float:
+        """Fraction of the run that is done, in [0, 1]."""
+        by_steps = step / self.steps
+        if not self.seconds:
+            return min(1.0, by_steps)
+        return min(1.0, max(by_steps, (self._clock() - self._start) / self.seconds))
