@@ -11,11 +11,15 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from egovcp.robot.mjcf import robot_spec
+from egovcp.robot.stance_design import NU, StanceModel, balanced_pose, linearise, load_response, pitch_at
+from egovcp.robot.stance_gains import compensator
 from egovcp.spec import JOINT_NAMES
 
 PACKAGE = Path(__file__).parent
+HEIGHTS = tuple(round(0.50 + 0.02 * i, 2) for i in range(15))  # m
 
 
 def kinematic_table(model: mujoco.MjModel) -> dict[str, Any]:
@@ -46,9 +50,32 @@ def write_kinematics(path: Path) -> None:
     path.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
 
 
+def stance_row(stance: StanceModel, height: float) -> dict[str, NDArray[np.float64]]:
+    """All numbers of the stance law at one pelvis height."""
+    pose = balanced_pose(stance, height)
+    response = load_response(stance, pose, height)
+    return {
+        "height": np.array(height),
+        "pelvis": np.array([pose.qpos[0], pose.qpos[1], float(pitch_at(height))]),
+        "joints": pose.qpos[7:22],
+        "torque": pose.torque,
+        "joints_per_moment": response[:, :NU].T,
+        "torque_per_moment": response[:, NU:].T,
+        "compensator": compensator(linearise(stance, pose)),
+    }
+
+
+def write_stance(path: Path) -> None:
+    """Write ``g1_stance.npz``."""
+    stance = StanceModel(robot_spec().compile())
+    rows = [stance_row(stance, height) for height in HEIGHTS]
+    np.savez(path, **{name: np.stack([row[name] for row in rows]) for name in rows[0]})
+
+
 def main() -> None:
     """Regenerate every table in place."""
     write_kinematics(PACKAGE / "g1_kinematics.json")
+    write_stance(PACKAGE / "g1_stance.npz")
 
 
 if __name__ == "__main__":

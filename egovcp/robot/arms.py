@@ -1,0 +1,135 @@
+"""Both arms at once: kinematics in the torso frame, inverse kinematics, gravity torques.
+
+Shapes carry the side (left, right) and the arm's joint: (B, 2, 7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from egovcp.robot import kinematics
+from egovcp.robot.g1 import ARMS
+from egovcp.robot.kinematics import Array, joint_rotations, rotate
+
+_SHAPE: Final = (2, 7)
+_FIRST_LINK: Final = ARMS.start + 1
+_OFFSET: Final = kinematics.LINK_OFFSET[ARMS].reshape(*_SHAPE, 3)
+_MASS: Final = kinematics.LINK_MASS[_FIRST_LINK:].reshape(_SHAPE)
+_COM: Final = kinematics.LINK_COM[_FIRST_LINK:].reshape(*_SHAPE, 3)
+_AXIS: Final = np.argmax(np.abs(kinematics.JOINT_AXIS[ARMS]), axis=-1).reshape(_SHAPE)
+_PALM: Final = kinematics.PALM_OFFSET  # (2, 3)
+LOWER: Final = kinematics.JOINT_LOWER[ARMS].reshape(_SHAPE)
+UPPER: Final = kinematics.JOINT_UPPER[ARMS].reshape(_SHAPE)
+SHOULDER: Final = _OFFSET[:, 0]  # (2, 3) m, torso frame
+_TAIL_MASS: Final = np.cumsum(_MASS[:, ::-1], axis=1)[:, ::-1]  # (2, 7) joint's link and beyond
+ARM_MASS: Final = float(_MASS.sum())  # kg, both arms
+
+REST: Final = np.array([[0.25, 0.2, 0.0, 0.75, 0, 0, 0], [0.25, -0.2, 0.0, 0.75, 0, 0, 0]])
+#: Share of each joint in reaching: the wrist helps little, its motors are weak.
+_SHARE: Final = np.array([1.0, 1.0, 0.8, 1.0, 0.2, 0.25, 0.25])
+_LIMIT_MARGIN: Final = 0.03  # rad kept free at each joint limit
+_LIMIT_LOW: Final = LOWER + _LIMIT_MARGIN
+_LIMIT_HIGH: Final = UPPER - _LIMIT_MARGIN
+_DAMPING: Final = 0.05  # m: damped least squares, lambda
+_REST_PULL: Final = 0.08  # share of the way to REST per iteration, in the null space
+REACH: Final = 0.45  # m, shoulder to palm; a straight arm is 0.465
+_TRUNK_RADII: Final = (0.16, 0.15)  # m, keep-out ellipse around the trunk: forward, sideways
+_CROSS: Final = (np.array([1, 2, 0]), np.array([2, 0, 1]))
+
+
+def cross(a: Array, b: Array) -> Array:
+    """a x b over the last axis."""
+    i, j = _CROSS
+    out: Array = a[..., i] * b[..., j] - a[..., j] * b[..., i]
+    return out
+
+
+@dataclass(frozen=True)
+class ArmPose:
+    """Where the joints of both arms are, in the torso frame."""
+
+    origin: Array  # (B, 2, 7, 3) joint origins, m
+    axis: Array  # (B, 2, 7, 3) joint axes
+    rotation: Array  # (B, 2, 7, 3, 3) link frames
+    palm: Array  # (B, 2, 3) m
+
+
+def forward(joint_position: Array) -> ArmPose:
+    """Arm joints (B, 2, 7) rad -> poses."""
+    batch = len(joint_position)
+    local = joint_rotations(joint_position.reshape(batch, -1), ARMS).reshape(batch, *_SHAPE, 3, 3)
+    rotation = np.empty_like(local)
+    origin = np.empty((batch, *_SHAPE, 3))
+    rotation[:, :, 0], origin[:, :, 0] = local[:, :, 0], SHOULDER
+    for i in range(1, 7):
+        base = rotation[:, :, i - 1]
+        rotation[:, :, i] = base @ local[:, :, i]
+        origin[:, :, i] = origin[:, :, i - 1] + rotate(base, _OFFSET[:, i])
+    palm = origin[:, :, 6] + rotate(rotation[:, :, 6], _PALM)
+    axis = np.take_along_axis(rotation, _AXIS[None, :, :, None, None], axis=-1)[..., 0]
+    return ArmPose(origin, axis, rotation, palm)
+
+
+def reachable(target: Array) -> Array:
+    """Nearest sensible palm targets (B, 2, 3), torso frame: outside the trunk, within reach."""
+    out = target.copy()
+    y = out[..., 1] / _TRUNK_RADII[1]
+    out[..., 0] = np.maximum(out[..., 0], _TRUNK_RADII[0] * np.sqrt(np.maximum(1 - y * y, 0.0)))
+    arm = out - SHOULDER
+    length = np.sqrt(np.sum(arm * arm, axis=-1, keepdims=True))
+    return np.asarray(SHOULDER + arm * np.minimum(1.0, REACH / np.maximum(length, 1e-6)))
+
+
+def improve(joint_position: Array, target: Array, max_step: float) -> tuple[Array, ArmPose]:
+    """One step of damped least squares towards palm targets, and the pose it started from.
+
+    dq = W J^T (J W J^T + lambda^2)^-1 (e - J n) + n, where n pulls towards REST; clipped
+    to ``max_step`` (rad) per joint and to the joint limits.
+
+    Args:
+        joint_position: (B, 2, 7) rad.
+        target: (B, 2, 3) m, torso frame.
+    """
+    pose = forward(joint_position)
+    jac = cross(pose.axis, pose.palm[:, :, None] - pose.origin)  # (B, 2, 7, 3)
+    pull = _REST_PULL * (REST - joint_position)
+    error = target - pose.palm - np.sum(jac * pull[..., None], axis=2)
+    weighted = jac * _SHARE[:, None]
+    normal = np.swapaxes(weighted, -1, -2) @ jac + _DAMPING**2 * np.eye(3)
+    solved = _solve_symmetric(normal, error)
+    step = np.sum(weighted * solved[:, :, None], axis=-1) + pull
+    step = np.minimum(np.maximum(step, -max_step), max_step)
+    return np.minimum(np.maximum(joint_position + step, _LIMIT_LOW), _LIMIT_HIGH), pose
+
+
+def _solve_symmetric(matrix: Array, vector: Array) -> Array:
+    """Solve (..., 3, 3) positive definite systems by Cramer's rule."""
+    r0, r1, r2 = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
+    c0, c1, c2 = cross(r1, r2), cross(r2, r0), cross(r0, r1)
+    det = np.sum(r0 * c0, axis=-1, keepdims=True)
+    combined: Array = (
+        c0 * vector[..., 0:1] + c1 * vector[..., 1:2] + c2 * vector[..., 2:3]
+    ) / det
+    return combined
+
+
+def first_moment(pose: ArmPose) -> Array:
+    """Sum of mass times position over each joint's link and all beyond, (B, 2, 7, 3) kg m."""
+    com = pose.origin + rotate(pose.rotation, _COM)
+    moment = com * _MASS[..., None]
+    return np.asarray(np.cumsum(moment[:, :, ::-1], axis=2)[:, :, ::-1])
+
+
+def holding_torque(pose: ArmPose, moment: Array, gravity: Array) -> Array:
+    """Joint torques (B, 2, 7) that carry the arms' weight.
+
+    Args:
+        pose: of the arms.
+        moment: its ``first_moment``.
+        gravity: (B, 3) gravitational acceleration in the torso frame, m/s^2.
+    """
+    lever = moment - _TAIL_MASS[..., None] * pose.origin
+    return np.asarray(-np.sum(pose.axis * cross(lever, gravity[:, None, None]), axis=-1))

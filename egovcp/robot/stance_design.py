@@ -1,0 +1,253 @@
+"""Designs the stance law: poses, reduced dynamics, gains. Runs offline, needs MuJoCo and SciPy.
+
+With both feet planted the robot has few degrees of freedom left: the pelvis pose (6) and
+the waist (3); the arms count as a fixed load. Write z (9) for these coordinates and T
+(35, 9) for the map from their rates to the rates of the model (the legs follow from the
+planted feet, T_leg = -J_leg^-1 J_pelvis). Then, with servo targets u of legs and waist,
+
+    M_r z'' = T^T (kp (u - q) - kd q' - bias(q)),    M_r = T^T M T
+
+is linearised at a static pose and discretised exactly to the controller's 20 ms. One tick
+of actuation delay is part of the design: the state is x = [z - z0, z'] (18) and u_{k-1}.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.robot.arms import REST
+from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS
+from egovcp.spec import CONTROLLER_HZ, NUM_JOINTS
+
+Array = NDArray[np.float64]
+
+NZ: Final = 9  # pelvis xyz, pelvis rotation vector (body frame), waist yaw roll pitch
+NX: Final = 2 * NZ
+NU: Final = 15  # legs 12, waist 3
+NY: Final = 36  # gravity 3, gyro 3, joint positions 15, joint velocities 15
+_MOMENT_STEP: Final = 0.5  # kg m, of the difference quotient
+
+SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the ground
+FOOT_CENTRE: Final = 0.039  # m, middle of the foot's support, forward of the ankle
+FOOT_SPACING: Final = 0.1185  # m, ankle to the midline: the G1's hips, legs vertical
+
+#: Natural pelvis pitch (rad) against height (m): below 0.61 m the ankle's limit tips it.
+PITCH_HEIGHTS: Final = (0.50, 0.55, 0.60, 0.64)
+PITCHES: Final = (0.50, 0.34, 0.12, 0.0)
+
+
+def rest_joints() -> Array:
+    """(J,) arms at rest, everything else zero."""
+    q = np.zeros(NUM_JOINTS)
+    q[ARMS] = REST.ravel()
+    return q
+
+
+@dataclass(frozen=True)
+class Pose:
+    """A static two-feet stance: model coordinates and the servo torques that hold it."""
+
+    qpos: Array  # (36,)
+    torque: Array  # (15,) N m, legs and waist
+
+
+class StanceModel:
+    """The robot on two planted feet, for one model; every method works on its own data."""
+
+    def __init__(self, model: Any) -> None:
+        import mujoco
+
+        self.mj = mujoco
+        self.model = model
+        self.data = mujoco.MjData(model)
+        self.feet = [model.body(f"{s}_ankle_roll_link").id for s in ("left", "right")]
+        self.target = np.array([[0.0, s * FOOT_SPACING, SOLE_HEIGHT] for s in (1, -1)])
+
+    def place(self, qpos: Array) -> None:
+        """Set the configuration and compute positions, inertia and bias forces."""
+        self.data.qpos[:] = qpos
+        self.data.qvel[:] = 0.0
+        self.mj.mj_forward(self.model, self.data)
+
+    def feet_jacobian(self) -> Array:
+        """(12, 35): linear and angular velocity of both ankle-roll frames, world."""
+        rows = []
+        for foot in self.feet:
+            linear, angular = np.zeros((2, 3, self.model.nv))
+            self.mj.mj_jac(self.model, self.data, linear, angular, self.data.xpos[foot], foot)
+            rows += [linear, angular]
+        return np.concatenate(rows)
+
+    def feet_error(self) -> Array:
+        """(12,) how far both feet are from flat on their spots: metres and radians."""
+        out = []
+        for foot, target in zip(self.feet, self.target, strict=True):
+            turn = np.zeros(3)
+            self.mj.mju_quat2Vel(turn, self.data.xquat[foot], 1.0)
+            out += [self.data.xpos[foot] - target, turn]
+        return np.concatenate(out)
+
+    def plant(self, qpos: Array) -> Array:
+        """Solve the twelve leg joints so that both feet stand on their spots (Newton)."""
+        q = qpos.copy()
+        for _ in range(30):
+            self.place(q)
+            error = self.feet_error()
+            if np.abs(error).max() < 1e-12:
+                break
+            step = np.linalg.solve(self.feet_jacobian()[:, 6:18], -error)
+            q[7:19] += np.clip(step, -0.3, 0.3)
+        return q
+
+    def basis(self) -> Array:
+        """T (35, 9) at the configuration last placed."""
+        jac = self.feet_jacobian()
+        basis = np.zeros((self.model.nv, NZ))
+        basis[:6, :6] = np.eye(6)
+        basis[6:18, :6] = -np.linalg.solve(jac[:, 6:18], jac[:, :6])
+        basis[18:21, 6:] = np.eye(3)
+        return basis
+
+    def displaced(self, qpos: Array, z: Array) -> Array:
+        """``qpos`` with pelvis and waist displaced by z (9) and the feet still planted."""
+        velocity = np.zeros(self.model.nv)
+        velocity[:6], velocity[18:21] = z[:6], z[6:]
+        out = qpos.copy()
+        self.mj.mj_integratePos(self.model, out, velocity, 1.0)
+        return self.plant(out)
+
+    def force(self, qpos: Array, target: Array) -> Array:
+        """(9,) generalised force on z at rest, for servo targets (15,)."""
+        self.place(qpos)
+        torque = np.zeros(self.model.nv)
+        torque[6:21] = STIFFNESS[:NU] * (target - qpos[7:22])
+        return self.basis().T @ (torque - self.data.qfrc_bias)
+
+    def com(self) -> Array:
+        """(3,) centre of mass at the configuration last placed, m."""
+        out: Array = self.data.subtree_com[1].copy()
+        return out
+
+
+def pitch_at(height: float | Array) -> Array:
+    """Natural pelvis pitch (rad) at a pelvis height (m)."""
+    return np.asarray(np.interp(height, PITCH_HEIGHTS, PITCHES))
+
+
+def upright(height: float, x: float, y: float = 0.0) -> Array:
+    """Model coordinates with arms at rest, the pelvis at (x, y, height), knees bent a little."""
+    pitch = float(pitch_at(height))
+    qpos = np.zeros(7 + NUM_JOINTS)
+    qpos[:7] = [x, y, height, np.cos(pitch / 2), 0.0, np.sin(pitch / 2), 0.0]
+    qpos[7:] = rest_joints()
+    bend = np.sqrt(max(0.8 - height, 0.0)) * 1.9
+    qpos[[10, 16]] = bend
+    qpos[[7, 13]] = -bend / 2 - pitch
+    qpos[[11, 17]] = -bend / 2
+    return qpos
+
+
+def balanced_pose(stance: StanceModel, height: float) -> Pose:
+    """The pose at a height whose centre of mass is over the middle of the feet."""
+    x, y = 0.0, 0.0
+    for _ in range(20):
+        qpos = stance.plant(upright(height, x, y))
+        com = stance.com()
+        x += FOOT_CENTRE - com[0]
+        y -= com[1]
+    return Pose(qpos, holding_torque(stance))
+
+
+def load_response(stance: StanceModel, pose: Pose, height: float) -> Array:
+    """How the balanced pose answers a load that the arms carry off its place.
+
+    Returns:
+        (2, 30): change of [joints 15 (rad), torques 15 (N m)] per kg m of first moment
+        that the arms add, forward and to the left (pelvis heading frame).
+    """
+    torso = stance.model.body("torso_link").id
+    rest = stance.model.body_ipos[torso].copy()
+    out = []
+    for axis in ([1.0, 0.0, 0.0], [0.0, 1.0, 0.0]):
+        ends = []
+        for sign in (1.0, -1.0):
+            stance.place(pose.qpos)
+            in_torso = stance.data.xmat[torso].reshape(3, 3).T @ np.array(axis)
+            shift = sign * _MOMENT_STEP / stance.model.body_mass[torso]
+            stance.model.body_ipos[torso] = rest + shift * in_torso
+            moved = balanced_pose(stance, height)
+            ends.append(np.concatenate([moved.qpos[7:22], moved.torque]))
+            stance.model.body_ipos[torso] = rest
+        out.append((ends[0] - ends[1]) / (2 * _MOMENT_STEP))
+    return np.stack(out)
+
+
+def holding_torque(stance: StanceModel) -> Array:
+    """(15,) smallest torques (relative to each joint's stiffness) that hold the pose placed."""
+    basis = stance.basis()
+    weight = STIFFNESS[:NU]
+    wanted = basis.T @ stance.data.qfrc_bias
+    scaled = basis[6:21].T * weight
+    return np.asarray(weight * np.linalg.lstsq(scaled, wanted, rcond=None)[0])
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Discrete dynamics of the planted robot around a pose, and what its sensors see."""
+
+    a: Array  # (18, 18)
+    b: Array  # (18, 15)
+    c: Array  # (36, 18)
+    legs: Array  # (15, 9): joint displacement per z
+    torque_x: Array  # (15, 18): servo torque per x
+    torque_u: Array  # (15, 15)
+
+
+def linearise(stance: StanceModel, pose: Pose) -> Linear:
+    """Central differences of the static force, exact zero-order hold over one tick."""
+    from scipy.linalg import expm
+
+    target = pose.qpos[7:22] + pose.torque / STIFFNESS[:NU]
+    step = 1e-4
+    spring = np.empty((NZ, NZ))
+    for i, unit in enumerate(np.eye(NZ) * step):
+        ahead = stance.force(stance.displaced(pose.qpos, unit), target)
+        behind = stance.force(stance.displaced(pose.qpos, -unit), target)
+        spring[:, i] = (ahead - behind) / (2 * step)
+    stance.place(pose.qpos)
+    basis = stance.basis()
+    mass = np.zeros((stance.model.nv, stance.model.nv))
+    stance.mj.mj_fullM(stance.model, stance.data, mass)
+    inverse = np.linalg.inv(basis.T @ mass @ basis)
+    joints = basis[6:21]
+    kp, kd = np.diag(STIFFNESS[:NU]), np.diag(DAMPING[:NU])
+    continuous = np.zeros((NX + NU, NX + NU))
+    continuous[:NZ, NZ:NX] = np.eye(NZ)
+    continuous[NZ:NX, :NZ] = inverse @ spring
+    continuous[NZ:NX, NZ:NX] = -inverse @ joints.T @ kd @ joints
+    continuous[NZ:NX, NX:] = inverse @ joints.T @ kp
+    discrete = expm(continuous / CONTROLLER_HZ)
+    return Linear(
+        a=discrete[:NX, :NX],
+        b=discrete[:NX, NX:],
+        c=sensor_matrix(pose, joints),
+        legs=joints,
+        torque_x=np.hstack([-kp @ joints, -kd @ joints]),
+        torque_u=kp,
+    )
+
+
+def sensor_matrix(pose: Pose, joints: Array) -> Array:
+    """C (36, 18): gravity turns by -phi x g for a body rotation phi; the rest is direct."""
+    pitch = 2 * np.arctan2(pose.qpos[5], pose.qpos[3])
+    gx, gz = np.sin(pitch), -np.cos(pitch)
+    c = np.zeros((NY, NX))
+    c[0:3, 3:6] = [[0, -gz, 0], [gz, 0, -gx], [0, gx, 0]]
+    c[3:6, NZ + 3 : NZ + 6] = np.eye(3)
+    c[6:21, :NZ] = joints
+    c[21:36, NZ:] = joints
+    return c

@@ -1,0 +1,89 @@
+"""The stance law's numbers (``g1_stance.npz``), looked up by pelvis height."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import Final
+
+import numpy as np
+
+from egovcp.robot.g1 import ARMS, WAIST
+from egovcp.robot.arms import REST
+from egovcp.robot.kinematics import Array
+from egovcp.spec import NUM_JOINTS
+
+NX: Final = 18  # states: pelvis pose 6 and waist 3, and their rates
+NU: Final = 15  # servo targets: legs 12, waist 3
+NY: Final = 36  # measurements: gravity 3, gyro 3, joint positions 15, joint rates 15
+_FIELDS: Final = (
+    "pelvis", "joints", "torque", "joints_per_moment", "torque_per_moment", "compensator"
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class StanceRow:
+    """The law's numbers for each robot; leading axis B."""
+
+    pelvis: Array  # (B, 3) x, y of the pelvis from the ankles' middle (m), pitch (rad)
+    joints: Array  # (B, 15) rad
+    torque: Array  # (B, 15) N m
+    joints_per_moment: Array  # (B, 15, 2) rad per kg m
+    torque_per_moment: Array  # (B, 15, 2) N m per kg m
+    compensator: Array  # (B, 33, 69)
+
+
+class StanceTable:
+    """Linear interpolation between the designed heights; clamped at both ends."""
+
+    def __init__(self, arrays: dict[str, Array]) -> None:
+        self.heights = arrays["height"]
+        parts = [arrays[name].reshape(len(self.heights), -1) for name in _FIELDS]
+        self._shapes = [arrays[name].shape[1:] for name in _FIELDS]
+        self._splits = np.cumsum([part.shape[1] for part in parts])[:-1]
+        self._flat = np.concatenate(parts, axis=1)
+        self._slope = np.diff(self._flat, axis=0) / np.diff(self.heights)[:, None]
+
+    def at(self, height: Array) -> StanceRow:
+        """Numbers for heights (B,) in metres."""
+        h = np.minimum(np.maximum(height, self.heights[0]), self.heights[-1])
+        index = np.searchsorted(self.heights[1:-1], h, side="right")
+        flat = self._slope[index] * (h - self.heights[index])[:, None]
+        flat += self._flat[index]
+        parts = np.split(flat, self._splits, axis=1)
+        shaped = [p.reshape(len(h), *s) for p, s in zip(parts, self._shapes, strict=True)]
+        return StanceRow(*shaped)
+
+    def fingerprint(self) -> str:
+        """8 hexadecimal digits that change with any number of the table."""
+        return hashlib.sha256(self._flat.tobytes() + self.heights.tobytes()).hexdigest()[:8]
+
+
+@cache
+def stance_table() -> StanceTable:
+    """The table that the package ships."""
+    path = resources.files("egovcp.robot").joinpath("g1_stance.npz")
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+        return StanceTable({name: arrays[name] for name in arrays.files})
+
+
+@dataclass(frozen=True)
+class StandingPose:
+    """A static pose on two flat feet, for placing a robot in a scene."""
+
+    position: Array  # (3,) pelvis, m; the middle between the ankles is at x = y = 0
+    quaternion: Array  # (4,) wxyz
+    joints: Array  # (J,) rad, JOINT_NAMES order
+
+
+def standing_pose(height: float) -> StandingPose:
+    """Balanced pose with arms at rest at a pelvis height (m), clamped to the table's range."""
+    row = stance_table().at(np.array([height]))
+    x, y, pitch = row.pelvis[0]
+    joints = np.zeros(NUM_JOINTS)
+    joints[: WAIST.stop], joints[ARMS] = row.joints[0], REST.ravel()
+    quaternion = np.array([np.cos(pitch / 2), 0.0, np.sin(pitch / 2), 0.0])
+    clamped = np.clip(height, stance_table().heights[0], stance_table().heights[-1])
+    return StandingPose(np.array([x, y, clamped]), quaternion, joints)
