@@ -1,0 +1,82 @@
+"""The LeRobot v3.0 layout of an egovcp dataset: files, columns, types."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import Any, Final
+
+import pyarrow as pa
+
+from egovcp import spec
+
+CODEBASE_VERSION: Final = "v3.0"
+ROBOT_TYPE: Final = "unitree_g1"
+DEPTH_UNIT: Final = "mm"
+CHUNK_FILES: Final = 1000  # files per chunk folder
+FILE_MB: Final = 100  # a data file rolls over beyond this size
+
+DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+INFO_PATH: Final = "meta/info.json"
+STATS_PATH: Final = "meta/stats.json"
+TASKS_PATH: Final = "meta/tasks.parquet"
+#: What LeRobot has no place for: provenance and the scenario of each episode.
+COLLECTION_PATH: Final = "meta/collection.json"
+COLLECTION_VERSION: Final = 1
+
+#: Columns that LeRobot adds to every dataset.
+INDEX_FEATURES: Final[dict[str, dict[str, object]]] = {
+    "timestamp": {"dtype": "float32", "shape": (1,), "names": None},
+    "frame_index": {"dtype": "int64", "shape": (1,), "names": None},
+    "episode_index": {"dtype": "int64", "shape": (1,), "names": None},
+    "index": {"dtype": "int64", "shape": (1,), "names": None},
+    "task_index": {"dtype": "int64", "shape": (1,), "names": None},
+}
+FEATURES: Final = {**spec.FEATURES, **INDEX_FEATURES}
+
+#: Numeric columns in the order of ``FEATURES``; every one but the depth image.
+NUMERIC_KEYS: Final = tuple(key for key in FEATURES if key != spec.DEPTH_KEY)
+
+
+def width(key: str) -> int:
+    """Values per frame of a numeric column."""
+    shape = FEATURES[key]["shape"]
+    assert isinstance(shape, tuple)
+    return int(shape[0])
+
+
+def info_features(controller_id: str) -> dict[str, dict[str, object]]:
+    """The ``features`` of ``info.json``.
+
+    The controller is named inside the action's ``info``: what an action does depends on
+    it, and LeRobot's own tools keep feature descriptions and refuse to merge unequal ones.
+    """
+    features = {key: dict(value) for key, value in FEATURES.items()}
+    features[spec.DEPTH_KEY]["info"] = {"is_depth_map": True, "depth_unit": DEPTH_UNIT}
+    features[spec.ACTION_KEY]["info"] = {"controller_id": controller_id}
+    return features
+
+
+def arrow_schema() -> pa.Schema:
+    """Arrow schema of the data files, with the metadata that `datasets` reads its types from."""
+    fields = [pa.field(key, _arrow_type(feature)) for key, feature in FEATURES.items()]
+    hub = {key: _hub_type(feature) for key, feature in FEATURES.items()}
+    metadata = {"huggingface": json.dumps({"info": {"features": hub}})}
+    return pa.schema(fields, metadata=metadata)
+
+
+def _arrow_type(feature: Mapping[str, Any]) -> pa.DataType:
+    if feature["dtype"] == "image":
+        return pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    scalar = {"float32": pa.float32(), "int64": pa.int64(), "bool": pa.bool_()}[feature["dtype"]]
+    size = feature["shape"][0]
+    return scalar if size == 1 else pa.list_(scalar, size)
+
+
+def _hub_type(feature: Mapping[str, Any]) -> dict[str, object]:
+    if feature["dtype"] == "image":
+        return {"_type": "Image"}
+    scalar = {"dtype": feature["dtype"], "_type": "Value"}
+    size = feature["shape"][0]
+    return scalar if size == 1 else {"feature": scalar, "length": size, "_type": "List"}

@@ -1,0 +1,113 @@
+"""Per-episode statistics and their aggregate, in the shape LeRobot stores them.
+
+All columns of an episode share one matrix ``(R, D)``: a row per statistic, a column per
+scalar (depth counts as one, over all pixels). Aggregation, as in LeRobot, is exact for
+min, max, mean and std, and the count-weighted mean of the episodes' quantiles.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from egovcp import spec
+from egovcp.data import schema
+
+QUANTILES: Final = (0.01, 0.10, 0.50, 0.90, 0.99)
+ROWS: Final = ("min", "max", "mean", "std", *(f"q{round(100 * q):02d}" for q in QUANTILES))
+_MIN, _MAX, _MEAN, _STD, _QUANTILES = 0, 1, 2, 3, slice(4, None)
+
+type Matrix = NDArray[np.float64]
+
+
+def _layout() -> dict[str, slice]:
+    slices, start = {spec.DEPTH_KEY: slice(0, 1)}, 1
+    for key in schema.NUMERIC_KEYS:
+        slices[key] = slice(start, start + schema.width(key))
+        start = slices[key].stop
+    return slices
+
+
+LAYOUT: Final = _layout()
+
+
+def episode_stats(depth: NDArray[np.uint16], columns: Mapping[str, NDArray[np.generic]]) -> Matrix:
+    """Statistics ``(R, D)`` of one episode.
+
+    Args:
+        depth: (T, H, W) mm.
+        columns: every key of ``schema.NUMERIC_KEYS``, (T,) or (T, n).
+    """
+    blocks = [np.asarray(columns[key]).reshape(len(depth), -1) for key in schema.NUMERIC_KEYS]
+    values = np.concatenate(blocks, axis=1, dtype=np.float64, casting="unsafe")
+    numeric = np.stack([values.min(0), values.max(0), values.mean(0), values.std(0)])
+    quantiles = np.quantile(values, QUANTILES, axis=0)
+    return np.concatenate([_depth_stats(depth), np.concatenate([numeric, quantiles])], axis=1)
+
+
+def _depth_stats(depth: NDArray[np.uint16]) -> Matrix:
+    """(R, 1) from the histogram of all pixels: exact, and one pass over them."""
+    counts = np.bincount(depth.reshape(-1))
+    present = np.flatnonzero(counts)
+    weights = counts[present]
+    total = int(weights.sum())
+    mean = float(present @ weights) / total
+    std = np.sqrt(float((present - mean) ** 2 @ weights) / total)
+    ranks = np.searchsorted(weights.cumsum(), np.asarray(QUANTILES) * (total - 1), side="right")
+    quantiles = present[ranks]
+    return np.array([present[0], present[-1], mean, std, *quantiles], dtype=np.float64)[:, None]
+
+
+def aggregate(matrices: Sequence[Matrix], counts: Sequence[int]) -> Matrix:
+    """Statistics of the union of episodes (or of groups of them) with these frame counts."""
+    stacked, weight = np.stack(matrices), np.asarray(counts, dtype=np.float64)[:, None]
+    total = weight.sum()
+    out: Matrix = np.empty_like(stacked[0])
+    out[_MIN], out[_MAX] = stacked[:, _MIN].min(0), stacked[:, _MAX].max(0)
+    out[_MEAN] = (stacked[:, _MEAN] * weight).sum(0) / total
+    spread = stacked[:, _STD] ** 2 + (stacked[:, _MEAN] - out[_MEAN]) ** 2
+    out[_STD] = np.sqrt((spread * weight).sum(0) / total)
+    out[_QUANTILES] = (stacked[:, _QUANTILES] * weight[:, None]).sum(0) / total
+    return out
+
+
+def to_json(matrix: Matrix, count: int) -> dict[str, dict[str, object]]:
+    """The content of ``stats.json``; depth statistics are shaped (1, 1, 1) like an image's."""
+    return {
+        key: {
+            **{row: _nest(key, matrix[i, part].tolist()) for i, row in enumerate(ROWS)},
+            "count": [count],
+        }
+        for key, part in LAYOUT.items()
+    }
+
+
+def _nest(key: str, values: list[float]) -> object:
+    return [[values]] if key == spec.DEPTH_KEY else values
+
+
+def to_arrow(matrices: Sequence[Matrix], counts: Sequence[int]) -> dict[str, pa.Array]:
+    """``stats/<feature>/<statistic>`` columns of the episodes table, one row per episode."""
+    stacked = np.stack(matrices)
+    columns: dict[str, pa.Array] = {}
+    for key, part in LAYOUT.items():
+        for i, row in enumerate(ROWS):
+            column = _lists(np.ascontiguousarray(stacked[:, i, part]))
+            for _ in range(2 if key == spec.DEPTH_KEY else 0):
+                column = pa.ListArray.from_arrays(_offsets(len(stacked), 1), column)
+            columns[f"stats/{key}/{row}"] = column
+        columns[f"stats/{key}/count"] = _lists(np.asarray(counts, dtype=np.int64)[:, None])
+    return columns
+
+
+def _lists(values: NDArray[np.generic]) -> pa.ListArray:
+    rows, size = values.shape
+    return pa.ListArray.from_arrays(_offsets(rows, size), pa.array(values.reshape(-1)))
+
+
+def _offsets(rows: int, size: int) -> pa.Int32Array:
+    return pa.array(np.arange(rows + 1, dtype=np.int32) * np.int32(size))

@@ -1,0 +1,181 @@
+"""Endless training batches ``[B, T, ...]`` of windows of episodes, exactly resumable.
+
+A window is placed by drawing a row and its place within the window, then moving the
+window inside the episode: all rows are covered, the first and the last ones (where
+memory starts from nothing, and where falls are) somewhat more often. Only an episode
+shorter than the window is padded. Every draw comes from one generator, whose state is
+the state of the stream.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
+from egovcp.data.store import EpisodeStore
+from egovcp.errors import DataError, UsageError
+
+type Batch = dict[str, NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class StreamConfig:
+    """How windows are drawn."""
+
+    batch_size: int = 16
+    """Windows per batch, B."""
+    length: int = 48
+    """Rows that count in each window."""
+    burn_in: int = 0
+    """Rows before them that only warm up the memory: valid only where the episode starts."""
+    event_fraction: float = 0.0
+    """Share of windows placed around an event, which a uniform choice would rarely meet."""
+    event_quantile: float = 0.98
+    """A row is an event if its reward is farther from the task's median than this quantile."""
+    mirror: bool = True
+    """Reflect half of the windows left to right."""
+    seed: int = 0
+    """Seed of all draws."""
+
+    def check(self) -> None:
+        """Raise `UsageError` for values that make no sense."""
+        if self.batch_size < 1 or self.length < 1 or self.burn_in < 0:
+            raise UsageError(
+                f"batch_size {self.batch_size}, length {self.length}, burn_in {self.burn_in}: "
+                "expected at least 1, 1 and 0"
+            )
+        if not (0 <= self.event_fraction <= 1 and 0 <= self.event_quantile < 1):
+            raise UsageError(
+                f"event_fraction {self.event_fraction} and event_quantile {self.event_quantile}: "
+                "expected shares between 0 and 1"
+            )
+
+
+class SequenceStream:
+    """Iterator over batches from an `EpisodeStore`."""
+
+    def __init__(self, store: EpisodeStore, config: StreamConfig) -> None:
+        """Find the events and seed the generator.
+
+        Raises:
+            UsageError: the configuration makes no sense.
+        """
+        config.check()
+        self.store = store
+        self.config = config
+        self._rng = np.random.default_rng(config.seed)
+        self._batches = 0
+        self._episode_of = np.repeat(np.arange(len(store.length)), store.length)
+        self._events = event_rows(store, config.event_quantile)
+
+    def __iter__(self) -> Iterator[Batch]:
+        return self
+
+    def __next__(self) -> Batch:
+        """The next batch; keys as in `gather`, ``valid`` false where a row must not count."""
+        config, rng = self.config, self._rng
+        start, episode = self._draw_windows()
+        batch = gather(self.store, start, episode, config.burn_in + config.length)
+        warm_up = (np.arange(config.burn_in + config.length) < config.burn_in) & (
+            batch["t"][:, :1] > 0
+        )
+        batch["valid"] &= ~warm_up
+        if config.mirror:
+            _mirror_rows(batch, np.flatnonzero(rng.random(config.batch_size) < 0.5))
+        self._batches += 1
+        return batch
+
+    def state_dict(self) -> dict[str, Any]:
+        """JSON-compatible state; a stream that loads it continues with exactly the next batch."""
+        return {
+            "rng": self._rng.bit_generator.state,
+            "batches": self._batches,
+            "config": vars(self.config).copy(),
+            "fingerprint": self.store.fingerprint,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> Self:
+        """Continue where another stream over the same episodes stopped.
+
+        Raises:
+            DataError: the episodes differ.
+            UsageError: the configuration differs.
+        """
+        if state["fingerprint"] != self.store.fingerprint:
+            raise DataError("cannot resume the data stream: the dataset's episodes have changed")
+        own = vars(self.config)
+        changed = [
+            f"{k} {state['config'].get(k)} -> {v}"
+            for k, v in own.items()
+            if state["config"].get(k) != v
+        ]
+        if changed:
+            raise UsageError(f"cannot resume the data stream with {', '.join(changed)}")
+        self._rng.bit_generator.state = state["rng"]
+        self._batches = int(state["batches"])
+        return self
+
+    def _draw_windows(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """First frame and episode of each window, (B,) each."""
+        config, rng, store = self.config, self._rng, self.store
+        span = config.burn_in + config.length
+        rows = rng.integers(store.num_frames, size=config.batch_size)
+        if len(self._events):
+            events = rng.choice(self._events, size=config.batch_size)
+            rows = np.where(rng.random(config.batch_size) < config.event_fraction, events, rows)
+        episode = self._episode_of[rows]
+        place = rng.integers(config.burn_in, span, size=config.batch_size)
+        first = store.start[episode]
+        latest = first + np.maximum(store.length[episode] - span, 0)
+        return np.clip(rows - place, first, latest), episode
+
+
+def event_rows(store: EpisodeStore, quantile: float) -> NDArray[np.int64]:
+    """Rows with an exceptional reward for their task, and rows that end in failure.
+
+    Judged by the reward column alone: no simulator truth, no knowledge of the tasks.
+    """
+    task_of = np.repeat(np.array(store.tasks), store.length)
+    events = store.terminal_next.copy()
+    for task in set(store.tasks):
+        rows = np.flatnonzero(task_of == task)
+        distance = np.abs(store.reward[rows] - np.median(store.reward[rows]))
+        events[rows[distance > np.quantile(distance, quantile)]] = True
+    return np.flatnonzero(events)
+
+
+def gather(
+    store: EpisodeStore, start: NDArray[np.int64], episode: NDArray[np.int64], span: int
+) -> Batch:
+    """Windows of ``span`` rows, each from one episode, as arrays ``[B, span, ...]``.
+
+    Keys: depth (uint16 mm), state, action, prev_action, reward, done, success, is_first,
+    valid, mc_return, mc_valid, terminal_next; episode [B] and t [B, span] for reports.
+    Past the episode's end the last row is repeated with ``valid``, ``mc_valid`` and the
+    flags false.
+    """
+    end = store.start[episode] + store.length[episode]
+    wanted = start[:, None] + np.arange(span)
+    valid = wanted < end[:, None]
+    rows = np.minimum(wanted, end[:, None] - 1)
+    t = rows - store.start[episode][:, None]
+    batch: Batch = {
+        name: getattr(store, name)[rows]
+        for name in ("depth", "state", "action", "prev_action", "reward", "mc_return")
+    }
+    for name in ("done", "success", "terminal_next", "mc_valid"):
+        batch[name] = getattr(store, name)[rows] & valid
+    batch |= {"is_first": (t == 0) & valid, "valid": valid, "episode": episode, "t": t}
+    return batch
+
+
+def _mirror_rows(batch: Batch, rows: NDArray[np.intp]) -> None:
+    batch["depth"][rows] = mirror_depth(batch["depth"][rows])
+    batch["state"][rows] = mirror_state(batch["state"][rows])
+    for name in ("action", "prev_action"):
+        batch[name][rows] = mirror_action(batch[name][rows])

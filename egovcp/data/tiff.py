@@ -1,0 +1,103 @@
+"""Depth frames as raw one-strip TIFF blobs, a whole episode at a time.
+
+LeRobot stores a depth frame as an uncompressed little-endian TIFF (what Pillow writes
+for a 16-bit image): one image file directory of nine entries, then the pixels. Every
+frame of a dataset has the same 122-byte header, so encoding is one broadcast copy and
+decoding is a comparison of headers and one reshape; any other TIFF goes through Pillow.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from functools import cache
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from egovcp.errors import DataError
+
+_SHORT, _LONG = 3, 4
+_ENTRY_BYTES = 12
+_BITS = 16
+
+
+@cache
+def header(rows: int, cols: int) -> bytes:
+    """The bytes before the pixels of a (rows, cols) uint16 TIFF."""
+    strip_bytes = rows * cols * _BITS // 8
+    entries = [  # (tag, type, value), TIFF 6.0 section 8
+        (256, _LONG, cols),  # ImageWidth
+        (257, _LONG, rows),  # ImageLength
+        (258, _SHORT, _BITS),  # BitsPerSample
+        (259, _SHORT, 1),  # Compression: none
+        (262, _SHORT, 1),  # PhotometricInterpretation: black is zero
+        (273, _LONG, 0),  # StripOffsets, filled in below
+        (278, _LONG, rows),  # RowsPerStrip
+        (279, _LONG, strip_bytes),  # StripByteCounts
+        (284, _SHORT, 1),  # PlanarConfiguration: chunky
+    ]
+    size = 8 + 2 + _ENTRY_BYTES * len(entries) + 4
+    directory = b"".join(
+        struct.pack("<HHII", tag, kind, 1, size if tag == 273 else value)
+        for tag, kind, value in entries
+    )
+    return struct.pack("<2sHIH", b"II", 42, 8, len(entries)) + directory + struct.pack("<I", 0)
+
+
+def encode(depth: NDArray[np.uint16]) -> pa.BinaryArray:
+    """Depth ``(T, H, W)`` uint16 -> ``T`` TIFF blobs."""
+    frames, rows, cols = depth.shape
+    head = np.frombuffer(header(rows, cols), dtype=np.uint8)
+    pixels = np.ascontiguousarray(depth, dtype="<u2").reshape(frames, -1).view(np.uint8)
+    blobs = np.empty((frames, head.size + pixels.shape[1]), dtype=np.uint8)
+    blobs[:, : head.size] = head
+    blobs[:, head.size :] = pixels
+    offsets = np.arange(frames + 1, dtype=np.int32) * np.int32(blobs.shape[1])
+    buffers = [None, pa.py_buffer(offsets), pa.py_buffer(blobs)]
+    return pa.Array.from_buffers(pa.binary(), frames, buffers)
+
+
+def decode(blobs: pa.BinaryArray, rows: int, cols: int) -> NDArray[np.uint16]:
+    """``T`` TIFF blobs -> depth ``(T, rows, cols)`` uint16; a view where the layout is ours.
+
+    Raises:
+        DataError: a blob is missing, is no TIFF, or has another size or pixel type.
+    """
+    if blobs.null_count:
+        raise DataError(f"{blobs.null_count} of {len(blobs)} depth frames are empty")
+    raw = _fixed_size_bytes(blobs, len(header(rows, cols)) + 2 * rows * cols)
+    if raw is not None:
+        head = np.frombuffer(header(rows, cols), dtype=np.uint8)
+        if np.array_equal(raw[:, : head.size], np.broadcast_to(head, (len(raw), head.size))):
+            pixels = np.ascontiguousarray(raw[:, head.size :])
+            return pixels.view("<u2").reshape(-1, rows, cols)
+    return np.stack([_decode_any(blob.as_py(), i, rows, cols) for i, blob in enumerate(blobs)])
+
+
+def _fixed_size_bytes(blobs: pa.BinaryArray, size: int) -> NDArray[np.uint8] | None:
+    """The blobs as ``(T, size)`` bytes without a copy; None if any has another length."""
+    _, offset_buffer, data = blobs.buffers()
+    offsets = np.frombuffer(offset_buffer, dtype=np.int32)
+    offsets = offsets[blobs.offset : blobs.offset + len(blobs) + 1]
+    if data is None or not np.all(np.diff(offsets) == size):
+        return None
+    window = np.frombuffer(data, dtype=np.uint8)[offsets[0] : offsets[-1]]
+    return window.reshape(len(blobs), size)
+
+
+def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uint16]:
+    from PIL import Image, UnidentifiedImageError  # only for layouts that are not ours
+
+    try:
+        with Image.open(io.BytesIO(blob)) as image:
+            mode, size = image.mode, image.size
+            pixels = np.asarray(image)
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
+        raise DataError(f"depth frame {frame} is not a readable TIFF: {error}") from error
+    if not mode.startswith("I;16") or size != (cols, rows):
+        raise DataError(
+            f"depth frame {frame} is {mode} {size[1]}x{size[0]}, expected uint16 {rows}x{cols}"
+        )
+    return pixels.astype(np.uint16)
