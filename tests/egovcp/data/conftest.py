@@ -1,0 +1,66 @@
+"""Synthetic episodes and a small dataset on disk."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egovcp import spec
+from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, Provenance
+
+type MakeEpisode = Callable[..., Episode]
+
+
+def _make_episode(
+    number: int, length: int = 12, time_limit: int | None = None, task: str = "ball", seed: int = 0
+) -> Episode:
+    """A random episode; it falls if ``length`` is less than ``time_limit``."""
+    rng = np.random.default_rng((seed, number))
+    limit = time_limit or length
+    last = np.arange(length) == length - 1
+    pixels = (length, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+    depth = rng.integers(280, 5000, pixels).astype(np.uint16)
+    depth[rng.random(pixels) < 0.1] = 0
+    return Episode(
+        depth=depth,
+        state=rng.normal(size=(length, spec.STATE_DIM)).astype(np.float32),
+        action=rng.uniform(-1, 1, (length, spec.ACTION_DIM)).astype(np.float32),
+        reward=rng.normal(size=length).astype(np.float32),
+        done=last,
+        success=rng.random(length) < 0.1,
+        truncated=last & (length == limit),
+        task=task,
+        time_limit=limit,
+        metadata={"seed": seed, "episode": number, "ball": {"radius": 0.1}},
+    )
+
+
+@pytest.fixture(scope="session")
+def make_episode() -> MakeEpisode:
+    return _make_episode
+
+
+@pytest.fixture(scope="session")
+def episodes() -> list[Episode]:
+    """Six episodes of two tasks and several lengths; two of them end in a fall."""
+    shapes = [(12, 12), (7, 12), (12, 12), (1, 12), (20, 20), (12, 12)]
+    tasks = ["ball", "wall"]
+    return [
+        _make_episode(i, length, limit, tasks[i % 2]) for i, (length, limit) in enumerate(shapes)
+    ]
+
+
+@pytest.fixture(scope="session")
+def dataset_root(tmp_path_factory: pytest.TempPathFactory, episodes: list[Episode]) -> Path:
+    """A dataset of the six episodes; tests must not change it."""
+    root = tmp_path_factory.mktemp("data") / "six"
+    with DatasetWriter(root, Provenance("stance-1", seed=0, command="collect")) as writer:
+        for episode in episodes:
+            writer.add(episode)
+    return root
+
+
+@pytest.fixture(scope="session")
+def reader(dataset_root: Path) -> DatasetReader:
+    return DatasetReader.open(DatasetConfig(root=str(dataset_root)))

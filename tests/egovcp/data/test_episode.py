@@ -1,0 +1,46 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egovcp.data import Episode
+from egovcp.errors import DataError
+
+
+def _put(name: str, frame: int, value: object):  # type: ignore[no-untyped-def]
+    def damage(episode: Episode) -> Episode:
+        array = getattr(episode, name).copy()
+        array[frame] = value
+        return replace(episode, **{name: array})
+
+    return damage
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (_put("reward", 4, np.inf), "frame 4: reward is not finite"),
+        (_put("action", 2, 1.5), "frame 2: action lies outside"),
+        (_put("action", 2, np.nan), "frame 2: action is not finite"),
+        (_put("depth", 3, 60_000), "frame 3: depth exceeds"),
+        (_put("done", 3, True), "frame 3: done must be set at the last frame"),
+        (_put("done", -1, False), "frame 11: done must be set"),
+        (_put("truncated", 0, True), "frame 0: truncated before the last frame"),
+        (lambda e: replace(e, task="bal"), "did you mean 'ball'"),
+        (lambda e: replace(e, time_limit=20), "time limit of 20"),
+        (lambda e: replace(e, time_limit=5), "time limit of 5"),
+        (lambda e: replace(e, state=e.state[:, :70]), r"state is float32 \(12, 70\), expected"),
+        (lambda e: replace(e, reward=e.reward.astype(np.float64)), "expected float32"),
+        (lambda e: replace(e, depth=e.depth[:5]), "depth is uint16"),
+        (lambda e: replace(e, reward=e.reward[:0]), "no frames"),
+    ],
+)
+def test_every_violation_is_named(episodes: list[Episode], damage, message: str) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(DataError, match=message):
+        damage(episodes[0]).validate()
+
+
+def test_valid_episodes_pass(episodes: list[Episode]) -> None:
+    for episode in episodes:
+        episode.validate()
+    assert [e.terminated for e in episodes] == [False, True, False, True, False, False]

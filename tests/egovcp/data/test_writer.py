@@ -1,0 +1,105 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egovcp import spec
+from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, Provenance
+from egovcp.errors import DataError, UsageError
+
+_ARRAYS = ("depth", "state", "action", "reward", "done", "success", "truncated")
+
+
+def _rewrite(reader: DatasetReader, root: Path, max_file_bytes: int = 10**8) -> Path:
+    with DatasetWriter(root, Provenance("stance-1", 0, "collect"), max_file_bytes) as writer:
+        for index in range(len(reader)):
+            writer.add(reader.read(index))
+    return root
+
+
+def _files(root: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+
+def test_write_read_write_is_the_identity(reader: DatasetReader, tmp_path: Path) -> None:
+    assert _files(_rewrite(reader, tmp_path / "again")) == _files(reader.root)
+
+
+def test_reading_returns_what_was_written(reader: DatasetReader, episodes: list[Episode]) -> None:
+    assert len(reader) == len(episodes)
+    assert reader.num_frames == sum(len(e) for e in episodes)
+    for index, expected in enumerate(episodes):
+        found = reader.read(index)
+        for name in _ARRAYS:
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+        assert (found.task, found.time_limit) == (expected.task, expected.time_limit)
+        assert found.metadata == expected.metadata
+
+
+def test_files_roll_over_and_read_alike(reader: DatasetReader, tmp_path: Path) -> None:
+    root = _rewrite(reader, tmp_path / "small-files", max_file_bytes=100_000)
+    assert len(list(root.glob("data/*/*.parquet"))) > 2
+    rolled = DatasetReader.open(DatasetConfig(root=str(root)))
+    for index in range(len(reader)):
+        np.testing.assert_array_equal(rolled.read(index).depth, reader.read(index).depth)
+
+
+def test_statistics_are_those_of_all_frames(reader: DatasetReader) -> None:
+    state = reader.read_columns([spec.STATE_KEY])[spec.STATE_KEY].astype(np.float64)
+    depth = reader.read_columns([spec.DEPTH_KEY])[spec.DEPTH_KEY].astype(np.float64)
+    for key, values in ((spec.STATE_KEY, state), (spec.DEPTH_KEY, depth.reshape(-1, 1))):
+        found = reader.stats[key]
+        for name in ("min", "max", "mean", "std"):
+            expected = getattr(values, name)(axis=0)
+            np.testing.assert_allclose(np.ravel(found[name]), expected, rtol=1e-9, atol=1e-9)
+        assert found["count"] == [reader.num_frames]
+
+
+def test_depth_quantiles_are_exact_for_one_episode(
+    tmp_path: Path, make_episode: object, episodes: list[Episode]
+) -> None:
+    with DatasetWriter(tmp_path / "one", Provenance("stance-1")) as writer:
+        writer.add(episodes[0])
+    stats = json.loads((tmp_path / "one/meta/stats.json").read_text())[spec.DEPTH_KEY]
+    pixels = episodes[0].depth.astype(np.float64)
+    for name, q in (("q01", 0.01), ("q50", 0.5), ("q99", 0.99)):
+        expected = np.quantile(pixels, q, method="lower")
+        assert np.ravel(stats[name])[0] == pytest.approx(expected, abs=1.0)
+
+
+def test_an_existing_folder_is_refused_and_untouched(
+    tmp_path: Path, episodes: list[Episode]
+) -> None:
+    (tmp_path / "keep.txt").write_text("mine")
+    with pytest.raises(UsageError, match="exists already"):
+        DatasetWriter(tmp_path, Provenance("stance-1"))
+    assert [p.name for p in tmp_path.iterdir()] == ["keep.txt"]
+
+
+def test_a_failed_run_leaves_nothing(tmp_path: Path, episodes: list[Episode]) -> None:
+    with (
+        pytest.raises(RuntimeError, match="stop"),
+        DatasetWriter(tmp_path / "new", Provenance("stance-1")) as writer,
+    ):
+        writer.add(episodes[0])
+        raise RuntimeError("stop")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_episode_is_no_dataset(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no episode"):
+        DatasetWriter(tmp_path / "new", Provenance("stance-1")).finalize()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_bad_episode_is_refused_with_its_frame(tmp_path: Path, make_episode: object) -> None:
+    assert callable(make_episode)
+    episode = make_episode(0)
+    episode.state[5, 3] = np.nan
+    with (
+        pytest.raises(DataError, match="episode 0, frame 5: state is not finite"),
+        DatasetWriter(tmp_path / "new", Provenance("stance-1")) as writer,
+    ):
+        writer.add(episode)
+    assert list(tmp_path.iterdir()) == []
