@@ -1,0 +1,125 @@
+"""Surfaces of the G1's links for drawing: read from the model file, thinned out.
+
+Needs the model in the mjlab wheel but no simulator: binary STL and the ``visual`` geoms of
+the MJCF are read directly. The full meshes hold 390 000 triangles, 19 MB in every log;
+merging vertices on a grid keeps the shape at a tenth of that.
+"""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.robot.g1 import model_path
+
+_GRID_M: Final = 0.008  # vertices within one cell become one
+_STL_HEADER_BYTES: Final = 84
+_STL_TRIANGLE: Final = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("_", "<u2")])
+_DARK: Final = (60, 60, 65)
+_LIGHT: Final = (190, 192, 198)
+
+
+@dataclass(frozen=True)
+class LinkMesh:
+    """Triangles of one link in its own frame."""
+
+    vertices: NDArray[np.float32]
+    """(V, 3) m."""
+    triangles: NDArray[np.uint32]
+    """(F, 3) indices of vertices, counter-clockwise seen from outside."""
+    normals: NDArray[np.float32]
+    """(V, 3) outward unit vectors."""
+    colours: NDArray[np.uint8]
+    """(V, 3) RGB."""
+
+
+def link_meshes() -> dict[str, LinkMesh]:
+    """Link name -> mesh; empty where the model is not installed, as on a robot computer."""
+    try:
+        path = model_path()
+    except EnvironmentFailure:
+        return {}
+    return _load(path)
+
+
+@cache
+def _load(path: Path) -> dict[str, LinkMesh]:
+    root = ElementTree.parse(path).getroot()
+    files = {m.attrib["name"]: path.parent / "assets" / m.attrib["file"] for m in root.iter("mesh")}
+    meshes = {}
+    for body in root.iter("body"):
+        geoms = [g for g in body.findall("geom") if g.get("class") == "visual"]
+        if geoms:
+            parts = [_geom(geom, files[geom.attrib["mesh"]]) for geom in geoms]
+            meshes[body.attrib["name"]] = _merge(parts)
+    return meshes
+
+
+def _geom(geom: ElementTree.Element, file: Path) -> LinkMesh:
+    """One visual geom, thinned, in the frame of its link (no geom of the G1 is rotated)."""
+    vertices, triangles = thin(_read_stl(file), _GRID_M)
+    offset = np.array(geom.get("pos", "0 0 0").split(), np.float32)
+    colour = _DARK if geom.get("material") == "black" else _LIGHT
+    return LinkMesh(
+        vertices + offset,
+        triangles,
+        _normals(vertices, triangles),
+        np.tile(np.array(colour, np.uint8), (len(vertices), 1)),
+    )
+
+
+def _read_stl(file: Path) -> NDArray[np.float32]:
+    """(F, 3, 3) corners of the triangles of a binary STL."""
+    corners: NDArray[np.float32] = np.frombuffer(
+        file.read_bytes(), _STL_TRIANGLE, offset=_STL_HEADER_BYTES
+    )["vertices"]
+    return corners
+
+
+def thin(
+    corners: NDArray[np.float32], grid: float
+) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
+    """Triangles (F, 3, 3) -> (V, 3) vertices and (F', 3) indices, one vertex per grid cell.
+
+    A cell's vertex is the mean of those it holds; triangles that fall into fewer than three
+    cells vanish, and so do repetitions.
+    """
+    points = corners.reshape(-1, 3)
+    cells = np.round(points / grid).astype(np.int64)
+    _, index, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    sums = np.stack([np.bincount(index, points[:, k]) for k in range(3)], axis=1)
+    triangles = index.reshape(-1, 3)
+    a, b, c = triangles.T
+    triangles = np.unique(triangles[(a != b) & (b != c) & (a != c)], axis=0)
+    return (sums / count[:, None]).astype(np.float32), triangles.astype(np.uint32)
+
+
+def _normals(
+    vertices: NDArray[np.float32], triangles: NDArray[np.uint32]
+) -> NDArray[np.float32]:
+    """(V, 3) mean normal of the triangles at each vertex, weighted by their area."""
+    a, b, c = (vertices[triangles[:, k]] for k in range(3))
+    faces = np.cross(b - a, c - a)
+    total = np.zeros_like(vertices)
+    for k in range(3):
+        np.add.at(total, triangles[:, k], faces)
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.asarray(total / np.maximum(length, 1e-12), np.float32)
+
+
+def _merge(parts: list[LinkMesh]) -> LinkMesh:
+    """Several meshes as one."""
+    starts = np.cumsum([0, *[len(part.vertices) for part in parts[:-1]]])
+    return LinkMesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([p.triangles + np.uint32(s) for p, s in zip(parts, starts, strict=True)]),
+        np.concatenate([part.normals for part in parts]),
+        np.concatenate([part.colours for part in parts]),
+    )

@@ -1,0 +1,167 @@
+"""One tick as ROS 2 messages: which topic holds what."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.log import ros2
+from egovcp.log.info import CameraView
+from egovcp.log.pose import RobotPose, robot_pose
+from egovcp.log.tick import Candidates, Tick
+from egovcp.robot.kinematics import LINK_NAMES, quaternion
+from egovcp.spec import ACTION_NAMES, JOINT_NAMES, STATE_NAMES, STATE_SLICES
+
+CAMERA_FRAME: Final = "head_camera_optical"
+HEADING_FRAME: Final = "pelvis_heading"
+CANDIDATE_FIELDS: Final = ("x", "y", "z", "value")
+
+
+class Topic(StrEnum):
+    """What is where in the file."""
+
+    DEPTH = "/head/depth"
+    RECONSTRUCTED = "/head/depth_reconstructed"
+    IMAGINED = "/head/depth_imagined"  # 1..K ticks ahead, side by side
+    CAMERA_INFO = "/head/camera_info"
+    TF = "/tf"
+    BASE = "/robot/base_pose"  # simulator truth
+    JOINTS = "/robot/joint_states"
+    STATE = "/policy/state"
+    ACTION = "/policy/action"  # as sent
+    ACTION_PLANNED = "/policy/action_planned"
+    PLAN = "/plan/best"
+    CANDIDATES = "/plan/candidates"  # rows: candidates; columns: left then right per step
+    PLAN_SCALARS = "/plan/scalars"
+    REWARD = "/reward"
+    TIMING = "/timing"
+    SCENE = "/scene/objects"
+    LOG = "/rosout"
+
+
+MESSAGE_TYPES: Final = {
+    Topic.DEPTH: "sensor_msgs/Image",
+    Topic.RECONSTRUCTED: "sensor_msgs/Image",
+    Topic.IMAGINED: "sensor_msgs/Image",
+    Topic.CAMERA_INFO: "sensor_msgs/CameraInfo",
+    Topic.TF: "tf2_msgs/TFMessage",
+    Topic.BASE: "geometry_msgs/PoseStamped",
+    Topic.JOINTS: "sensor_msgs/JointState",
+    Topic.CANDIDATES: "sensor_msgs/PointCloud2",
+    Topic.LOG: "rcl_interfaces/Log",
+}
+
+
+def message_type(topic: Topic) -> str:
+    """ROS 2 type of the messages on ``topic``, such as ``sensor_msgs/Image``."""
+    return MESSAGE_TYPES.get(topic, "std_msgs/Float64MultiArray")
+
+
+def encode_tick(tick: Tick, view: CameraView) -> dict[Topic, bytes]:
+    """All messages of one tick; what the tick does not have is left out."""
+    pose = robot_pose(tick)
+    return {
+        **_camera_messages(tick, view),
+        Topic.TF: _transform_tree(tick, pose, view),
+        **_robot_messages(tick),
+        **_plan_messages(tick),
+        **_outcome_messages(tick),
+    }
+
+
+def _camera_messages(tick: Tick, view: CameraView) -> dict[Topic, bytes]:
+    t = tick.time_ns
+    messages = {
+        Topic.DEPTH: ros2.image_16uc1(t, CAMERA_FRAME, tick.depth),
+        Topic.CAMERA_INFO: ros2.camera_info(t, CAMERA_FRAME, view),
+    }
+    if tick.depth_reconstructed is not None:
+        image = to_millimetres(tick.depth_reconstructed)
+        messages[Topic.RECONSTRUCTED] = ros2.image_16uc1(t, CAMERA_FRAME, image)
+    if tick.depth_imagined is not None:
+        strip = np.concatenate(list(to_millimetres(tick.depth_imagined)), axis=1)
+        messages[Topic.IMAGINED] = ros2.image_16uc1(t, CAMERA_FRAME, strip)
+    return messages
+
+
+def _transform_tree(tick: Tick, pose: RobotPose, view: CameraView) -> bytes:
+    """Every link, the camera, the heading frame and both hand targets, each in the world."""
+    camera_position, camera_rotation = pose.camera(view)
+    targets = pose.from_heading(tick.state[STATE_SLICES["command_hands"]].reshape(2, 3))
+    names = (*LINK_NAMES, CAMERA_FRAME, HEADING_FRAME, "left_hand_target", "right_hand_target")
+    positions = [*pose.positions_w, camera_position, pose.positions_w[0], *targets]
+    extra = np.stack([camera_rotation, *[pose.heading_w] * 3])
+    rotations = np.concatenate([pose.quaternions_w, quaternion(extra)])
+    return ros2.transforms(tick.time_ns, names, positions, rotations)
+
+
+def _robot_messages(tick: Tick) -> dict[Topic, bytes]:
+    position = tick.state[STATE_SLICES["joint_position"]]
+    velocity = tick.state[STATE_SLICES["joint_velocity"]]
+    messages = {
+        Topic.JOINTS: ros2.joint_state(tick.time_ns, JOINT_NAMES, position, velocity),
+        Topic.STATE: ros2.multi_array(tick.state, [",".join(STATE_NAMES)]),
+        Topic.ACTION: ros2.multi_array(tick.action_sent, [_ACTIONS]),
+        Topic.ACTION_PLANNED: ros2.multi_array(tick.action_planned, [_ACTIONS]),
+    }
+    if tick.base is not None:
+        messages[Topic.BASE] = ros2.pose_stamped(
+            tick.time_ns, tick.base.position_w, tick.base.quaternion_w
+        )
+    return messages
+
+
+_ACTIONS: Final = ",".join(ACTION_NAMES)
+
+
+def _plan_messages(tick: Tick) -> dict[Topic, bytes]:
+    messages = {}
+    if tick.plan is not None:
+        messages[Topic.PLAN] = ros2.multi_array(tick.plan, ["step", _ACTIONS])
+    if tick.candidates is not None:
+        cloud = candidate_cloud(tick.candidates)
+        messages[Topic.CANDIDATES] = ros2.point_cloud(
+            tick.time_ns, HEADING_FRAME, cloud, CANDIDATE_FIELDS
+        )
+    scalars = {"value": tick.value, "termination": tick.termination}
+    known = {name: value for name, value in scalars.items() if value is not None}
+    if known:
+        messages[Topic.PLAN_SCALARS] = _named(known)
+    return messages
+
+
+def _outcome_messages(tick: Tick) -> dict[Topic, bytes]:
+    flags = ("terminated", "truncated", "success")
+    reward = {"reward": tick.reward} | {flag: float(getattr(tick, flag)) for flag in flags}
+    messages = {Topic.REWARD: _named(reward | dict(tick.reward_terms))}
+    if tick.timing_ms:
+        messages[Topic.TIMING] = _named(dict(tick.timing_ms))
+    if tick.scene:
+        rows = [(*o.position_w, *o.quaternion_w, *o.size) for o in tick.scene]
+        names = ",".join(f"{o.name}:{o.shape}" for o in tick.scene)
+        messages[Topic.SCENE] = ros2.multi_array(rows, [names, "x,y,z,qw,qx,qy,qz,sx,sy,sz"])
+    if tick.events:
+        messages[Topic.LOG] = ros2.log_line(tick.time_ns, "\n".join(tick.events))
+    return messages
+
+
+def _named(scalars: dict[str, float]) -> bytes:
+    """A vector whose axis label lists what its elements are."""
+    return ros2.multi_array(list(scalars.values()), [",".join(scalars)])
+
+
+def to_millimetres(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
+    """Metres -> whole millimetres; what is not a number, negative or too far becomes 0."""
+    mm = np.rint(np.nan_to_num(np.asarray(depth_m, np.float64), posinf=0.0) * 1000.0)
+    return np.where((mm > 0) & (mm < 65536), mm, 0).astype(np.uint16)
+
+
+def candidate_cloud(candidates: Candidates) -> NDArray[np.float32]:
+    """(n, 2 N, 4) points x, y, z, value: per candidate, left and right hand of each step."""
+    hands = np.asarray(candidates.hands_b, np.float32)
+    points = hands.reshape(len(hands), -1, 3)
+    values = np.asarray(candidates.values, np.float32)[:, None, None]
+    return np.concatenate([points, np.broadcast_to(values, (*points.shape[:2], 1))], axis=2)

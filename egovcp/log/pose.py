@@ -1,0 +1,90 @@
+"""Where the robot, its camera and its hand targets are in the world at one tick.
+
+With simulator truth the pelvis pose is exact. Without it (a real robot) the pelvis stands
+at the origin at its commanded height, tilted as its IMU says, heading along x.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.log.info import CameraView
+from egovcp.log.tick import Tick
+from egovcp.robot.kinematics import (
+    LINK_NAMES,
+    heading_rotation,
+    link_transforms,
+    palm_positions,
+    quaternion,
+)
+from egovcp.spec import STATE_SLICES
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class RobotPose:
+    """Poses of every link, the camera and the heading frame in the world."""
+
+    positions_w: Array
+    """(L, 3) m, in the order of `LINK_NAMES`."""
+    rotations_w: Array
+    """(L, 3, 3)."""
+    heading_w: Array
+    """(3, 3) rotation of the pelvis heading frame: yaw only."""
+    palms_w: Array
+    """(2, 3) palm sites, left then right, m."""
+
+    @property
+    def quaternions_w(self) -> Array:
+        """(L, 4) unit quaternions (w, x, y, z)."""
+        return quaternion(self.rotations_w)
+
+    def from_heading(self, points_b: NDArray[np.floating]) -> Array:
+        """(..., 3) points of the pelvis heading frame -> world, m."""
+        out: Array = self.positions_w[0] + np.asarray(points_b, np.float64) @ self.heading_w.T
+        return out
+
+    def camera(self, view: CameraView) -> tuple[Array, Array]:
+        """Optical frame (x right, y down, z forward) in the world: (3,) m and (3, 3)."""
+        link = LINK_NAMES.index(view.link)
+        rotation = self.rotations_w[link]
+        return self.positions_w[link] + rotation @ view.position, rotation @ view.rotation
+
+
+def robot_pose(tick: Tick) -> RobotPose:
+    """Forward kinematics of ``tick``'s measured joints on its pelvis pose."""
+    state = np.asarray(tick.state, np.float64)[None]
+    to_heading = heading_rotation(state[:, STATE_SLICES["projected_gravity"]])[0]
+    if tick.base is None:
+        origin = np.array([0.0, 0.0, state[0, STATE_SLICES["command_height"]].item()])
+        pelvis = to_heading
+    else:
+        origin = np.asarray(tick.base.position_w, np.float64)
+        pelvis = rotation_matrix(tick.base.quaternion_w)
+    position, rotation = link_transforms(state[:, STATE_SLICES["joint_position"]])
+    heading = _yaw_only(pelvis)
+    return RobotPose(
+        positions_w=origin + position[0] @ pelvis.T,
+        rotations_w=pelvis @ rotation[0],
+        heading_w=heading,
+        palms_w=origin + palm_positions(state)[0] @ heading.T,
+    )
+
+
+def rotation_matrix(quaternion_wxyz: NDArray[np.floating]) -> Array:
+    """(4,) unit quaternion (w, x, y, z) -> (3, 3): R = 1 + 2 w [v] + 2 [v]^2."""
+    w, x, y, z = np.asarray(quaternion_wxyz, np.float64)
+    v = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    out: Array = np.eye(3) + 2.0 * w * v + 2.0 * v @ v
+    return out
+
+
+def _yaw_only(rotation: Array) -> Array:
+    """The heading of ``rotation`` (3, 3): its x axis made horizontal, z up."""
+    yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

@@ -1,0 +1,166 @@
+"""ROS 2 message types used in the MCAP logs: their definitions and their encoders.
+
+These are the types that Rerun and Foxglove both show without plugins. Every encoder takes
+the time of the tick in nanoseconds and returns CDR bytes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from egovcp.log.cdr import Cdr
+from egovcp.log.info import CameraView
+from egovcp.rate import NS_PER_S
+from egovcp.spec import DEPTH_COLS, DEPTH_ROWS
+
+_PARTS: Final = {
+    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
+    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+    "geometry_msgs/Transform": (
+        "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation"
+    ),
+    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+    "geometry_msgs/TransformStamped": (
+        "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
+    ),
+    "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
+    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+    "sensor_msgs/Image": (
+        "std_msgs/Header header\nuint32 height\nuint32 width\nstring encoding\n"
+        "uint8 is_bigendian\nuint32 step\nuint8[] data"
+    ),
+    "sensor_msgs/RegionOfInterest": (
+        "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify"
+    ),
+    "sensor_msgs/CameraInfo": (
+        "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\n"
+        "float64[] d\nfloat64[9] k\nfloat64[9] r\nfloat64[12] p\nuint32 binning_x\n"
+        "uint32 binning_y\nsensor_msgs/RegionOfInterest roi"
+    ),
+    "sensor_msgs/JointState": (
+        "std_msgs/Header header\nstring[] name\nfloat64[] position\nfloat64[] velocity\n"
+        "float64[] effort"
+    ),
+    "sensor_msgs/PointField": "string name\nuint32 offset\nuint8 datatype\nuint32 count",
+    "sensor_msgs/PointCloud2": (
+        "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\n"
+        "bool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense"
+    ),
+    "std_msgs/MultiArrayDimension": "string label\nuint32 size\nuint32 stride",
+    "std_msgs/MultiArrayLayout": "std_msgs/MultiArrayDimension[] dim\nuint32 data_offset",
+    "std_msgs/Float64MultiArray": "std_msgs/MultiArrayLayout layout\nfloat64[] data",
+    "rcl_interfaces/Log": (
+        "builtin_interfaces/Time stamp\nuint8 level\nstring name\nstring msg\nstring file\n"
+        "string function\nuint32 line"
+    ),
+}
+
+_FLOAT32: Final = 7  # sensor_msgs/PointField.FLOAT32
+_INFO: Final = 20  # rcl_interfaces/Log.INFO
+
+
+def definition(name: str) -> str:
+    """Text of message ``name`` (such as ``sensor_msgs/Image``) with all its dependencies."""
+    text = _PARTS[name]
+    for part in _dependencies(name):
+        text += f"\n{'=' * 80}\nMSG: {part}\n{_PARTS[part]}"
+    return text
+
+
+def _dependencies(name: str) -> list[str]:
+    """Every message type inside ``name``, outermost first, each once."""
+    found: dict[str, None] = {}
+    for line in _PARTS[name].splitlines():
+        kind = line.split()[0].removesuffix("[]")
+        if kind in _PARTS:
+            found |= dict.fromkeys([kind, *_dependencies(kind)])
+    return list(found)
+
+
+def _stamp(cdr: Cdr, time_ns: int) -> Cdr:
+    return cdr.i32(time_ns // NS_PER_S).u32(time_ns % NS_PER_S)
+
+
+def _header(time_ns: int, frame: str) -> Cdr:
+    return _stamp(Cdr(), time_ns).string(frame)
+
+
+def image_16uc1(time_ns: int, frame: str, image: NDArray[np.uint16]) -> bytes:
+    """``sensor_msgs/Image`` of depth (H, W) in millimetres."""
+    rows, cols = image.shape
+    cdr = _header(time_ns, frame).u32(rows, cols).string("16UC1").u8(0).u32(2 * cols)
+    return cdr.octets(image.astype("<u2", copy=False).tobytes()).done()
+
+
+def camera_info(time_ns: int, frame: str, view: CameraView) -> bytes:
+    """``sensor_msgs/CameraInfo`` of an undistorted pinhole."""
+    f, (cx, cy) = view.focal_px, view.centre_px
+    cdr = _header(time_ns, frame).u32(DEPTH_ROWS, DEPTH_COLS).string("plumb_bob").f64s([0.0] * 5)
+    cdr.f64([f, 0, cx, 0, f, cy, 0, 0, 1]).f64(np.eye(3))
+    cdr.f64([f, 0, cx, 0, 0, f, cy, 0, 0, 0, 1, 0])
+    return cdr.u32(0, 0).u32(0, 0, 0, 0).u8(0).done()
+
+
+def transforms(
+    time_ns: int, names: Sequence[str], positions: ArrayLike, quaternions: ArrayLike
+) -> bytes:
+    """``tf2_msgs/TFMessage`` of frames in ``world``: (n, 3) m and (n, 4) wxyz."""
+    poses = _pose_rows(positions, quaternions)
+    cdr = Cdr().u32(len(names))
+    for name, pose in zip(names, poses, strict=True):
+        _stamp(cdr, time_ns).string("world").string(name).f64(pose)
+    return cdr.done()
+
+
+def pose_stamped(time_ns: int, position: ArrayLike, quaternion: ArrayLike) -> bytes:
+    """``geometry_msgs/PoseStamped`` in ``world``: (3,) m and (4,) wxyz."""
+    rows = _pose_rows(np.reshape(position, (1, 3)), np.reshape(quaternion, (1, 4)))
+    return _header(time_ns, "world").f64(rows).done()
+
+
+def _pose_rows(positions: ArrayLike, quaternions: ArrayLike) -> NDArray[np.float64]:
+    """(n, 7): ROS orders quaternions x, y, z, w."""
+    wxyz = np.asarray(quaternions, np.float64)
+    return np.concatenate([np.asarray(positions, np.float64), wxyz[:, [1, 2, 3, 0]]], axis=1)
+
+
+def joint_state(
+    time_ns: int, names: tuple[str, ...], position: ArrayLike, velocity: ArrayLike
+) -> bytes:
+    """``sensor_msgs/JointState``: rad and rad/s; effort is not measured."""
+    return _header(time_ns, "").strings(names).f64s(position).f64s(velocity).f64s([]).done()
+
+
+def multi_array(values: ArrayLike, labels: Sequence[str]) -> bytes:
+    """``std_msgs/Float64MultiArray``: one label per axis of ``values``."""
+    array = np.asarray(values, np.float64)
+    cdr = Cdr().u32(array.ndim)
+    for axis, label in enumerate(labels):
+        stride = int(np.prod(array.shape[axis:]))
+        cdr.string(label).u32(array.shape[axis], stride)
+    return cdr.u32(0).f64s(array).done()
+
+
+def point_cloud(
+    time_ns: int, frame: str, points: NDArray[np.float32], fields: Sequence[str]
+) -> bytes:
+    """``sensor_msgs/PointCloud2`` of float32 rows (height, width, len(fields)); xyz in metres."""
+    height, width, count = points.shape
+    cdr = _header(time_ns, frame).u32(height, width).u32(count)
+    for i, name in enumerate(fields):
+        cdr.string(name).u32(4 * i).u8(_FLOAT32).u32(1)
+    cdr.u8(0).u32(4 * count, 4 * count * width)
+    return cdr.octets(points.astype("<f4", copy=False).tobytes()).u8(1).done()
+
+
+def log_line(time_ns: int, text: str) -> bytes:
+    """``rcl_interfaces/Log`` at level INFO."""
+    cdr = _stamp(Cdr(), time_ns).u8(_INFO).string("egovcp").string(text)
+    return cdr.string("").string("").u32(0).done()

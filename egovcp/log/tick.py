@@ -1,0 +1,91 @@
+"""One planner tick, as every log sees it, and what describes the run it belongs to."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.floating]
+
+
+@dataclass(frozen=True)
+class SceneObject:
+    """A thing in the simulated scene; known in simulation only."""
+
+    name: str
+    """Unique within the scene, such as ``ball``."""
+    shape: Literal["sphere", "box"]
+    position_w: tuple[float, float, float]
+    """Centre, m, world frame."""
+    quaternion_w: tuple[float, float, float, float]
+    """Rotation to the world frame, (w, x, y, z)."""
+    size: tuple[float, float, float]
+    """Half extents along its own axes, m; a sphere repeats its radius."""
+
+
+@dataclass(frozen=True)
+class BasePose:
+    """Pelvis pose in the world: simulator truth, never an input of the policy."""
+
+    position_w: Array
+    """(3,) m."""
+    quaternion_w: Array
+    """(4,) (w, x, y, z)."""
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """Some of the plans that the planner weighed, drawn as paths of both hands."""
+
+    hands_b: Array
+    """(n, N, 2, 3) targets of the left and right hand, m, pelvis heading frame."""
+    values: Array
+    """(n,) objective of each candidate, return units."""
+
+
+@dataclass(frozen=True)
+class Tick:
+    """Everything that one planner tick saw, thought and did.
+
+    ``depth`` and ``state`` are o_t, the actions a_t, and the reward and flags follow from a_t,
+    so a recording converts to dataset rows without shifting anything.
+    """
+
+    index: int
+    """Planner ticks since the start of the run."""
+    time_ns: int
+    """Time of o_t, nanoseconds; simulated time in lock-step."""
+    depth: NDArray[np.uint16]
+    """(48, 64) planar depth, mm; 0 invalid."""
+    state: Array
+    """(74,) proprioception, `spec.STATE_SLICES`."""
+    action_planned: Array
+    """(7,) what the planner asked for, box units."""
+    action_sent: Array
+    """(7,) what the robot was sent after the safety filter, box units."""
+    depth_reconstructed: Array | None = None
+    """(48, 64) decoded from the posterior, m."""
+    depth_imagined: Array | None = None
+    """(K, 48, 64) decoded 1..K ticks ahead along the chosen plan, m."""
+    plan: Array | None = None
+    """(N, 7) chosen actions, box units."""
+    candidates: Candidates | None = None
+    value: float | None = None
+    """Objective of the chosen plan, return units."""
+    termination: float | None = None
+    """Probability that the present state is a failure, in [0, 1]."""
+    reward: float = 0.0
+    reward_terms: Mapping[str, float] = field(default_factory=dict)
+    terminated: bool = False
+    truncated: bool = False
+    success: bool = False
+    timing_ms: Mapping[str, float] = field(default_factory=dict)
+    """Duration of each part of the tick, ms."""
+    base: BasePose | None = None
+    scene: tuple[SceneObject, ...] = ()
+    events: tuple[str, ...] = ()
+    """Human-readable lines: throws, contacts, faults."""

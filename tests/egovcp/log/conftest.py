@@ -1,0 +1,64 @@
+"""Synthetic ticks: a squatting robot, a flying ball, and everything a log can hold."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from egovcp.log.tick import BasePose, Candidates, SceneObject, Tick
+from egovcp.spec import STATE_DIM, STATE_SLICES
+
+MakeTick = Callable[..., Tick]
+
+
+@pytest.fixture
+def make_tick() -> MakeTick:
+    """``make_tick(index)`` with everything; ``make_tick(index, bare=True)`` with the least."""
+    return _tick
+
+
+def _tick(index: int, bare: bool = False) -> Tick:
+    rng = np.random.default_rng(index)
+    state = rng.normal(0, 0.1, STATE_DIM).astype(np.float32)
+    state[STATE_SLICES["projected_gravity"]] = (0.0, 0.0, -1.0)
+    state[STATE_SLICES["command_height"]] = 0.7
+    state[STATE_SLICES["command_hands"]] = (0.3, 0.2, 0.1, 0.3, -0.2, 0.1)
+    depth = rng.integers(280, 5000, (48, 64)).astype(np.uint16)
+    depth[rng.random((48, 64)) < 0.1] = 0
+    action = rng.uniform(-1, 1, (2, 7)).astype(np.float32)
+    least = {
+        "index": index,
+        "time_ns": index * 40_000_000,
+        "depth": depth,
+        "state": state,
+        "action_planned": action[0],
+        "action_sent": action[1],
+        "reward": 0.25 * index,
+    }
+    return Tick(**least) if bare else Tick(**least, **_rest(index, rng))
+
+
+def _rest(index: int, rng: np.random.Generator) -> dict[str, object]:
+    ball = (2.0 - 0.1 * index, 0.1, 1.0)
+    return {
+        "depth_reconstructed": rng.integers(0, 5000, (48, 64)) / 1000.0,
+        "depth_imagined": rng.integers(0, 5000, (5, 48, 64)) / 1000.0,
+        "plan": rng.uniform(-1, 1, (4, 7)),
+        "candidates": Candidates(
+            rng.uniform(0, 0.5, (8, 4, 2, 3)).astype(np.float32),
+            rng.normal(size=8).astype(np.float32),
+        ),
+        "value": float(rng.normal()),
+        "termination": 0.01 * index,
+        "reward_terms": {"block": 1.0 * index, "pose": -0.1},
+        "success": index > 1,
+        "timing_ms": {"filter": 1.5, "plan": 12.0},
+        "base": BasePose(np.array([0.01 * index, 0.0, 0.7]), np.array([1.0, 0.0, 0.0, 0.0])),
+        "scene": (
+            SceneObject("ball", "sphere", ball, (1.0, 0.0, 0.0, 0.0), (0.1, 0.1, 0.1)),
+            SceneObject("wall", "box", (0.9, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), (0.05, 2.0, 1.0)),
+        ),
+        "events": ("ball thrown", "second line") if index == 1 else (),
+    }

@@ -1,0 +1,151 @@
+"""An MCAP recording reads back as it was written, whole or torn."""
+
+from __future__ import annotations
+
+from dataclasses import fields, is_dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.stream_reader import StreamReader
+from mcap_ros2.decoder import DecoderFactory
+
+from egovcp.errors import DataError, EnvironmentFailure
+from egovcp.log.info import CameraView, RunInfo
+from egovcp.log.mcap import McapSink
+from egovcp.log.mcap_reader import read_recording
+from egovcp.log.messages import Topic
+from egovcp.log.tick import Tick
+from egovcp.robot.kinematics import LINK_NAMES
+
+INFO = RunInfo(
+    task="ball",
+    seed=3,
+    episode=7,
+    camera=CameraView(pitch=0.05),
+    config={"planner": {"samples": 64}},
+    hashes={"model.safetensors": "00ff"},
+    versions={"egovcp": "0.1.0"},
+)
+
+
+def record(path: Path, ticks: list[Tick]) -> Path:
+    sink = McapSink(path)
+    sink.open(INFO)
+    for tick in ticks:
+        sink.write(tick)
+    sink.close()
+    return path
+
+
+def assert_same(a: Any, b: Any, where: str = "tick") -> None:
+    if is_dataclass(a):
+        for field in fields(a):
+            assert_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
+    elif isinstance(a, np.ndarray):
+        assert a.shape == b.shape, where
+        np.testing.assert_array_equal(a, b, err_msg=where)
+    else:
+        assert a == b, where
+
+
+def test_write_then_read_is_the_identity(tmp_path: Path, make_tick: Any) -> None:
+    ticks = [make_tick(0, bare=True), make_tick(1), make_tick(2), make_tick(3, bare=True)]
+    recording = read_recording(record(tmp_path / "a.mcap", ticks))
+    assert recording.complete
+    assert_same(recording.info, INFO, "info")
+    assert len(recording.ticks) == len(ticks)
+    for written, read in zip(ticks, recording.ticks, strict=True):
+        assert_same(written, read)
+
+
+def test_the_metadata_record_comes_before_any_tick(tmp_path: Path, make_tick: Any) -> None:
+    path = record(tmp_path / "a.mcap", [make_tick(0)])
+    with path.open("rb") as file:
+        kinds = [type(r).__name__ for r in StreamReader(file).records]
+    assert kinds[:2] == ["Header", "Metadata"]
+    assert "Chunk" not in kinds
+    assert kinds.index("Message") > 1
+
+
+def test_one_message_per_topic_and_tick_at_the_ticks_time(tmp_path: Path, make_tick: Any) -> None:
+    path = record(tmp_path / "a.mcap", [make_tick(i) for i in range(3)])
+    with path.open("rb") as file:
+        messages = [(c.topic, m.log_time) for _, c, m in make_reader(file).iter_messages()]
+    assert len(set(messages)) == len(messages)
+    assert {t for _, t in messages} == {0, 40_000_000, 80_000_000}
+    for topic in Topic:
+        expected = 1 if topic is Topic.LOG else 3
+        assert sum(name == topic for name, _ in messages) == expected, topic
+
+
+def test_a_standard_ros_decoder_reads_every_message(tmp_path: Path, make_tick: Any) -> None:
+    tick = make_tick(1)
+    path = record(tmp_path / "a.mcap", [tick])
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        decoded = {c.topic: d for _, c, _, d in reader.iter_decoded_messages()}
+    assert set(decoded) == set(Topic)
+    image = decoded[Topic.DEPTH]
+    assert (image.encoding, image.height, image.width, image.step) == ("16UC1", 48, 64, 128)
+    assert image.header.stamp.nanosec == 40_000_000
+    frames = [t.child_frame_id for t in decoded[Topic.TF].transforms]
+    assert set(LINK_NAMES) < set(frames)
+    assert {t.header.frame_id for t in decoded[Topic.TF].transforms} == {"world"}
+    pelvis = decoded[Topic.TF].transforms[frames.index("pelvis")].transform
+    assert pelvis.translation.z == pytest.approx(0.7)
+    camera = decoded[Topic.CAMERA_INFO]
+    assert 2 * np.arctan(24 / camera.k[4]) == pytest.approx(INFO.camera.vertical_fov)
+    assert decoded[Topic.LOG].msg == "ball thrown\nsecond line"
+    assert [f.name for f in decoded[Topic.CANDIDATES].fields] == ["x", "y", "z", "value"]
+
+
+def test_a_killed_process_loses_no_written_tick(tmp_path: Path, make_tick: Any) -> None:
+    sink = McapSink(tmp_path / "a.mcap")
+    sink.open(INFO)
+    ticks = [make_tick(i) for i in range(4)]
+    for tick in ticks:
+        sink.write(tick)
+    recording = read_recording(tmp_path / "a.mcap")  # not closed: as after kill -9
+    sink.close()
+    assert not recording.complete
+    assert [t.index for t in recording.ticks] == [0, 1, 2, 3]
+    assert_same(ticks[3], recording.ticks[3])
+
+
+def test_a_torn_tail_keeps_all_ticks_before_it(tmp_path: Path, make_tick: Any) -> None:
+    path = record(tmp_path / "a.mcap", [make_tick(i) for i in range(6)])
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    recording = read_recording(path)
+    assert not recording.complete
+    assert [t.index for t in recording.ticks] == list(range(len(recording.ticks)))
+    assert 1 <= len(recording.ticks) < 6
+
+
+def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(b"precious")
+    with pytest.raises(EnvironmentFailure, match="exists already"):
+        McapSink(path).open(INFO)
+    assert path.read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize("content", [None, b"", b"not an mcap file at all, but longer than magic"])
+def test_what_is_not_a_recording_is_refused(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "a.mcap"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DataError, match=r"a\.mcap"):
+        read_recording(path)
+
+
+def test_closing_twice_or_unopened_is_harmless(tmp_path: Path, make_tick: Any) -> None:
+    McapSink(tmp_path / "unopened.mcap").close()
+    sink = McapSink(tmp_path / "a.mcap")
+    sink.open(INFO)
+    sink.write(make_tick(0))
+    sink.close()
+    sink.close()
+    assert read_recording(tmp_path / "a.mcap").complete
