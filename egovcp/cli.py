@@ -12,10 +12,13 @@ after an interrupt. A traceback is printed only with ``--debug``.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import errno
+import json
 import sys
+import tempfile
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -42,12 +45,7 @@ class _Parser(ArgumentParser[Any]):
     """draccus' parser that raises `UsageError` instead of ending the process."""
 
     def known_flags(self) -> list[str]:
-        return [
-            o
-            for a in self.parser._actions
-            for o in a.option_strings
-            if o.startswith("--")
-        ]
+        return [o for a in self.parser._actions for o in a.option_strings if o.startswith("--")]
 
 
 class _TeachingHelp(argparse.ArgumentDefaultsHelpFormatter):
@@ -56,11 +54,16 @@ class _TeachingHelp(argparse.ArgumentDefaultsHelpFormatter):
 
 
 def parse_config[C](
-    config_class: type[C], argv: Sequence[str], prog: str, epilog: str = ""
+    config_class: type[C],
+    argv: Sequence[str],
+    prog: str,
+    epilog: str = "",
+    defaults: Callable[[Sequence[str]], Mapping[str, Any]] | None = None,
 ) -> C:
     """Parse dotted flags into ``config_class``; raise `UsageError` naming the flag at fault.
 
-    A flag without a value is true (``--resume`` is ``--resume=true``).
+    A flag without a value is true (``--resume`` is ``--resume=true``). ``defaults`` maps
+    the flags to nested values that stand where no flag and no config file says otherwise.
     """
     parser = _Parser(
         config_class,
@@ -75,21 +78,32 @@ def parse_config[C](
     for arg in args:
         flag = arg.split("=", 1)[0]
         if not flag.startswith("-"):
-            raise UsageError(
-                f"unexpected argument {arg!r}; options are written --name=value"
-            )
+            raise UsageError(f"unexpected argument {arg!r}; options are written --name=value")
         if flag not in known and flag != "-h":
             near = suggest(flag, known).split(" choose from")[0].rstrip(";")
             raise UsageError(f"unknown option {flag}{near}; see {prog} --help")
     try:
-        config: C = parser.parse_args(args)
+        with _defaults_file(defaults(args) if defaults else {}) as path:
+            parser.config_path = path
+            config: C = parser.parse_args(args)
     except (DraccusException, argparse.ArgumentError, ValueError, TypeError) as error:
-        raise UsageError(
-            f"{' '.join(str(error).split())}; see {prog} --help"
-        ) from error
+        raise UsageError(f"{' '.join(str(error).split())}; see {prog} --help") from error
     except OSError as error:
         raise UsageError(f"cannot read {error.filename}: {error.strerror}") from error
     return config
+
+
+@contextlib.contextmanager
+def _defaults_file(values: Mapping[str, Any]) -> Iterator[str | None]:
+    """The values as a file that draccus reads below the flags: it takes partial configs no
+    other way."""
+    if not values:
+        yield None
+        return
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", encoding="utf-8") as file:
+        json.dump(values, file)  # JSON is YAML
+        file.flush()
+        yield file.name
 
 
 def _bare_flags_are_true(argv: Sequence[str]) -> list[str]:
@@ -102,8 +116,7 @@ def _bare_flags_are_true(argv: Sequence[str]) -> list[str]:
         else:
             out.append(arg)
     return [
-        f"{a}=true" if a.startswith("--") and "=" not in a and a != "--help" else a
-        for a in out
+        f"{a}=true" if a.startswith("--") and "=" not in a and a != "--help" else a for a in out
     ]
 
 
@@ -114,17 +127,15 @@ def run_command[C](
     *,
     prog: str,
     epilog: str = "",
+    defaults: Callable[[Sequence[str]], Mapping[str, Any]] | None = None,
 ) -> int:
     """Parse ``argv``, call ``run`` and return the exit code; one line on an error."""
     args = list(sys.argv[1:] if argv is None else argv)
     debug = "--debug" in args
-    epilog = (
-        epilog + "\n" if epilog else ""
-    ) + "--debug prints the traceback of an error."
+    epilog = (epilog + "\n" if epilog else "") + "--debug prints the traceback of an error."
     try:
-        config = parse_config(
-            config_class, [a for a in args if a != "--debug"], prog, epilog
-        )
+        plain = [a for a in args if a != "--debug"]
+        config = parse_config(config_class, plain, prog, epilog, defaults)
         run(config)
     except KeyboardInterrupt:
         print(f"{prog}: interrupted", file=sys.stderr)
@@ -132,9 +143,7 @@ def run_command[C](
     except OSError as error:
         if error.errno not in _ENVIRONMENT_ERRNOS:
             raise
-        failure = EnvironmentFailure(
-            f"{error.strerror}: {error.filename or ''}".rstrip(": ")
-        )
+        failure = EnvironmentFailure(f"{error.strerror}: {error.filename or ''}".rstrip(": "))
         return _report(prog, failure, debug)
     except EgovcpError as error:
         return _report(prog, error, debug)

@@ -45,8 +45,8 @@ class WorldModelConfig:
     """Size of the stochastic state z (diagonal Gaussian)."""
     units: int = 256
     """Width of every MLP."""
-    channels: tuple[int, ...] = (16, 32, 64, 64)
-    """Channels of the depth CNN, one stride-2 layer each; the decoder mirrors them."""
+    channels: tuple[int, int, int] = (32, 64, 64)
+    """Channels of the three layers of the depth CNN; the decoder uses the last."""
     min_std: float = 0.1
     """Floor of the latent standard deviation."""
     update_bias: float = -1.0
@@ -70,5 +70,5 @@ PAPER_LOSS = LossConfig(
 PRESETS = {
     "default": WorldModelConfig(),
     "paper": WorldModelConfig(loss=PAPER_LOSS),
-    "debug": WorldModelConfig(hidden=32, latent=8, units=32, channels=(4, 8, 8, 8)),
+    "debug": WorldModelConfig(hidden=32, latent=8, units=32, channels=(4, 8, 8)),
 }

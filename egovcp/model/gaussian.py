@@ -23,9 +23,7 @@ class Gaussian(NamedTuple):
 
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
         """One reparametrised draw."""
-        noise = torch.randn(
-            self.mean.shape, generator=generator, device=self.mean.device
-        )
+        noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device)
         return self.mean + self.std * noise
 
     def detach(self) -> Gaussian:

@@ -98,16 +98,12 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     return (x * weight).sum() / weight.sum().clamp_min(1.0)
 
 
-def depth_loss(
-    model: WorldModel, rollout: Rollout, batch: Batch, config: LossConfig
-) -> Tensor:
+def depth_loss(model: WorldModel, rollout: Rollout, batch: Batch, config: LossConfig) -> Tensor:
     """Gaussian negative log likelihood of the image, moving pixels weighted up."""
     image = model.decode_depth(rollout.carry.features.flatten(0, 1))
     error = 0.5 * (image.float() - rollout.near.flatten(0, 1)).square()
     if config.moving > 0:
-        weight = 1.0 + config.moving * moving_pixels(
-            rollout.near, config.moving_threshold
-        )
+        weight = 1.0 + config.moving * moving_pixels(rollout.near, config.moving_threshold)
         error = error * weight.flatten(0, 1)
     return masked_mean(error.mean((-2, -1)), batch.valid.flatten())
 
@@ -163,9 +159,7 @@ def value_and_termination_losses(
                 logit, batch.terminal_next.float(), reduction="none"
             )
             losses["termination"] = config.termination * masked_mean(bce, batch.valid)
-        carry = Carry(
-            carry.h[:, :-1], carry.z[:, :-1]
-        )  # (B, T - k): the rows that exist
+        carry = Carry(carry.h[:, :-1], carry.z[:, :-1])  # (B, T - k): the rows that exist
         if config.imagined_steps and k < length:
             same_episode = _unbroken(batch, k)
             q = model.standardised_value(carry, batch.action[:, k:])

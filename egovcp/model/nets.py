@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -32,52 +34,57 @@ class GruCell(nn.Module):
 
     def forward(self, x: Tensor, h: Tensor) -> Tensor:
         """(B, inputs), (B, hidden) -> (B, hidden)."""
-        reset, candidate, update = self.norm(self.project(torch.cat([x, h], -1))).chunk(
-            3, -1
-        )
+        reset, candidate, update = self.norm(self.project(torch.cat([x, h], -1))).chunk(3, -1)
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
         gate = torch.sigmoid(update + self.update_bias)
         return torch.lerp(h, candidate.to(h.dtype), gate.to(h.dtype))
 
 
-def feature_shape(channels: tuple[int, ...]) -> tuple[int, int, int]:
-    """(C, H, W) of the innermost feature map of the depth CNN."""
-    halvings = 2 ** len(channels)
-    return channels[-1], spec.DEPTH_ROWS // halvings, spec.DEPTH_COLS // halvings
-
-
 class DepthEncoder(nn.Module):
-    """Image of nearness and validity (B, 2, 48, 64) -> features (B, C*H*W)."""
+    """Image of nearness and validity (B, 2, 48, 64) -> features (B, C * 3 * 4).
 
-    def __init__(self, channels: tuple[int, ...]) -> None:
+    The stem reads overlapping 8 x 8 patches on a grid of 4 pixels: a third of the cost of
+    two stride-2 layers on a CPU, and a distant ball, 3 pixels wide, still fills a patch.
+    """
+
+    def __init__(self, channels: tuple[int, int, int]) -> None:
         super().__init__()
-        layers: list[nn.Module] = []
-        for inputs, outputs in zip((2, *channels[:-1]), channels, strict=True):
-            layers += [nn.Conv2d(inputs, outputs, 4, stride=2, padding=1), nn.SiLU()]
-        self.layers = nn.Sequential(*layers)
-        self.outputs = int(torch.tensor(feature_shape(channels)).prod())
+        stem, middle, last = channels
+        self.layers = nn.Sequential(
+            nn.Conv2d(2, stem, 8, stride=4, padding=2),
+            nn.SiLU(),
+            nn.Conv2d(stem, middle, 3, stride=2, padding=1),
+            nn.SiLU(),
+            nn.Conv2d(middle, last, 3, stride=2, padding=1),
+            nn.SiLU(),
+            nn.Flatten(),
+        )
+        self.outputs = last * (spec.DEPTH_ROWS // 16) * (spec.DEPTH_COLS // 16)
 
     def forward(self, image: Tensor) -> Tensor:
-        features: Tensor = self.layers(
-            image.contiguous(memory_format=torch.channels_last)
-        )
-        return features.flatten(1)
+        features: Tensor = self.layers(image.contiguous(memory_format=torch.channels_last))
+        return features
 
 
 class DepthDecoder(nn.Module):
-    """State features (B, inputs) -> nearness image (B, 48, 64)."""
+    """State features (B, inputs) -> nearness image (B, 48, 64).
 
-    def __init__(self, inputs: int, channels: tuple[int, ...]) -> None:
+    A map of 6 x 8 cells, each of which paints its own 8 x 8 pixels.
+    """
+
+    PATCH = 8
+
+    def __init__(self, inputs: int, channels: int) -> None:
         super().__init__()
-        self.shape = feature_shape(channels)
-        self.project = nn.Linear(inputs, int(torch.tensor(self.shape).prod()))
-        layers: list[nn.Module] = []
-        reverse = channels[::-1]
-        for i, (n_in, n_out) in enumerate(zip(reverse, (*reverse[1:], 1), strict=True)):
-            layers.append(nn.ConvTranspose2d(n_in, n_out, 4, stride=2, padding=1))
-            if i < len(reverse) - 1:
-                layers.append(nn.SiLU())
-        self.layers = nn.Sequential(*layers)
+        self.shape = (channels, spec.DEPTH_ROWS // self.PATCH, spec.DEPTH_COLS // self.PATCH)
+        self.project = nn.Linear(inputs, math.prod(self.shape))
+        self.layers = nn.Sequential(
+            nn.SiLU(),
+            nn.Conv2d(channels, channels, 3, padding=1),
+            nn.SiLU(),
+            nn.Conv2d(channels, self.PATCH**2, 1),
+            nn.PixelShuffle(self.PATCH),
+        )
 
     def forward(self, features: Tensor) -> Tensor:
         maps = self.project(features).view(-1, *self.shape)

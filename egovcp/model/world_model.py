@@ -57,7 +57,7 @@ class WorldModel(nn.Module):
         self.gru = GruCell(c.units, c.hidden, c.update_bias)
         self.posterior = mlp(c.hidden + embedding, c.units, 2 * c.latent, 1)
         self.prior = mlp(c.hidden, c.units, 2 * c.latent, 1)
-        self.decode_depth = DepthDecoder(features, c.channels)
+        self.decode_depth = DepthDecoder(features, c.channels[-1])
         self.decode_state = mlp(features, c.units, spec.STATE_DIM, 1)
         self.termination_head = mlp(features, c.units, 1, 1)
         self.value_head = mlp(features + spec.ACTION_DIM, c.units, 1, 2)
@@ -79,9 +79,7 @@ class WorldModel(nn.Module):
     # --- observation -----------------------------------------------------------------
     def embed(self, depth: Tensor, state: Tensor) -> Tensor:
         """Raw depth (B, 48, 64) mm and state (B, 74) -> embedding (B, E)."""
-        return self.embed_near(
-            nearness(depth, self.config.depth_max_m), self.standardise(state)
-        )
+        return self.embed_near(nearness(depth, self.config.depth_max_m), self.standardise(state))
 
     def embed_near(self, near: Tensor, standardised: Tensor) -> Tensor:
         """The same from nearness (B, 48, 64) and standardised state (B, 74)."""
@@ -151,9 +149,7 @@ class WorldModel(nn.Module):
     # --- heads -----------------------------------------------------------------------
     def value(self, carry: Carry, action: Tensor) -> Tensor:
         """Q(h, z, a) in units of return, (...,); equation 5."""
-        return (
-            self.standardised_value(carry, action) * self.return_std + self.return_mean
-        )
+        return self.standardised_value(carry, action) * self.return_std + self.return_mean
 
     def standardised_value(self, carry: Carry, action: Tensor) -> Tensor:
         """Q in units of the return's deviation from its mean, (...,)."""
@@ -173,6 +169,4 @@ class WorldModel(nn.Module):
         """Carry (B, ...) -> depth (B, 48, 64) in metres, 0 = nothing in range; state (B, 74)."""
         features = carry.features
         depth = to_metres(self.decode_depth(features).float(), self.config.depth_max_m)
-        return depth, self.decode_state(
-            features
-        ).float() * self.state_std + self.state_mean
+        return depth, self.decode_state(features).float() * self.state_std + self.state_mean

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from egovcp.cli import DatasetConfig
+from egovcp.data import DatasetConfig, ReturnConfig
 from egovcp.model import WorldModelConfig
 from egovcp.plan import PlannerConfig
 
@@ -38,8 +38,6 @@ class SamplingConfig:
     """Share of windows that are placed around events instead of anywhere."""
     mirror: bool = True
     """Left-right mirror half of the windows (the robot is symmetric)."""
-    full_returns: bool = True
-    """Train Q only on returns that the time limit does not cut short; false: the paper's."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +59,8 @@ class TrainConfig:
     """World model and losses."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     """Planner settings stored in the artefact."""
+    returns: ReturnConfig = field(default_factory=ReturnConfig)
+    """Monte Carlo target of Q."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     """Batches."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)

@@ -1,0 +1,51 @@
+"""From the data stream's arrays to the model's tensors and normalisation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from egovcp.data import EpisodeStore
+from egovcp.errors import DataError
+from egovcp.model import Batch, WorldModel
+
+STD_FLOOR = 0.02  # a constant value (v of the standing tasks) must not be blown up
+WORST_RETURN_QUANTILE = 0.001
+
+
+def to_tensors(arrays: Mapping[str, NDArray[Any]], device: torch.device) -> Batch:
+    """A batch of `SequenceStream` as the tensors that the losses read."""
+    depth = torch.from_numpy(arrays["depth"].astype(np.int32))
+    rest = {k: torch.from_numpy(arrays[k]) for k in Batch._fields if k != "depth"}
+    return Batch(depth=depth, **rest)._replace(
+        **{k: v.to(device, non_blocking=True) for k, v in {"depth": depth, **rest}.items()}
+    )
+
+
+def set_normalisation(model: WorldModel, store: EpisodeStore) -> None:
+    """Fix the model's statistics from the training episodes: state, return, worst return.
+
+    Raises:
+        DataError: no return is usable, because the episodes are too short.
+    """
+    returns = store.mc_return[store.mc_valid]
+    if len(returns) == 0:
+        raise DataError(
+            f"no row has a complete Monte Carlo return: the episodes (at most "
+            f"{int(store.length.max())} ticks) are not longer than --returns.steps; lower it, or "
+            "collect longer episodes"
+        )
+    state = store.state.astype(np.float64)
+    values = {
+        "state_mean": state.mean(0),
+        "state_std": np.maximum(state.std(0), STD_FLOOR),
+        "return_mean": returns.mean(dtype=np.float64),
+        "return_std": max(float(returns.std(dtype=np.float64)), 1e-6),
+        "return_floor": np.quantile(returns, WORST_RETURN_QUANTILE),
+    }
+    for name, value in values.items():
+        getattr(model, name).copy_(torch.as_tensor(value, dtype=torch.float32))

@@ -1,0 +1,229 @@
+"""``egovcp-train``: dataset in, policy artefact out."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import draccus
+import torch
+from tqdm import tqdm
+
+from egovcp.artefact import save_artefact
+from egovcp.cli import run_command, save_config
+from egovcp.data import DatasetReader, EpisodeStore, SequenceStream, StreamConfig
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.model import PRESETS, WorldModel
+from egovcp_train.batches import set_normalisation, to_tensors
+from egovcp_train.checkpoint import begin_checkpoint, finish_checkpoint, load_training_state
+from egovcp_train.config import TrainConfig
+from egovcp_train.evaluation import evaluate
+from egovcp_train.loop import Budget, Learner
+from egovcp_train.records import Recorder
+
+PROG = "egovcp-train"
+EVALUATION_BATCHES = 8
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run_command(TrainConfig, train, argv, prog=PROG, defaults=preset_defaults)
+
+
+def preset_defaults(argv: Sequence[str]) -> dict[str, Any]:
+    """The --policy options that --preset stands for."""
+    names = [a.split("=", 1)[1] for a in argv if a.startswith("--preset=")]
+    preset = PRESETS.get(names[-1]) if names else None
+    return {"policy": draccus.encode(preset)} if preset else {}
+
+
+def train(config: TrainConfig) -> None:
+    """Run training to its end, or to the first SIGINT or SIGTERM, and write the artefact."""
+    output = _prepare_output(config)
+    torch.set_num_threads(config.threads or torch.get_num_threads())
+    device = _device(config.device)
+    reader = DatasetReader.open(config.dataset)
+    learning, heldout = _load(reader, config)
+    torch.manual_seed(config.seed)
+    model = WorldModel(config.policy)
+    set_normalisation(model, learning)
+    learner = Learner(model.to(device), config.optimizer, config.seed)
+    stream = SequenceStream(learning, _stream_config(config, config.seed))
+    if config.resume:
+        state = load_training_state(output)
+        learner.load_state_dict(state["learner"])
+        stream.load_state_dict(state["stream"])
+    output.mkdir(parents=True, exist_ok=True)
+    save_config(config, str(output / "train_config.yaml"))
+    run = Run(config, output, learner, stream, heldout, device, _provenance(reader, config))
+    run.execute()
+
+
+class Run:
+    """One training run: steps, evaluations, checkpoints."""
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        output: Path,
+        learner: Learner,
+        stream: SequenceStream,
+        heldout: EpisodeStore,
+        device: torch.device,
+        provenance: dict[str, Any],
+    ) -> None:
+        self.config, self.output, self.learner, self.stream = config, output, learner, stream
+        self.heldout, self.device, self.provenance = heldout, device, provenance
+        self.metrics: dict[str, float] = {}
+        self.recorder = Recorder(output, enabled=config.tensorboard)
+
+    def execute(self) -> None:
+        """Train until the budget or a signal ends it; the last state is always saved."""
+        config, learner = self.config, self.learner
+        budget = Budget(config.steps, config.max_minutes)
+        frames = config.batch_size * (config.sampling.length + config.sampling.burn_in)
+        with (
+            _stop_on_signal() as stopped,
+            tqdm(
+                total=config.steps, initial=learner.step, unit="step", desc="train", mininterval=1.0
+            ) as bar,
+        ):
+            while budget.progress(learner.step) < 1.0 and not stopped:
+                batch = to_tensors(next(self.stream), self.device)
+                terms = learner.update(batch, budget.progress(learner.step))
+                bar.update()
+                if learner.step % config.log_freq == 0:
+                    self.recorder.scalars(learner.step, {k: float(v) for k, v in terms.items()})
+                    bar.set_postfix(self._summary(terms, bar, frames))
+                if config.eval_freq and learner.step % config.eval_freq == 0:
+                    self.evaluate()
+                if learner.step % config.save_freq == 0:
+                    self.save()
+        self.evaluate()
+        final = self.save()
+        self.recorder.close()
+        print(self._last_words(final, bool(stopped)))
+
+    def evaluate(self) -> None:
+        """Measure the averaged weights on held-out episodes."""
+        fresh = SequenceStream(self.heldout, _stream_config(self.config, seed=12345, mirror=False))
+        batches = (to_tensors(next(fresh), self.device) for _ in range(EVALUATION_BATCHES))
+        self.metrics = evaluate(self.learner.averaged, batches)
+        self.recorder.scalars(
+            self.learner.step, {f"heldout/{k}": v for k, v in self.metrics.items()}
+        )
+
+    def save(self) -> Path:
+        """Write a checkpoint: artefact and training state, complete or not at all."""
+        partial = begin_checkpoint(self.output, self.learner.step)
+        provenance = self.provenance | {"step": self.learner.step, "heldout": self.metrics}
+        averaged = self.learner.averaged
+        save_artefact(partial / "pretrained_model", averaged, self.config.planner, provenance)
+        state = {"learner": self.learner.state_dict(), "stream": self.stream.state_dict()}
+        return finish_checkpoint(partial, state)
+
+    def _summary(self, terms: dict[str, Any], bar: Any, frames: int) -> dict[str, str]:
+        summary = {"loss": f"{float(terms['loss/total']):.3f}"}
+        if bar.format_dict["rate"]:
+            summary["frames/s"] = f"{bar.format_dict['rate'] * frames:.0f}"
+        if "value/r2" in self.metrics:
+            summary["heldout_r2"] = f"{self.metrics['value/r2']:.3f}"
+        return summary
+
+    def _last_words(self, final: Path, stopped: bool) -> str:
+        lines = [f"  {name:<20} {value:.4f}" for name, value in sorted(self.metrics.items())]
+        state = "stopped early; --resume continues" if stopped else "done"
+        artefact = final / "pretrained_model"
+        return "\n".join(
+            [
+                f"{PROG}: {state} at step {self.learner.step}; on held-out episodes:",
+                *lines,
+                f"artefact: {artefact}",
+                f"next: egovcp-eval --policy.path={artefact} --task=... --output_dir=...",
+            ]
+        )
+
+
+def _prepare_output(config: TrainConfig) -> Path:
+    """Refuse a bad destination before any work starts."""
+    if min(config.steps, config.batch_size, config.log_freq, config.save_freq) < 1:
+        raise UsageError("--steps, --batch_size, --log_freq and --save_freq must be at least 1")
+    output = Path(config.output_dir)
+    if config.resume:
+        load_training_state(output)
+        return output
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise UsageError(
+            f"output folder {output} exists and is not empty; choose another, or continue the run "
+            "in it with --resume"
+        )
+    parent = next(p for p in [output, *output.absolute().parents] if p.exists())
+    try:
+        with tempfile.TemporaryFile(dir=parent):
+            pass
+    except OSError as error:
+        raise EnvironmentFailure(f"cannot write to {parent}: {error.strerror}") from error
+    return output
+
+
+def _device(name: str) -> torch.device:
+    available = torch.cuda.is_available()
+    if name == "auto":
+        return torch.device("cuda" if available else "cpu")
+    if name.startswith("cuda") and not available:
+        raise EnvironmentFailure("--device=cuda, but torch finds no CUDA device; use --device=cpu")
+    try:
+        return torch.device(name)
+    except RuntimeError as error:
+        raise UsageError(f"unknown --device {name!r}; expected cpu, cuda or auto") from error
+
+
+def _load(reader: DatasetReader, config: TrainConfig) -> tuple[EpisodeStore, EpisodeStore]:
+    learning, heldout = (
+        EpisodeStore.load([reader], split, config.returns) for split in ("train", "heldout")
+    )
+    return learning, heldout
+
+
+def _stream_config(config: TrainConfig, seed: int, mirror: bool | None = None) -> StreamConfig:
+    sampling = config.sampling
+    return StreamConfig(
+        batch_size=config.batch_size,
+        length=sampling.length,
+        burn_in=sampling.burn_in,
+        event_fraction=sampling.event_fraction,
+        mirror=sampling.mirror if mirror is None else mirror,
+        seed=seed,
+    )
+
+
+def _provenance(reader: DatasetReader, config: TrainConfig) -> dict[str, Any]:
+    return {
+        "controller_id": reader.controller_id,
+        "datasets": [{"repo_id": reader.source.repo_id, "revision": reader.source.commit}],
+        "train_config": draccus.encode(config),
+        "command": [PROG, *sys.argv[1:]],
+    }
+
+
+@contextlib.contextmanager
+def _stop_on_signal() -> Iterator[list[int]]:
+    """A list that fills when SIGINT or SIGTERM asks for the end; a second one is obeyed at once."""
+    received: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        if received:
+            raise KeyboardInterrupt
+        received.append(number)
+
+    previous = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
