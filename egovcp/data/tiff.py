@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import io
 import struct
+import warnings
 from functools import cache
 
 import numpy as np
@@ -91,7 +92,7 @@ def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uin
     from PIL import Image, UnidentifiedImageError  # only for layouts that are not ours
 
     try:
-        with Image.open(io.BytesIO(blob)) as image:
+        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(blob)) as image:
             mode, size = image.mode, image.size
             pixels = np.asarray(image)
     except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:

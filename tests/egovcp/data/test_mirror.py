@@ -2,6 +2,7 @@ import numpy as np
 
 from egovcp import spec
 from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
+from egovcp.robot.kinematics import palm_positions
 
 
 def _reflect_hands(metric: np.ndarray) -> np.ndarray:
@@ -43,3 +44,11 @@ def test_every_joint_meets_its_counterpart() -> None:
         state[spec.STATE_NAMES.index(f"{name}.pos")] = 1.0
         found = mirror_state(state)[spec.STATE_NAMES.index(f"{other}.pos")]
         assert found == (-1.0 if "roll" in name or "yaw" in name else 1.0)
+
+
+def test_the_mirrored_robot_holds_its_hands_in_the_mirrored_places() -> None:
+    state = np.random.default_rng(3).normal(scale=0.3, size=(50, spec.STATE_DIM))
+    state[:, 3:6] += [0, 0, -1]
+    palms = palm_positions(state)  # (50, left and right, xyz)
+    mirrored = palm_positions(mirror_state(state))
+    np.testing.assert_allclose(mirrored, palms[:, ::-1] * [1, -1, 1], atol=1e-4)

@@ -56,9 +56,7 @@ def test_statistics_are_those_of_all_frames(reader: DatasetReader) -> None:
         assert found["count"] == [reader.num_frames]
 
 
-def test_depth_quantiles_are_exact_for_one_episode(
-    tmp_path: Path, make_episode: object, episodes: list[Episode]
-) -> None:
+def test_depth_quantiles_are_exact_for_one_episode(tmp_path: Path, episodes: list[Episode]) -> None:
     with DatasetWriter(tmp_path / "one", Provenance("stance-1")) as writer:
         writer.add(episodes[0])
     stats = json.loads((tmp_path / "one/meta/stats.json").read_text())[spec.DEPTH_KEY]
@@ -68,22 +66,22 @@ def test_depth_quantiles_are_exact_for_one_episode(
         assert np.ravel(stats[name])[0] == pytest.approx(expected, abs=1.0)
 
 
-def test_an_existing_folder_is_refused_and_untouched(
-    tmp_path: Path, episodes: list[Episode]
-) -> None:
+def test_an_existing_folder_is_refused_and_untouched(tmp_path: Path) -> None:
     (tmp_path / "keep.txt").write_text("mine")
     with pytest.raises(UsageError, match="exists already"):
         DatasetWriter(tmp_path, Provenance("stance-1"))
     assert [p.name for p in tmp_path.iterdir()] == ["keep.txt"]
 
 
-def test_a_failed_run_leaves_nothing(tmp_path: Path, episodes: list[Episode]) -> None:
-    with (
-        pytest.raises(RuntimeError, match="stop"),
-        DatasetWriter(tmp_path / "new", Provenance("stance-1")) as writer,
-    ):
-        writer.add(episodes[0])
+def _fail_after(root: Path, episode: Episode) -> None:
+    with DatasetWriter(root, Provenance("stance-1")) as writer:
+        writer.add(episode)
         raise RuntimeError("stop")
+
+
+def test_a_failed_run_leaves_nothing(tmp_path: Path, episodes: list[Episode]) -> None:
+    with pytest.raises(RuntimeError, match="stop"):
+        _fail_after(tmp_path / "new", episodes[0])
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,0 +1,156 @@
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from egovcp import spec
+from egovcp.data import DatasetConfig, DatasetReader
+from egovcp.errors import DataError, UsageError
+
+_DATA = "data/chunk-000/file-000.parquet"
+
+
+@pytest.fixture
+def copy(dataset_root: Path, tmp_path: Path) -> Path:
+    """A copy of the dataset that a test may damage."""
+    return Path(shutil.copytree(dataset_root, tmp_path / "copy"))
+
+
+def _read_all(root: Path) -> None:
+    reader = DatasetReader.open(DatasetConfig(root=str(root)))
+    for index in range(len(reader)):
+        reader.read(index)
+
+
+def _edit_json(name: str, edit: Callable[[dict], object]) -> Callable[[Path], None]:
+    def damage(root: Path) -> None:
+        content = json.loads((root / name).read_text())
+        edit(content)
+        (root / name).write_text(json.dumps(content))
+
+    return damage
+
+
+def _edit_info(edit: Callable[[dict], object]) -> Callable[[Path], None]:
+    return _edit_json("meta/info.json", edit)
+
+
+def _cut(name: str, keep: float) -> Callable[[Path], None]:
+    def damage(root: Path) -> None:
+        content = (root / name).read_bytes()
+        (root / name).write_bytes(content[: int(keep * len(content))])
+
+    return damage
+
+
+def _edit_table(column: str, values: Callable[[list], list]) -> Callable[[Path], None]:
+    def damage(root: Path) -> None:
+        table = pq.read_table(root / _DATA)
+        at = table.schema.get_field_index(column)
+        field = table.schema.field(at)
+        import pyarrow as pa
+
+        new = pa.array(values(table[column].to_pylist()), field.type)
+        pq.write_table(table.set_column(at, field, new), root / _DATA)
+
+    return damage
+
+
+def _nan_at_20(rows: list) -> list:
+    rows[20] = float("nan")
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda r: (r / "meta/info.json").unlink(), "no dataset at"),
+        (lambda r: (r / "meta/tasks.parquet").unlink(), "tasks.parquet is missing"),
+        (lambda r: (r / _DATA).unlink(), "file-000.parquet is missing"),
+        (lambda r: (r / "meta/collection.json").unlink(), "controller .* unknown"),
+        (lambda r: shutil.rmtree(r / "meta/episodes"), "holds no parquet file"),
+        (_cut("meta/info.json", 0.5), "info.json is damaged"),
+        (_cut("meta/episodes/chunk-000/file-000.parquet", 0.5), "file-000.parquet is damaged"),
+        (_cut(_DATA, 0.9), "data/chunk-000/file-000.parquet is damaged"),
+        (_edit_info(lambda i: i.update(fps=30)), "30 fps, expected 25"),
+        (_edit_info(lambda i: i.update(codebase_version="v2.1")), "LeRobot format v2.1"),
+        (_edit_info(lambda i: i.update(total_episodes=7)), "6 episodes, info.json says 7"),
+        (_edit_info(lambda i: i.update(total_frames=7)), "info.json says 7"),
+        (_edit_info(lambda i: i.pop("features")), "lacks features"),
+        (_edit_info(lambda i: i["features"].pop("action")), "feature action is missing"),
+        (
+            _edit_info(lambda i: i["features"]["action"].update(shape=[6])),
+            r"action has shape \[6\], expected \[7\]",
+        ),
+        (
+            _edit_info(lambda i: i["features"][spec.DEPTH_KEY]["info"].update(depth_unit="m")),
+            "no depth map in mm",
+        ),
+        (
+            _edit_info(lambda i: i.update(data_path="../{chunk_index}/{file_index}.parquet")),
+            "leads outside",
+        ),
+        (_edit_info(lambda i: i.update(data_path="/etc/{chunk_index}")), "leads outside"),
+        (_edit_json("meta/collection.json", lambda c: c["episodes"].pop()), "5 episodes"),
+        (_edit_json("meta/collection.json", lambda c: c.update(spec_version=0)), "specification 0"),
+        (_edit_json("meta/collection.json", lambda c: c.update(controller_id="")), "no low-level"),
+        (_edit_table("next.reward", _nan_at_20), "episode 2, frame 1: reward is not finite"),
+        (_edit_table("timestamp", lambda rows: [2 * t for t in rows]), "timestamps are not those"),
+        (_edit_table("index", lambda rows: rows[::-1]), "column index does not count"),
+        (_edit_table("task_index", lambda rows: [0] * len(rows)), "tasks .'ball'.*says wall"),
+    ],
+)
+def test_damage_is_refused_and_named(
+    copy: Path, damage: Callable[[Path], object], message: str
+) -> None:
+    damage(copy)
+    with pytest.raises(DataError, match=message):
+        _read_all(copy)
+
+
+def test_the_undamaged_copy_is_accepted(copy: Path) -> None:
+    _read_all(copy)
+
+
+def test_one_row_group_for_all_episodes_reads_alike(copy: Path, reader: DatasetReader) -> None:
+    pq.write_table(pq.read_table(copy / _DATA), copy / _DATA)
+    rewritten = DatasetReader.open(DatasetConfig(root=str(copy)))
+    for index in range(len(reader)):
+        np.testing.assert_array_equal(rewritten.read(index).depth, reader.read(index).depth)
+
+
+def test_columns_are_the_episodes_one_after_the_other(reader: DatasetReader) -> None:
+    columns = reader.read_columns([spec.DEPTH_KEY, spec.ACTION_KEY, "frame_index"])
+    read = [reader.read(i) for i in range(len(reader))]
+    np.testing.assert_array_equal(columns[spec.DEPTH_KEY], np.concatenate([e.depth for e in read]))
+    np.testing.assert_array_equal(
+        columns[spec.ACTION_KEY], np.concatenate([e.action for e in read])
+    )
+    with pytest.raises(DataError, match="did you mean 'action'"):
+        reader.read_columns(["actions"])
+
+
+def test_an_episode_out_of_range_is_an_index_error(reader: DatasetReader) -> None:
+    for index in (-1, len(reader)):
+        with pytest.raises(IndexError):
+            reader.read(index)
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (DatasetConfig(), "which dataset"),
+        (DatasetConfig(repo_id="../../etc"), "not of the form user/name"),
+        (DatasetConfig(repo_id="name"), "not of the form user/name"),
+        (DatasetConfig(root="somewhere", revision="main"), "drop it"),
+    ],
+)
+def test_a_config_that_names_no_dataset_is_a_usage_error(
+    config: DatasetConfig, message: str
+) -> None:
+    with pytest.raises(UsageError, match=message):
+        DatasetReader.open(config)

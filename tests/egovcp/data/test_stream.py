@@ -1,0 +1,172 @@
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egovcp.data import (
+    DatasetConfig,
+    DatasetReader,
+    DatasetWriter,
+    Episode,
+    EpisodeStore,
+    Provenance,
+    ReturnConfig,
+    SequenceStream,
+    StreamConfig,
+)
+from egovcp.data.mirror import mirror_action, mirror_state
+from egovcp.data.stream import event_rows
+from egovcp.errors import DataError, UsageError
+
+
+@pytest.fixture(scope="module")
+def store(reader: DatasetReader) -> EpisodeStore:
+    return EpisodeStore.load([reader], returns=ReturnConfig(steps=5))
+
+
+def _config(**changes: object) -> StreamConfig:
+    return StreamConfig(**{"batch_size": 8, "length": 6, "mirror": False, **changes})
+
+
+def _same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
+
+
+def test_every_row_of_a_window_is_the_row_of_its_episode(
+    store: EpisodeStore, episodes: list[Episode]
+) -> None:
+    stream = SequenceStream(store, _config())
+    for batch in (next(stream) for _ in range(20)):
+        for b, episode in enumerate(batch["episode"]):
+            t, source = batch["t"][b], episodes[episode]
+            valid = batch["valid"][b]
+            np.testing.assert_array_equal(np.diff(t[valid]), 1)
+            for name in ("depth", "state", "action", "reward", "success"):
+                rows = getattr(source, name)[t[valid]]
+                np.testing.assert_array_equal(batch[name][b][valid], rows)
+            np.testing.assert_array_equal(batch["is_first"][b], (t == 0) & valid)
+            fell = source.terminated & (t == len(source) - 1) & valid
+            np.testing.assert_array_equal(batch["terminal_next"][b], fell)
+            assert valid.sum() == min(6, len(source))
+            assert not batch["mc_valid"][b][~valid].any()
+
+
+def test_prev_action_is_the_action_before_and_neutral_at_the_start(
+    store: EpisodeStore, episodes: list[Episode]
+) -> None:
+    for first, length, episode in zip(store.start, store.length, episodes, strict=True):
+        before = store.prev_action[first : first + length]
+        assert not before[0].any()
+        np.testing.assert_array_equal(before[1:], episode.action[:-1])
+
+
+def test_every_row_is_visited(store: EpisodeStore) -> None:
+    stream = SequenceStream(store, _config())
+    seen = set()
+    for batch in (next(stream) for _ in range(150)):
+        rows = store.start[batch["episode"]][:, None] + batch["t"]
+        seen.update(rows[batch["valid"]].tolist())
+    assert seen == set(range(store.num_frames))
+
+
+def test_a_seed_gives_the_same_batches_and_another_seed_others(store: EpisodeStore) -> None:
+    one, two = (SequenceStream(store, _config(mirror=True)) for _ in range(2))
+    other = SequenceStream(store, _config(mirror=True, seed=1))
+    first = next(one)
+    assert _same(first, next(two))
+    assert not _same(first, next(other))
+
+
+def test_resuming_continues_with_exactly_the_next_batches(store: EpisodeStore) -> None:
+    config = _config(mirror=True, event_fraction=0.5, burn_in=2)
+    straight = SequenceStream(store, config)
+    stopped = SequenceStream(store, config)
+    for _ in range(7):
+        next(straight), next(stopped)
+    state = json.loads(json.dumps(stopped.state_dict()))
+    resumed = SequenceStream(store, config).load_state_dict(state)
+    for _ in range(5):
+        assert _same(next(straight), next(resumed))
+
+
+def test_resuming_with_other_data_or_settings_is_refused(
+    store: EpisodeStore, reader: DatasetReader
+) -> None:
+    state = SequenceStream(store, _config()).state_dict()
+    with pytest.raises(UsageError, match="length 6 -> 7"):
+        SequenceStream(store, _config(length=7)).load_state_dict(state)
+    fewer = EpisodeStore.load([reader], "train", heldout_fraction=0.5)
+    with pytest.raises(DataError, match="episodes have changed"):
+        SequenceStream(fewer, _config()).load_state_dict(state)
+
+
+def test_burn_in_rows_count_only_at_the_start_of_an_episode(store: EpisodeStore) -> None:
+    stream = SequenceStream(store, _config(burn_in=3))
+    for batch in (next(stream) for _ in range(20)):
+        assert batch["valid"].shape == (8, 9)
+        inside = batch["t"][:, 0] > 0
+        assert not batch["valid"][inside, :3].any()
+        assert batch["valid"][~inside, 0].all()
+
+
+def test_event_windows_hold_an_event(store: EpisodeStore) -> None:
+    events = set(event_rows(store, 0.9).tolist())
+    assert {int(store.start[e] + store.length[e] - 1) for e in (1, 3)} <= events
+    stream = SequenceStream(store, _config(event_fraction=1.0, event_quantile=0.9, burn_in=2))
+    for batch in (next(stream) for _ in range(20)):
+        rows = store.start[batch["episode"]][:, None] + batch["t"]
+        for row, valid in zip(rows, batch["valid"], strict=True):
+            assert events & set(row[valid].tolist())
+
+
+def test_mirrored_windows_are_reflections(store: EpisodeStore) -> None:
+    plain = SequenceStream(store, _config(batch_size=64))
+    mirrored = SequenceStream(store, _config(batch_size=64, mirror=True))
+    a, b = next(plain), next(mirrored)
+    flipped = (a["depth"] != b["depth"]).any(axis=(1, 2, 3))
+    assert 10 < flipped.sum() < 54
+    np.testing.assert_array_equal(b["depth"][flipped], a["depth"][flipped][..., ::-1])
+    np.testing.assert_array_equal(b["state"][flipped], mirror_state(a["state"][flipped]))
+    for name in ("action", "prev_action"):
+        np.testing.assert_array_equal(b[name][flipped], mirror_action(a[name][flipped]))
+    np.testing.assert_array_equal(a["mc_return"], b["mc_return"])
+
+
+def test_the_splits_part_the_episodes(reader: DatasetReader) -> None:
+    train, heldout = (
+        EpisodeStore.load([reader], split, heldout_fraction=0.5) for split in ("train", "heldout")
+    )
+    everything = EpisodeStore.load([reader], "all")
+    assert not set(train.identities) & set(heldout.identities)
+    assert set(train.identities) | set(heldout.identities) == set(everything.identities)
+
+
+def test_the_held_out_share_is_near_its_fraction_and_ignores_order() -> None:
+    from egovcp.data.split import is_heldout
+
+    chosen = [i for i in range(20_000) if is_heldout(f"ball/0/{i}")]
+    assert 850 < len(chosen) < 1150
+    assert [i for i in reversed(range(20_000)) if is_heldout(f"ball/0/{i}")] == chosen[::-1]
+
+
+def test_datasets_of_different_controllers_do_not_mix(
+    tmp_path: Path, reader: DatasetReader, episodes: list[Episode]
+) -> None:
+    with DatasetWriter(tmp_path / "other", Provenance("walker-2")) as writer:
+        writer.add(episodes[0])
+    other = DatasetReader.open(DatasetConfig(root=str(tmp_path / "other")))
+    with pytest.raises(DataError, match=r"controller_id walker-2.*stance-1.*do not mix"):
+        EpisodeStore.load([reader, other])
+    assert EpisodeStore.load([other, other]).num_frames == 24
+
+
+@pytest.mark.parametrize("changes", [{"length": 0}, {"batch_size": 0}, {"event_fraction": 1.5}])
+def test_senseless_settings_are_refused(store: EpisodeStore, changes: dict[str, object]) -> None:
+    with pytest.raises(UsageError, match="expected"):
+        SequenceStream(store, _config(**changes))
+
+
+def test_an_unknown_split_is_refused(reader: DatasetReader) -> None:
+    with pytest.raises(UsageError, match="did you mean 'heldout'"):
+        EpisodeStore.load([reader], "held_out")
