@@ -116,7 +116,7 @@ def moving_pixels(near: Tensor, threshold: float) -> Tensor:
 
 def state_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
     """Gaussian negative log likelihood of the standardised proprioception."""
-    prediction = model.decode_state(rollout.carry.features).float()
+    prediction = model.decode_state(rollout.carry.h, rollout.carry.z).float()
     error = 0.5 * (prediction - rollout.state).square().mean(-1)
     return masked_mean(error, batch.valid)
 

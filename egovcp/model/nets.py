@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -10,17 +11,53 @@ from torch import Tensor, nn
 from egovcp import spec
 
 
-def mlp(inputs: int, units: int, outputs: int, hidden_layers: int) -> nn.Sequential:
-    """``hidden_layers`` of Linear + LayerNorm + SiLU, then a Linear to ``outputs``."""
-    layers: list[nn.Module] = []
-    for _ in range(hidden_layers):
-        layers += [nn.Linear(inputs, units, bias=False), nn.LayerNorm(units), nn.SiLU()]
-        inputs = units
-    return nn.Sequential(*layers, nn.Linear(inputs, outputs))
+class SplitLinear(nn.Module):
+    """A Linear on the concatenation of several inputs, computed part by part.
+
+    Parts may differ in their leading dimensions as long as these broadcast: a state
+    shared by many candidate actions is multiplied once, and an observation's part can be
+    computed for all steps before a recurrence starts.
+    """
+
+    def __init__(self, inputs: Sequence[int], outputs: int, bias: bool = False) -> None:
+        super().__init__()
+        self.parts = nn.ModuleList(nn.Linear(n, outputs, bias=False) for n in inputs)
+        self.bias = nn.Parameter(torch.zeros(outputs)) if bias else None
+        bound = sum(inputs) ** -0.5  # of one Linear on all inputs
+        for part in self.parts:
+            nn.init.uniform_(part.weight, -bound, bound)  # type: ignore[arg-type]
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """One tensor (..., n_i) per part -> (..., outputs)."""
+        total: Tensor = self.parts[0](inputs[0])
+        for part, x in zip(self.parts[1:], inputs[1:], strict=True):
+            total = total + part(x)
+        return total if self.bias is None else total + self.bias
+
+
+class SplitMlp(nn.Module):
+    """``hidden_layers`` of Linear + LayerNorm + SiLU on several inputs, then a Linear."""
+
+    def __init__(
+        self, inputs: Sequence[int], units: int, outputs: int, hidden_layers: int = 1
+    ) -> None:
+        super().__init__()
+        self.first = SplitLinear(inputs, units)
+        layers: list[nn.Module] = []
+        for _ in range(hidden_layers - 1):
+            layers += [nn.LayerNorm(units), nn.SiLU(), nn.Linear(units, units, bias=False)]
+        self.rest = nn.Sequential(
+            *layers, nn.LayerNorm(units), nn.SiLU(), nn.Linear(units, outputs)
+        )
+
+    def forward(self, *inputs: Tensor) -> Tensor:
+        """One tensor (..., n_i) per input -> (..., outputs)."""
+        outputs: Tensor = self.rest(self.first(*inputs))
+        return outputs
 
 
 class GruCell(nn.Module):
-    """A GRU cell with one normalised projection of [input, h] (equation 1).
+    """A GRU cell with one normalised projection of input and h (equation 1).
 
     The update gate starts biased towards keeping ``h``, so that gradients reach far
     back from the first step of training.
@@ -29,12 +66,12 @@ class GruCell(nn.Module):
     def __init__(self, inputs: int, hidden: int, update_bias: float) -> None:
         super().__init__()
         self.update_bias = update_bias
-        self.project = nn.Linear(inputs + hidden, 3 * hidden, bias=False)
+        self.project = SplitLinear((inputs, hidden), 3 * hidden)
         self.norm = nn.LayerNorm(3 * hidden)
 
     def forward(self, x: Tensor, h: Tensor) -> Tensor:
-        """(B, inputs), (B, hidden) -> (B, hidden)."""
-        reset, candidate, update = self.norm(self.project(torch.cat([x, h], -1))).chunk(3, -1)
+        """(..., inputs), (..., hidden) -> (..., hidden)."""
+        reset, candidate, update = self.norm(self.project(x, h)).chunk(3, -1)
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
         gate = torch.sigmoid(update + self.update_bias)
         return torch.lerp(h, candidate.to(h.dtype), gate.to(h.dtype))

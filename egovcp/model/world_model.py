@@ -7,6 +7,9 @@
     d_t = D(h_t, z_t)                         (4)   probability of termination
     Q_t = Q(h_t, z_t, a_t)                    (5)   surrogate value
 
+Every method accepts a carry whose leading dimensions broadcast against the action's: one
+state judged under a thousand candidates is computed once.
+
 The recurrence is an explicit `Carry`: the same `observe` step serves training, filtering
 on the robot and replay; `imagine` advances it without an observation.
 """
@@ -22,7 +25,7 @@ from egovcp import spec
 from egovcp.model.config import WorldModelConfig
 from egovcp.model.depth import nearness, network_image, to_metres
 from egovcp.model.gaussian import Gaussian
-from egovcp.model.nets import DepthDecoder, DepthEncoder, GruCell, mlp
+from egovcp.model.nets import DepthDecoder, DepthEncoder, GruCell, SplitLinear, SplitMlp
 
 
 class Carry(NamedTuple):
@@ -34,6 +37,19 @@ class Carry(NamedTuple):
     @property
     def features(self) -> Tensor:
         return torch.cat([self.h, self.z], -1)
+
+
+class PosteriorHead(nn.Module):
+    """One hidden layer on [h, o]; the part of o arrives ready-made (`embed_observation`)."""
+
+    def __init__(self, hidden: int, units: int, latent: int) -> None:
+        super().__init__()
+        self.project_h = nn.Linear(hidden, units, bias=False)
+        self.rest = nn.Sequential(nn.LayerNorm(units), nn.SiLU(), nn.Linear(units, 2 * latent))
+
+    def forward(self, h: Tensor, embedding: Tensor) -> Tensor:
+        logits: Tensor = self.rest(self.project_h(h) + embedding)
+        return logits
 
 
 class WorldModel(nn.Module):
@@ -48,19 +64,19 @@ class WorldModel(nn.Module):
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
         self.config = c = config
-        features = c.hidden + c.latent
+        state = (c.hidden, c.latent)  # what every head reads
         self.encode_depth = DepthEncoder(c.channels)
-        self.encode_state = mlp(spec.STATE_DIM, c.units, c.units, 1)
-        embedding = self.encode_depth.outputs + c.units
-        self.mix = nn.Linear(c.latent + spec.ACTION_DIM, c.units, bias=False)
+        self.encode_state = SplitMlp((spec.STATE_DIM,), c.units, c.units)
+        self.embed_observation = SplitLinear((self.encode_depth.outputs, c.units), c.units)
+        self.mix = SplitLinear((c.latent, spec.ACTION_DIM), c.units)
         self.mix_act = nn.Sequential(nn.LayerNorm(c.units), nn.SiLU())
         self.gru = GruCell(c.units, c.hidden, c.update_bias)
-        self.posterior = mlp(c.hidden + embedding, c.units, 2 * c.latent, 1)
-        self.prior = mlp(c.hidden, c.units, 2 * c.latent, 1)
-        self.decode_depth = DepthDecoder(features, c.channels[-1])
-        self.decode_state = mlp(features, c.units, spec.STATE_DIM, 1)
-        self.termination_head = mlp(features, c.units, 1, 1)
-        self.value_head = mlp(features + spec.ACTION_DIM, c.units, 1, 2)
+        self.posterior = PosteriorHead(c.hidden, c.units, c.latent)
+        self.prior = SplitMlp((c.hidden,), c.units, 2 * c.latent)
+        self.decode_depth = DepthDecoder(sum(state), c.channels[-1])
+        self.decode_state = SplitMlp(state, c.units, spec.STATE_DIM)
+        self.termination_head = SplitMlp(state, c.units, 1)
+        self.value_head = SplitMlp((*state, spec.ACTION_DIM), c.units, 1, hidden_layers=2)
         self._start_at_zero()
         self.register_buffer("state_mean", torch.zeros(spec.STATE_DIM))
         self.register_buffer("state_std", torch.ones(spec.STATE_DIM))
@@ -71,20 +87,21 @@ class WorldModel(nn.Module):
     def _start_at_zero(self) -> None:
         """Value and termination start as constants, so that early plans are not random."""
         for head in (self.value_head, self.termination_head):
-            last = head[-1]
+            last = head.rest[-1]
             assert isinstance(last, nn.Linear)
             nn.init.zeros_(last.weight)
             nn.init.zeros_(last.bias)
 
     # --- observation -----------------------------------------------------------------
     def embed(self, depth: Tensor, state: Tensor) -> Tensor:
-        """Raw depth (B, 48, 64) mm and state (B, 74) -> embedding (B, E)."""
+        """Raw depth (B, 48, 64) mm and state (B, 74) -> embedding (B, units)."""
         return self.embed_near(nearness(depth, self.config.depth_max_m), self.standardise(state))
 
     def embed_near(self, near: Tensor, standardised: Tensor) -> Tensor:
         """The same from nearness (B, 48, 64) and standardised state (B, 74)."""
         image = self.encode_depth(network_image(near))
-        return torch.cat([image, self.encode_state(standardised)], -1)
+        embedding: Tensor = self.embed_observation(image, self.encode_state(standardised))
+        return embedding
 
     def standardise(self, state: Tensor) -> Tensor:
         """(..., 74) raw state -> zero mean, unit variance, clipped to +-10."""
@@ -101,15 +118,14 @@ class WorldModel(nn.Module):
 
     def transition(self, carry: Carry, action: Tensor) -> Tensor:
         """h_{t+1} from (h_t, z_t) and a_t (B, 7); equation 1."""
-        x = self.mix_act(self.mix(torch.cat([carry.z, action], -1)))
+        x = self.mix_act(self.mix(carry.z, action))
         h: Tensor = self.gru(x, carry.h)
         return h
 
     def infer(self, h: Tensor, embedding: Tensor) -> Gaussian:
         """Posterior q(z | h, o); equation 2."""
-        return Gaussian.from_logits(
-            self.posterior(torch.cat([h, embedding], -1)), self.config.min_std
-        )
+        logits = self.posterior(h, embedding)
+        return Gaussian.from_logits(logits, self.config.min_std)
 
     def predict(self, h: Tensor) -> Gaussian:
         """Prior p(z | h)."""
@@ -142,9 +158,9 @@ class WorldModel(nn.Module):
         return Carry(h, self.predict(h).mean)
 
     @staticmethod
-    def repeat(carry: Carry, times: int) -> Carry:
-        """(E, ...) -> (E * times, ...), each row repeated in place."""
-        return Carry(*(x.repeat_interleave(times, 0) for x in carry))
+    def spread(carry: Carry) -> Carry:
+        """(E, ...) -> (E, 1, ...): one state that broadcasts over candidate actions."""
+        return Carry(carry.h[:, None], carry.z[:, None])
 
     # --- heads -----------------------------------------------------------------------
     def value(self, carry: Carry, action: Tensor) -> Tensor:
@@ -153,12 +169,12 @@ class WorldModel(nn.Module):
 
     def standardised_value(self, carry: Carry, action: Tensor) -> Tensor:
         """Q in units of the return's deviation from its mean, (...,)."""
-        q: Tensor = self.value_head(torch.cat([carry.features, action], -1))
+        q: Tensor = self.value_head(carry.h, carry.z, action)
         return q.squeeze(-1).float()
 
     def termination_logit(self, carry: Carry) -> Tensor:
         """Log-odds that the episode has failed at this state, (...,); equation 4."""
-        d: Tensor = self.termination_head(carry.features)
+        d: Tensor = self.termination_head(carry.h, carry.z)
         return d.squeeze(-1).float()
 
     def termination(self, carry: Carry) -> Tensor:
@@ -167,6 +183,5 @@ class WorldModel(nn.Module):
 
     def decode(self, carry: Carry) -> tuple[Tensor, Tensor]:
         """Carry (B, ...) -> depth (B, 48, 64) in metres, 0 = nothing in range; state (B, 74)."""
-        features = carry.features
-        depth = to_metres(self.decode_depth(features).float(), self.config.depth_max_m)
-        return depth, self.decode_state(features).float() * self.state_std + self.state_mean
+        depth = to_metres(self.decode_depth(carry.features).float(), self.config.depth_max_m)
+        return depth, self.decode_state(carry.h, carry.z).float() * self.state_std + self.state_mean

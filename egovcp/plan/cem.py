@@ -22,27 +22,27 @@ TerminationRule = Literal["paper", "shift", "survival"]
 
 
 class Dynamics[L](Protocol):
-    """What the planner needs of a world model; every method is batched over rows."""
+    """What the planner needs of a world model; leading dimensions broadcast (E robots, M plans)."""
 
     @property
     def return_floor(self) -> Tensor:
         """The worst return of the data: what a failed plan is worth under rule ``shift``."""
         ...
 
-    def repeat(self, carry: L, times: int) -> L:
-        """(E, ...) -> (E * times, ...), each row repeated in place."""
+    def spread(self, carry: L) -> L:
+        """(E, ...) -> (E, 1, ...): one state that all candidates of a robot share."""
         ...
 
     def imagine(self, carry: L, action: Tensor) -> L:
-        """Advance by one tick under action (B, 7)."""
+        """Advance by one tick under action (E, M, 7)."""
         ...
 
     def value(self, carry: L, action: Tensor) -> Tensor:
-        """Q, (B,)."""
+        """Q, (E, M)."""
         ...
 
     def termination(self, carry: L) -> Tensor:
-        """Probability that this state is a failure, (B,)."""
+        """Probability that this state is a failure, (E, M)."""
         ...
 
 
@@ -70,9 +70,7 @@ class PlannerConfig:
 
     def __post_init__(self) -> None:
         if min(self.samples, self.horizon, self.iterations, self.elites) < 1:
-            raise UsageError(
-                "samples, horizon, iterations and elites must be at least 1"
-            )
+            raise UsageError("samples, horizon, iterations and elites must be at least 1")
         if self.elites > self.samples:
             raise UsageError(f"elites ({self.elites}) exceed samples ({self.samples})")
 
@@ -95,27 +93,26 @@ def reflect(x: Tensor) -> Tensor:
 
 
 def walk(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
-    """Actions (B, N, 7) of the data's process from ``start`` (B, 7) by ``deltas`` (B, N, 7)."""
+    """Actions (..., N, 7) of the data's process from ``start`` (..., 7) by ``deltas``."""
     actions = []
     action = start
-    for delta in deltas.unbind(1):
+    for delta in deltas.unbind(-2):
         action = reflect(action + eta * delta)
         actions.append(action)
-    return torch.stack(actions, 1)
+    return torch.stack(actions, -2)
 
 
-def evaluate[L](
-    model: Dynamics[L], carry: L, actions: Tensor, config: PlannerConfig
-) -> Tensor:
-    """J (B,) of action sequences (B, N, 7), each from its own row of the carry (B, ...)."""
-    horizon = actions.shape[1]
+def evaluate[L](model: Dynamics[L], carry: L, actions: Tensor, config: PlannerConfig) -> Tensor:
+    """J (E, M) of plans (E, M, N, 7) from the robots' carry (E, ...)."""
+    horizon = actions.shape[-2]
     floor = 0.0 if config.termination_rule == "paper" else model.return_floor
-    total = torch.zeros_like(actions[:, 0, 0])
+    total = torch.zeros_like(actions[..., 0, 0])
     alive = torch.ones_like(total)
+    carry = model.spread(carry)
     for k in range(horizon):
         if k > 0:
-            carry = model.imagine(carry, actions[:, k - 1])
-        total = total + alive * (model.value(carry, actions[:, k]) - floor)
+            carry = model.imagine(carry, actions[..., k - 1, :])
+        total = total + alive * (model.value(carry, actions[..., k, :]) - floor)
         if k == 0 or k == horizon - 1:
             continue  # o_t was seen alive; and nothing follows the last step
         dead = model.termination(carry)
@@ -145,12 +142,10 @@ def plan_cem[L](
     shape = (robots, config.horizon, spec.ACTION_DIM)
     mean = executed.new_zeros(shape) if warm is None else warm
     std = torch.full_like(mean, 3.0**-0.5)  # of U(-1, 1)
-    many = model.repeat(carry, config.samples)
-    start = executed.repeat_interleave(config.samples, 0)
+    start = executed[:, None]  # (E, 1, 7)
     for _ in range(config.iterations):
         deltas = _sample(mean, std, config, generator)  # (E, M, N, 7)
-        actions = walk(start, deltas.flatten(0, 1), config.eta)
-        values = evaluate(model, many, actions, config).view(robots, config.samples)
+        values = evaluate(model, carry, walk(start, deltas, config.eta), config)
         values = values.nan_to_num(nan=-torch.inf)
         top, index = values.topk(config.elites, dim=1)
         elites = deltas.take_along_dim(index[:, :, None, None], 1)
@@ -159,16 +154,12 @@ def plan_cem[L](
             elites.std(1, correction=0).clamp_min(config.min_std),
         )
     chosen = walk(executed, mean, config.eta)
-    best = walk(
-        executed.repeat_interleave(config.elites, 0), elites.flatten(0, 1), config.eta
-    )
+    best = walk(executed.repeat_interleave(config.elites, 0), elites.flatten(0, 1), config.eta)
     best = best.view(robots, config.elites, *shape[1:])
     return Plan(chosen, mean, top.mean(1), best, top, config.iterations)
 
 
-def _sample(
-    mean: Tensor, std: Tensor, config: PlannerConfig, generator: torch.Generator
-) -> Tensor:
+def _sample(mean: Tensor, std: Tensor, config: PlannerConfig, generator: torch.Generator) -> Tensor:
     """(E, M, N, 7) deltas; the first candidate is the mean itself, the second stands still."""
     size = (1, config.samples, *mean.shape[1:])
     noise = torch.randn(size, generator=generator, device=mean.device)

@@ -50,9 +50,7 @@ class Policy:
             self._carry = self.model.initial(self.num_envs)
             self._sent = torch.zeros(self.num_envs, spec.ACTION_DIM)
             self._first = torch.ones(self.num_envs, dtype=torch.bool)
-            self._warm = torch.zeros(
-                self.num_envs, self.config.horizon, spec.ACTION_DIM
-            )
+            self._warm = torch.zeros(self.num_envs, self.config.horizon, spec.ACTION_DIM)
             self._generator = torch.Generator().manual_seed(self._seed)
             return
         index = torch.as_tensor(rows)
