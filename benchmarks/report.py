@@ -1,0 +1,65 @@
+"""What every benchmark prints: flat keys, the hardware beside them."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+
+
+def hardware() -> dict[str, object]:
+    """The machine in words that mean something to somebody else."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        names = [line for line in info.read_text().splitlines() if line.startswith("model name")]
+        model = names[0].split(":", 1)[1].strip() if names else model
+    return {
+        "hardware_cpu": model,
+        "hardware_cores": os.cpu_count() or 1,
+        "hardware_gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else "none",
+        "torch": torch.__version__,
+        "torch_threads": torch.get_num_threads(),
+    }
+
+
+def interleaved(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Median seconds of each case; the cases take turns, so that drift hits all alike."""
+    times: dict[str, list[float]] = {name: [] for name in cases}
+    for case in cases.values():
+        case()
+    for _ in range(rounds):
+        for name, case in cases.items():
+            start = time.perf_counter()
+            case()
+            times[name].append(time.perf_counter() - start)
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def parser(description: str | None) -> argparse.ArgumentParser:
+    """Options that all benchmarks share."""
+    p = argparse.ArgumentParser(
+        description=description, formatter_class=argparse.ArgumentDefaultsHelpFormatter
+    )
+    p.add_argument("--json", type=Path, help="also write the figures to this file")
+    p.add_argument("--rounds", type=int, default=15, help="measurements of each case")
+    return p
+
+
+def publish(figures: dict[str, object], path: Path | None) -> None:
+    """Print the figures, one per line, and write them as JSON where asked."""
+    figures = {**figures, **hardware()}
+    width = max(map(len, figures))
+    for name, value in figures.items():
+        shown = f"{value:.4g}" if isinstance(value, float) else value
+        print(f"{name:<{width}}  {shown}")
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
