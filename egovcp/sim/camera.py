@@ -1,0 +1,107 @@
+"""Depth pictures by ray casting: planar depth and the faults of a stereo camera.
+
+A pixel (row i, column j) looks along d = (1, -(j - cx)/f, -(i - cy)/f) in the camera frame
+(x along the optical axis, y left, z up), f = (rows / 2) / tan(fov / 2). The depth of a hit
+at range s along d/|d| is its coordinate along the optical axis, z = s / |d|.
+"""
+
+from __future__ import annotations
+
+import math
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.sim.config import CameraConfig
+from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_MIN_M, DEPTH_ROWS
+
+Array = NDArray[np.float64]
+
+_GROUPS = np.array([1, 0, 0, 1, 0, 0], dtype=np.uint8)
+_NUM_PIXELS = DEPTH_ROWS * DEPTH_COLS
+
+
+class DepthCamera:
+    """Casts one ray per pixel from a mount on the torso, which itself stays unseen."""
+
+    def __init__(self, config: CameraConfig) -> None:
+        self.position = np.array(config.position)
+        self.focal = DEPTH_ROWS / 2 / math.tan(config.vertical_fov / 2)  # pixels
+        rays = pixel_rays(self.focal)
+        self._axial = 1.0 / np.linalg.norm(rays, axis=1)  # cosine to the optical axis
+        self._directions = rays * self._axial[:, None]
+        self._cutoff = DEPTH_MAX_M / float(self._axial.min())
+        self._geom = np.empty(_NUM_PIXELS, dtype=np.int32)
+        self._range = np.empty(_NUM_PIXELS)
+
+    def pose(
+        self, data: mujoco.MjData, torso_body: int, pitch: float
+    ) -> tuple[Array, NDArray[np.float64]]:
+        """Position (3,) and rotation (3, 3) of the camera in the world; x is the optical axis."""
+        torso = data.xmat[torso_body].reshape(3, 3)
+        c, s = math.cos(pitch), math.sin(pitch)
+        tilt = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
+        return data.xpos[torso_body] + torso @ self.position, torso @ tilt
+
+    def render(
+        self, model: mujoco.MjModel, data: mujoco.MjData, torso_body: int, pitch: float
+    ) -> NDArray[np.float32]:
+        """True planar depth (H, W), m; 0 where nothing is within the camera's range.
+
+        ``data`` must hold current body poses (``mj_kinematics``).
+        """
+        origin, rotation = self.pose(data, torso_body, pitch)
+        rays = self._directions @ rotation.T
+        mujoco.mj_multiRay(
+            model, data, origin, rays.ravel(), _GROUPS, True, torso_body,
+            self._geom, self._range, None, _NUM_PIXELS, self._cutoff,
+        )  # fmt: skip
+        depth = (self._range * self._axial).astype(np.float32)
+        return within_range(depth).reshape(DEPTH_ROWS, DEPTH_COLS)
+
+
+def pixel_rays(focal: float) -> Array:
+    """Directions (H * W, 3) of all pixels with unit length along the optical axis."""
+    row, column = np.mgrid[:DEPTH_ROWS, :DEPTH_COLS]
+    left = -(column - (DEPTH_COLS - 1) / 2) / focal
+    up = -(row - (DEPTH_ROWS - 1) / 2) / focal
+    return np.stack([np.ones(left.shape), left, up], axis=-1).reshape(-1, 3)
+
+
+def within_range(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """``depth`` in metres with 0 wherever the camera would measure nothing."""
+    valid = (depth >= DEPTH_MIN_M) & (depth <= DEPTH_MAX_M)
+    return np.where(valid, depth, np.float32(0))
+
+
+class DepthNoise:
+    """The faults of one camera in one episode: noise growing with z^2, holes, lost edges."""
+
+    def __init__(self, config: CameraConfig, rng: np.random.Generator) -> None:
+        self._rng = rng
+        self._per_z2 = np.float32(rng.uniform(*config.noise_per_z2))
+        self._holes = np.float32(rng.uniform(*config.hole_probability))
+        self._edges = np.float32(rng.uniform(*config.edge_probability))
+        self._step = np.float32(config.edge_step)
+
+    def apply(self, depth: NDArray[np.float32]) -> NDArray[np.uint16]:
+        """True depth (H, W) in metres -> measured depth (H, W) in millimetres, 0 invalid."""
+        noise = self._rng.standard_normal(depth.shape, dtype=np.float32)
+        chance = self._rng.random(depth.shape, dtype=np.float32)
+        lost = chance < np.where(discontinuity(depth, self._step), self._edges, 0) + self._holes
+        noisy = depth + noise * (self._per_z2 * depth * depth)
+        measured = within_range(np.where(lost, np.float32(0), noisy))
+        return np.rint(measured * 1000.0).astype(np.uint16)
+
+
+def discontinuity(depth: NDArray[np.float32], step: np.float32) -> NDArray[np.bool_]:
+    """(H, W) pixels that differ by more than ``step`` from a neighbour in row or column."""
+    edge = np.zeros(depth.shape, dtype=np.bool_)
+    across = np.abs(np.diff(depth, axis=1)) > step
+    down = np.abs(np.diff(depth, axis=0)) > step
+    edge[:, 1:] |= across
+    edge[:, :-1] |= across
+    edge[1:] |= down
+    edge[:-1] |= down
+    return edge

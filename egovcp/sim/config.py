@@ -1,0 +1,239 @@
+"""Every scene, sensor and randomisation parameter of the simulated robot.
+
+Frozen data only. Ranges are (low, high) and drawn uniformly once per episode.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+from egovcp.errors import UsageError, suggest
+from egovcp.spec import TASKS
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class EpisodeConfig:
+    """Length of an episode and the time of its event, in planner ticks of 40 ms."""
+
+    ticks: int = 150
+    """Time limit, planner ticks; reaching it truncates the episode."""
+    event_ticks: tuple[int, int] = (20, 60)
+    """First and last tick at which the throw, the push or the arch may start."""
+    empty_probability: float = 0.1
+    """Share of episodes in which nothing happens, so that doing nothing is learned too."""
+
+
+@dataclass(frozen=True)
+class BallConfig:
+    """A ball thrown at the upper body; a first contact with hand or wrist blocks it."""
+
+    radius_range: Range = (0.09, 0.12)
+    """Radius of the ball, m."""
+    mass_range: Range = (0.15, 0.35)
+    """Mass of the ball, kg."""
+    distance_range: Range = (2.5, 3.5)
+    """Horizontal distance of the release point from the pelvis, m."""
+    bearing_range: Range = (-0.35, 0.35)
+    """Direction of the release point seen from the pelvis, rad, 0 is straight ahead."""
+    release_height_range: Range = (0.7, 1.4)
+    """Height of the release point above ground, m."""
+    flight_range: Range = (0.65, 0.95)
+    """Time from release to the aim point, s."""
+    aim_forward: float = 0.10
+    """Aim point in front of the pelvis, m, heading frame."""
+    aim_lateral_range: Range = (-0.22, 0.22)
+    """Aim point left of the pelvis, m, heading frame."""
+    aim_height_range: Range = (0.10, 0.48)
+    """Aim point above the pelvis, m."""
+    grace: float = 0.3
+    """Contacts within this time after a block do not count, s."""
+    block_reward: float = 1.0
+    """Once, at a first contact with a hand or wrist."""
+    hit_cost: float = 1.0
+    """Once, when the ball touches torso, head or leg."""
+    pose_cost: float = 0.01
+    """Per tick, times the mean squared action: the price of leaving the neutral pose."""
+    fall_cost: float = 1.0
+    """Once, at a fall."""
+
+
+@dataclass(frozen=True)
+class WallConfig:
+    """A wall before the robot, which is pushed towards it; only hands may touch."""
+
+    distance_range: Range = (0.55, 0.70)
+    """Wall surface before the pelvis, m."""
+    yaw_range: Range = (-0.10, 0.10)
+    """Turn of the wall about the vertical, rad; 0 faces the robot squarely."""
+    push_speed_range: Range = (0.40, 0.70)
+    """Change of base velocity by a push towards the wall, m/s."""
+    push_bearing_range: Range = (-0.20, 0.20)
+    """Direction of a push towards the wall, rad from straight ahead."""
+    away_probability: float = 0.1
+    """Share of the pushes that go away from the wall."""
+    away_speed_range: Range = (0.05, 0.15)
+    """Change of base velocity by a push away from the wall, m/s; the stance survives it."""
+    push_time: float = 0.02
+    """Time over which a push acts, s."""
+    disturbed_time: float = 2.0
+    """Time after a push in which bracing is rewarded, s."""
+    brace_reward: float = 0.05
+    """Per tick upright with a hand on the wall while disturbed."""
+    upright_reward: float = 0.02
+    """Per tick upright while disturbed."""
+    contact_cost: float = 0.2
+    """Per tick with torso, head or leg on the wall."""
+    impact_cost: float = 0.05
+    """Per tick, times the peak hand force over ``impact_force``, at most 1 per tick."""
+    impact_force: float = 300.0
+    """Hand force that costs ``impact_cost`` in full, N."""
+    pose_cost: float = 0.01
+    """Per tick, times the mean squared action."""
+    fall_cost: float = 1.0
+    """Once, at a fall."""
+
+
+@dataclass(frozen=True)
+class ArchConfig:
+    """An arch that an upright robot would hit and a crouched one passes under."""
+
+    motion: Literal["rail"] = "rail"
+    """`rail`: the robot stands and the arch comes to it at the commanded speed, the same
+    relative motion as walking through it, until a walking controller exists."""
+    clearance_range: Range = (1.16, 1.24)
+    """Lower edge of the lintel above ground, m."""
+    width_range: Range = (1.1, 1.5)
+    """Free width between the posts, m."""
+    depth_range: Range = (0.10, 0.20)
+    """Thickness of posts and lintel along the direction of passage, m."""
+    lintel_height: float = 0.35
+    """Height of the lintel beam, m."""
+    distance_range: Range = (2.6, 3.6)
+    """Centre of the arch before the pelvis when it starts to move, m."""
+    lateral_range: Range = (-0.08, 0.08)
+    """Centre of the arch left of the pelvis, m."""
+    speed_range: Range = (0.3, 0.5)
+    """Commanded forward velocity, m/s; the arch moves towards the robot as fast."""
+    progress_reward: float = 0.05
+    """Per metre of progress towards and through the arch."""
+    pass_reward: float = 1.0
+    """Once, when the arch has been passed without any contact."""
+    head_cost: float = 0.3
+    """Per tick with the head on the arch."""
+    contact_cost: float = 0.1
+    """Per tick with any other part on the arch."""
+    crouch_cost: float = 0.02
+    """Per tick, times the share of the crouch (0 standing, 1 lowest) away from the arch."""
+    near: float = 0.9
+    """Crouching is free while the arch is nearer than this, m."""
+    pose_cost: float = 0.005
+    """Per tick, times the mean squared action of the hands."""
+    fall_cost: float = 1.0
+    """Once, at a fall."""
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """Depth camera on the head, and the noise of its pictures."""
+
+    position: tuple[float, float, float] = (0.058, 0.018, 0.42)
+    """Mount in the torso frame, m."""
+    pitch_range: Range = (math.radians(1.0), math.radians(5.0))
+    """Tilt below the torso's horizontal, rad, drawn per episode."""
+    vertical_fov: float = math.radians(58.0)
+    """Vertical field of view, rad; pixels are square."""
+    noise_per_z2: Range = (0.001, 0.004)
+    """Standard deviation of depth over depth squared, 1/m (stereo noise grows with z^2)."""
+    hole_probability: Range = (0.0, 0.01)
+    """Share of pixels lost at random."""
+    edge_probability: Range = (0.0, 0.25)
+    """Share of pixels lost beside a depth discontinuity."""
+    edge_step: float = 0.15
+    """Depth difference of neighbours that makes a discontinuity, m."""
+
+
+@dataclass(frozen=True)
+class SensorConfig:
+    """Standard deviations of proprioception, white, per 20 ms measurement."""
+
+    angular_velocity: float = 0.03
+    """rad/s."""
+    gravity: float = 0.005
+    """Of each component of the projected gravity, which stays a unit vector."""
+    joint_position: float = 0.002
+    """rad."""
+    joint_velocity: float = 0.05
+    """rad/s."""
+
+
+@dataclass(frozen=True)
+class DelayConfig:
+    """Delays, drawn per episode, in whole controller ticks of 20 ms."""
+
+    action_ticks: tuple[int, int] = (0, 2)
+    """Controller ticks from an action to its effect."""
+    image_age: Range = (0.02, 0.08)
+    """Age of the picture in an observation, s; rounded to controller ticks."""
+
+
+@dataclass(frozen=True)
+class RandomisationConfig:
+    """Ranges of the physical parameters, drawn per episode; (1, 1) switches one off."""
+
+    friction: Range = (0.6, 1.0)
+    """Sliding friction of the feet."""
+    payload: Range = (-0.5, 1.5)
+    """Mass added to the torso, kg."""
+    mass_scale: Range = (0.97, 1.03)
+    """Factor on every mass of the robot."""
+    stiffness_scale: Range = (0.95, 1.05)
+    """Factor on the servo stiffness."""
+    damping_scale: Range = (0.9, 1.1)
+    """Factor on the servo damping."""
+    initial_joint: float = 0.01
+    """Half width of the uniform offset on the joints of waist and arms at the start, rad."""
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """The simulated robot, its scenes and its sensors."""
+
+    ball: BallConfig = BallConfig()
+    """The ball."""
+    wall: WallConfig = WallConfig()
+    """The wall."""
+    arch: ArchConfig = ArchConfig()
+    """The arch."""
+    ball_episode: EpisodeConfig = EpisodeConfig()
+    """Length and timing of ball episodes."""
+    wall_episode: EpisodeConfig = EpisodeConfig()
+    """Length and timing of wall episodes."""
+    arch_episode: EpisodeConfig = EpisodeConfig(ticks=320, event_ticks=(0, 30))
+    """Length and timing of arch episodes; the default covers the slowest passage."""
+    feet: Literal["stock", "points"] = "points"
+    """Foot collision model: four points each (about twice as fast), or the stock capsules."""
+    camera: CameraConfig = CameraConfig()
+    """Depth camera."""
+    sensors: SensorConfig = SensorConfig()
+    """Noise of proprioception."""
+    delay: DelayConfig = DelayConfig()
+    """Latency of action and image."""
+    randomise: RandomisationConfig = RandomisationConfig()
+    """Physical parameters."""
+    threads: int = 1
+    """Threads that step physics and cast rays; results do not depend on it."""
+
+    def episode(self, task: str) -> EpisodeConfig:
+        """Length and timing of an episode of ``task``.
+
+        Raises:
+            UsageError: the task is unknown.
+        """
+        episodes = dict(zip(TASKS, (self.ball_episode, self.wall_episode, self.arch_episode)))
+        if task not in episodes:
+            raise UsageError(f"unknown task {task!r}{suggest(task, TASKS)}")
+        return episodes[task]

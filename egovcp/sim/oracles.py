@@ -1,0 +1,77 @@
+"""Scripted policies that see the truth: proof that a task can be solved.
+
+They obey the same delays and rate limits as every other policy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.sim.env import VectorEnv
+from egovcp.sim.scenario import Scenario
+from egovcp.sim.truth import Truth
+from egovcp.spec import ACTION_BOX
+
+Array = NDArray[np.float64]
+
+_GRAVITY: Final = np.array([0.0, 0.0, -9.81])
+_LOOKAHEAD: Final = np.arange(0.0, 1.2, 0.01)  # s
+
+
+@dataclass(frozen=True)
+class BallOracleConfig:
+    """Where and how the ball oracle meets the ball."""
+
+    reach: float = 0.32
+    """Distance before the pelvis at which the hand waits in the ball's way, m."""
+    hand_offset: tuple[float, float, float] = (0.03, 0.0, 0.0)
+    """Middle of the hand capsule from the palm site, m, heading frame."""
+
+
+class BallOracle:
+    """Puts the nearer hand where the ball will cross a plane before the body."""
+
+    def __init__(self, config: BallOracleConfig = BallOracleConfig()) -> None:
+        self._config = config
+
+    def act(self, truth: Truth, row: int) -> Array:
+        """(7,) the action for one row."""
+        if not truth.object_active[row]:
+            return np.zeros(7)
+        point = self._crossing(truth.object_b[row], truth.object_velocity_b[row])
+        target = np.asarray(ACTION_BOX.neutral).copy()
+        side = 0 if point[1] > 0 else 1
+        target[3 * side : 3 * side + 3] = point - self._config.hand_offset
+        return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
+
+    def _crossing(self, position: Array, velocity: Array) -> Array:
+        """Point of the ballistic path nearest to the plane x = reach."""
+        t = _LOOKAHEAD[:, None]
+        path = position + velocity * t + 0.5 * _GRAVITY * t * t
+        out: Array = path[np.argmin(np.abs(path[:, 0] - self._config.reach))]
+        return out
+
+
+class Oracle:
+    """The scripted solution of each row's task."""
+
+    def __init__(self) -> None:
+        self._by_task = {"ball": BallOracle()}
+
+    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
+        """Nothing to forget."""
+
+    def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
+        """Nothing to forget."""
+
+    def act(self, env: VectorEnv) -> Array:
+        """(B, 7) normalised actions."""
+        truth = env.snapshot()
+        return np.array(
+            [self._by_task[s.task].act(truth, row) for row, s in enumerate(env.scenarios)]
+        )

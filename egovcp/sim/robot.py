@@ -1,0 +1,134 @@
+"""One simulated robot: its own model and data, stepped and watched for contacts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.sim.scene import HEAD, PARTS, TORSO, Scene
+from egovcp.sim.sensors import base_rotation
+
+Array = NDArray[np.float64]
+
+_BAD_STATE = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
+
+
+@dataclass(frozen=True)
+class Touch:
+    """A contact of the robot with the task's object in one physics step."""
+
+    part: int
+    """Index into ``scene.PARTS``."""
+    force: float
+    """Normal force, N."""
+
+
+class SimulatedRobot:
+    """Physics of one robot in one task's scene.
+
+    Each robot has a model of its own, so an episode may edit masses, sizes and gains.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.index = scene.index
+        self.model = scene.copy_model()
+        self.data = mujoco.MjData(self.model)
+        self._wrench = np.zeros(6)
+
+    def reset(self, joint_position: Array, pelvis: Array) -> None:
+        """Stand still at ``pelvis`` (7,) (position m, quaternion wxyz) with the joints (J,) rad."""
+        mujoco.mj_setConst(self.model, self.data)
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:7] = pelvis
+        self.data.qpos[self.index.joint_qpos] = joint_position
+
+    def forward(self) -> None:
+        """Bring positions, contacts and velocities up to date with the state."""
+        mujoco.mj_forward(self.model, self.data)
+
+    def refresh_poses(self) -> None:
+        """Bring body, geom and site poses up to date with the state."""
+        mujoco.mj_kinematics(self.model, self.data)
+
+    def step(self) -> list[Touch]:
+        """One physics step; the contacts between robot and object that acted in it."""
+        mujoco.mj_step(self.model, self.data)
+        return self._touches()
+
+    def _touches(self) -> list[Touch]:
+        contact = self.data.contact
+        first, second = contact.geom[:, 0], contact.geom[:, 1]
+        of_object = self.index.is_object
+        hits = np.flatnonzero(of_object[first] | of_object[second])
+        found = []
+        for i in hits:
+            other = second[i] if of_object[first[i]] else first[i]
+            part = int(self.index.part[other])
+            if part >= 0:
+                mujoco.mj_contactForce(self.model, self.data, int(i), self._wrench)
+                found.append(Touch(part, float(self._wrench[0])))
+        return found
+
+    @property
+    def broken(self) -> bool:
+        """Whether the physics has diverged since the last reset."""
+        warnings = self.data.warning
+        return any(warnings[w].number > 0 for w in _BAD_STATE) or not self.finite
+
+    @property
+    def finite(self) -> bool:
+        """Whether positions and velocities hold numbers only."""
+        return bool(np.isfinite(self.data.qpos.sum() + self.data.qvel.sum()))
+
+    @property
+    def pelvis_height(self) -> float:
+        """m above ground."""
+        return float(self.data.qpos[2])
+
+    @property
+    def rotation(self) -> Array:
+        """(3, 3) from the pelvis frame to the world."""
+        return base_rotation(self.data.qpos[3:7])
+
+    @property
+    def tilt(self) -> float:
+        """Angle between the pelvis' z axis and the vertical, rad."""
+        return float(np.arccos(np.clip(self.rotation[2, 2], -1.0, 1.0)))
+
+    @property
+    def heading(self) -> Array:
+        """(3, 3) from the pelvis heading frame to the world: a rotation by yaw only."""
+        forward = self.rotation[:2, 0]
+        c, s = forward / max(float(np.hypot(*forward)), 1e-9)
+        return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+    def to_heading(self, point_w: Array) -> Array:
+        """World points (..., 3) -> pelvis heading frame (..., 3), m."""
+        out: Array = (point_w - self.data.qpos[:3]) @ self.heading
+        return out
+
+    @property
+    def palms_w(self) -> Array:
+        """(2, 3) palm sites, left and right, m."""
+        return self.data.site_xpos[self.index.palm_sites].copy()
+
+    @property
+    def on_floor(self) -> bool:
+        """Whether torso, pelvis or head touches the floor."""
+        geoms = self.data.contact.geom
+        touching = geoms[(geoms == self.index.floor).any(axis=1)]
+        return bool(np.isin(self.index.part[touching], (TORSO, HEAD)).any())
+
+    @cached_property
+    def no_forces(self) -> Array:
+        """(parts,) zeros, the shape of a tick's peak forces."""
+        return np.zeros(len(PARTS))

@@ -1,0 +1,45 @@
+"""Proprioception: what the IMU and the joint encoders of the robot measure."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.sim.config import SensorConfig
+from egovcp.sim.scene import SceneIndex
+from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES
+
+Array = NDArray[np.float64]
+
+
+def base_rotation(quaternion: Array) -> Array:
+    """Unit quaternion wxyz (4,) -> rotation (3, 3) from the pelvis frame to the world."""
+    out = np.empty(9)
+    mujoco.mju_quat2Mat(out, quaternion)
+    return out.reshape(3, 3)
+
+
+class Proprioception:
+    """The sensors of one robot in one episode; the command part is left to the caller."""
+
+    def __init__(self, config: SensorConfig, index: SceneIndex, rng: np.random.Generator) -> None:
+        self._index = index
+        self._rng = rng
+        self._std = np.zeros(STATE_DIM)
+        self._std[STATE_SLICES["angular_velocity"]] = config.angular_velocity
+        self._std[STATE_SLICES["projected_gravity"]] = config.gravity
+        self._std[STATE_SLICES["joint_position"]] = config.joint_position
+        self._std[STATE_SLICES["joint_velocity"]] = config.joint_velocity
+
+    def measure(self, data: mujoco.MjData, out: Array) -> None:
+        """Write a noisy measurement into ``out`` (S,), all but its command part."""
+        command = out[COMMAND_SLICE].copy()
+        out[STATE_SLICES["angular_velocity"]] = data.qvel[3:6]
+        out[STATE_SLICES["projected_gravity"]] = -base_rotation(data.qpos[3:7])[2]
+        out[STATE_SLICES["joint_position"]] = data.qpos[self._index.joint_qpos]
+        out[STATE_SLICES["joint_velocity"]] = data.qvel[self._index.joint_qvel]
+        out += self._std * self._rng.standard_normal(STATE_DIM)
+        gravity = out[STATE_SLICES["projected_gravity"]]
+        gravity /= np.sqrt(gravity @ gravity)
+        out[COMMAND_SLICE] = command

@@ -1,0 +1,152 @@
+"""Block the ball: a thrown ball must meet a hand or wrist before the body.
+
+The ball leaves s at the event and reaches the aim point p after the flight time T under
+gravity g:  v0 = (p - s) / T - g T / 2.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, Final
+
+import numpy as np
+
+from egovcp.sim.config import EnvConfig
+from egovcp.sim.robot import SimulatedRobot, Touch
+from egovcp.sim.scenario import Scenario
+from egovcp.sim.scene import BALL, HANDS, HEAD, LEG, TORSO
+from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
+
+_PARKED: Final = np.array([-20.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # behind the robot, unseen
+_GRAVITY: Final = np.array([0.0, 0.0, -9.81])  # m/s^2
+
+
+class BallTask(Task):
+    """One throw at the upper body, at the event."""
+
+    terms: ClassVar = ("block", "hit", "pose", "fall")
+
+    def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
+        super().__init__(config, scenario, robot)
+        self.config = config.ball
+        rng = scenario.rng("geometry")
+        c = self.config
+        self.radius = float(rng.uniform(*c.radius_range))
+        self._mass = float(rng.uniform(*c.mass_range))
+        self._distance = float(rng.uniform(*c.distance_range))
+        self._bearing = float(rng.uniform(*c.bearing_range))
+        self._release_height = float(rng.uniform(*c.release_height_range))
+        self.flight = float(rng.uniform(*c.flight_range))
+        self._aim_b = np.array(
+            [c.aim_forward, rng.uniform(*c.aim_lateral_range), rng.uniform(*c.aim_height_range)]
+        )
+        self._thrown = False
+        self._dead = False  # has met the floor: can neither be blocked nor hit any more
+        self._blocked_at: float | None = None
+        self._hit = False
+        self._new_block = False
+        self._new_hit = False
+        self._shape_ball()
+
+    def _shape_ball(self) -> None:
+        model, body = self.robot.model, self.robot.index.object_body
+        geom = model.body_geomadr[body]
+        model.geom_size[geom, 0] = self.radius
+        model.geom_rbound[geom] = self.radius
+        model.geom_aabb[geom, 3:] = self.radius
+        model.body_mass[body] = self._mass
+        model.body_inertia[body] = 0.4 * self._mass * self.radius**2
+
+    def place(self) -> None:
+        """Park the ball out of sight."""
+        self._set_ball(_PARKED, np.zeros(6))
+
+    def _set_ball(self, pose: Array, velocity: Array) -> None:
+        self.robot.data.qpos[-7:] = pose
+        self.robot.data.qvel[-6:] = velocity
+
+    def act(self) -> None:
+        """Keep the ball parked until the event, then throw it."""
+        if self._thrown:
+            return
+        if self.since_event < 0:
+            self.place()
+            return
+        self._thrown = True
+        start, velocity = self._throw()
+        self._set_ball(np.append(start, [1.0, 0, 0, 0]), np.append(velocity, [0.0, 0, 0]))
+
+    def _throw(self) -> tuple[Array, Array]:
+        """Release point and velocity, world, aimed at the robot as it stands now."""
+        pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
+        aim = pelvis + heading @ self._aim_b
+        away = np.array([math.cos(self._bearing), math.sin(self._bearing), 0.0])
+        start = pelvis + heading @ away * self._distance
+        start[2] = self._release_height
+        return start, (aim - start) / self.flight - 0.5 * _GRAVITY * self.flight
+
+    def observe(self, touches: Sequence[Touch]) -> None:
+        """Tell blocks from hits."""
+        if not self._thrown or self._dead:
+            return
+        parts = {touch.part for touch in touches}
+        if self._blocked_at is None and not self._hit and parts & set(HANDS):
+            self._blocked_at = self.time
+            self._new_block = True
+        elif not self._in_grace and not self._hit and parts & {TORSO, HEAD, LEG}:
+            self._hit = self._new_hit = True
+        self._dead = bool(self.robot.data.qpos[-5] < self.radius + 0.01)
+
+    @property
+    def _in_grace(self) -> bool:
+        """Shortly after a block, when further contacts do not count."""
+        return self._blocked_at is not None and self.time - self._blocked_at < self.config.grace
+
+    def rewards(self, action: Array) -> dict[str, float]:
+        """``block`` and ``hit`` once each, ``pose`` in every tick."""
+        block, self._new_block = self._new_block, False
+        hit, self._new_hit = self._new_hit, False
+        return {
+            "block": self.config.block_reward * block,
+            "hit": -self.config.hit_cost * hit,
+            "pose": -self.config.pose_cost * float(np.mean(action**2)),
+        }
+
+    @property
+    def fall_cost(self) -> float:
+        """Cost of a fall."""
+        return self.config.fall_cost
+
+    @property
+    def achieved(self) -> bool:
+        """Blocked by a hand and not hit elsewhere; in an empty episode, always."""
+        return not self._hit and (self.event_tick is None or self._blocked_at is not None)
+
+    @property
+    def blocked(self) -> bool:
+        """Whether a hand or wrist was the first to meet the ball."""
+        return self._blocked_at is not None
+
+    @property
+    def hit(self) -> bool:
+        """Whether the ball met torso, head or leg."""
+        return self._hit
+
+    def state(self) -> ObjectState:
+        """Ball centre and velocity; active from the throw to the first contact or floor."""
+        data = self.robot.data
+        over = self._dead or self._hit or self.blocked
+        if not self._thrown:
+            nothing = np.full(3, np.nan)
+            return ObjectState(nothing, nothing.copy(), self.radius, active=False)
+        return ObjectState(
+            data.qpos[-7:-4].copy(), data.qvel[-6:-3].copy(), self.radius, active=not over
+        )
+
+    def solids(self) -> tuple[Solid, ...]:
+        """The ball once thrown."""
+        if not self._thrown:
+            return ()
+        pose = self.robot.data.qpos[-7:].copy()
+        return (Solid(BALL, "sphere", (self.radius,) * 3, pose[:3], pose[3:]),)
