@@ -17,16 +17,14 @@ from egovcp.robot.kinematics import Array, joint_rotations, rotate
 _SHAPE: Final = (2, 7)
 _FIRST_LINK: Final = ARMS.start + 1
 _OFFSET: Final = kinematics.LINK_OFFSET[ARMS].reshape(*_SHAPE, 3)
-_MASS: Final = kinematics.LINK_MASS[_FIRST_LINK:].reshape(_SHAPE)
+MASS: Final = kinematics.LINK_MASS[_FIRST_LINK:].reshape(_SHAPE)
 _COM: Final = kinematics.LINK_COM[_FIRST_LINK:].reshape(*_SHAPE, 3)
 _AXIS: Final = np.argmax(np.abs(kinematics.JOINT_AXIS[ARMS]), axis=-1).reshape(_SHAPE)
 _PALM: Final = kinematics.PALM_OFFSET  # (2, 3)
 LOWER: Final = kinematics.JOINT_LOWER[ARMS].reshape(_SHAPE)
 UPPER: Final = kinematics.JOINT_UPPER[ARMS].reshape(_SHAPE)
 SHOULDER: Final = _OFFSET[:, 0]  # (2, 3) m, torso frame
-_TAIL_MASS: Final = np.cumsum(_MASS[:, ::-1], axis=1)[:, ::-1]  # (2, 7) joint's link and beyond
-ARM_MASS: Final = float(_MASS.sum())  # kg, both arms
-
+_TAIL_MASS: Final = np.cumsum(MASS[:, ::-1], axis=1)[:, ::-1]  # (2, 7) joint's link and beyond
 REST: Final = np.array([[0.25, 0.2, 0.0, 0.75, 0, 0, 0], [0.25, -0.2, 0.0, 0.75, 0, 0, 0]])
 #: Share of each joint in reaching: the wrist helps little, its motors are weak.
 _SHARE: Final = np.array([1.0, 1.0, 0.8, 1.0, 0.2, 0.25, 0.25])
@@ -37,6 +35,12 @@ _DAMPING: Final = 0.05  # m: damped least squares, lambda
 _REST_PULL: Final = 0.08  # share of the way to REST per iteration, in the null space
 REACH: Final = 0.45  # m, shoulder to palm; a straight arm is 0.465
 _TRUNK_RADII: Final = (0.16, 0.15)  # m, keep-out ellipse around the trunk: forward, sideways
+#: Every choice above, for the controller's identity.
+IDENTITY: Final = (
+    REST.tolist(),
+    _SHARE.tolist(),
+    (_LIMIT_MARGIN, _DAMPING, _REST_PULL, REACH, *_TRUNK_RADII),
+)
 _CROSS: Final = (np.array([1, 2, 0]), np.array([2, 0, 1]))
 
 
@@ -60,7 +64,7 @@ class ArmPose:
 def forward(joint_position: Array) -> ArmPose:
     """Arm joints (B, 2, 7) rad -> poses."""
     batch = len(joint_position)
-    local = joint_rotations(joint_position.reshape(batch, -1), ARMS).reshape(batch, *_SHAPE, 3, 3)
+    local = joint_rotations(joint_position.reshape(batch, 14), ARMS).reshape(batch, *_SHAPE, 3, 3)
     rotation = np.empty_like(local)
     origin = np.empty((batch, *_SHAPE, 3))
     rotation[:, :, 0], origin[:, :, 0] = local[:, :, 0], SHOULDER
@@ -83,8 +87,8 @@ def reachable(target: Array) -> Array:
     return np.asarray(SHOULDER + arm * np.minimum(1.0, REACH / np.maximum(length, 1e-6)))
 
 
-def improve(joint_position: Array, target: Array, max_step: float) -> tuple[Array, ArmPose]:
-    """One step of damped least squares towards palm targets, and the pose it started from.
+def improve(joint_position: Array, target: Array, max_step: float) -> Array:
+    """One step of damped least squares towards palm targets.
 
     dq = W J^T (J W J^T + lambda^2)^-1 (e - J n) + n, where n pulls towards REST; clipped
     to ``max_step`` (rad) per joint and to the joint limits.
@@ -102,7 +106,7 @@ def improve(joint_position: Array, target: Array, max_step: float) -> tuple[Arra
     solved = _solve_symmetric(normal, error)
     step = np.sum(weighted * solved[:, :, None], axis=-1) + pull
     step = np.minimum(np.maximum(step, -max_step), max_step)
-    return np.minimum(np.maximum(joint_position + step, _LIMIT_LOW), _LIMIT_HIGH), pose
+    return np.minimum(np.maximum(joint_position + step, _LIMIT_LOW), _LIMIT_HIGH)
 
 
 def _solve_symmetric(matrix: Array, vector: Array) -> Array:
@@ -116,10 +120,14 @@ def _solve_symmetric(matrix: Array, vector: Array) -> Array:
     return combined
 
 
-def first_moment(pose: ArmPose) -> Array:
+def link_coms(pose: ArmPose) -> Array:
+    """Centres of mass of the arms' links, torso frame: (B, 2, 7, 3) m."""
+    return np.asarray(pose.origin + rotate(pose.rotation, _COM))
+
+
+def first_moment(com: Array) -> Array:
     """Sum of mass times position over each joint's link and all beyond, (B, 2, 7, 3) kg m."""
-    com = pose.origin + rotate(pose.rotation, _COM)
-    moment = com * _MASS[..., None]
+    moment = com * MASS[..., None]
     return np.asarray(np.cumsum(moment[:, :, ::-1], axis=2)[:, :, ::-1])
 
 

@@ -53,15 +53,18 @@ def write_kinematics(path: Path) -> None:
 def stance_row(stance: StanceModel, height: float) -> dict[str, NDArray[np.float64]]:
     """All numbers of the stance law at one pelvis height."""
     pose = balanced_pose(stance, height)
+    linear = linearise(stance, pose)
     response = load_response(stance, pose, height)
     return {
         "height": np.array(height),
         "pelvis": np.array([pose.qpos[0], pose.qpos[1], float(pitch_at(height))]),
         "joints": pose.qpos[7:22],
         "torque": pose.torque,
-        "joints_per_moment": response[:, :NU].T,
-        "torque_per_moment": response[:, NU:].T,
-        "compensator": compensator(linearise(stance, pose)),
+        "pelvis_per_moment": response[:, :2].T,
+        "joints_per_moment": response[:, 2 : 2 + NU].T,
+        "torque_per_moment": response[:, 2 + NU :].T,
+        "mobility": linear.mobility,
+        "compensator": compensator(linear),
     }
 
 

@@ -21,14 +21,11 @@ from numpy.typing import NDArray
 
 from egovcp.robot.arms import REST
 from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS
+from egovcp.robot.stance_table import NU, NX, NY, NZ
 from egovcp.spec import CONTROLLER_HZ, NUM_JOINTS
 
 Array = NDArray[np.float64]
 
-NZ: Final = 9  # pelvis xyz, pelvis rotation vector (body frame), waist yaw roll pitch
-NX: Final = 2 * NZ
-NU: Final = 15  # legs 12, waist 3
-NY: Final = 36  # gravity 3, gyro 3, joint positions 15, joint velocities 15
 _MOMENT_STEP: Final = 0.5  # kg m, of the difference quotient
 
 SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the ground
@@ -166,8 +163,8 @@ def load_response(stance: StanceModel, pose: Pose, height: float) -> Array:
     """How the balanced pose answers a load that the arms carry off its place.
 
     Returns:
-        (2, 30): change of [joints 15 (rad), torques 15 (N m)] per kg m of first moment
-        that the arms add, forward and to the left (pelvis heading frame).
+        (2, 32): change of [pelvis x, y (m), joints 15 (rad), torques 15 (N m)] per kg m of
+        first moment that the arms add, forward and to the left (pelvis heading frame).
     """
     torso = stance.model.body("torso_link").id
     rest = stance.model.body_ipos[torso].copy()
@@ -180,7 +177,7 @@ def load_response(stance: StanceModel, pose: Pose, height: float) -> Array:
             shift = sign * _MOMENT_STEP / stance.model.body_mass[torso]
             stance.model.body_ipos[torso] = rest + shift * in_torso
             moved = balanced_pose(stance, height)
-            ends.append(np.concatenate([moved.qpos[7:22], moved.torque]))
+            ends.append(np.concatenate([moved.qpos[:2], moved.qpos[7:22], moved.torque]))
             stance.model.body_ipos[torso] = rest
         out.append((ends[0] - ends[1]) / (2 * _MOMENT_STEP))
     return np.stack(out)
@@ -205,6 +202,7 @@ class Linear:
     legs: Array  # (15, 9): joint displacement per z
     torque_x: Array  # (15, 18): servo torque per x
     torque_u: Array  # (15, 15)
+    mobility: Array  # (9, 9): M_r^-1, rate of z per generalised impulse
 
 
 def linearise(stance: StanceModel, pose: Pose) -> Linear:
@@ -238,6 +236,7 @@ def linearise(stance: StanceModel, pose: Pose) -> Linear:
         legs=joints,
         torque_x=np.hstack([-kp @ joints, -kd @ joints]),
         torque_u=kp,
+        mobility=inverse,
     )
 
 

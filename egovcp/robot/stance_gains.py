@@ -17,7 +17,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.robot.stance_design import NU, NX, NY, Linear
+from egovcp.robot.stance_design import Linear
+from egovcp.robot.stance_table import NU, NX, NY
 
 Array = NDArray[np.float64]
 

@@ -15,12 +15,20 @@ from egovcp.robot.arms import REST
 from egovcp.robot.kinematics import Array
 from egovcp.spec import NUM_JOINTS
 
-NX: Final = 18  # states: pelvis pose 6 and waist 3, and their rates
+NZ: Final = 9  # coordinates: pelvis pose 6, waist 3
+NX: Final = 2 * NZ  # states: coordinates and their rates
 NU: Final = 15  # servo targets: legs 12, waist 3
 NY: Final = 36  # measurements: gravity 3, gyro 3, joint positions 15, joint rates 15
 _FIELDS: Final = (
-    "pelvis", "joints", "torque", "joints_per_moment", "torque_per_moment", "compensator"
-)  # fmt: skip
+    "pelvis",
+    "joints",
+    "torque",
+    "pelvis_per_moment",
+    "joints_per_moment",
+    "torque_per_moment",
+    "mobility",
+    "compensator",
+)
 
 
 @dataclass(frozen=True)
@@ -30,8 +38,10 @@ class StanceRow:
     pelvis: Array  # (B, 3) x, y of the pelvis from the ankles' middle (m), pitch (rad)
     joints: Array  # (B, 15) rad
     torque: Array  # (B, 15) N m
+    pelvis_per_moment: Array  # (B, 2, 2) m per kg m
     joints_per_moment: Array  # (B, 15, 2) rad per kg m
     torque_per_moment: Array  # (B, 15, 2) N m per kg m
+    mobility: Array  # (B, 9, 9) pelvis and waist rates per generalised impulse
     compensator: Array  # (B, 33, 69)
 
 
@@ -46,9 +56,13 @@ class StanceTable:
         self._flat = np.concatenate(parts, axis=1)
         self._slope = np.diff(self._flat, axis=0) / np.diff(self.heights)[:, None]
 
+    def clamp(self, height: Array) -> Array:
+        """Heights within the table; not-a-number becomes the lowest."""
+        return np.asarray(np.fmin(np.fmax(height, self.heights[0]), self.heights[-1]))
+
     def at(self, height: Array) -> StanceRow:
         """Numbers for heights (B,) in metres."""
-        h = np.minimum(np.maximum(height, self.heights[0]), self.heights[-1])
+        h = self.clamp(height)
         index = np.searchsorted(self.heights[1:-1], h, side="right")
         flat = self._slope[index] * (h - self.heights[index])[:, None]
         flat += self._flat[index]
@@ -85,5 +99,5 @@ def standing_pose(height: float) -> StandingPose:
     joints = np.zeros(NUM_JOINTS)
     joints[: WAIST.stop], joints[ARMS] = row.joints[0], REST.ravel()
     quaternion = np.array([np.cos(pitch / 2), 0.0, np.sin(pitch / 2), 0.0])
-    clamped = np.clip(height, stance_table().heights[0], stance_table().heights[-1])
+    clamped = float(stance_table().clamp(np.array(height)))
     return StandingPose(np.array([x, y, clamped]), quaternion, joints)
