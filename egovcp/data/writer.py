@@ -37,7 +37,7 @@ class Provenance:
     """Command line that repeats it."""
     versions: Mapping[str, str] = field(default_factory=dict)
     """Installed version of each package that shapes the data."""
-    env: Mapping[str, Any] = field(default_factory=dict)
+    config: Mapping[str, Any] = field(default_factory=dict)
     """Complete configuration of the simulator and of the behaviour policy."""
 
 
