@@ -92,7 +92,12 @@ class DepthNoise:
         lost = chance < np.where(discontinuity(depth, self._step), self._edges, 0) + self._holes
         noisy = depth + noise * (self._per_z2 * depth * depth)
         measured = within_range(np.where(lost, np.float32(0), noisy))
-        return np.rint(measured * 1000.0).astype(np.uint16)
+        return quantise(measured)
+
+
+def quantise(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
+    """Metres -> whole millimetres."""
+    return np.asarray(np.rint(depth * 1000.0), dtype=np.uint16)
 
 
 def discontinuity(depth: NDArray[np.float32], step: np.float32) -> NDArray[np.bool_]:

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 from egovcp.errors import UsageError, suggest
-from egovcp.spec import TASKS
 
 Range = tuple[float, float]
 
@@ -233,7 +232,11 @@ class EnvConfig:
         Raises:
             UsageError: the task is unknown.
         """
-        episodes = dict(zip(TASKS, (self.ball_episode, self.wall_episode, self.arch_episode)))
+        episodes = {
+            "ball": self.ball_episode,
+            "wall": self.wall_episode,
+            "arch": self.arch_episode,
+        }
         if task not in episodes:
-            raise UsageError(f"unknown task {task!r}{suggest(task, TASKS)}")
+            raise UsageError(f"unknown task {task!r}{suggest(task, episodes)}")
         return episodes[task]

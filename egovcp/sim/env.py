@@ -7,7 +7,7 @@ robot does four physics steps of 5 ms under the joint targets.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -119,9 +119,7 @@ class VectorEnv:
         if len(scenarios) != self.num_envs:
             raise UsageError(f"expected {self.num_envs} scenarios, found {len(scenarios)}")
         if not self.lanes:
-            self.lanes = [
-                Lane(self.config, self._camera, self._standing, s) for s in scenarios
-            ]
+            self.lanes = [Lane(self.config, self._camera, self._standing, s) for s in scenarios]
             return self._begin(np.arange(self.num_envs), None)
         self._start_lanes(range(self.num_envs), scenarios)
         return self._begin(np.arange(self.num_envs), None)
@@ -154,8 +152,7 @@ class VectorEnv:
         self._send(action, live)
         for k in range(CONTROLLER_TICKS_PER_PLAN):
             self._measure(self._due_action(k))
-            targets = self.controller.step(self._controller_state)
-            self._each_lane(lambda row: self.lanes[row].advance(targets[row]))
+            self._advance(self.controller.step(self._controller_state))
         terms = [lane.end_tick(self._sent[row, 0]) for row, lane in enumerate(self.lanes)]
         return self._result(terms)
 
@@ -178,7 +175,8 @@ class VectorEnv:
         """(B, 7) the action in effect in controller tick ``k`` of this planner tick."""
         delay = np.array([lane.action_delay for lane in self.lanes])
         age = np.maximum(0, -((k - delay) // CONTROLLER_TICKS_PER_PLAN))
-        return self._sent[np.arange(self.num_envs), age]
+        due: Array = self._sent[np.arange(self.num_envs), age]
+        return due
 
     def _measure(self, action: Array) -> None:
         """The controllers' observations: fresh measurements and the command in effect."""
@@ -212,14 +210,19 @@ class VectorEnv:
             sent_action=self.sent_action,
         )
 
-    def _each_lane(self, work: Callable[[int], None]) -> None:
-        """Run ``work`` for every row; the physics releases the interpreter lock."""
-        if self._pool is None:
-            for row in range(self.num_envs):
-                work(row)
-            return
+    def _advance(self, targets: Array) -> None:
+        """One controller tick of every row; physics and rays release the interpreter lock."""
+
+        def work(rows: NDArray[np.intp]) -> None:
+            for row in rows:
+                self.lanes[row].advance(targets[row])
+
         chunks = np.array_split(np.arange(self.num_envs), self.config.threads)
-        list(self._pool.map(lambda rows: [work(int(row)) for row in rows], chunks))
+        if self._pool is None:
+            work(chunks[0])
+            return
+        for pending in [self._pool.submit(work, rows) for rows in chunks]:
+            pending.result()
 
     def snapshot(self) -> Truth:
         """The simulator's truth now: for oracles, probes and logs, never for a policy."""

@@ -92,7 +92,7 @@ class RandomWalk:
         """(B, 7) the next step of each row's walk."""
         delta = np.array([rng.uniform(-1.0, 1.0, ACTION_DIM) for rng in self._rngs])
         fold = reflect if self._bounds == "reflect" else _clip
-        self._action = fold(self._action + self._eta * delta)
+        self._action[:] = fold(self._action + self._eta * delta)
         return self._action.copy()
 
 

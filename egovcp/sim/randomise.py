@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
+from numpy.typing import NDArray
 
 from egovcp.sim.config import RandomisationConfig
 from egovcp.sim.scenario import Scenario
@@ -52,13 +53,18 @@ def apply_physics(physics: Physics, scene: Scene, model: mujoco.MjModel) -> None
     loaded = (model.body_mass[torso] + physics.payload) / model.body_mass[torso]
     model.body_mass[torso] *= loaded
     model.body_inertia[torso] *= loaded
-    servos = slice(0, NUM_JOINTS)
-    model.actuator_gainprm[servos, 0] = pristine.actuator_gainprm[servos, 0] * physics.stiffness_scale
-    model.actuator_biasprm[servos, 1] = pristine.actuator_biasprm[servos, 1] * physics.stiffness_scale
-    model.actuator_biasprm[servos, 2] = pristine.actuator_biasprm[servos, 2] * physics.damping_scale
+    _scale_servos(physics, pristine, model)
 
 
-def initial_offset(config: RandomisationConfig, scenario: Scenario) -> np.ndarray:
+def _scale_servos(physics: Physics, pristine: mujoco.MjModel, model: mujoco.MjModel) -> None:
+    """Torque = gain * target + bias . (1, q, q'), so kp is in both and kd in the bias."""
+    gain, bias = pristine.actuator_gainprm, pristine.actuator_biasprm
+    model.actuator_gainprm[:, 0] = gain[:, 0] * physics.stiffness_scale
+    model.actuator_biasprm[:, 1] = bias[:, 1] * physics.stiffness_scale
+    model.actuator_biasprm[:, 2] = bias[:, 2] * physics.damping_scale
+
+
+def initial_offset(config: RandomisationConfig, scenario: Scenario) -> NDArray[np.float64]:
     """(J,) rad to add to the joints of waist and arms at the start; the legs stay planted."""
     offset = scenario.rng("initial").uniform(-1.0, 1.0, NUM_JOINTS) * config.initial_joint
     offset[:12] = 0.0

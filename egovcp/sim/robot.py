@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.sim.scene import HEAD, PARTS, TORSO, Scene
+from egovcp.sim.scene import HEAD, TORSO, Scene
 from egovcp.sim.sensors import base_rotation
 
 Array = NDArray[np.float64]
@@ -119,7 +118,7 @@ class SimulatedRobot:
     @property
     def palms_w(self) -> Array:
         """(2, 3) palm sites, left and right, m."""
-        return self.data.site_xpos[self.index.palm_sites].copy()
+        return np.array(self.data.site_xpos[self.index.palm_sites])
 
     @property
     def on_floor(self) -> bool:
@@ -127,8 +126,3 @@ class SimulatedRobot:
         geoms = self.data.contact.geom
         touching = geoms[(geoms == self.index.floor).any(axis=1)]
         return bool(np.isin(self.index.part[touching], (TORSO, HEAD)).any())
-
-    @cached_property
-    def no_forces(self) -> Array:
-        """(parts,) zeros, the shape of a tick's peak forces."""
-        return np.zeros(len(PARTS))

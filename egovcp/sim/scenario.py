@@ -41,4 +41,5 @@ class Scenario:
         random quantity leaves all others as they were.
         """
         key = (self.episode, TASKS.index(self.task), zlib.crc32(name.encode()))
-        return np.random.Generator(np.random.PCG64(np.random.SeedSequence(self.seed, spawn_key=key)))
+        entropy = np.random.SeedSequence(self.seed, spawn_key=key)
+        return np.random.Generator(np.random.PCG64(entropy))
