@@ -83,13 +83,14 @@ class DepthNoise:
         self._per_z2 = np.float32(rng.uniform(*config.noise_per_z2))
         self._holes = np.float32(rng.uniform(*config.hole_probability))
         self._edges = np.float32(rng.uniform(*config.edge_probability))
-        self._step = np.float32(config.edge_step)
+        self._edge_ratio = np.float32(config.edge_ratio)
 
     def apply(self, depth: NDArray[np.float32]) -> NDArray[np.uint16]:
         """True depth (H, W) in metres -> measured depth (H, W) in millimetres, 0 invalid."""
         noise = self._rng.standard_normal(depth.shape, dtype=np.float32)
         chance = self._rng.random(depth.shape, dtype=np.float32)
-        lost = chance < np.where(discontinuity(depth, self._step), self._edges, 0) + self._holes
+        edge = discontinuity(depth, self._edge_ratio)
+        lost = chance < np.where(edge, self._edges, np.float32(0)) + self._holes
         noisy = depth + noise * (self._per_z2 * depth * depth)
         measured = within_range(np.where(lost, np.float32(0), noisy))
         return quantise(measured)
@@ -100,11 +101,14 @@ def quantise(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
     return np.asarray(np.rint(depth * 1000.0), dtype=np.uint16)
 
 
-def discontinuity(depth: NDArray[np.float32], step: np.float32) -> NDArray[np.bool_]:
-    """(H, W) pixels that differ by more than ``step`` from a neighbour in row or column."""
+def discontinuity(depth: NDArray[np.float32], ratio: np.float32) -> NDArray[np.bool_]:
+    """(H, W) pixels beside a jump of more than ``ratio`` of the greater depth.
+
+    The floor, seen at a slant, is no discontinuity; the border of nothing (0) is.
+    """
     edge = np.zeros(depth.shape, dtype=np.bool_)
-    across = np.abs(np.diff(depth, axis=1)) > step
-    down = np.abs(np.diff(depth, axis=0)) > step
+    across = np.abs(np.diff(depth, axis=1)) > ratio * np.maximum(depth[:, 1:], depth[:, :-1])
+    down = np.abs(np.diff(depth, axis=0)) > ratio * np.maximum(depth[1:], depth[:-1])
     edge[:, 1:] |= across
     edge[:, :-1] |= across
     edge[1:] |= down

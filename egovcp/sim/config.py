@@ -44,9 +44,9 @@ class BallConfig:
     """Time from release to the aim point, s."""
     aim_forward: float = 0.10
     """Aim point in front of the pelvis, m, heading frame."""
-    aim_lateral_range: Range = (-0.22, 0.22)
+    aim_lateral_range: Range = (-0.36, 0.36)
     """Aim point left of the pelvis, m, heading frame."""
-    aim_height_range: Range = (0.10, 0.48)
+    aim_height_range: Range = (0.04, 0.50)
     """Aim point above the pelvis, m."""
     grace: float = 0.3
     """Contacts within this time after a block do not count, s."""
@@ -151,8 +151,8 @@ class CameraConfig:
     """Share of pixels lost at random."""
     edge_probability: Range = (0.0, 0.25)
     """Share of pixels lost beside a depth discontinuity."""
-    edge_step: float = 0.15
-    """Depth difference of neighbours that makes a discontinuity, m."""
+    edge_ratio: float = 0.12
+    """Neighbours whose depths differ by this share of the greater make a discontinuity."""
 
 
 @dataclass(frozen=True)
