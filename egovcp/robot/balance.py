@@ -15,7 +15,7 @@ from egovcp.robot.arms import cross
 from egovcp.robot.g1 import DAMPING, EFFORT_LIMIT, STIFFNESS
 from egovcp.robot.kinematics import Array
 from egovcp.robot.reach import DT, TORSO_ORIGIN, Reach
-from egovcp.robot.stance_table import NU, NX, NZ, StanceRow, StanceTable
+from egovcp.robot.stance_table import NF, NU, NX, NZ, StanceRow, StanceTable
 from egovcp.spec import STATE_SLICES
 
 LOWER_BODY: Final = slice(0, NU)
@@ -53,7 +53,7 @@ class BalanceConfig:
 class Balance:
     """Memory of the stance; leading axis B."""
 
-    prediction: Array  # (B, 18) state expected at the next tick, off the reference
+    prediction: Array  # (B, 20) filter's state expected at the next tick, off the reference
     correction: Array  # (B, 15) rad, sent last and acting now
     height: Array  # (B,) reference, m
     height_rate: Array  # (B,) m/s
@@ -72,7 +72,7 @@ def start(height: Array, table: StanceTable) -> Balance:
     reference = np.zeros((batch, _WIDTH))
     reference[:, _POSITIONS] = _positions(row, height, np.zeros((batch, 2)))
     return Balance(
-        prediction=np.zeros((batch, NX)),
+        prediction=np.zeros((batch, NF)),
         correction=np.zeros((batch, NU)),
         height=height.copy(),
         height_rate=np.zeros(batch),
@@ -104,7 +104,7 @@ def balance(m: Balance, state: Array, row: StanceRow, reach: Reach, config: Bala
     out = _apply(row.compensator, vector)
     recoil = m.reached[:, _RECOIL] - m.sent[:, _RECOIL]
     m.prediction = out[:, NU:]
-    m.prediction[:, NZ:] += recoil
+    m.prediction[:, NZ:NX] += recoil
     m.prediction[:, :NZ] += 0.5 * DT * recoil
     m.correction = _bounded(out[:, :NU], m.prediction, config)
     m.reached, m.sent = m.sent, reference

@@ -202,6 +202,7 @@ class Linear:
     legs: Array  # (15, 9): joint displacement per z
     torque_x: Array  # (15, 18): servo torque per x
     torque_u: Array  # (15, 15)
+    rocking: Array  # (9, 2): z per roll and pitch of the whole robot on its feet's middle
     mobility: Array  # (9, 9): M_r^-1, rate of z per generalised impulse
 
 
@@ -236,8 +237,19 @@ def linearise(stance: StanceModel, pose: Pose) -> Linear:
         legs=joints,
         torque_x=np.hstack([-kp @ joints, -kd @ joints]),
         torque_u=kp,
+        rocking=rocking(pose),
         mobility=inverse,
     )
+
+
+def rocking(pose: Pose) -> Array:
+    """(9, 2): displacement z when the robot rolls and pitches rigidly about its feet's middle."""
+    forward, up = pose.qpos[0] - FOOT_CENTRE, pose.qpos[2]
+    pitch = 2 * np.arctan2(pose.qpos[5], pose.qpos[3])
+    out = np.zeros((NZ, 2))
+    out[:6, 0] = [0.0, -up, 0.0, np.cos(pitch), 0.0, np.sin(pitch)]
+    out[:6, 1] = [up, 0.0, -forward, 0.0, 1.0, 0.0]
+    return out
 
 
 def sensor_matrix(pose: Pose, joints: Array) -> Array:

@@ -7,7 +7,7 @@ targets, w_{k-1} the du sent last, which acts now because of the tick of delay):
     du = -K_x x^ - K_u w_{k-1}          LQR on the state extended by the delayed input
     x_' = A x^ + B w_{k-1}              prediction for the next tick
 
-All three are linear, so [du; x_'] = M [x_; dy; w_{k-1}] with one matrix M (33, 69).
+All three are linear, so [du; x_'] = M [x_; dy; w_{k-1}] with one matrix M (35, 71).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.stance_design import Linear
-from egovcp.robot.stance_table import NU, NX, NY
+from egovcp.robot.stance_table import NF, NU, NX, NY
 
 Array = NDArray[np.float64]
 
@@ -36,6 +36,8 @@ _GRAVITY_NOISE: Final = 0.015
 _GYRO_NOISE: Final = 0.08  # rad/s
 _JOINT_NOISE: Final = 0.008  # rad
 _JOINT_RATE_NOISE: Final = 0.4  # rad/s
+_ROCK: Final = 0.01  # rad
+_ROCK_DECAY: Final = 0.95
 #: Feet rock on their edges: a planted *ankle* is believed, a flat foot hardly.
 _ANKLE_FACTOR: Final = 5.0
 
@@ -62,14 +64,28 @@ def lqr_gain(linear: Linear) -> tuple[Array, Array]:
     return gain[:, :NX], gain[:, NX:]
 
 
-def kalman_gain(linear: Linear) -> Array:
-    """L (18, 36): steady-state measurement update, from the dual Riccati equation."""
+def filter_model(linear: Linear) -> tuple[Array, Array, Array]:
+    """A (20, 20), B (20, 15) and C (36, 20) with two states for feet that rock.
+
+    The legs measure the pelvis relative to the soles; gravity and gyro measure it truly.
+    A rock of the soles (roll, pitch), fading by itself, explains the difference.
+    """
+    a, b = np.zeros((NF, NF)), np.zeros((NF, NU))
+    a[:NX, :NX], b[:NX] = linear.a, linear.b
+    a[NX:, NX:] = _ROCK_DECAY * np.eye(2)
+    legs = np.zeros((NY, 2))
+    legs[6:21] = -linear.legs @ linear.rocking
+    return a, b, np.hstack([linear.c, legs])
+
+
+def kalman_gain(a: Array, c: Array) -> Array:
+    """L (20, 36): steady-state measurement update, from the dual Riccati equation."""
     from scipy.linalg import solve_discrete_are
 
     r = np.diag(measurement_noise() ** 2)
-    process = np.diag(np.concatenate([_DRIFT, _PUSH]) ** 2)
-    p = solve_discrete_are(linear.a.T, linear.c.T, process, r)
-    return np.asarray(np.linalg.solve(linear.c @ p @ linear.c.T + r, linear.c @ p).T)
+    process = np.diag(np.concatenate([_DRIFT, _PUSH, [_ROCK, _ROCK]]) ** 2)
+    p = solve_discrete_are(a.T, c.T, process, r)
+    return np.asarray(np.linalg.solve(c @ p @ c.T + r, c @ p).T)
 
 
 def measurement_noise() -> Array:
@@ -87,13 +103,11 @@ def measurement_noise() -> Array:
 
 
 def compensator(linear: Linear) -> Array:
-    """M (33, 69) of the module's equation."""
+    """M (35, 71) of the module's equation."""
     k_x, k_u = lqr_gain(linear)
-    gain = kalman_gain(linear)
-    filtered = np.hstack([np.eye(NX) - gain @ linear.c, gain, np.zeros((NX, NU))])
-    delayed = np.hstack([np.zeros((NU, NX + NY)), np.eye(NU)])
-    out = -k_x @ filtered - k_u @ delayed
-    prediction = linear.a @ filtered + linear.b @ delayed
-    return np.vstack([out, prediction])
-
-
+    k_x = np.hstack([k_x, np.zeros((NU, 2))])
+    a, b, c = filter_model(linear)
+    gain = kalman_gain(a, c)
+    filtered = np.hstack([np.eye(NF) - gain @ c, gain, np.zeros((NF, NU))])
+    delayed = np.hstack([np.zeros((NU, NF + NY)), np.eye(NU)])
+    return np.vstack([-k_x @ filtered - k_u @ delayed, a @ filtered + b @ delayed])

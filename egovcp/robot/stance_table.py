@@ -17,6 +17,7 @@ from egovcp.spec import NUM_JOINTS
 
 NZ: Final = 9  # coordinates: pelvis pose 6, waist 3
 NX: Final = 2 * NZ  # states: coordinates and their rates
+NF: Final = NX + 2  # filter: states, and the roll and pitch of feet that rock on their edges
 NU: Final = 15  # servo targets: legs 12, waist 3
 NY: Final = 36  # measurements: gravity 3, gyro 3, joint positions 15, joint rates 15
 _FIELDS: Final = (
@@ -42,7 +43,7 @@ class StanceRow:
     joints_per_moment: Array  # (B, 15, 2) rad per kg m
     torque_per_moment: Array  # (B, 15, 2) N m per kg m
     mobility: Array  # (B, 9, 9) pelvis and waist rates per generalised impulse
-    compensator: Array  # (B, 33, 69)
+    compensator: Array  # (B, 35, 71)
 
 
 class StanceTable:
