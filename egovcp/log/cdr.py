@@ -9,6 +9,7 @@ because the loop has about a millisecond: a generic encoder visits each number i
 from __future__ import annotations
 
 import struct
+from functools import lru_cache
 from typing import Self
 
 import numpy as np
@@ -46,16 +47,14 @@ class Cdr:
 
     def string(self, text: str) -> Self:
         """UTF-8 string."""
-        data = text.encode()
-        self.u32(len(data) + 1)
-        self._buffer += data + b"\x00"
+        self._align(4)
+        self._buffer += _string(text)
         return self
 
     def strings(self, texts: tuple[str, ...]) -> Self:
         """Sequence of strings."""
-        self.u32(len(texts))
-        for text in texts:
-            self.string(text)
+        self._align(4)
+        self._buffer += _strings(texts)
         return self
 
     def octets(self, data: bytes) -> Self:
@@ -77,6 +76,27 @@ class Cdr:
         array = np.asarray(values, dtype="<f8")
         return self.u32(array.size).f64(array)
 
+    def raw(self, data: bytes) -> Self:
+        """Bytes encoded before, which must fit the present alignment."""
+        self._buffer += data
+        return self
+
     def done(self) -> bytes:
         """The finished message."""
         return bytes(self._buffer)
+
+
+@lru_cache(maxsize=1024)
+def _string(text: str) -> bytes:
+    """A string from an aligned start; names repeat in every tick, so their bytes are kept."""
+    data = text.encode()
+    return struct.pack("<I", len(data) + 1) + data + b"\x00"
+
+
+@lru_cache(maxsize=64)
+def _strings(texts: tuple[str, ...]) -> bytes:
+    """A sequence of strings from an aligned start."""
+    cdr = Cdr().u32(len(texts))
+    for text in texts:
+        cdr.string(text)
+    return cdr.done()[_HEADER_BYTES:]

@@ -93,17 +93,26 @@ def thin(
     """
     points = corners.reshape(-1, 3)
     cells = np.round(points / grid).astype(np.int64)
-    _, index, count = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    _, index, count = np.unique(_keys(cells), return_inverse=True, return_counts=True)
     sums = np.stack([np.bincount(index, points[:, k]) for k in range(3)], axis=1)
     triangles = index.reshape(-1, 3)
     a, b, c = triangles.T
-    triangles = np.unique(triangles[(a != b) & (b != c) & (a != c)], axis=0)
-    return (sums / count[:, None]).astype(np.float32), triangles.astype(np.uint32)
+    triangles = triangles[(a != b) & (b != c) & (a != c)]
+    _, first = np.unique(_keys(triangles), return_index=True)
+    used, triangles = np.unique(triangles[first], return_inverse=True)
+    vertices = (sums[used] / count[used, None]).astype(np.float32)
+    return vertices, triangles.reshape(-1, 3).astype(np.uint32)
 
 
-def _normals(
-    vertices: NDArray[np.float32], triangles: NDArray[np.uint32]
-) -> NDArray[np.float32]:
+def _keys(rows: NDArray[np.integer]) -> NDArray[np.int64]:
+    """(n, 3) integers -> (n,), one number per distinct row."""
+    shifted = rows.astype(np.int64) - rows.min(axis=0)
+    spans = shifted.max(axis=0) + 1
+    keys: NDArray[np.int64] = (shifted[:, 0] * spans[1] + shifted[:, 1]) * spans[2] + shifted[:, 2]
+    return keys
+
+
+def _normals(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> NDArray[np.float32]:
     """(V, 3) mean normal of the triangles at each vertex, weighted by their area."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     faces = np.cross(b - a, c - a)

@@ -103,7 +103,7 @@ def _robot_messages(tick: Tick) -> dict[Topic, bytes]:
     velocity = tick.state[STATE_SLICES["joint_velocity"]]
     messages = {
         Topic.JOINTS: ros2.joint_state(tick.time_ns, JOINT_NAMES, position, velocity),
-        Topic.STATE: ros2.multi_array(tick.state, [",".join(STATE_NAMES)]),
+        Topic.STATE: ros2.multi_array(tick.state, [_STATES]),
         Topic.ACTION: ros2.multi_array(tick.action_sent, [_ACTIONS]),
         Topic.ACTION_PLANNED: ros2.multi_array(tick.action_planned, [_ACTIONS]),
     }
@@ -115,6 +115,7 @@ def _robot_messages(tick: Tick) -> dict[Topic, bytes]:
 
 
 _ACTIONS: Final = ",".join(ACTION_NAMES)
+_STATES: Final = ",".join(STATE_NAMES)
 
 
 def _plan_messages(tick: Tick) -> dict[Topic, bytes]:

@@ -7,6 +7,7 @@ the time of the tick in nanoseconds and returns CDR bytes.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Final
 
 import numpy as np
@@ -63,6 +64,9 @@ _PARTS: Final = {
 }
 
 _FLOAT32: Final = 7  # sensor_msgs/PointField.FLOAT32
+_ENCAPSULATION_BYTES: Final = 4
+_STAMP_BYTES: Final = 8
+_POSE_BYTES: Final = 7 * 8
 _INFO: Final = 20  # rcl_interfaces/Log.INFO
 
 
@@ -112,11 +116,24 @@ def transforms(
     time_ns: int, names: Sequence[str], positions: ArrayLike, quaternions: ArrayLike
 ) -> bytes:
     """``tf2_msgs/TFMessage`` of frames in ``world``: (n, 3) m and (n, 4) wxyz."""
-    poses = _pose_rows(positions, quaternions)
+    stamp = _stamp(Cdr(), time_ns).done()[_ENCAPSULATION_BYTES:]
     cdr = Cdr().u32(len(names))
-    for name, pose in zip(names, poses, strict=True):
-        _stamp(cdr, time_ns).string("world").string(name).f64(pose)
+    poses = _pose_rows(positions, quaternions).astype("<f8", copy=False)
+    for between, pose in zip(_frame_names(tuple(names)), poses, strict=True):
+        cdr.raw(stamp).raw(between).raw(pose.tobytes())
     return cdr.done()
+
+
+@lru_cache(maxsize=16)
+def _frame_names(names: tuple[str, ...]) -> tuple[bytes, ...]:
+    """What stands between stamp and pose of each transform: frame names and padding."""
+    cdr = Cdr().u32(len(names))
+    parts = []
+    for name in names:
+        start = len(cdr.raw(bytes(_STAMP_BYTES)).done())
+        cdr.string("world").string(name).f64(np.zeros(7))
+        parts.append(cdr.done()[start:-_POSE_BYTES])
+    return tuple(parts)
 
 
 def pose_stamped(time_ns: int, position: ArrayLike, quaternion: ArrayLike) -> bytes:

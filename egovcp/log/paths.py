@@ -1,0 +1,22 @@
+"""Entity paths of the Rerun log."""
+
+from __future__ import annotations
+
+from typing import Final
+
+WORLD: Final = "/world"
+ROBOT: Final = "/world/robot"  # one entity per link beneath
+SKELETON: Final = "/world/skeleton"
+SCENE: Final = "/world/scene"  # one entity per object beneath
+CAMERA: Final = "/world/camera"
+DEPTH: Final = "/world/camera/depth"
+HAND_TARGETS: Final = "/world/hand_targets"
+CANDIDATES: Final = "/world/candidates"
+BEST: Final = "/world/plan"
+RECONSTRUCTED: Final = "/depth/reconstructed"
+IMAGINED: Final = "/depth/imagined"  # one entity per horizon beneath
+PLAN: Final = "/plan"
+REWARD: Final = "/reward"
+TIMING: Final = "/timing"
+EVENTS: Final = "/events"
+INFO: Final = "/info"

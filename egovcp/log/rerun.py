@@ -1,0 +1,167 @@
+"""A Rerun recording of a run: 3D robot and scene, depth seen and imagined, plans, curves.
+
+Ticks are sent in batches of columns: a batch costs about as many calls as one tick would.
+What must survive a killed process goes to the MCAP file; here up to a batch may be lost.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import rerun as rr
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.log import paths
+from egovcp.log.blueprint import blueprint
+from egovcp.log.colour import BALL, LEFT, OBSTACLE, RIGHT
+from egovcp.log.info import CameraView, RunInfo
+from egovcp.log.meshes import link_meshes
+from egovcp.log.pose import robot_poses
+from egovcp.log.rerun_columns import Frame, all_columns, skeleton_columns
+from egovcp.log.tick import SceneObject, Tick
+from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_ROWS
+
+BATCH_TICKS: Final = 25  # one second
+_NS: Final = "ns"
+
+
+class RerunSink:
+    """Writes ticks to the Rerun file ``path``.
+
+    Args:
+        path: the ``.rrd`` to create; raises `EnvironmentFailure` when it exists.
+        imagined: horizons of the imagined depth to show, planner ticks ahead.
+        meshes: draw the links' surfaces where the model is installed, else a skeleton.
+    """
+
+    def __init__(
+        self, path: Path, imagined: tuple[int, ...] = (4, 8, 16), meshes: bool = True
+    ) -> None:
+        self._path = path
+        self._imagined = imagined
+        self._meshes = link_meshes() if meshes else {}
+        self._batch: list[Tick] = []
+        self._known: set[str] = set()
+        self._stream: rr.RecordingStream | None = None
+
+    def open(self, info: RunInfo) -> None:
+        """Create the file and log all that does not change."""
+        if self._path.exists():
+            raise EnvironmentFailure(
+                f"{self._path} exists already; recordings are never overwritten: choose another"
+            )
+        self._view = info.camera
+        name = f"{info.task} seed {info.seed} episode {info.episode}"
+        stream = rr.RecordingStream("egovcp", recording_id=name)
+        stream.save(self._path, default_blueprint=blueprint(self._imagined))
+        stream.send_recording_name(name)
+        self._stream = stream
+        _log_static(stream, info, self._imagined)
+        for link, mesh in self._meshes.items():
+            surface = rr.Mesh3D(
+                vertex_positions=mesh.vertices,
+                triangle_indices=mesh.triangles,
+                vertex_normals=mesh.normals,
+                vertex_colors=mesh.colours,
+            )
+            stream.log(f"{paths.ROBOT}/{link}", surface, static=True)
+
+    def write(self, tick: Tick) -> None:
+        """Take the tick; a full batch goes to the file."""
+        self._batch.append(tick)
+        if len(self._batch) >= BATCH_TICKS:
+            self._send()
+
+    def close(self) -> None:
+        """Send what is left and finish the file."""
+        if self._stream is None:
+            return
+        if self._batch:
+            self._send()
+        self._stream.flush()
+        self._stream.disconnect()
+        self._stream = None
+
+    def _send(self) -> None:
+        assert self._stream is not None, "open the sink before writing to it"
+        poses = robot_poses(self._batch)
+        frames = [Frame(*pair) for pair in zip(self._batch, poses, strict=True)]
+        self._log_new_objects()
+        groups = [*all_columns(frames, self._view, self._imagined)]
+        if not self._meshes:
+            groups.append(skeleton_columns(frames))
+        for path, ticks, columns in groups:
+            if ticks:
+                self._stream.send_columns(path, _times(ticks), columns)
+        self._batch.clear()
+
+    def _log_new_objects(self) -> None:
+        assert self._stream is not None, "open the sink before writing to it"
+        for tick in self._batch:
+            for thing in tick.scene:
+                if thing.name not in self._known:
+                    self._known.add(thing.name)
+                    path = f"{paths.SCENE}/{thing.name}"
+                    self._stream.log(path, _shape(thing), static=True)
+
+
+def _times(ticks: Sequence[Tick]) -> list[rr.TimeColumn]:
+    durations = np.array([tick.time_ns for tick in ticks], f"timedelta64[{_NS}]")
+    return [
+        rr.TimeColumn("tick", sequence=[tick.index for tick in ticks]),
+        rr.TimeColumn("time", duration=durations),
+    ]
+
+
+def _shape(thing: SceneObject) -> rr.Boxes3D | rr.Ellipsoids3D:
+    if thing.shape == "sphere":
+        return rr.Ellipsoids3D(half_sizes=[thing.size], colors=[BALL], fill_mode="solid")
+    return rr.Boxes3D(half_sizes=[thing.size], colors=[OBSTACLE], fill_mode="solid")
+
+
+def _log_static(stream: rr.RecordingStream, info: RunInfo, imagined: tuple[int, ...]) -> None:
+    stream.log(paths.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    stream.log(paths.CAMERA, _pinhole(info.camera), static=True)
+    pictures = [paths.DEPTH, paths.RECONSTRUCTED]
+    pictures += [f"{paths.IMAGINED}/{i}" for i in range(len(imagined))]
+    for path in pictures:
+        stream.log(path, _depth_style(), static=True)
+    hands = rr.Points3D.from_fields(colors=[LEFT, RIGHT], radii=[0.03], show_labels=False)
+    stream.log(paths.HAND_TARGETS, hands, static=True)
+    stream.log(paths.CANDIDATES, rr.LineStrips3D.from_fields(radii=[0.003]), static=True)
+    best = rr.LineStrips3D.from_fields(colors=[LEFT, RIGHT], radii=[0.008])
+    stream.log(paths.BEST, best, static=True)
+    text = json.dumps(asdict(info), indent=2, sort_keys=True)
+    document = rr.TextDocument(f"```json\n{text}\n```", media_type="text/markdown")
+    stream.log(paths.INFO, document, static=True)
+
+
+def _pinhole(view: CameraView) -> rr.Pinhole:
+    return rr.Pinhole(
+        focal_length=view.focal_px,
+        principal_point=view.centre_px,
+        width=DEPTH_COLS,
+        height=DEPTH_ROWS,
+        camera_xyz=rr.ViewCoordinates.RDF,
+        image_plane_distance=0.15,
+    )
+
+
+def _depth_style() -> rr.DepthImage:
+    """What all depth pictures share: size, millimetres, one colour scale for all."""
+    return rr.DepthImage.from_fields(
+        format=rr.components.ImageFormat(
+            width=DEPTH_COLS,
+            height=DEPTH_ROWS,
+            channel_datatype=rr.ChannelDatatype.U16,
+            color_model=rr.ColorModel.L,
+        ),
+        meter=1000.0,
+        colormap=rr.components.Colormap.Turbo,
+        depth_range=[0.0, DEPTH_MAX_M * 1000.0],
+    )

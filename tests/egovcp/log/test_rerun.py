@@ -1,0 +1,92 @@
+"""A Rerun recording loads in Rerun itself and holds what the ticks held."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.experimental import RrdReader
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.log import paths
+from egovcp.log.info import RunInfo
+from egovcp.log.rerun import BATCH_TICKS, RerunSink
+from egovcp.log.tick import Tick
+from egovcp.robot.kinematics import LINK_NAMES
+
+INFO = RunInfo(task="ball", seed=1, episode=2)
+
+
+def record(path: Path, ticks: Sequence[Tick], **options: Any) -> Any:
+    sink = RerunSink(path, **options)
+    sink.open(INFO)
+    for tick in ticks:
+        sink.write(tick)
+    sink.close()
+    return RrdReader(path).store()
+
+
+def column(store: Any, path: str, component: str) -> list[Any]:
+    """Values of one component over time, in the order of the ticks."""
+    rows: list[tuple[int, Any]] = []
+    for chunk in store.stream().to_chunks():
+        if chunk.entity_path != path or chunk.is_static:
+            continue
+        batch = chunk.to_record_batch()
+        if component in batch.schema.names:
+            ticks = batch.column("tick").to_pylist()
+            rows += zip(ticks, batch.column(component).to_pylist(), strict=True)
+    return [value for _, value in sorted(rows)]
+
+
+def entities(store: Any) -> set[str]:
+    return set(store.schema().entity_paths())
+
+
+def test_every_part_of_a_tick_has_its_entity(tmp_path: Path, make_tick: Any) -> None:
+    ticks = [make_tick(i) for i in range(3)]
+    found = entities(record(tmp_path / "a.rrd", ticks, imagined=(1, 5)))
+    fixed = [paths.DEPTH, paths.RECONSTRUCTED, paths.CAMERA, paths.CANDIDATES, paths.BEST]
+    named = [f"{paths.ROBOT}/{link}" for link in LINK_NAMES]
+    named += [f"{paths.IMAGINED}/{i}" for i in range(2)] + [f"{paths.SCENE}/ball"]
+    named += ["/plan/value", "/plan/termination", "/reward/block", "/timing/plan", "/events"]
+    assert set(fixed + named) <= found
+
+
+@pytest.mark.parametrize("count", [1, BATCH_TICKS, BATCH_TICKS + 1])
+def test_no_tick_is_lost_at_the_edge_of_a_batch(tmp_path: Path, make_tick: Any, count: int) -> None:
+    ticks = [make_tick(i) for i in range(count)]
+    store = record(tmp_path / "a.rrd", ticks, meshes=False)
+    rewards = column(store, "/reward/total", "Scalars:scalars")
+    np.testing.assert_allclose(np.ravel(rewards), [tick.reward for tick in ticks])
+
+
+def test_depth_is_logged_bit_for_bit(tmp_path: Path, make_tick: Any) -> None:
+    ticks = [make_tick(i) for i in range(2)]
+    store = record(tmp_path / "a.rrd", ticks, meshes=False)
+    for tick, blob in zip(ticks, column(store, paths.DEPTH, "DepthImage:buffer"), strict=True):
+        image = np.asarray(blob[0], np.uint8).view(np.uint16).reshape(48, 64)
+        np.testing.assert_array_equal(image, tick.depth)
+
+
+def test_parts_that_a_tick_lacks_are_left_out(tmp_path: Path, make_tick: Any) -> None:
+    found = entities(record(tmp_path / "a.rrd", [make_tick(0, bare=True)], meshes=False))
+    assert paths.DEPTH in found
+    assert not any(path.startswith((paths.SCENE, paths.PLAN)) for path in found)
+
+
+def test_without_meshes_the_robot_is_a_skeleton(tmp_path: Path, make_tick: Any) -> None:
+    store = record(tmp_path / "a.rrd", [make_tick(0)], meshes=False)
+    (strips,) = column(store, paths.SKELETON, "LineStrips3D:strips")
+    assert len(strips) == len(LINK_NAMES) - 1 + 2
+
+
+def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
+    path = tmp_path / "a.rrd"
+    path.write_bytes(b"precious")
+    with pytest.raises(EnvironmentFailure, match="exists already"):
+        RerunSink(path, meshes=False).open(INFO)
+    assert path.read_bytes() == b"precious"
