@@ -19,7 +19,7 @@ from egovcp.data.source import local_root
 from egovcp.robot.stance import StanceController
 from egovcp_collect.config import CollectConfig
 from egovcp_collect.progress import Progress
-from egovcp_collect.workers import Shared, make_shared, run_groups
+from egovcp_collect.workers import Shared, SimulationFailed, make_shared, run_groups
 
 PROG = "egovcp-collect"
 _PACKAGES = ("egovcp", "mujoco", "mjlab", "numpy", "lerobot")
@@ -77,8 +77,8 @@ def _write_all(
         while True:
             try:
                 group = next(groups, None)
-            except Exception as error:  # whatever ended the simulation, keep what is finished
-                return error
+            except SimulationFailed as failed:
+                return failed.__cause__
             if group is None:
                 break
             for episode in group:

@@ -36,6 +36,10 @@ class Shared:
     """Not zero: stop at the next tick."""
 
 
+class SimulationFailed(Exception):
+    """The simulation ended early; the cause says why. What was yielded before is good."""
+
+
 def make_shared() -> Shared:
     """Counters in shared memory, for processes that are spawned."""
     context = multiprocessing.get_context("spawn")
@@ -55,7 +59,7 @@ def run_groups(
         on_wait: called several times per second while nothing is ready.
 
     Raises:
-        EnvironmentFailure: a worker was killed.
+        SimulationFailed: a worker raised an error or was killed.
     """
     context = multiprocessing.get_context("spawn")
     executor = ProcessPoolExecutor(
@@ -77,10 +81,7 @@ def run_groups(
                 break
             yield episodes
     except BrokenProcessPool as error:
-        if not shared.stop.value:
-            raise EnvironmentFailure(
-                "a worker process was killed (out of memory?); try fewer --num_workers"
-            ) from error
+        raise SimulationFailed from _killed(error)
     finally:
         shared.stop.value = 1
         executor.shutdown(wait=True, cancel_futures=True)
@@ -94,7 +95,19 @@ def _result(
         on_wait()
         if shared.stop.value:
             return None
+    error = future.exception()
+    if error is not None:
+        raise SimulationFailed from _killed(error)
     return future.result()
+
+
+def _killed(error: BaseException) -> BaseException:
+    """What to tell the user of a process that is gone; any other error as it is."""
+    if not isinstance(error, BrokenProcessPool):
+        return error
+    return EnvironmentFailure(
+        "a worker process was killed (out of memory?); try fewer --num_workers"
+    )
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 from typing import Any, Self
 
 import numpy as np
@@ -78,16 +79,12 @@ class EpisodeStore:
             UsageError: there is no such split.
         """
         require_mixable(readers)
-        chosen = [
-            (reader, index)
-            for reader in readers
-            for index in range(len(reader))
-            if in_split(reader.identity(index), split, heldout_fraction)
-        ]
+        episodes = [(reader, index) for reader in readers for index in range(len(reader))]
+        identities = [reader.identity(index) for reader, index in episodes]
+        chosen = list(compress(episodes, in_split(identities, split, heldout_fraction)))
         if not chosen:
-            total = sum(len(reader) for reader in readers)
             raise DataError(
-                f"none of the {total} episodes falls into split {split!r}; collect more"
+                f"none of the {len(episodes)} episodes falls into split {split!r}; collect more"
             )
         length = np.array([reader.lengths[index] for reader, index in chosen], dtype=np.int64)
         arrays = _allocate(int(length.sum()))

@@ -49,6 +49,13 @@ def require_new(root: Path) -> None:
         )
 
 
+def _make_parent(root: Path) -> None:
+    try:
+        root.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise UsageError(f"output folder {root} would lie below a file; choose another") from error
+
+
 class DatasetWriter:
     """Adds episodes one by one; ``finalize`` makes the dataset appear at ``root``.
 
@@ -61,7 +68,7 @@ class DatasetWriter:
         """Create the temporary folder.
 
         Raises:
-            UsageError: ``root`` exists.
+            UsageError: ``root`` exists, or cannot exist.
         """
         self.root = Path(root).absolute()
         require_new(self.root)
@@ -71,7 +78,7 @@ class DatasetWriter:
         self._max_file_bytes = max_file_bytes
         self._tasks: dict[str, int] = {}
         self._metadata: list[dict[str, Any]] = []
-        self.root.parent.mkdir(parents=True, exist_ok=True)
+        _make_parent(self.root)
         self._folder = self.root.with_name(f".{self.root.name}.{secrets.token_hex(4)}.partial")
         self._folder.mkdir()
         self._data = RollingParquet(self._folder, schema.DATA_PATH, dictionary=False)

@@ -16,6 +16,7 @@ from egovcp.data import (
     StreamConfig,
 )
 from egovcp.data.mirror import mirror_action, mirror_state
+from egovcp.data.split import in_split
 from egovcp.data.stream import event_rows
 from egovcp.errors import DataError, UsageError
 
@@ -143,11 +144,21 @@ def test_the_splits_part_the_episodes(reader: DatasetReader) -> None:
 
 
 def test_the_held_out_share_is_near_its_fraction_and_ignores_order() -> None:
-    from egovcp.data.split import is_heldout
+    names = [f"ball/0/{i}" for i in range(20_000)]
+    heldout = in_split(names, "heldout")
+    assert 850 < sum(heldout) < 1150
+    assert in_split(names[::-1], "heldout") == heldout[::-1]
+    assert in_split(names[:10_000], "heldout") == heldout[:10_000]
+    assert in_split(names, "train") == [not h for h in heldout]
 
-    chosen = [i for i in range(20_000) if is_heldout(f"ball/0/{i}")]
-    assert 850 < len(chosen) < 1150
-    assert [i for i in reversed(range(20_000)) if is_heldout(f"ball/0/{i}")] == chosen[::-1]
+
+@pytest.mark.parametrize("count", [2, 3, 10])
+def test_a_small_dataset_has_both_training_and_held_out_episodes(count: int) -> None:
+    names = [f"ball/3/{i}" for i in range(count)]
+    heldout, train = in_split(names, "heldout"), in_split(names, "train")
+    assert any(heldout)
+    assert any(train)
+    assert [not h for h in heldout] == train
 
 
 def test_datasets_of_different_controllers_do_not_mix(

@@ -1,0 +1,195 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egovcp import spec
+from egovcp.data import DatasetConfig, DatasetReader
+from egovcp_collect.collect import main
+from egovcp_collect.config import CollectConfig, MixConfig
+
+_SHORT = ["--env.ball_episode.ticks=6", "--env.ball_episode.event_ticks=[0,1]"]
+
+
+def _collect(root: Path, *flags: str) -> int:
+    return main([f"--dataset.root={root}", "--dataset.repo_id=me/ball", *_SHORT, *flags])
+
+
+def _data(root: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in (root / "data").rglob("*.parquet")}
+
+
+@pytest.fixture(scope="module")
+def collected(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("collect") / "ball"
+    assert _collect(root, "--episodes=4", "--num_envs=2", "--num_workers=2", "--seed=3") == 0
+    return root
+
+
+def test_a_collection_is_a_valid_dataset(collected: Path) -> None:
+    reader = DatasetReader.open(DatasetConfig(root=str(collected)))
+    assert reader.lengths.tolist() == [6] * 4
+    assert reader.controller_id
+    for index in range(4):
+        episode = reader.read(index)
+        assert (episode.task, episode.time_limit) == ("ball", 6)
+        assert episode.metadata["seed"] == 3
+        assert episode.metadata["episode"] == index
+        sums = [term["sum"] for term in episode.metadata["reward_terms"].values()]
+        assert sum(sums) == pytest.approx(episode.reward.sum(), abs=1e-5)
+
+
+def test_a_row_holds_the_observation_before_its_action(collected: Path) -> None:
+    reader = DatasetReader.open(DatasetConfig(root=str(collected)))
+    for index in range(4):
+        episode = reader.read(index)
+        command = episode.state[:, spec.COMMAND_SLICE][:, 3:]
+        sent = np.concatenate([np.zeros((1, spec.ACTION_DIM)), episode.action[:-1]])
+        np.testing.assert_allclose(command, spec.ACTION_BOX.to_metric(sent), atol=1e-5)
+        steps = np.diff(episode.action, axis=0, prepend=0)
+        assert np.abs(steps).max() <= spec.ACTION_ETA + 1e-6
+        assert np.abs(steps).max() > 0.5 * spec.ACTION_ETA
+
+
+def test_the_command_and_its_configuration_are_recorded(collected: Path) -> None:
+    recorded = json.loads((collected / "meta/collection.json").read_text())
+    assert recorded["seed"] == 3
+    assert recorded["command"].startswith("egovcp-collect ")
+    assert recorded["config"]["eta"] == 0.32
+    assert recorded["config"]["env"]["ball_episode"]["ticks"] == 6
+    assert recorded["versions"]["mujoco"]
+
+
+def test_the_data_do_not_depend_on_how_the_work_is_shared(collected: Path, tmp_path: Path) -> None:
+    assert _collect(tmp_path / "one", "--episodes=4", "--num_envs=3", "--num_workers=1",
+                    "--seed=3") == 0  # fmt: skip
+    assert _data(tmp_path / "one") == _data(collected)
+
+
+def test_the_last_line_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert _collect(tmp_path / "new", "--episodes=2", "--num_envs=2", "--num_workers=1") == 0
+    last = capsys.readouterr().out.strip().splitlines()[-1]
+    assert last.startswith("2 episodes, 12 steps, ")
+    assert last.endswith(" steps/s")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (["--task=bal"], "did you mean 'ball'"),
+        (["--episodes=0"], "--episodes=0: expected at least 1"),
+        (["--num_workers=-1"], "expected at least 0"),
+        (["--seed=-1"], "expected at least 0"),
+        (["--eta=0.5"], "rate limit"),
+        (["--boundary=bounce"], "bounce"),
+        (["--task=all", "--mix.ball=0", "--mix.wall=0", "--mix.arch=0"], "weights"),
+        (["--episode=3"], "did you mean '--episodes'"),
+        (["--dataset.revision=main"], "no meaning for a new dataset"),
+    ],
+)
+def test_bad_options_end_with_one_line_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], message: str
+) -> None:
+    assert _collect(tmp_path / "new", *flags) == 2
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert len(captured.err.strip().splitlines()) == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_existing_folder_is_refused(collected: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = _data(collected)
+    assert _collect(collected, "--episodes=1") == 2
+    assert "exists already" in capsys.readouterr().err
+    assert _data(collected) == before
+
+
+def test_a_place_that_cannot_be_written_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("mine")
+    assert _collect(tmp_path / "file" / "new", "--episodes=1") == 2
+    assert "below a file" in capsys.readouterr().err
+
+
+def test_no_destination_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--episodes=1"]) == 2
+    assert "--dataset.repo_id" in capsys.readouterr().err
+
+
+@pytest.fixture
+def endless(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A long collection into ``cut``, in a process group of its own, that has written data."""
+    command = [sys.executable, "-m", "egovcp_collect.collect", f"--dataset.root={tmp_path / 'cut'}",
+               *_SHORT, "--episodes=100000", "--num_envs=1", "--num_workers=1"]  # fmt: skip
+    process = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    _wait_for_data(tmp_path)
+    yield process
+    process.kill()
+    process.wait()
+
+
+def _wait_for_data(folder: Path) -> None:
+    """Until some episodes have been written."""
+    deadline = time.monotonic() + 60
+    while time.monotonic() < deadline:
+        if any(p.stat().st_size > 100_000 for p in folder.rglob("data/**/*.parquet")):
+            return
+        time.sleep(0.05)
+    raise TimeoutError("no episode within a minute")
+
+
+def _require_prefix(folder: Path, last_line: str) -> None:
+    """The dataset holds the first episodes, as many as the last line says, and nothing lies
+    beside it."""
+    reader = DatasetReader.open(DatasetConfig(root=str(folder / "cut")))
+    assert last_line.startswith(f"{len(reader)} episodes, ")
+    assert [reader.read(i).metadata["episode"] for i in range(len(reader))] == [*range(len(reader))]
+    assert [p.name for p in folder.iterdir()] == ["cut"]
+
+
+def test_an_interrupt_keeps_the_finished_episodes(
+    endless: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    os.killpg(endless.pid, signal.SIGINT)  # as a terminal does: the workers get it, too
+    out, err = endless.communicate(timeout=30)
+    assert endless.returncode == 130, err
+    assert "Traceback" not in err
+    _require_prefix(tmp_path, out.strip().splitlines()[-1])
+
+
+def test_a_killed_worker_ends_the_run_but_not_its_episodes(
+    endless: subprocess.Popen[str], tmp_path: Path
+) -> None:
+    children = Path(f"/proc/{endless.pid}/task/{endless.pid}/children").read_text().split()
+    worker = next(c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes())
+    os.kill(int(worker), signal.SIGKILL)
+    out, err = endless.communicate(timeout=30)
+    assert endless.returncode == 5, err
+    assert "a worker process was killed" in err.strip().splitlines()[-1]
+    _require_prefix(tmp_path, out.strip().splitlines()[-1])
+
+
+@pytest.mark.parametrize("mix", [MixConfig(), MixConfig(3, 1, 0), MixConfig(0.2, 0.5, 0.3)])
+def test_every_prefix_holds_the_tasks_in_their_shares(mix: MixConfig) -> None:
+    tasks = [s.task for s in CollectConfig(task="all", mix=mix, episodes=300).scenarios()]
+    weights = np.array([mix.ball, mix.wall, mix.arch])
+    for length in range(1, 301):
+        counts = np.array([tasks[:length].count(task) for task in spec.TASKS])
+        assert np.abs(counts - length * weights / weights.sum()).max() < 1.5
+
+
+def test_groups_cover_all_episodes_in_order() -> None:
+    config = CollectConfig(episodes=35, num_envs=16, num_workers=8)
+    groups = config.groups()
+    assert [s.episode for group in groups for s in group] == list(range(35))
+    assert config.workers == len(groups) == 3
