@@ -20,6 +20,8 @@ from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
 from egovcp.data.store import EpisodeStore
 from egovcp.errors import DataError, UsageError
 
+_EVENT_SHARE = 0.1  # of the farthest reward, below which a row is no event
+
 type Batch = dict[str, NDArray[Any]]
 
 
@@ -36,7 +38,7 @@ class StreamConfig:
     event_fraction: float = 0.0
     """Share of windows placed around an event, which a uniform choice would rarely meet."""
     event_quantile: float = 0.98
-    """A row is an event if its reward is farther from the task's median than this quantile."""
+    """At most the rows beyond this quantile of the reward's distance from its median count."""
     mirror: bool = True
     """Reflect half of the windows left to right."""
     seed: int = 0
@@ -138,14 +140,18 @@ class SequenceStream:
 def event_rows(store: EpisodeStore, quantile: float) -> NDArray[np.int64]:
     """Rows with an exceptional reward for their task, and rows that end in failure.
 
-    Judged by the reward column alone: no simulator truth, no knowledge of the tasks.
+    Judged by the reward column alone: no simulator truth, no knowledge of the tasks. A
+    reward is exceptional if it is farther from the task's median than ``quantile`` of all
+    rows and than a tenth of the farthest: a dense cost, such as that of the pose, has its
+    outliers too, but they are no events beside a contact or a fall.
     """
     task_of = np.repeat(np.array(store.tasks), store.length)
     events = store.terminal_next.copy()
     for task in set(store.tasks):
         rows = np.flatnonzero(task_of == task)
         distance = np.abs(store.reward[rows] - np.median(store.reward[rows]))
-        events[rows[distance > np.quantile(distance, quantile)]] = True
+        bound = max(np.quantile(distance, quantile), _EVENT_SHARE * distance.max())
+        events[rows[distance > bound]] = True
     return np.flatnonzero(events)
 
 
