@@ -124,10 +124,10 @@ def test_event_windows_hold_an_event(store: EpisodeStore) -> None:
 
 def test_the_outliers_of_a_dense_cost_are_no_events(store: EpisodeStore) -> None:
     reward = -0.01 * np.random.default_rng(0).random(store.num_frames).astype(np.float32)
-    reward[[5, 40]] = [1.0, -1.0]
+    reward[[5, 15]] = [1.0, -1.0]  # one in either task
     calm = np.zeros_like(store.terminal_next)
     found = event_rows(replace(store, reward=reward, terminal_next=calm), 0.5)
-    assert found.tolist() == [5, 40]
+    assert found.tolist() == [5, 15]
 
 
 def test_mirrored_windows_are_reflections(store: EpisodeStore) -> None:
