@@ -142,10 +142,13 @@ class ActionBox:
 
 
 #: Hand targets (palm sites) in the pelvis heading frame, then pelvis height above ground.
+#: Neutral: arms hanging with slightly bent elbows, beside the hips. Shoulders are at
+#: (0, +-0.15, 0.29) and a straight arm is 0.465 m, so x = 0.55 lies beyond reach: the arm
+#: then stretches fully and can push. z = 0.50 is the head's height, z = -0.20 the thighs'.
 ACTION_BOX: Final = ActionBox(
-    low=(0.05, -0.05, -0.15, 0.05, -0.40, -0.15, 0.52),
-    neutral=(0.18, 0.20, 0.00, 0.18, -0.20, 0.00, 0.74),
-    high=(0.55, 0.40, 0.50, 0.55, 0.05, 0.50, 0.76),
+    low=(0.00, -0.08, -0.20, 0.00, -0.42, -0.20, 0.52),
+    neutral=(0.12, 0.24, -0.10, 0.12, -0.24, -0.10, 0.74),
+    high=(0.55, 0.42, 0.50, 0.55, 0.08, 0.50, 0.76),
 )
 
 # --- LeRobot feature names ---------------------------------------------------------
