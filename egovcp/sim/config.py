@@ -68,6 +68,8 @@ class WallConfig:
     """Wall surface before the pelvis, m."""
     yaw_range: Range = (-0.10, 0.10)
     """Turn of the wall about the vertical, rad; 0 faces the robot squarely."""
+    friction_range: Range = (0.6, 1.0)
+    """Sliding friction of the wall."""
     push_speed_range: Range = (0.40, 0.70)
     """Change of base velocity by a push towards the wall, m/s."""
     push_bearing_range: Range = (-0.20, 0.20)
@@ -78,20 +80,21 @@ class WallConfig:
     """Change of base velocity by a push away from the wall, m/s; the stance survives it."""
     push_time: float = 0.02
     """Time over which a push acts, s."""
-    disturbed_time: float = 2.0
-    """Time after a push in which bracing is rewarded, s."""
-    brace_reward: float = 0.05
+    disturbed_time: float = 6.0
+    """Time after a push in which bracing is rewarded, s; the stance cannot step back from a
+    wall that it leans on, so by default this is the rest of the episode."""
+    brace_reward: float = 0.03
     """Per tick upright with a hand on the wall while disturbed."""
     upright_reward: float = 0.02
     """Per tick upright while disturbed."""
-    contact_cost: float = 0.2
-    """Per tick with torso, head or leg on the wall."""
+    contact_cost: float = 0.1
+    """Per tick with anything but a hand on the wall."""
     impact_cost: float = 0.05
     """Per tick, times the peak hand force over ``impact_force``, at most 1 per tick."""
     impact_force: float = 300.0
     """Hand force that costs ``impact_cost`` in full, N."""
-    pose_cost: float = 0.01
-    """Per tick, times the mean squared action."""
+    pose_cost: float = 0.03
+    """Per tick, times the mean squared action; makes a permanent guard expensive."""
     fall_cost: float = 1.0
     """Once, at a fall."""
 

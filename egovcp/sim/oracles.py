@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +21,14 @@ Array = NDArray[np.float64]
 
 _GRAVITY: Final = np.array([0.0, 0.0, -9.81])
 _LOOKAHEAD: Final = np.arange(0.0, 1.2, 0.01)  # s
+
+
+class TaskOracle(Protocol):
+    """The solution of one task."""
+
+    def act(self, truth: Truth, row: int) -> Array:
+        """(7,) the action for one row."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -57,11 +65,40 @@ class BallOracle:
         return out
 
 
+@dataclass(frozen=True)
+class WallOracleConfig:
+    """How the wall oracle braces, m, heading frame."""
+
+    press: float = 0.10
+    """How far beyond the wall's surface the hands aim, so that they push."""
+    lateral: float = 0.20
+    """Hands left and right of the middle."""
+    height: float = 0.10
+    """Hands above the pelvis."""
+
+
+class WallOracle:
+    """From a push towards the wall onwards, presses both hands on the wall."""
+
+    def __init__(self, config: WallOracleConfig = WallOracleConfig()) -> None:
+        self._config = config
+
+    def act(self, truth: Truth, row: int) -> Array:
+        """(7,) the action for one row."""
+        if not truth.object_active[row]:
+            return np.zeros(7)
+        c = self._config
+        ahead = truth.object_b[row, 0] + c.press
+        left, right = (ahead, c.lateral, c.height), (ahead, -c.lateral, c.height)
+        target = np.array([*left, *right, ACTION_BOX.neutral[-1]])
+        return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
+
+
 class Oracle:
     """The scripted solution of each row's task."""
 
     def __init__(self) -> None:
-        self._by_task = {"ball": BallOracle()}
+        self._by_task: dict[str, TaskOracle] = {"ball": BallOracle(), "wall": WallOracle()}
 
     def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
         """Nothing to forget."""

@@ -135,6 +135,7 @@ def _add_wall(spec: mujoco.MjSpec) -> None:
         pos=[WALL_HALF_SIZE[0], 0, WALL_HALF_SIZE[2]],
         contype=1,
         conaffinity=0,
+        priority=1,
     )
 
 

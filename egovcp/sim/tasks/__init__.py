@@ -9,8 +9,9 @@ from egovcp.sim.robot import SimulatedRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.ball import BallTask
 from egovcp.sim.tasks.base import Task
+from egovcp.sim.tasks.wall import WallTask
 
-_TASKS: Final[dict[str, type[Task]]] = {"ball": BallTask}
+_TASKS: Final[dict[str, type[Task]]] = {"ball": BallTask, "wall": WallTask}
 
 
 def make_task(config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> Task:

@@ -1,0 +1,108 @@
+"""Brace against the wall: pushed at a wall, stay up and touch it with the hands only."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, Final
+
+import numpy as np
+
+from egovcp.sim.config import EnvConfig
+from egovcp.sim.robot import SimulatedRobot, Touch
+from egovcp.sim.scenario import Scenario
+from egovcp.sim.scene import HANDS, PARTS, WALL, WALL_HALF_SIZE
+from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
+from egovcp.spec import PHYSICS_DT
+
+_HANDS: Final = list(HANDS)
+_OTHERS: Final = [part for part in range(len(PARTS)) if part not in HANDS]
+_BRACE_FORCE: Final = 5.0  # N, a hand that presses less only brushes the wall
+
+
+class WallTask(Task):
+    """One push, towards the wall or (sometimes) away from it, at the event."""
+
+    terms: ClassVar = ("brace", "upright", "contact", "impact", "pose", "fall")
+
+    def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
+        super().__init__(config, scenario, robot)
+        self.config = config.wall
+        rng = scenario.rng("geometry")
+        c = self.config
+        self.distance = float(rng.uniform(*c.distance_range))
+        self._yaw = float(rng.uniform(*c.yaw_range))
+        self._friction = float(rng.uniform(*c.friction_range))
+        push = scenario.rng("push")
+        self.away = bool(push.random() < c.away_probability)
+        self._bearing = float(push.uniform(*c.push_bearing_range)) + math.pi * self.away
+        speed = c.away_speed_range if self.away else c.push_speed_range
+        self.push_speed = float(push.uniform(*speed))
+        self._touched_otherwise = False
+        robot.model.geom_friction[robot.index.is_object, 0] = self._friction
+
+    def place(self) -> None:
+        """Stand the wall before the pelvis."""
+        pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
+        self._surface = pelvis + heading @ np.array([self.distance, 0.0, 0.0])
+        self._surface[2] = 0.0
+        turn = math.atan2(heading[1, 0], heading[0, 0]) + self._yaw
+        self.robot.data.mocap_pos[0] = self._surface
+        self.robot.data.mocap_quat[0] = [math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]
+        self._normal = np.array([math.cos(turn), math.sin(turn), 0.0])
+
+    def act(self) -> None:
+        """Push: the base gains ``push_speed`` in equal parts over ``push_time``."""
+        # half a step of slack keeps rounding from adding or losing one part
+        since = self.since_event + PHYSICS_DT / 2
+        if 0.0 <= since < self.config.push_time:
+            part = self.push_speed * PHYSICS_DT / self.config.push_time
+            direction = np.array([math.cos(self._bearing), math.sin(self._bearing), 0.0])
+            self.robot.data.qvel[:3] += part * (self.robot.heading @ direction)
+
+    def observe(self, touches: Sequence[Touch]) -> None:
+        """Remember any touch that was not a hand's."""
+        if any(touch.part not in HANDS for touch in touches):
+            self._touched_otherwise = True
+
+    @property
+    def disturbed(self) -> bool:
+        """Whether a push is being felt or has just been."""
+        return 0.0 <= self.since_event <= self.config.disturbed_time
+
+    def rewards(self, action: Array) -> dict[str, float]:
+        """``brace`` and ``upright`` while disturbed; contact, impact and pose in every tick."""
+        c = self.config
+        hand_force = float(self.forces[_HANDS].max())
+        upright = math.cos(self.robot.tilt) if self.disturbed else 0.0
+        braced = self.disturbed and not self.away and hand_force > _BRACE_FORCE
+        return {
+            "brace": c.brace_reward * upright * braced,
+            "upright": c.upright_reward * upright,
+            "contact": -c.contact_cost * bool(self.forces[_OTHERS].any()),
+            "impact": -c.impact_cost * min(1.0, hand_force / c.impact_force),
+            "pose": -c.pose_cost * float(np.mean(action**2)),
+        }
+
+    @property
+    def fall_cost(self) -> float:
+        """Cost of a fall."""
+        return self.config.fall_cost
+
+    @property
+    def achieved(self) -> bool:
+        """Nothing but hands has touched the wall."""
+        return not self._touched_otherwise
+
+    def state(self) -> ObjectState:
+        """Where the pelvis' x axis meets the wall; active while disturbed towards it."""
+        pelvis, forward = self.robot.data.qpos[:3], self.robot.heading[:, 0]
+        gap = (self._surface - pelvis) @ self._normal / max(float(forward @ self._normal), 0.1)
+        point = pelvis + gap * forward
+        return ObjectState(point, np.zeros(3), math.nan, self.disturbed and not self.away)
+
+    def solids(self) -> tuple[Solid, ...]:
+        """The wall."""
+        centre = self._surface + WALL_HALF_SIZE[0] * self._normal
+        centre[2] = WALL_HALF_SIZE[2]
+        return (Solid(WALL, "box", WALL_HALF_SIZE, centre, self.robot.data.mocap_quat[0].copy()),)
