@@ -53,7 +53,7 @@ class BalanceConfig:
 class Balance:
     """Memory of the stance; leading axis B."""
 
-    prediction: Array  # (B, 20) filter's state expected at the next tick, off the reference
+    prediction: Array  # (B, 29) filter's state expected at the next tick, off the reference
     correction: Array  # (B, 15) rad, sent last and acting now
     height: Array  # (B,) reference, m
     height_rate: Array  # (B,) m/s

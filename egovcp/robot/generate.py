@@ -50,7 +50,7 @@ def write_kinematics(path: Path) -> None:
     path.write_text(json.dumps(table, indent=1) + "\n", encoding="utf-8")
 
 
-def stance_row(stance: StanceModel, height: float) -> dict[str, NDArray[np.float64]]:
+def stance_row(stance: StanceModel, height: float) -> dict[str, NDArray[np.floating]]:
     """All numbers of the stance law at one pelvis height."""
     pose = balanced_pose(stance, height)
     linear = linearise(stance, pose)
@@ -64,7 +64,7 @@ def stance_row(stance: StanceModel, height: float) -> dict[str, NDArray[np.float
         "joints_per_moment": response[:, 2 : 2 + NU].T,
         "torque_per_moment": response[:, 2 + NU :].T,
         "mobility": linear.mobility,
-        "compensator": compensator(linear),
+        "compensator": compensator(linear).astype(np.float32),
     }
 
 

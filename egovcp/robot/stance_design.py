@@ -199,6 +199,7 @@ class Linear:
     a: Array  # (18, 18)
     b: Array  # (18, 15)
     c: Array  # (36, 18)
+    force: Array  # (18, 9): x per constant generalised force on z (N, N m)
     legs: Array  # (15, 9): joint displacement per z
     torque_x: Array  # (15, 18): servo torque per x
     torque_u: Array  # (15, 15)
@@ -224,15 +225,17 @@ def linearise(stance: StanceModel, pose: Pose) -> Linear:
     inverse = np.linalg.inv(basis.T @ mass @ basis)
     joints = basis[6:21]
     kp, kd = np.diag(STIFFNESS[:NU]), np.diag(DAMPING[:NU])
-    continuous = np.zeros((NX + NU, NX + NU))
+    continuous = np.zeros((NX + NU + NZ, NX + NU + NZ))
     continuous[:NZ, NZ:NX] = np.eye(NZ)
     continuous[NZ:NX, :NZ] = inverse @ spring
     continuous[NZ:NX, NZ:NX] = -inverse @ joints.T @ kd @ joints
-    continuous[NZ:NX, NX:] = inverse @ joints.T @ kp
+    continuous[NZ:NX, NX : NX + NU] = inverse @ joints.T @ kp
+    continuous[NZ:NX, NX + NU :] = inverse
     discrete = expm(continuous / CONTROLLER_HZ)
     return Linear(
         a=discrete[:NX, :NX],
-        b=discrete[:NX, NX:],
+        b=discrete[:NX, NX : NX + NU],
+        force=discrete[:NX, NX + NU :],
         c=sensor_matrix(pose, joints),
         legs=joints,
         torque_x=np.hstack([-kp @ joints, -kd @ joints]),

@@ -17,7 +17,8 @@ from egovcp.spec import NUM_JOINTS
 
 NZ: Final = 9  # coordinates: pelvis pose 6, waist 3
 NX: Final = 2 * NZ  # states: coordinates and their rates
-NF: Final = NX + 2  # filter: states, and the roll and pitch of feet that rock on their edges
+NR: Final = 2  # roll and pitch of feet that rock on their edges
+NF: Final = NX + NR + NZ  # filter: states, rocking, and a slowly changing force on each coordinate
 NU: Final = 15  # servo targets: legs 12, waist 3
 NY: Final = 36  # measurements: gravity 3, gyro 3, joint positions 15, joint rates 15
 _FIELDS: Final = (
@@ -43,7 +44,7 @@ class StanceRow:
     joints_per_moment: Array  # (B, 15, 2) rad per kg m
     torque_per_moment: Array  # (B, 15, 2) N m per kg m
     mobility: Array  # (B, 9, 9) pelvis and waist rates per generalised impulse
-    compensator: Array  # (B, 35, 71)
+    compensator: Array  # (B, 44, 80)
 
 
 class StanceTable:
@@ -51,7 +52,7 @@ class StanceTable:
 
     def __init__(self, arrays: dict[str, Array]) -> None:
         self.heights = arrays["height"]
-        parts = [arrays[name].reshape(len(self.heights), -1) for name in _FIELDS]
+        parts = [arrays[name].astype(np.float64).reshape(len(self.heights), -1) for name in _FIELDS]
         self._shapes = [arrays[name].shape[1:] for name in _FIELDS]
         self._splits = np.cumsum([part.shape[1] for part in parts])[:-1]
         self._flat = np.concatenate(parts, axis=1)
