@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from egovcp.errors import EnvironmentFailure
 from egovcp.robot.g1 import model_path
 
-_GRID_M: Final = 0.008  # vertices within one cell become one
+GRID_M: Final = 0.008
 _STL_HEADER_BYTES: Final = 84
 _STL_TRIANGLE: Final = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("_", "<u2")])
 _DARK: Final = (60, 60, 65)
@@ -40,31 +40,35 @@ class LinkMesh:
     """(V, 3) RGB."""
 
 
-def link_meshes() -> dict[str, LinkMesh]:
-    """Link name -> mesh; empty where the model is not installed, as on a robot computer."""
+def link_meshes(grid: float = GRID_M) -> dict[str, LinkMesh]:
+    """Link name -> mesh; empty where the model is not installed, as on a robot computer.
+
+    Args:
+        grid: vertices within one cell of this size, m, become one.
+    """
     try:
         path = model_path()
     except EnvironmentFailure:
         return {}
-    return _load(path)
+    return _load(path, grid)
 
 
 @cache
-def _load(path: Path) -> dict[str, LinkMesh]:
+def _load(path: Path, grid: float) -> dict[str, LinkMesh]:
     root = ElementTree.parse(path).getroot()
     files = {m.attrib["name"]: path.parent / "assets" / m.attrib["file"] for m in root.iter("mesh")}
     meshes = {}
     for body in root.iter("body"):
         geoms = [g for g in body.findall("geom") if g.get("class") == "visual"]
         if geoms:
-            parts = [_geom(geom, files[geom.attrib["mesh"]]) for geom in geoms]
+            parts = [_geom(geom, files[geom.attrib["mesh"]], grid) for geom in geoms]
             meshes[body.attrib["name"]] = _merge(parts)
     return meshes
 
 
-def _geom(geom: ElementTree.Element, file: Path) -> LinkMesh:
+def _geom(geom: ElementTree.Element, file: Path, grid: float) -> LinkMesh:
     """One visual geom, thinned, in the frame of its link (no geom of the G1 is rotated)."""
-    vertices, triangles = thin(_read_stl(file), _GRID_M)
+    vertices, triangles = thin(_read_stl(file), grid)
     offset = np.array(geom.get("pos", "0 0 0").split(), np.float32)
     colour = _DARK if geom.get("material") == "black" else _LIGHT
     return LinkMesh(
@@ -106,8 +110,8 @@ def thin(
 
 def _keys(rows: NDArray[np.integer]) -> NDArray[np.int64]:
     """(n, 3) integers -> (n,), one number per distinct row."""
-    shifted = rows.astype(np.int64) - rows.min(axis=0)
-    spans = shifted.max(axis=0) + 1
+    shifted = rows.astype(np.int64) - rows.min(axis=0, initial=0)
+    spans = shifted.max(axis=0, initial=0) + 1
     keys: NDArray[np.int64] = (shifted[:, 0] * spans[1] + shifted[:, 1]) * spans[2] + shifted[:, 2]
     return keys
 

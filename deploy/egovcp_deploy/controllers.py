@@ -1,0 +1,116 @@
+"""The controllers that are compared: the planner, and references that need no learning."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.plan import Policy, PolicyStep
+from egovcp.sim.env import Observation, VectorEnv
+from egovcp.sim.oracles import Oracle
+from egovcp.sim.policies import Hold, RandomWalk
+from egovcp.sim.policies import Policy as ReferencePolicy
+from egovcp.sim.scenario import Scenario
+
+Array = NDArray[np.float64]
+
+CONTROLLERS: Final = ("planner", "hold", "constant", "random", "oracle")
+
+
+class Controller(Protocol):
+    """Decides for a batch of robots, one per scenario."""
+
+    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
+        """Every row has just begun an episode."""
+        ...
+
+    def act(self, env: VectorEnv, observation: Observation) -> NDArray[np.floating]:
+        """(E, 7) planned actions; any value, safety comes after."""
+        ...
+
+    def advance(self, sent: Array) -> None:
+        """(E, 7) what the robots were really sent."""
+        ...
+
+
+class PlanningPolicy(Protocol):
+    """What is needed of `egovcp.plan.Policy` here."""
+
+    def reset(self) -> None:
+        """Forget the past."""
+        ...
+
+    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+        """Observations of E robots -> plans."""
+        ...
+
+    def advance(self, sent: NDArray[np.floating]) -> None:
+        """The actions that were really sent."""
+        ...
+
+
+class Planned:
+    """The world model's policy; it sees the observation and nothing else."""
+
+    def __init__(self, policy: PlanningPolicy | Policy) -> None:
+        self._policy = policy
+
+    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
+        """Forget the past of every row."""
+        self._policy.reset()
+
+    def act(self, env: VectorEnv, observation: Observation) -> NDArray[np.floating]:
+        """The first action of every row's plan."""
+        return self._policy.act(observation.depth, observation.state).action
+
+    def advance(self, sent: Array) -> None:
+        """Advance the recurrence with what was sent."""
+        self._policy.advance(sent)
+
+
+class Reference:
+    """A policy of the simulator package."""
+
+    def __init__(self, policy: ReferencePolicy) -> None:
+        self._policy = policy
+
+    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
+        """Hand the scenarios on."""
+        self._policy.reset(env, scenarios)
+
+    def act(self, env: VectorEnv, observation: Observation) -> NDArray[np.floating]:
+        """The reference's actions."""
+        return self._policy.act(env)
+
+    def advance(self, sent: Array) -> None:
+        """References keep no state of what was sent."""
+
+
+class Constants:
+    """A fixed action for each row."""
+
+    def __init__(self, actions: NDArray[np.floating]) -> None:
+        self._actions = np.asarray(actions, np.float64)
+
+    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
+        """Nothing to forget."""
+
+    def act(self, env: VectorEnv, observation: Observation) -> NDArray[np.floating]:
+        """(E, 7) the same actions always."""
+        return self._actions
+
+    def advance(self, sent: Array) -> None:
+        """Nothing to remember."""
+
+
+def reference(name: str) -> Controller:
+    """``hold``, ``random`` or ``oracle``."""
+    policies: dict[str, type[ReferencePolicy]] = {
+        "hold": Hold,
+        "random": RandomWalk,
+        "oracle": Oracle,
+    }
+    return Reference(policies[name]())

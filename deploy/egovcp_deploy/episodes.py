@@ -1,0 +1,221 @@
+"""Plays groups of episodes side by side, in this process or in worker processes."""
+
+from __future__ import annotations
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass, field
+from multiprocessing.synchronize import Event
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from egovcp.artefact import Artefact, load_artefact
+from egovcp.errors import EnvironmentFailure
+from egovcp.sim.config import EnvConfig
+from egovcp.sim.env import VectorEnv
+from egovcp.sim.scenario import Scenario
+from egovcp_deploy.controllers import Constants, Controller, Planned, reference
+from egovcp_deploy.options import PlannerOptions
+from egovcp_deploy.safety import SafetyFilter
+from egovcp_deploy.scores import EpisodeScore
+
+_THREAD_LIMITS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+@dataclass(frozen=True)
+class Setup:
+    """What every group needs; sent to each worker once."""
+
+    env: EnvConfig
+    policy_path: str = ""
+    """Empty when no planner plays."""
+    revision: str = ""
+    planner: PlannerOptions = field(default_factory=PlannerOptions)
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Group:
+    """Scenarios of one task, played side by side by one controller."""
+
+    controller: str
+    scenarios: tuple[Scenario, ...]
+    actions: tuple[tuple[float, ...], ...] = ()
+    """For ``constant``: one action per scenario."""
+
+
+class Stopped(Exception):
+    """The evaluation was asked to stop."""
+
+
+class Player:
+    """Plays groups in this process; environments and the artefact are kept between groups."""
+
+    def __init__(self, setup: Setup, artefact: Artefact | None = None) -> None:
+        self._setup = setup
+        self._artefact = artefact
+        self._envs: dict[int, VectorEnv] = {}
+
+    def play(self, group: Group, stopped: Callable[[], bool] = lambda: False) -> list[EpisodeScore]:
+        """Scores in the order of the group's scenarios; raises `Stopped` when asked to."""
+        size = len(group.scenarios)
+        if size not in self._envs:
+            self._envs[size] = VectorEnv(self._setup.env, size)
+        return play(self._envs[size], self._controller(group), group.scenarios, stopped)
+
+    def _controller(self, group: Group) -> Controller:
+        if group.controller == "constant":
+            return Constants(np.array(group.actions))
+        if group.controller != "planner":
+            return reference(group.controller)
+        setup = self._setup
+        if self._artefact is None:
+            self._artefact = load_artefact(setup.policy_path, setup.revision)
+        planner = setup.planner.apply(self._artefact.planner)
+        return Planned(self._artefact.make_policy(len(group.scenarios), setup.seed, planner))
+
+
+def play(
+    env: VectorEnv,
+    controller: Controller,
+    scenarios: Sequence[Scenario],
+    stopped: Callable[[], bool] = lambda: False,
+) -> list[EpisodeScore]:
+    """One episode per row of ``env``, to the end of all of them."""
+    observation = env.reset(scenarios)
+    controller.reset(env, scenarios)
+    safety = SafetyFilter(env.num_envs)
+    tally = _Tally(env.num_envs)
+    while not env.done.all():
+        if stopped():
+            raise Stopped
+        live = ~env.done
+        begin = time.perf_counter()
+        planned = controller.act(env, observation)
+        tally.plan_ms.append((time.perf_counter() - begin) * 1e3 / env.num_envs)
+        result = env.step(safety.filter(planned).action)
+        controller.advance(result.sent_action)
+        tally.rewards += np.where(live, result.reward, 0.0)
+        tally.steps += live
+        tally.success, tally.terminated = result.success, result.terminated
+        observation = result.observation
+    return tally.scores(scenarios)
+
+
+class _Tally:
+    """Running sums of a group."""
+
+    def __init__(self, rows: int) -> None:
+        self.rewards = np.zeros(rows)
+        self.steps = np.zeros(rows, np.int64)
+        self.success: NDArray[np.bool_] = np.zeros(rows, np.bool_)
+        self.terminated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
+        self.plan_ms: list[float] = []
+
+    def scores(self, scenarios: Sequence[Scenario]) -> list[EpisodeScore]:
+        """One score per row."""
+        return [
+            EpisodeScore(
+                episode=scenario.episode,
+                steps=int(self.steps[i]),
+                reward=float(self.rewards[i]),
+                success=bool(self.success[i]),
+                terminated=bool(self.terminated[i]),
+                plan_ms=self.plan_ms[: int(self.steps[i])],
+            )
+            for i, scenario in enumerate(scenarios)
+        ]
+
+
+class Stage:
+    """Where groups are played: this process, or worker processes that stay until it closes.
+
+    Args:
+        setup: what all groups share.
+        num_workers: processes; 1 plays in this process, 0 takes one per processor core.
+        artefact: spares this process loading it again.
+    """
+
+    def __init__(
+        self, setup: Setup, num_workers: int = 0, artefact: Artefact | None = None
+    ) -> None:
+        self._workers = num_workers or len(os.sched_getaffinity(0))
+        self._player = Player(setup, artefact)
+        self._setup = setup
+        self._executor: ProcessPoolExecutor | None = None
+
+    def play(self, groups: Sequence[Group]) -> Iterator[tuple[int, list[EpisodeScore]]]:
+        """Play ``groups``; yields (index of a group, its scores) as they finish.
+
+        Raises:
+            EnvironmentFailure: a worker was killed.
+        """
+        if self._workers == 1:
+            yield from ((i, self._player.play(group)) for i, group in enumerate(groups))
+            return
+        try:
+            futures = self._submit(groups)
+            for future in as_completed(futures):
+                yield futures[future], future.result()
+        except BrokenProcessPool as error:
+            raise EnvironmentFailure(
+                "a worker process was killed (out of memory?); try fewer --num_workers"
+            ) from error
+
+    def _submit(self, groups: Sequence[Group]) -> dict[Future[list[EpisodeScore]], int]:
+        with _inherited_by_workers():
+            if self._executor is None:
+                context = multiprocessing.get_context("spawn")
+                self._stop = context.Event()
+                self._executor = ProcessPoolExecutor(
+                    self._workers, context, initializer=_start, initargs=(self._setup, self._stop)
+                )
+            executor = self._executor
+            return {executor.submit(_work, group): i for i, group in enumerate(groups)}
+
+    def close(self) -> None:
+        """Stop what is being played and end the workers."""
+        if self._executor is not None:
+            self._stop.set()
+            self._executor.shutdown(wait=True, cancel_futures=True)
+            self._executor = None
+
+
+@contextlib.contextmanager
+def _inherited_by_workers() -> Iterator[None]:
+    """Workers start deaf to Ctrl-C, which the main process answers, and with one thread each."""
+    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    limits = {name: "1" for name in _THREAD_LIMITS if name not in os.environ}
+    os.environ.update(limits)
+    try:
+        yield
+    finally:
+        for name in limits:
+            del os.environ[name]
+        signal.signal(signal.SIGINT, previous)
+
+
+class _Worker:
+    """The state of a worker process."""
+
+    player: Player
+    stop: Event
+
+
+def _start(setup: Setup, stop: Event) -> None:
+    torch.set_num_threads(1)
+    _Worker.player, _Worker.stop = Player(setup), stop
+
+
+def _work(group: Group) -> list[EpisodeScore]:
+    """Runs in a worker."""
+    return _Worker.player.play(group, _Worker.stop.is_set)

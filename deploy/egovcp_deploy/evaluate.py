@@ -1,0 +1,254 @@
+"""`egovcp-eval`: the planner and its references on the same held-out scenarios."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from dataclasses import asdict, dataclass, field, replace
+from itertools import batched
+from pathlib import Path
+from typing import Any, Final
+
+import draccus
+from tqdm import tqdm
+
+from egovcp.artefact import Artefact, load_artefact
+from egovcp.cli import run_command
+from egovcp.errors import UsageError
+from egovcp.robot.stance import StanceController
+from egovcp.sim.config import EnvConfig
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import TASKS
+from egovcp_deploy.constant_search import Action, BestConstant, load_constants, search_constant
+from egovcp_deploy.controllers import CONTROLLERS
+from egovcp_deploy.episodes import Group, Setup, Stage
+from egovcp_deploy.options import (
+    PlannerOptions,
+    PolicyOptions,
+    check_choice,
+    check_output_dir,
+    check_positive,
+    make_output_dir,
+    versions,
+    write_json,
+)
+from egovcp_deploy.report import gains, summary, table
+from egovcp_deploy.scenarios import eventful, held_out
+from egovcp_deploy.scores import EpisodeScore
+
+PROG: Final = "egovcp-eval"
+_ALL: Final = "all"
+_EPILOG: Final = (
+    "All controllers play the same scenarios, which no collection ever plays (seeds are "
+    "offset), each with an event: no empty scenes unless --env.*_episode.empty_probability "
+    "says so. Success: ball blocked by a hand and not hit elsewhere; wall still up and touched "
+    "by hands only; arch passed untouched. 'constant' is the best fixed action of a grid, "
+    "chosen on scenarios of its own. plan_ms is the time per robot when num_envs robots are "
+    "planned together; --num_envs=1 --num_workers=1 gives the latency of one. Writes eval.json "
+    "(figures), eval_run.json (config and every episode) and constant.json."
+)
+
+type Scores = dict[str, dict[str, list[EpisodeScore]]]
+
+
+@dataclass(frozen=True)
+class ConstantOptions:
+    """The reference `constant`."""
+
+    path: str = ""
+    """constant.json of an earlier evaluation; spares the search. Empty: search."""
+
+
+@dataclass(frozen=True)
+class EvalConfig:
+    """Play held-out scenarios with the planner and with references; print and save figures."""
+
+    policy: PolicyOptions = field(default_factory=PolicyOptions)
+    """The policy artefact; not needed without the controller `planner`."""
+    planner: PlannerOptions = field(default_factory=PlannerOptions)
+    """Changes to the artefact's planner."""
+    task: str = "ball"
+    """ball, wall, arch, or all."""
+    episodes: int = 80
+    """Scenarios per task."""
+    seed: int = 0
+    """Which held-out scenarios."""
+    controllers: str = ",".join(CONTROLLERS)
+    """Who plays, separated by commas: planner, hold (neutral pose), constant (best fixed action),
+    random (the data's walk), oracle (scripted, sees the truth)."""
+    constant: ConstantOptions = field(default_factory=ConstantOptions)
+    """The reference `constant`."""
+    output_dir: str = ""
+    """New folder for the results."""
+    num_envs: int = 8
+    """Robots that each process plays side by side."""
+    num_workers: int = 0
+    """Processes; 0: one per processor core."""
+    env: EnvConfig = field(default_factory=eventful)
+    """Scenes, sensors, delays and randomisation."""
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The tasks to play."""
+        return TASKS if self.task == _ALL else (self.task,)
+
+    @property
+    def players(self) -> tuple[str, ...]:
+        """The controllers to play, each once."""
+        names = self.controllers.strip("[]").replace(" ", "").split(",")
+        return tuple(dict.fromkeys(names))
+
+    def check(self) -> None:
+        """Raise `UsageError` for values that make no sense."""
+        check_choice("--task", self.task, (*TASKS, _ALL))
+        for name in self.players:
+            check_choice("--controllers", name, CONTROLLERS)
+        for flag in ("episodes", "num_envs"):
+            check_positive(f"--{flag}", getattr(self, flag))
+        if self.num_workers < 0:
+            raise UsageError(f"--num_workers={self.num_workers}: expected 0 or more")
+        if "planner" in self.players and not self.policy.path:
+            raise UsageError(
+                "--policy.path is missing; name the artefact, or leave planner out of --controllers"
+            )
+        held_out(self.tasks[0], self.seed, 0)
+        check_output_dir(self.output_dir)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run_command(EvalConfig, evaluate, argv, prog=PROG, epilog=_EPILOG)
+
+
+def evaluate(config: EvalConfig) -> None:
+    """Check everything, play, print the table and write the files.
+
+    Raises:
+        UsageError: an option makes no sense, or the folder holds results.
+        DataError: ``--constant.path`` cannot be used.
+        ArtefactError: the artefact is missing, damaged, or of another controller.
+    """
+    config.check()
+    constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
+    artefact = _load_policy(config)
+    folder = make_output_dir(config.output_dir)
+    setup = Setup(
+        config.env, config.policy.path, config.policy.revision, config.planner, config.seed
+    )
+    with closing(Stage(setup, config.num_workers, artefact)) as stage:
+        if "constant" in config.players:
+            constants = _find_constants(config, stage, constants)
+            write_json(folder / "constant.json", {k: asdict(v) for k, v in constants.items()})
+        scores = _play(config, stage, constants)
+    figures = summary(scores)
+    write_json(folder / "eval_run.json", _record(config, artefact, constants, scores))
+    write_json(folder / "eval.json", figures)
+    print(table(figures))
+    print(f"figures: {folder / 'eval.json'}")
+
+
+def _load_policy(config: EvalConfig) -> Artefact | None:
+    if "planner" not in config.players:
+        return None
+    artefact = load_artefact(config.policy.path, config.policy.revision)
+    artefact.require_controller(StanceController().id)
+    config.planner.apply(artefact.planner)
+    return artefact
+
+
+def _find_constants(
+    config: EvalConfig, stage: Stage, known: dict[str, BestConstant]
+) -> dict[str, BestConstant]:
+    """Task -> best constant action, searched for where it is not known yet."""
+    found = {}
+    for task in config.tasks:
+        with tqdm(unit="ep", desc=f"{task}: best constant action") as bar:
+
+            def play(
+                actions: Sequence[Action], scenarios: Sequence[Scenario]
+            ) -> list[EpisodeScore]:
+                groups = [
+                    Group("constant", tuple(s for _, s in part), tuple(a for a, _ in part))
+                    for part in batched(zip(actions, scenarios, strict=True), config.num_envs)
+                ]
+                return _in_order(stage, groups, bar)
+
+            found[task] = known.get(task) or search_constant(task, config.seed, play)
+    return found
+
+
+def _in_order(stage: Stage, groups: Sequence[Group], bar: Any) -> list[EpisodeScore]:
+    """Scores of all groups in the order of their scenarios."""
+    parts: dict[int, list[EpisodeScore]] = {}
+    for i, scores in stage.play(groups):
+        parts[i] = scores
+        bar.update(len(scores))
+    return [score for i in sorted(parts) for score in parts[i]]
+
+
+def _play(config: EvalConfig, stage: Stage, constants: dict[str, BestConstant]) -> Scores:
+    """Every controller on every task; progress shows the success rates so far."""
+    groups = list(_groups(config, constants))
+    scores: Scores = {task: {name: [] for name in config.players} for task in config.tasks}
+    total = sum(len(group.scenarios) for group in groups)
+    with tqdm(total=total, unit="ep", desc="evaluate") as bar:
+        for i, part in stage.play(groups):
+            group = groups[i]
+            scores[group.scenarios[0].task][group.controller] += part
+            bar.set_postfix_str(_so_far(scores), refresh=False)
+            bar.update(len(part))
+    for task in scores.values():
+        for played in task.values():
+            played.sort(key=lambda score: score.episode)
+    return scores
+
+
+def _groups(config: EvalConfig, constants: dict[str, BestConstant]) -> Iterable[Group]:
+    """The planner's first, since they take longest."""
+    for name in sorted(config.players, key=lambda name: name != "planner"):
+        for task in config.tasks:
+            scenarios = [held_out(task, config.seed, i) for i in range(config.episodes)]
+            for part in batched(scenarios, config.num_envs):
+                group = Group(name, part)
+                if name == "constant":
+                    group = replace(group, actions=(constants[task].action,) * len(part))
+                yield group
+
+
+def _so_far(scores: Scores) -> str:
+    """``planner 61%, hold 20%``: over all tasks."""
+    parts = []
+    for name in next(iter(scores.values())):
+        played = [score for task in scores.values() for score in task[name]]
+        if played:
+            parts.append(f"{name} {sum(s.success for s in played) / len(played):.0%}")
+    return ", ".join(parts)
+
+
+def _record(
+    config: EvalConfig,
+    artefact: Artefact | None,
+    constants: dict[str, BestConstant],
+    scores: Scores,
+) -> dict[str, Any]:
+    """Content of ``eval_run.json``: what the figures came from."""
+    return {
+        "config": draccus.encode(config),
+        "artefact": artefact.manifest if artefact else None,
+        "low_level_controller": StanceController().id,
+        "versions": versions(),
+        "constants": {task: asdict(best) for task, best in constants.items()},
+        "success_gain_of_planner": gains(scores),
+        "episodes": {
+            task: {name: [_brief(score) for score in played] for name, played in row.items()}
+            for task, row in scores.items()
+        },
+    }
+
+
+def _brief(score: EpisodeScore) -> dict[str, Any]:
+    return {name: value for name, value in asdict(score).items() if name != "plan_ms"}
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

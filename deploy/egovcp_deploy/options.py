@@ -1,0 +1,119 @@
+"""Options that the commands of this package share, and what is checked before any work."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final
+
+from egovcp.errors import EnvironmentFailure, UsageError, suggest
+from egovcp.plan import PlannerConfig
+
+_PACKAGES: Final = ("egovcp", "egovcp-deploy", "torch", "numpy")
+
+
+@dataclass(frozen=True)
+class PolicyOptions:
+    """Which policy artefact."""
+
+    path: str = ""
+    """Folder of the artefact, or its Hub id `user/name`."""
+    revision: str = ""
+    """Branch, tag or commit SHA on the Hub; empty: the latest."""
+
+
+@dataclass(frozen=True)
+class PlannerOptions:
+    """Changes to the artefact's own planner; what is not given stays as it is there."""
+
+    samples: int | None = None
+    """M, candidate plans per iteration."""
+    horizon: int | None = None
+    """N, planner ticks of 40 ms."""
+    iterations: int | None = None
+    """Rounds of the cross-entropy method."""
+    elites: int | None = None
+    """Best candidates that the next round is fitted to."""
+
+    def apply(self, planner: PlannerConfig) -> PlannerConfig:
+        """``planner`` with these changes.
+
+        Raises:
+            UsageError: the numbers do not go together.
+        """
+        return replace(planner, **{k: v for k, v in asdict(self).items() if v is not None})
+
+
+def check_choice(flag: str, value: str, valid: Iterable[str]) -> None:
+    """Raise `UsageError` unless ``value`` is one of ``valid``."""
+    choices = tuple(valid)
+    if value not in choices:
+        raise UsageError(f"unknown value {flag}={value}{suggest(value, choices)}")
+
+
+def check_positive(flag: str, value: int) -> None:
+    """Raise `UsageError` unless ``value`` counts from 1."""
+    if value < 1:
+        raise UsageError(f"{flag}={value}: expected at least 1")
+
+
+def check_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
+    """The output folder; one that holds anything is refused. Creates nothing.
+
+    Args:
+        path: the folder of ``--output_dir``.
+        reusable: file names that may be there already.
+
+    Raises:
+        UsageError: no folder was named, or it holds other files.
+    """
+    if not path:
+        raise UsageError("--output_dir is missing; name a new folder for the results")
+    folder = Path(path)
+    if folder.exists() and not folder.is_dir():
+        raise UsageError(f"--output_dir={path} is a file; name a new folder")
+    present = [entry.name for entry in folder.iterdir()] if folder.exists() else []
+    foreign = sorted(name for name in present if name not in reusable)
+    if foreign:
+        raise UsageError(
+            f"--output_dir={path} holds {foreign[0]} already; results are never overwritten: "
+            "name another folder or remove this one"
+        )
+    return folder
+
+
+def make_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
+    """Create the folder that `check_output_dir` accepts.
+
+    Raises:
+        UsageError: as `check_output_dir`.
+        EnvironmentFailure: it cannot be created or written to.
+    """
+    folder = check_output_dir(path, reusable)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise EnvironmentFailure(f"cannot create {path}: {error.strerror}") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise EnvironmentFailure(f"cannot write to {path}: permission denied")
+    return folder
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write ``content`` atomically: the file is complete or absent, also after a crash."""
+    temporary = path.with_name(f".{path.name}.partial")
+    with temporary.open("w", encoding="utf-8") as file:
+        json.dump(content, file, indent=2, allow_nan=False)
+        file.write("\n")
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.replace(path)
+
+
+def versions() -> dict[str, str]:
+    """Distribution -> version of what shaped the results."""
+    return {name: version(name) for name in _PACKAGES}

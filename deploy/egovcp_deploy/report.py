@@ -1,0 +1,70 @@
+"""The figures of an evaluation as JSON values and as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+from egovcp_deploy.scores import EpisodeScore, success_gain, summarise
+
+type Played = Mapping[str, Mapping[str, Sequence[EpisodeScore]]]
+
+_HEAD: Final = ("task", "controller", "success", "95 %", "reward/step", "95 %", "plan ms", "p99")
+
+
+def summary(scores: Played) -> dict[str, dict[str, dict[str, Any]]]:
+    """``{task: {controller: figures}}``, the content of ``eval.json``."""
+    return {
+        task: {name: summarise(played) for name, played in row.items()}
+        for task, row in scores.items()
+    }
+
+
+def gains(scores: Played) -> dict[str, dict[str, Any]]:
+    """Task -> reference -> planner's success rate minus the reference's, paired by scenario."""
+    out: dict[str, dict[str, Any]] = {}
+    for task, row in scores.items():
+        others = [name for name in row if name != "planner"] if "planner" in row else []
+        out[task] = {
+            name: {
+                "gain": _rate(row["planner"]) - _rate(row[name]),
+                "ci95": list(success_gain(row["planner"], row[name])),
+            }
+            for name in others
+        }
+    return out
+
+
+def _rate(scores: Sequence[EpisodeScore]) -> float:
+    return sum(score.success for score in scores) / len(scores)
+
+
+def table(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
+    """The figures for reading: one line per task and controller, columns aligned."""
+    lines = [_HEAD, *(_line(t, n, f) for t, row in figures.items() for n, f in row.items())]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(_HEAD))]
+    return "\n".join(_aligned(line, widths) for line in lines)
+
+
+def _line(task: str, name: str, figures: Mapping[str, Any]) -> tuple[str, ...]:
+    low, high = figures["success_ci95"]
+    worst, best = figures["reward_ci95"]
+    return (
+        task,
+        name,
+        f"{figures['success_rate']:.1%}",
+        f"{low:.1%} to {high:.1%}",
+        f"{figures['reward_mean']:+.5f}",
+        f"{worst:+.5f} to {best:+.5f}",
+        f"{figures['plan_ms_p50']:.2f}",
+        f"{figures['plan_ms_p99']:.2f}",
+    )
+
+
+def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:
+    """Words to the left, numbers to the right."""
+    cells = [
+        cell.ljust(width) if i < 2 else cell.rjust(width)
+        for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+    ]
+    return "  ".join(cells).rstrip()

@@ -1,0 +1,99 @@
+"""The simulated robot: one row of `VectorEnv` in lock-step, time passes only in ``act``."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.log.info import CameraView
+from egovcp.log.tick import BasePose, SceneObject
+from egovcp.sim.config import EnvConfig
+from egovcp.sim.env import Observation, VectorEnv
+from egovcp.sim.tasks.base import Solid
+from egovcp_deploy.robots.base import Outcome, Sensed
+from egovcp_deploy.scenarios import held_out
+
+_BEGINS: Final = {"ball": "ball thrown", "wall": "robot pushed", "arch": "arch starts to move"}
+#: Reward terms that are paid once, and what it means when they are.
+_ONCE: Final = {
+    "block": "ball blocked by a hand",
+    "hit": "ball hit the body",
+    "pass": "arch passed",
+    "fall": "robot fell",
+}
+
+
+class SimRobot:
+    """Plays the held-out scenarios of ``task``; rollout i is scenario i of ``seed``."""
+
+    def __init__(self, config: EnvConfig, task: str, seed: int) -> None:
+        self._env = VectorEnv(config, num_envs=1)
+        self._fov = config.camera.vertical_fov
+        self._mount = config.camera.position
+        self._task = task
+        self._seed = seed
+        self._observation: Observation | None = None
+        self._before_event = True
+
+    @property
+    def controller_id(self) -> str:
+        """Identity of the simulated robot's low-level controller."""
+        return self._env.controller.id
+
+    @property
+    def camera(self) -> CameraView:
+        """The camera as this episode's randomisation has mounted it."""
+        pitch = self._env.lanes[0].camera_pitch if self._env.lanes else 0.0
+        return CameraView("torso_link", self._mount, pitch, self._fov)
+
+    def start(self, episode: int) -> None:
+        """Reset to scenario ``episode``."""
+        self._observation = self._env.reset([held_out(self._task, self._seed, episode)])
+        self._before_event = True
+
+    def observe(self) -> Sensed:
+        """The observation, with pelvis pose and scene as the simulator has them."""
+        assert self._observation is not None, "start an episode first"
+        truth = self._env.snapshot()
+        pelvis = truth.pelvis_w[0]
+        return Sensed(
+            depth=self._observation.depth[0],
+            state=self._observation.state[0],
+            base=BasePose(pelvis[:3].copy(), pelvis[3:].copy()),
+            scene=tuple(_scene_object(solid) for solid in truth.solids[0]),
+        )
+
+    def act(self, action: NDArray[np.float64]) -> Outcome:
+        """Send ``action`` and let 40 ms of simulated time pass."""
+        result = self._env.step(action[None])
+        self._observation = result.observation
+        terms = {name: float(values[0]) for name, values in result.reward_terms.items()}
+        return Outcome(
+            sent=result.sent_action[0],
+            reward=float(result.reward[0]),
+            reward_terms=terms,
+            terminated=bool(result.terminated[0]),
+            truncated=bool(result.truncated[0]),
+            success=bool(result.success[0]),
+            events=tuple(self._events(terms)),
+        )
+
+    def _events(self, terms: dict[str, float]) -> list[str]:
+        happened = [text for name, text in _ONCE.items() if terms.get(name, 0.0) != 0.0]
+        begun = float(self._env.snapshot().since_event[0]) >= 0.0
+        if begun and self._before_event:
+            self._before_event = False
+            return [_BEGINS[self._task], *happened]
+        return happened
+
+    def close(self) -> None:
+        """End the simulator's threads."""
+        self._env.close()
+
+
+def _scene_object(solid: Solid) -> SceneObject:
+    x, y, z = map(float, solid.position_w)
+    qw, qx, qy, qz = map(float, solid.quaternion_w)
+    return SceneObject(solid.name, solid.shape, (x, y, z), (qw, qx, qy, qz), solid.size)

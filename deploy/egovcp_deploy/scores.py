@@ -1,0 +1,82 @@
+"""Statistics of played episodes: rates, means and their 95 % confidence intervals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Final
+
+import numpy as np
+
+_Z: Final = 1.959964  # two-sided 95 % quantile of the normal distribution
+_RESAMPLES: Final = 4000
+
+type Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class EpisodeScore:
+    """One episode, played by one controller."""
+
+    episode: int
+    """Index of the scenario."""
+    steps: int
+    """Planner ticks until the time limit or the fall."""
+    reward: float
+    """Sum over the episode."""
+    success: bool
+    terminated: bool
+    plan_ms: list[float] = field(default_factory=list)
+    """Time per tick to decide on one action, ms; shared by robots planned together."""
+
+
+def wilson(successes: int, trials: int) -> Interval:
+    """Wilson's score interval of a rate; it stays inside [0, 1] and is honest at 0 and 1.
+
+    (p + z^2/2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)
+    """
+    p, n = successes / trials, trials
+    middle = p + _Z**2 / (2 * n)
+    half = _Z * math.sqrt(p * (1 - p) / n + _Z**2 / (4 * n * n))
+    scale = 1 + _Z**2 / n
+    return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
+
+
+def reward_per_step(scores: Sequence[EpisodeScore]) -> float:
+    """Sum of all rewards over the number of all steps."""
+    return sum(score.reward for score in scores) / sum(score.steps for score in scores)
+
+
+def reward_interval(scores: Sequence[EpisodeScore]) -> Interval:
+    """Bootstrap interval of `reward_per_step` over episodes; the draws are fixed."""
+    rewards = np.array([score.reward for score in scores])
+    steps = np.array([score.steps for score in scores])
+    picks = np.random.default_rng(0).integers(len(scores), size=(_RESAMPLES, len(scores)))
+    means = rewards[picks].sum(axis=1) / steps[picks].sum(axis=1)
+    low, high = np.percentile(means, [2.5, 97.5])
+    return float(low), float(high)
+
+
+def success_gain(scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]) -> Interval:
+    """Bootstrap interval of the difference in success rate on the *same* scenarios."""
+    theirs = {score.episode: score.success for score in others}
+    gains = np.array([float(s.success) - float(theirs[s.episode]) for s in scores])
+    picks = np.random.default_rng(0).integers(len(gains), size=(_RESAMPLES, len(gains)))
+    low, high = np.percentile(gains[picks].mean(axis=1), [2.5, 97.5])
+    return float(low), float(high)
+
+
+def summarise(scores: Sequence[EpisodeScore]) -> dict[str, float | int | list[float]]:
+    """The figures of one controller on one task, under the keys of ``eval.json``."""
+    successes = sum(score.success for score in scores)
+    plan_ms = np.concatenate([score.plan_ms for score in scores])
+    return {
+        "episodes": len(scores),
+        "success_rate": successes / len(scores),
+        "success_ci95": list(wilson(successes, len(scores))),
+        "reward_mean": reward_per_step(scores),
+        "reward_ci95": list(reward_interval(scores)),
+        "plan_ms_p50": float(np.percentile(plan_ms, 50)),
+        "plan_ms_p99": float(np.percentile(plan_ms, 99)),
+    }

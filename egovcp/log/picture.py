@@ -1,0 +1,174 @@
+"""A rollout as one picture: a film strip over the curves of value and reward.
+
+Rows: the robot, the depth it saw, what the world model reconstructed, and what it had
+imagined of this moment some ticks before. No graphics card and no display are needed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.log.info import RunInfo
+from egovcp.log.meshes import LinkMesh, link_meshes
+from egovcp.log.pose import robot_pose
+from egovcp.log.sketch import Eye, paint, paint_floor, paint_skeleton, robot_surface, scene_surface
+from egovcp.log.tick import Tick
+from egovcp.spec import DEPTH_MAX_M, PLANNER_DT
+
+MOMENTS: Final = 7  # columns of the film strip
+AHEAD: Final = 8  # how many ticks before a moment the imagination shown for it was made
+_BEFORE_TICKS: Final = 2  # the strip starts this long before the first event
+_AFTER_TICKS: Final = 6  # and ends this long after the last one
+_MESH_GRID_M: Final = 0.024
+
+
+class PictureSink:
+    """Keeps the ticks of one run and draws them when closed."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._title = ""
+        self._ticks: list[Tick] = []
+
+    def open(self, info: RunInfo) -> None:
+        """Start; nothing is written before `close`."""
+        if self._path.exists():
+            raise EnvironmentFailure(
+                f"{self._path} exists already; recordings are never overwritten: choose another"
+            )
+        self._title = f"{info.task}, seed {info.seed}, episode {info.episode}"
+
+    def write(self, tick: Tick) -> None:
+        """Keep the tick, but of what was imagined only the frame that is shown."""
+        film = tick.depth_imagined
+        self._ticks.append(replace(tick, candidates=None, depth_imagined=_last_shown(film)))
+
+    def close(self) -> None:
+        """Draw the picture of what was written, if anything was."""
+        if self._ticks:
+            rollout_picture(self._ticks, self._path, self._title)
+            self._ticks = []
+
+
+def _last_shown(film: NDArray[np.floating] | None) -> NDArray[np.floating] | None:
+    return None if film is None else film[:AHEAD]
+
+
+def rollout_picture(ticks: Sequence[Tick], path: Path, title: str = "") -> None:
+    """Draw ``ticks`` (in order, without gaps) into the PNG ``path``."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    moments = key_moments(ticks)
+    figure = Figure(figsize=(2.1 * len(moments) + 0.5, 8.6), facecolor="white")
+    FigureCanvasAgg(figure)
+    _film_strip(figure, ticks, moments)
+    _curves(figure, ticks, moments)
+    figure.suptitle(title, fontsize=12, y=0.99)
+    figure.savefig(path, dpi=110)
+
+
+def key_moments(ticks: Sequence[Tick], count: int = MOMENTS) -> list[int]:
+    """Indices of up to ``count`` ticks, evenly spread from just before the first event to
+    just after the last; over the whole run when nothing happened."""
+    last = len(ticks) - 1
+    eventful = [i for i, tick in enumerate(ticks) if tick.events]
+    begin = max(0, eventful[0] - _BEFORE_TICKS) if eventful else 0
+    end = min(last, eventful[-1] + _AFTER_TICKS) if eventful else last
+    return sorted({int(i) for i in np.rint(np.linspace(begin, end, count))})
+
+
+def _film_strip(figure: Any, ticks: Sequence[Tick], moments: Sequence[int]) -> None:
+    place = {"left": 0.05, "right": 0.995, "bottom": 0.28, "top": 0.94}
+    grid = figure.add_gridspec(4, len(moments), hspace=0.04, wspace=0.03, **place)
+    rows = grid.subplots(squeeze=False)
+    meshes = link_meshes(_MESH_GRID_M)
+    for column, i in enumerate(moments):
+        tick = ticks[i]
+        _robot(rows[0, column], tick, meshes)
+        rows[0, column].set_title(f"{tick.index * PLANNER_DT:.2f} s", fontsize=9)
+        _depth(rows[1, column], tick.depth / 1000.0)
+        _depth(rows[2, column], tick.depth_reconstructed)
+        _depth(rows[3, column], imagined_of(ticks, i))
+    names = ("", "depth seen", "reconstructed", f"imagined\n{AHEAD * PLANNER_DT:.2f} s before")
+    for row, name in zip(rows[:, 0], names, strict=True):
+        row.set_ylabel(name, fontsize=9)
+
+
+def imagined_of(ticks: Sequence[Tick], i: int) -> NDArray[np.floating] | None:
+    """What tick i - AHEAD imagined of tick i, (48, 64) m; None where there is nothing."""
+    film = ticks[i - AHEAD].depth_imagined if i >= AHEAD else None
+    return film[AHEAD - 1] if film is not None and len(film) >= AHEAD else None
+
+
+def _robot(axes: Any, tick: Tick, meshes: dict[str, LinkMesh]) -> None:
+    pose, eye = robot_pose(tick), Eye()
+    paint_floor(axes, eye)
+    surfaces = robot_surface(pose, meshes) + scene_surface(tick.scene)
+    if not meshes:
+        paint_skeleton(axes, pose, eye)
+    if surfaces:
+        paint(axes, surfaces, eye)
+    axes.set(xlim=(-1.0, 1.0), ylim=(-0.75, 0.75), xticks=[], yticks=[], aspect="equal")
+    axes.set_frame_on(False)
+
+
+def _depth(axes: Any, depth_m: NDArray[np.floating] | None) -> None:
+    axes.set(xticks=[], yticks=[])
+    if depth_m is None:
+        axes.set_facecolor("0.95")
+        axes.set_box_aspect(48 / 64)
+        return
+    shown = np.where(np.asarray(depth_m) > 0.0, depth_m, np.nan)
+    image = axes.imshow(shown, cmap="viridis_r", vmin=0.3, vmax=DEPTH_MAX_M)
+    image.cmap.set_bad("0.15")
+
+
+def _curves(figure: Any, ticks: Sequence[Tick], moments: Sequence[int]) -> None:
+    grid = figure.add_gridspec(1, 2, left=0.05, right=0.995, bottom=0.06, top=0.25, wspace=0.08)
+    left, right = grid.subplots()
+    time = [tick.index * PLANNER_DT for tick in ticks]
+    _curve(left, time, [tick.value for tick in ticks], "value of the plan", "C0")
+    _curve(left, time, [tick.termination for tick in ticks], "termination probability", "C3")
+    right.plot(time, np.cumsum([tick.reward for tick in ticks]), color="C2", label="return so far")
+    for axes in (left, right):
+        for i in moments:
+            axes.axvline(time[i], color="0.9", linewidth=1, zorder=0)
+        _mark_events(axes, ticks, time)
+        axes.set_xlabel("s", fontsize=9)
+        axes.tick_params(labelsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(fontsize=8, frameon=False, loc="upper left")
+
+
+def _curve(
+    axes: Any, time: list[float], values: list[float | None], label: str, style: str
+) -> None:
+    if any(value is not None for value in values):
+        known = [np.nan if value is None else value for value in values]
+        axes.plot(time, known, color=style, label=label)
+
+
+def _mark_events(axes: Any, ticks: Sequence[Tick], time: list[float]) -> None:
+    """A dashed line and its text per event, the text at the top of the plot."""
+    for tick, moment in zip(ticks, time, strict=True):
+        if tick.events:
+            axes.axvline(moment, color="0.4", linewidth=0.8, linestyle="--")
+            text = "\n".join(tick.events)
+            axes.annotate(
+                text,
+                (moment, 1.0),
+                xycoords=("data", "axes fraction"),
+                fontsize=7,
+                xytext=(3, -2),
+                textcoords="offset points",
+                va="top",
+                rotation=0,
+            )
