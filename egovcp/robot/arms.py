@@ -12,19 +12,37 @@ import numpy as np
 
 from egovcp.robot import kinematics
 from egovcp.robot.g1 import ARMS
-from egovcp.robot.kinematics import Array, joint_rotations, rotate
+from egovcp.robot.kinematics import Array, rotate
 
 _SHAPE: Final = (2, 7)
 _FIRST_LINK: Final = ARMS.start + 1
 _OFFSET: Final = kinematics.LINK_OFFSET[ARMS].reshape(*_SHAPE, 3)
 MASS: Final = kinematics.LINK_MASS[_FIRST_LINK:].reshape(_SHAPE)
 _COM: Final = kinematics.LINK_COM[_FIRST_LINK:].reshape(*_SHAPE, 3)
-_AXIS: Final = np.argmax(np.abs(kinematics.JOINT_AXIS[ARMS]), axis=-1).reshape(_SHAPE)
+_AXIS: Final = np.argmax(np.abs(kinematics.JOINT_AXIS[ARMS]), axis=-1)  # (14,) 0, 1 or 2
 _PALM: Final = kinematics.PALM_OFFSET  # (2, 3)
 LOWER: Final = kinematics.JOINT_LOWER[ARMS].reshape(_SHAPE)
 UPPER: Final = kinematics.JOINT_UPPER[ARMS].reshape(_SHAPE)
 SHOULDER: Final = _OFFSET[:, 0]  # (2, 3) m, torso frame
 _TAIL_MASS: Final = np.cumsum(MASS[:, ::-1], axis=1)[:, ::-1]  # (2, 7) joint's link and beyond
+
+def _homogeneous(rotation: Array, offset: Array) -> Array:
+    """(2, 7, 4, 4) from rotations (14, 3, 3) and offsets (2, 7, 3); the last row stays zero."""
+    out = np.zeros((*_SHAPE, 4, 4))
+    out[..., :3, :3] = rotation.reshape(*_SHAPE, 3, 3)
+    out[..., :3, 3] = offset
+    return out
+
+
+_H0: Final = _homogeneous(kinematics.REST_ROTATION[ARMS], _OFFSET)
+_H0[..., 3, 3] = 1.0
+_H1: Final = _homogeneous(kinematics.SIN_ROTATION[ARMS], np.zeros(3))
+_H2: Final = _homogeneous(kinematics.COS_ROTATION[ARMS], np.zeros(3))
+#: Entries of the flattened chain (2, 7, 4, 4) that hold each joint's axis.
+_AXIS_ENTRIES: Final = (
+    16 * np.arange(14)[:, None] + 4 * np.arange(3) + _AXIS[:, None]
+).reshape(*_SHAPE, 3)
+
 REST: Final = np.array([[0.25, 0.2, 0.0, 0.75, 0, 0, 0], [0.25, -0.2, 0.0, 0.75, 0, 0, 0]])
 #: Share of each joint in reaching: the wrist helps little, its motors are weak.
 _SHARE: Final = np.array([1.0, 1.0, 0.8, 1.0, 0.2, 0.25, 0.25])
@@ -32,14 +50,15 @@ _LIMIT_MARGIN: Final = 0.03  # rad kept free at each joint limit
 _LIMIT_LOW: Final = LOWER + _LIMIT_MARGIN
 _LIMIT_HIGH: Final = UPPER - _LIMIT_MARGIN
 _DAMPING: Final = 0.05  # m: damped least squares, lambda
-_REST_PULL: Final = 0.08  # share of the way to REST per iteration, in the null space
+_MAX_STEP: Final = 0.3  # rad per joint and iteration
+_REST_PULL: Final = 0.12  # share of the way to REST per iteration, in the null space
 REACH: Final = 0.45  # m, shoulder to palm; a straight arm is 0.465
 _TRUNK_RADII: Final = (0.16, 0.15)  # m, keep-out ellipse around the trunk: forward, sideways
 #: Every choice above, for the controller's identity.
 IDENTITY: Final = (
     REST.tolist(),
     _SHARE.tolist(),
-    (_LIMIT_MARGIN, _DAMPING, _REST_PULL, REACH, *_TRUNK_RADII),
+    (_LIMIT_MARGIN, _DAMPING, _MAX_STEP, _REST_PULL, REACH, *_TRUNK_RADII),
 )
 _CROSS: Final = (np.array([1, 2, 0]), np.array([2, 0, 1]))
 
@@ -47,7 +66,7 @@ _CROSS: Final = (np.array([1, 2, 0]), np.array([2, 0, 1]))
 def cross(a: Array, b: Array) -> Array:
     """a x b over the last axis."""
     i, j = _CROSS
-    out: Array = a[..., i] * b[..., j] - a[..., j] * b[..., i]
+    out: Array = np.take(a, i, -1) * np.take(b, j, -1) - np.take(a, j, -1) * np.take(b, i, -1)
     return out
 
 
@@ -62,19 +81,18 @@ class ArmPose:
 
 
 def forward(joint_position: Array) -> ArmPose:
-    """Arm joints (B, 2, 7) rad -> poses."""
+    """Arm joints (B, 2, 7) rad -> poses.
+
+    Chains homogeneous transforms T_i = T_{i-1} (H0 + sin q H1 + (1 - cos q) H2), 4 x 4.
+    """
     batch = len(joint_position)
-    local = joint_rotations(joint_position.reshape(batch, 14), ARMS).reshape(batch, *_SHAPE, 3, 3)
-    rotation = np.empty_like(local)
-    origin = np.empty((batch, *_SHAPE, 3))
-    rotation[:, :, 0], origin[:, :, 0] = local[:, :, 0], SHOULDER
+    s, c = np.sin(joint_position), 1.0 - np.cos(joint_position)
+    chain = _H0 + s[..., None, None] * _H1 + c[..., None, None] * _H2
     for i in range(1, 7):
-        base = rotation[:, :, i - 1]
-        rotation[:, :, i] = base @ local[:, :, i]
-        origin[:, :, i] = origin[:, :, i - 1] + rotate(base, _OFFSET[:, i])
-    palm = origin[:, :, 6] + rotate(rotation[:, :, 6], _PALM)
-    axis = np.take_along_axis(rotation, _AXIS[None, :, :, None, None], axis=-1)[..., 0]
-    return ArmPose(origin, axis, rotation, palm)
+        chain[:, :, i] = chain[:, :, i - 1] @ chain[:, :, i]
+    axis = np.take(chain.reshape(batch, _H0.size), _AXIS_ENTRIES, axis=1)
+    palm = chain[:, :, 6, :3, 3] + rotate(chain[:, :, 6, :3, :3], _PALM)
+    return ArmPose(chain[..., :3, 3], axis, chain[..., :3, :3], palm)
 
 
 def reachable(target: Array) -> Array:
@@ -87,11 +105,11 @@ def reachable(target: Array) -> Array:
     return np.asarray(SHOULDER + arm * np.minimum(1.0, REACH / np.maximum(length, 1e-6)))
 
 
-def improve(joint_position: Array, target: Array, max_step: float) -> Array:
+def improve(joint_position: Array, target: Array) -> Array:
     """One step of damped least squares towards palm targets.
 
     dq = W J^T (J W J^T + lambda^2)^-1 (e - J n) + n, where n pulls towards REST; clipped
-    to ``max_step`` (rad) per joint and to the joint limits.
+    per joint and to the joint limits.
 
     Args:
         joint_position: (B, 2, 7) rad.
@@ -105,7 +123,7 @@ def improve(joint_position: Array, target: Array, max_step: float) -> Array:
     normal = np.swapaxes(weighted, -1, -2) @ jac + _DAMPING**2 * np.eye(3)
     solved = _solve_symmetric(normal, error)
     step = np.sum(weighted * solved[:, :, None], axis=-1) + pull
-    step = np.minimum(np.maximum(step, -max_step), max_step)
+    step = np.minimum(np.maximum(step, -_MAX_STEP), _MAX_STEP)
     return np.minimum(np.maximum(joint_position + step, _LIMIT_LOW), _LIMIT_HIGH)
 
 

@@ -50,24 +50,20 @@ def _rotation_constants(rest: Array, axis: Array) -> tuple[Array, Array, Array]:
     return rest, rest @ k, rest @ k @ k
 
 
-_REST, _SIN, _COS = _rotation_constants(np.array(_TABLE["rest"]), JOINT_AXIS)
+REST_ROTATION, SIN_ROTATION, COS_ROTATION = _rotation_constants(np.array(_TABLE["rest"]), JOINT_AXIS)
 
 
 def joint_rotations(joint_position: Array, joints: slice = slice(None)) -> Array:
     """Rotation from each joint's child frame to its parent's: (..., J') -> (..., J', 3, 3)."""
     s = np.sin(joint_position)[..., None, None]
     c = 1.0 - np.cos(joint_position)[..., None, None]
-    out: Array = _REST[joints] + s * _SIN[joints] + c * _COS[joints]
+    out: Array = REST_ROTATION[joints] + s * SIN_ROTATION[joints] + c * COS_ROTATION[joints]
     return out
 
 
 def rotate(rotation: Array, vector: Array) -> Array:
     """(..., 3, 3) times (..., 3), broadcast; the same bits for a row whatever the batch."""
-    out: Array = (
-        rotation[..., 0] * vector[..., None, 0]
-        + rotation[..., 1] * vector[..., None, 1]
-        + rotation[..., 2] * vector[..., None, 2]
-    )
+    out: Array = (rotation @ vector[..., None])[..., 0]
     return out
 
 

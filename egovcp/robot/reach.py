@@ -73,8 +73,7 @@ def follow(memory: Reach, hands: Array, torso: Array, config: ReachConfig) -> Ar
     """
     inverse = np.swapaxes(torso, 1, 2)
     goal = arms.reachable(rotate(inverse[:, None], hands))
-    for _ in range(2):
-        memory.goal = arms.improve(memory.goal, goal, config.speed * DT)
+    memory.goal = arms.improve(memory.goal, goal)
     _smooth(memory, config)
     pose = arms.forward(memory.joints)
     com = arms.link_coms(pose)

@@ -54,7 +54,8 @@ class StanceTable:
         self.heights = arrays["height"]
         parts = [arrays[name].astype(np.float64).reshape(len(self.heights), -1) for name in _FIELDS]
         self._shapes = [arrays[name].shape[1:] for name in _FIELDS]
-        self._splits = np.cumsum([part.shape[1] for part in parts])[:-1]
+        ends = np.cumsum([part.shape[1] for part in parts])
+        self._slices = [slice(e - p.shape[1], e) for e, p in zip(ends, parts, strict=True)]
         self._flat = np.concatenate(parts, axis=1)
         self._slope = np.diff(self._flat, axis=0) / np.diff(self.heights)[:, None]
 
@@ -68,9 +69,8 @@ class StanceTable:
         index = np.searchsorted(self.heights[1:-1], h, side="right")
         flat = self._slope[index] * (h - self.heights[index])[:, None]
         flat += self._flat[index]
-        parts = np.split(flat, self._splits, axis=1)
-        shaped = [p.reshape(len(h), *s) for p, s in zip(parts, self._shapes, strict=True)]
-        return StanceRow(*shaped)
+        fields = zip(self._slices, self._shapes, strict=True)
+        return StanceRow(*(flat[:, part].reshape(len(h), *shape) for part, shape in fields))
 
     def fingerprint(self) -> str:
         """8 hexadecimal digits that change with any number of the table."""
