@@ -70,7 +70,7 @@ class WallConfig:
     """Turn of the wall about the vertical, rad; 0 faces the robot squarely."""
     friction_range: Range = (0.6, 1.0)
     """Sliding friction of the wall."""
-    push_speed_range: Range = (0.40, 0.70)
+    push_speed_range: Range = (0.40, 0.60)
     """Change of base velocity by a push towards the wall, m/s."""
     push_bearing_range: Range = (-0.20, 0.20)
     """Direction of a push towards the wall, rad from straight ahead."""
@@ -114,7 +114,7 @@ class ArchConfig:
     """Thickness of posts and lintel along the direction of passage, m."""
     lintel_height: float = 0.35
     """Height of the lintel beam, m."""
-    distance_range: Range = (2.6, 3.6)
+    distance_range: Range = (1.6, 2.2)
     """Centre of the arch before the pelvis when it starts to move, m."""
     lateral_range: Range = (-0.08, 0.08)
     """Centre of the arch left of the pelvis, m."""
@@ -214,7 +214,7 @@ class EnvConfig:
     """Length and timing of ball episodes."""
     wall_episode: EpisodeConfig = EpisodeConfig()
     """Length and timing of wall episodes."""
-    arch_episode: EpisodeConfig = EpisodeConfig(ticks=320, event_ticks=(0, 30))
+    arch_episode: EpisodeConfig = EpisodeConfig(ticks=230, event_ticks=(5, 25))
     """Length and timing of arch episodes; the default covers the slowest passage."""
     feet: Literal["stock", "points"] = "points"
     """Foot collision model: four points each (about twice as fast), or the stock capsules."""

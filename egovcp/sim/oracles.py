@@ -94,11 +94,42 @@ class WallOracle:
         return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
 
 
+@dataclass(frozen=True)
+class ArchOracleConfig:
+    """When and how the arch oracle ducks."""
+
+    before: float = 0.75
+    """Ducks while the arch is nearer than this before the pelvis, m."""
+    behind: float = 0.30
+    """Stays down until the arch is this far behind the pelvis, m."""
+    height: float = 0.55
+    """Pelvis height under the arch, m."""
+
+
+class ArchOracle:
+    """Squats while the arch is near."""
+
+    def __init__(self, config: ArchOracleConfig = ArchOracleConfig()) -> None:
+        self._config = config
+
+    def act(self, truth: Truth, row: int) -> Array:
+        """(7,) the action for one row."""
+        ahead, c = truth.object_b[row, 0], self._config
+        target = np.array(ACTION_BOX.neutral)
+        if truth.object_active[row] and -c.behind < ahead < c.before:
+            target[6] = c.height
+        return ACTION_BOX.to_normalised(target)
+
+
 class Oracle:
     """The scripted solution of each row's task."""
 
     def __init__(self) -> None:
-        self._by_task: dict[str, TaskOracle] = {"ball": BallOracle(), "wall": WallOracle()}
+        self._by_task: dict[str, TaskOracle] = {
+            "ball": BallOracle(),
+            "wall": WallOracle(),
+            "arch": ArchOracle(),
+        }
 
     def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
         """Nothing to forget."""

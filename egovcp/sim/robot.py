@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -42,6 +43,24 @@ class SimulatedRobot:
         self.model = scene.copy_model()
         self.data = mujoco.MjData(self.model)
         self._wrench = np.zeros(6)
+
+    def shape_geom(self, geom: int, size: Sequence[float], centre: Sequence[float]) -> None:
+        """Give a sphere or box of the object another size (m) and place in its body's frame.
+
+        Everything that the compiler derived from the size is kept consistent: contacts and
+        rays skip what these bounds exclude.
+        """
+        model, body = self.model, self.index.object_body
+        extent = np.resize(np.asarray(size, dtype=np.float64), 3)
+        model.geom_size[geom, : len(size)] = size
+        model.geom_pos[geom] = centre
+        model.geom_aabb[geom, 3:] = extent
+        model.geom_rbound[geom] = size[0] if len(size) == 1 else np.linalg.norm(extent)
+        first = model.body_bvhadr[body]
+        nodes = model.bvh_aabb[first : first + model.body_bvhnum[body]]
+        reach = np.abs(centre) + extent
+        nodes[:, :3] = 0.0
+        nodes[:, 3:] = np.maximum(nodes[:, 3:], reach)
 
     def reset(self, joint_position: Array, pelvis: Array) -> None:
         """Stand still at ``pelvis`` (7,) (position m, quaternion wxyz) with the joints (J,) rad."""

@@ -51,10 +51,7 @@ class BallTask(Task):
 
     def _shape_ball(self) -> None:
         model, body = self.robot.model, self.robot.index.object_body
-        geom = model.body_geomadr[body]
-        model.geom_size[geom, 0] = self.radius
-        model.geom_rbound[geom] = self.radius
-        model.geom_aabb[geom, 3:] = self.radius
+        self.robot.shape_geom(int(model.body_geomadr[body]), [self.radius], [0.0, 0.0, 0.0])
         model.body_mass[body] = self._mass
         model.body_inertia[body] = 0.4 * self._mass * self.radius**2
 

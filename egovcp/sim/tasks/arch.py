@@ -1,0 +1,139 @@
+"""Traverse the arch: duck under a lintel that an upright robot would hit.
+
+On the rail the robot stands and the arch comes to it at the commanded speed: the same
+relative motion as walking through it. A kinematic arch cannot be pushed away.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import ClassVar, Final
+
+import numpy as np
+
+from egovcp.sim.config import EnvConfig
+from egovcp.sim.robot import SimulatedRobot, Touch
+from egovcp.sim.scenario import Scenario
+from egovcp.sim.scene import ARCH_GEOMS, HEAD, PARTS
+from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
+from egovcp.spec import PHYSICS_DT, PLANNER_DT
+
+_OTHERS: Final = [part for part in range(len(PARTS)) if part != HEAD]
+_POST_HALF_WIDTH: Final = 0.06  # m
+_BEHIND: Final = 0.25  # m, an arch this far behind the pelvis has been passed
+
+
+class ArchTask(Task):
+    """One arch, which starts to move at the event."""
+
+    terms: ClassVar = ("progress", "pass", "head", "contact", "crouch", "pose", "fall")
+
+    def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
+        super().__init__(config, scenario, robot)
+        self.config = config.arch
+        rng = scenario.rng("geometry")
+        c = self.config
+        self.clearance = float(rng.uniform(*c.clearance_range))
+        self._half_width = float(rng.uniform(*c.width_range)) / 2
+        self._half_depth = float(rng.uniform(*c.depth_range)) / 2
+        self._ahead = float(rng.uniform(*c.distance_range))  # arch centre before the pelvis, m
+        self._lateral = float(rng.uniform(*c.lateral_range))
+        self.speed = float(rng.uniform(*c.speed_range))
+        self._touched = False
+        self._passed = False
+        self._shape_arch()
+
+    def _shape_arch(self) -> None:
+        """Write the sizes of posts and lintel; the arch's origin is its centre on the ground."""
+        post_half = (self.clearance + self.config.lintel_height) / 2
+        aside = self._half_width + _POST_HALF_WIDTH
+        post = (self._half_depth, _POST_HALF_WIDTH, post_half)
+        lintel = (self._half_depth, self._half_width, self.config.lintel_height / 2)
+        above = self.clearance + lintel[2]
+        boxes = (
+            (post, (0.0, aside, post_half)),
+            (post, (0.0, -aside, post_half)),
+            (lintel, (0.0, 0.0, above)),
+        )
+        for name, (size, centre) in zip(ARCH_GEOMS, boxes, strict=True):
+            self.robot.shape_geom(self.robot.model.geom(name).id, size, centre)
+
+    def place(self) -> None:
+        """Stand the arch across the robot's way."""
+        pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
+        self._direction = heading[:, 0].copy()
+        self._origin = pelvis + heading @ np.array([0.0, self._lateral, 0.0])
+        self._origin[2] = 0.0
+        turn = math.atan2(heading[1, 0], heading[0, 0])
+        self.robot.data.mocap_quat[0] = [math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]
+        self._put()
+
+    def _put(self) -> None:
+        self.robot.data.mocap_pos[0] = self._origin + self._ahead * self._direction
+
+    @property
+    def moving(self) -> bool:
+        """Whether the arch comes nearer."""
+        return self.since_event >= 0.0
+
+    @property
+    def velocity_command(self) -> Array:
+        """(3,) forward at the arch's speed once it moves."""
+        return np.array([self.speed if self.moving else 0.0, 0.0, 0.0])
+
+    def act(self) -> None:
+        """Move the arch along the rail."""
+        if self.moving:
+            self._ahead -= self.speed * PHYSICS_DT
+            self._put()
+
+    def observe(self, touches: Sequence[Touch]) -> None:
+        """Remember any contact."""
+        self._touched = self._touched or bool(touches)
+
+    def rewards(self, action: Array) -> dict[str, float]:
+        """Progress, once the passage, and the costs of contact, crouch and pose."""
+        c = self.config
+        passes = not self._passed and self._ahead + self._half_depth < -_BEHIND
+        under_way = self.moving and not self._passed
+        self._passed = self._passed or passes
+        needless = abs(self._ahead) > c.near or self._passed
+        crouch = max(0.0, -float(action[6]))
+        return {
+            "progress": c.progress_reward * self.speed * PLANNER_DT * under_way,
+            "pass": c.pass_reward * (passes and not self._touched),
+            "head": -c.head_cost * bool(self.forces[HEAD] > 0.0),
+            "contact": -c.contact_cost * bool(self.forces[_OTHERS].any()),
+            "crouch": -c.crouch_cost * crouch * needless,
+            "pose": -c.pose_cost * float(np.mean(action[:6] ** 2)),
+        }
+
+    @property
+    def fall_cost(self) -> float:
+        """Cost of a fall."""
+        return self.config.fall_cost
+
+    @property
+    def achieved(self) -> bool:
+        """Passed untouched; in an empty episode the arch never comes."""
+        return not self._touched and (self.event_tick is None or self._passed)
+
+    def state(self) -> ObjectState:
+        """Arch centre on the ground; active until it has been passed."""
+        velocity = -self.speed * self.moving * self._direction
+        position = self.robot.data.mocap_pos[0].copy()
+        return ObjectState(position, velocity, self.clearance, self.moving and not self._passed)
+
+    def solids(self) -> tuple[Solid, ...]:
+        """Both posts and the lintel."""
+        model, data = self.robot.model, self.robot.data
+        found = []
+        for name in ARCH_GEOMS:
+            geom = model.geom(name).id
+            size = tuple(float(s) for s in model.geom_size[geom])
+            centre = data.geom_xpos[geom].copy()
+            found.append(
+                Solid(name, "box", (size[0], size[1], size[2]), centre, data.mocap_quat[0].copy())
+            )
+        return tuple(found)
