@@ -45,6 +45,10 @@ class SafetyStop(EgovcpError):
     exit_code = 6
 
 
+class ConformanceError(EgovcpError):
+    """A part does not keep its contract with the others (see `egovcp.checks`)."""
+
+
 def suggest(name: str, valid: Iterable[str]) -> str:
     """``"; did you mean 'ball'? Choose from: arch, ball, wall"`` for an unknown ``name``."""
     choices = sorted(valid)

@@ -48,8 +48,13 @@ def filter_sequence(
     batch: Batch,
     carry: Carry | None = None,
     generator: torch.Generator | None = None,
+    *,
+    sample: bool = True,
 ) -> Rollout:
-    """Run the posterior over whole sequences, sampling z; `WorldModel.observe` step by step."""
+    """Run the posterior over whole sequences, as `WorldModel.observe` does step by step.
+
+    Training samples z; without ``sample`` z is the posterior mean, as it is on the robot.
+    """
     size, length = batch.valid.shape
     near = nearness(batch.depth.flatten(0, 1), model.config.depth_max_m)
     state = model.standardise(batch.state)
@@ -61,7 +66,7 @@ def filter_sequence(
     for t in range(length):
         h = model.advance(carry, batch.prev_action[:, t], batch.is_first[:, t])
         posterior = model.infer(h, embedding[:, t])
-        carry = Carry(h, posterior.sample(generator))
+        carry = Carry(h, posterior.sample(generator) if sample else posterior.mean)
         hs.append(carry.h)
         zs.append(carry.z)
         posteriors.append(posterior)

@@ -148,9 +148,13 @@ class WorldModel(nn.Module):
         return Carry(h, self.infer(h, self.embed(depth, state)).mean)
 
     def advance(self, carry: Carry, action: Tensor, is_first: Tensor) -> Tensor:
-        """h_t of equation 1, restarting from zeros where ``is_first`` (B,)."""
-        keep = (~is_first).to(carry.h.dtype)[:, None]
-        return self.transition(Carry(carry.h * keep, carry.z * keep), action * keep)
+        """h_t of equation 1, restarting from zeros where ``is_first`` (B,).
+
+        The old memory is replaced, not multiplied by zero: a reset heals NaN, too.
+        """
+        first = is_first[:, None]
+        h, z, action = (x.masked_fill(first, 0.0) for x in (*carry, action))
+        return self.transition(Carry(h, z), action)
 
     def imagine(self, carry: Carry, action: Tensor) -> Carry:
         """Advance by one tick without an observation; z is the prior mean."""

@@ -80,9 +80,9 @@ class Plan(NamedTuple):
 
     actions: Tensor  # (E, N, 7) in [-1, 1]; the first is to be executed
     deltas: Tensor  # (E, N, 7) its steps; shifted, the warm start of the next plan
-    value: Tensor  # (E,) J of the best candidates' mean (mean over the last elites)
+    value: Tensor  # (E,) J, the mean over the last elites; -inf if no candidate had a finite J
     candidates: Tensor  # (E, elites, N, 7) elites of the last round, best first
-    candidate_values: Tensor  # (E, elites)
+    candidate_values: Tensor  # (E, elites); -inf where J was not a number
     iterations: int
 
 
@@ -146,17 +146,28 @@ def plan_cem[L](
     for _ in range(config.iterations):
         deltas = _sample(mean, std, config, generator)  # (E, M, N, 7)
         values = evaluate(model, carry, walk(start, deltas, config.eta), config)
-        values = values.nan_to_num(nan=-torch.inf)
+        values = values.masked_fill(~values.isfinite(), -torch.inf)
         top, index = values.topk(config.elites, dim=1)
         elites = deltas.take_along_dim(index[:, :, None, None], 1)
-        mean, std = (
-            elites.mean(1),
-            elites.std(1, correction=0).clamp_min(config.min_std),
-        )
+        usable = top.isfinite()
+        mean, std = _refit(elites, usable, mean, std)
+        std = std.clamp_min(config.min_std)
     chosen = walk(executed, mean, config.eta)
     best = walk(executed.repeat_interleave(config.elites, 0), elites.flatten(0, 1), config.eta)
     best = best.view(robots, config.elites, *shape[1:])
-    return Plan(chosen, mean, top.mean(1), best, top, config.iterations)
+    value = top.masked_fill(~usable, 0.0).sum(1) / usable.sum(1).clamp_min(1)
+    value = value.masked_fill(~usable.any(1), -torch.inf)
+    return Plan(chosen, mean, value, best, top, config.iterations)
+
+
+def _refit(elites: Tensor, usable: Tensor, mean: Tensor, std: Tensor) -> tuple[Tensor, Tensor]:
+    """Mean and deviation (E, N, 7) of the usable elites (E, elites, N, 7); without any, the old."""
+    weight = usable[:, :, None, None].to(elites.dtype)
+    count = weight.sum(1)
+    fitted = (elites * weight).sum(1) / count.clamp_min(1.0)
+    squares = (elites - fitted[:, None]).square() * weight
+    spread = (squares.sum(1) / count.clamp_min(1.0)).sqrt()
+    return torch.where(count > 0, fitted, mean), torch.where(count > 0, spread, std)
 
 
 def _sample(mean: Tensor, std: Tensor, config: PlannerConfig, generator: torch.Generator) -> Tensor:

@@ -1,0 +1,162 @@
+"""Does a vectorised environment keep time, limits and promises?"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp import spec
+from egovcp.errors import ConformanceError
+
+COMMAND_TOLERANCE = 1e-4  # m; float32 rounding of a command
+
+type Array = NDArray[np.floating]
+
+
+class _Observation(Protocol):
+    @property
+    def depth(self) -> NDArray[np.uint16]: ...
+
+    @property
+    def state(self) -> NDArray[np.float32]: ...
+
+
+class _Step[O: _Observation](Protocol):
+    @property
+    def observation(self) -> O: ...
+
+    @property
+    def reward(self) -> Array: ...
+
+    @property
+    def reward_terms(self) -> Mapping[str, Array]: ...
+
+    @property
+    def terminated(self) -> NDArray[np.bool_]: ...
+
+    @property
+    def truncated(self) -> NDArray[np.bool_]: ...
+
+    @property
+    def success(self) -> NDArray[np.bool_]: ...
+
+    @property
+    def sent_action(self) -> Array: ...
+
+
+class Environment[S, O: _Observation](Protocol):
+    """What collection and evaluation need of a vectorised environment."""
+
+    @property
+    def num_envs(self) -> int: ...
+
+    def reset(self, scenarios: Sequence[S]) -> O: ...
+
+    def step(self, action: Array) -> _Step[O]: ...
+
+
+def check_env[S, O: _Observation](
+    env: Environment[S, O], scenarios: Sequence[S], ticks: int = 20, seed: int = 0
+) -> None:
+    """Run the scenarios twice under the same random actions and check every tick.
+
+    Args:
+        scenarios: one per row of the environment.
+        ticks: planner ticks per run; actions jump farther than the rate limit allows.
+
+    Raises:
+        ConformanceError: naming the tick and the property that it breaks.
+    """
+    rng = np.random.default_rng(seed)
+    actions = rng.uniform(-1, 1, (ticks, env.num_envs, spec.ACTION_DIM))
+    first = _drive(env, scenarios, actions)
+    for t, (a, b) in enumerate(zip(first, _drive(env, scenarios, actions), strict=True)):
+        for name in a:
+            if not np.array_equal(a[name], b[name]):
+                raise ConformanceError(f"environment, tick {t}: {name} is not repeatable")
+
+
+def _drive[S, O: _Observation](
+    env: Environment[S, O], scenarios: Sequence[S], actions: Array
+) -> list[dict[str, NDArray[np.generic]]]:
+    """What each tick brought; tick 0 is the observation of the reset."""
+    sent: Array = np.zeros((env.num_envs, spec.ACTION_DIM))
+    over: NDArray[np.bool_] = np.zeros(env.num_envs, dtype=np.bool_)
+    observation = env.reset(scenarios)
+    _check_observation(observation, sent, 0)
+    history: list[dict[str, NDArray[np.generic]]] = [_arrays(observation)]
+    for t, action in enumerate(actions, start=1):
+        step = env.step(action)
+        _check_step(step, over, t)
+        _check_sent(step.sent_action, sent, t)
+        _check_observation(step.observation, step.sent_action, t)
+        history.append(_arrays(step.observation) | {"reward": np.array(step.reward)})
+        sent, over = np.array(step.sent_action), step.terminated | step.truncated
+    return history
+
+
+def _arrays(observation: _Observation) -> dict[str, NDArray[np.generic]]:
+    return {"depth": observation.depth.copy(), "state": observation.state.copy()}
+
+
+def _check_observation(observation: _Observation, sent: Array, t: int) -> None:
+    rows = len(sent)
+    layout: dict[str, tuple[NDArray[Any], tuple[int, ...], type[np.generic]]] = {
+        "depth": (observation.depth, (rows, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16),
+        "state": (observation.state, (rows, spec.STATE_DIM), np.float32),
+    }
+    for name, (array, shape, dtype) in layout.items():
+        _require(
+            array.shape == shape and array.dtype == dtype,
+            t,
+            f"{name} is {array.dtype} {array.shape}, expected {np.dtype(dtype)} {shape}",
+        )
+    _require(bool(np.isfinite(observation.state).all()), t, "state is not finite")
+    _require(
+        bool((observation.depth <= 1000 * spec.DEPTH_MAX_M).all()),
+        t,
+        f"depth exceeds {spec.DEPTH_MAX_M} m",
+    )
+    late = np.abs(commanded(observation.state) - spec.ACTION_BOX.to_metric(sent)).max()
+    _require(
+        bool(late <= COMMAND_TOLERANCE),
+        t,
+        f"the command in the state is not the last one sent (off by {late:.3g} m)",
+    )
+
+
+def _check_sent(sent: Array, before: Array, t: int) -> None:
+    change = np.abs(sent - before).max()
+    limit = spec.ACTION_RATE_LIMIT
+    _require(
+        bool(change <= limit + 1e-6),
+        t,
+        f"the action sent moved by {change:.3g} box units, the rate limit is {limit}",
+    )
+    _require(bool(np.abs(sent).max() <= 1 + 1e-6), t, "the action sent leaves [-1, 1]")
+
+
+def _check_step[O: _Observation](step: _Step[O], over: NDArray[np.bool_], t: int) -> None:
+    terms = np.sum(list(step.reward_terms.values()), axis=0)
+    _require(bool(np.isfinite(step.reward).all()), t, "reward is not finite")
+    _require(np.allclose(terms, step.reward), t, "reward is not the sum of its terms")
+    both = step.terminated & step.truncated
+    _require(not both.any(), t, "a row is terminated and truncated at once")
+    _require(
+        bool((step.terminated | step.truncated)[over].all()), t, "an episode that was over goes on"
+    )
+    _require(not np.any(step.reward[over]), t, "reward after the end of an episode")
+
+
+def _require(ok: bool, t: int, problem: str) -> None:
+    if not ok:
+        raise ConformanceError(f"environment, tick {t}: {problem}")
+
+
+def commanded(state: NDArray[np.floating]) -> NDArray[np.floating]:
+    """(..., 74) state -> (..., 7) commanded hands and height, metres."""
+    hands, height = spec.STATE_SLICES["command_hands"], spec.STATE_SLICES["command_height"]
+    return state[..., hands.start : height.stop]

@@ -1,0 +1,155 @@
+"""Does a world model keep the contract that filtering and planning rely on?"""
+
+from __future__ import annotations
+
+import copy
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.errors import ConformanceError
+from egovcp.model import Carry
+
+TOLERANCE = 1e-4  # of network outputs computed in another order
+
+
+class RecurrentModel(Protocol):
+    """What filtering and planning need of a world model; shapes as in `WorldModel`."""
+
+    @property
+    def return_floor(self) -> Tensor: ...
+
+    def initial(self, batch: int) -> Carry: ...
+
+    def observe(
+        self, carry: Carry, action: Tensor, depth: Tensor, state: Tensor, is_first: Tensor
+    ) -> Carry: ...
+
+    def spread(self, carry: Carry) -> Carry: ...
+
+    def imagine(self, carry: Carry, action: Tensor) -> Carry: ...
+
+    def value(self, carry: Carry, action: Tensor) -> Tensor: ...
+
+    def termination(self, carry: Carry) -> Tensor: ...
+
+    def decode(self, carry: Carry) -> tuple[Tensor, Tensor]: ...
+
+
+class RandomInputs:
+    """Random but repeatable inputs for B rows."""
+
+    def __init__(self, rows: int, seed: int) -> None:
+        rng = torch.Generator().manual_seed(seed)
+        self.action = torch.rand(rows, spec.ACTION_DIM, generator=rng) * 2 - 1
+        pixels = (rows, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+        self.depth = torch.randint(0, 5000, pixels, generator=rng, dtype=torch.int32)
+        self.state = torch.randn(rows, spec.STATE_DIM, generator=rng)
+        self.plans = torch.rand(rows, 3, spec.ACTION_DIM, generator=rng) * 2 - 1
+
+
+@torch.no_grad()
+def check_world_model(model: RecurrentModel, seed: int = 0) -> None:
+    """Check the contract that filtering on the robot and planning rely on.
+
+    Raises:
+        ConformanceError: naming the method and the property that it breaks.
+    """
+    rows = 3
+    first, rest = torch.ones(rows, dtype=torch.bool), torch.zeros(rows, dtype=torch.bool)
+    one, two = RandomInputs(rows, seed), RandomInputs(rows, seed + 1)
+    start = model.observe(model.initial(rows), one.action, one.depth, one.state, first)
+    before = copy.deepcopy(start)
+    later = model.observe(start, two.action, two.depth, two.state, rest)
+    _same("observe changes its input carry", before, start)
+    _require(
+        later.h.shape == start.h.shape and later.z.shape == start.z.shape,
+        "observe changes the shape of the carry",
+    )
+    _finite("observe", later)
+    again = model.observe(start, two.action, two.depth, two.state, rest)
+    _same("observe gives another result the second time", later, again)
+    lost = Carry(torch.full_like(later.h, torch.nan), torch.full_like(later.z, torch.nan))
+    for name, memory in (("the memory", later), ("a memory of NaN", lost)):
+        fresh = model.observe(memory, two.action, one.depth, one.state, first)
+        _same(f"observe with is_first does not forget {name} and the last action", start, fresh)
+    _check_rows(model, start, two, later)
+    _check_planning(model, later, two.plans)
+    _check_decoder(model, later)
+
+
+def _check_rows(model: RecurrentModel, start: Carry, inputs: RandomInputs, batched: Carry) -> None:
+    """Each row of a batch is treated as if it were alone."""
+    going_on = torch.zeros(1, dtype=torch.bool)
+    for b in range(len(inputs.action)):
+        row = slice(b, b + 1)
+        alone = model.observe(
+            Carry(start.h[row], start.z[row]),
+            inputs.action[row],
+            inputs.depth[row],
+            inputs.state[row],
+            going_on,
+        )
+        expected = Carry(batched.h[row], batched.z[row])
+        _same("observe lets the rows of a batch influence each other", expected, alone)
+
+
+def _check_planning(model: RecurrentModel, carry: Carry, plans: Tensor) -> None:
+    """imagine, value and termination broadcast (E, 1, ...) states over (E, M, 7) actions."""
+    robots, many = plans.shape[:2]
+    shared = model.spread(carry)
+    before = copy.deepcopy(shared)
+    ahead = model.imagine(shared, plans)
+    _same("imagine changes its input carry", before, shared)
+    _finite("imagine", ahead)
+    heads: dict[str, Tensor] = {
+        "value": model.value(shared, plans),
+        "value of imagined states": model.value(ahead, plans),
+        "termination of imagined states": model.termination(ahead),
+    }
+    for name, answer in heads.items():
+        _require(
+            answer.shape == (robots, many),
+            f"{name} has shape {tuple(answer.shape)}, expected {(robots, many)}",
+        )
+        _require(bool(answer.isfinite().all()), f"{name} is not finite")
+    dead = heads["termination of imagined states"]
+    _require(bool(((dead >= 0) & (dead <= 1)).all()), "termination is not a probability")
+    _require(
+        bool(torch.as_tensor(model.return_floor).isfinite().all()), "return_floor is not finite"
+    )
+    alone = model.imagine(carry, plans[:, 0])
+    _same(
+        "imagine lets the candidates influence each other",
+        Carry(ahead.h[:, 0], ahead.z[:, 0]),
+        alone,
+    )
+
+
+def _check_decoder(model: RecurrentModel, carry: Carry) -> None:
+    depth, state = model.decode(carry)
+    rows = len(carry.h)
+    _require(
+        depth.shape == (rows, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+        and state.shape == (rows, spec.STATE_DIM),
+        f"decode gives {tuple(depth.shape)} and {tuple(state.shape)}",
+    )
+    _require(bool(depth.isfinite().all() and state.isfinite().all()), "decode is not finite")
+    _require(bool((depth >= 0).all()), "decode gives negative depth")
+
+
+def _require(ok: bool, problem: str) -> None:
+    if not ok:
+        raise ConformanceError(f"world model: {problem}")
+
+
+def _finite(name: str, carry: Carry) -> None:
+    _require(bool(carry.h.isfinite().all() and carry.z.isfinite().all()), f"{name} is not finite")
+
+
+def _same(problem: str, expected: Carry, found: Carry) -> None:
+    for a, b in zip(expected, found, strict=True):
+        close = torch.allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE)
+        _require(close, f"{problem}: differs by up to {float((a - b).abs().max()):.3g}")
