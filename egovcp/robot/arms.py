@@ -26,6 +26,7 @@ UPPER: Final = kinematics.JOINT_UPPER[ARMS].reshape(_SHAPE)
 SHOULDER: Final = _OFFSET[:, 0]  # (2, 3) m, torso frame
 _TAIL_MASS: Final = np.cumsum(MASS[:, ::-1], axis=1)[:, ::-1]  # (2, 7) joint's link and beyond
 
+
 def _homogeneous(rotation: Array, offset: Array) -> Array:
     """(2, 7, 4, 4) from rotations (14, 3, 3) and offsets (2, 7, 3); the last row stays zero."""
     out = np.zeros((*_SHAPE, 4, 4))
@@ -39,9 +40,9 @@ _H0[..., 3, 3] = 1.0
 _H1: Final = _homogeneous(kinematics.SIN_ROTATION[ARMS], np.zeros(3))
 _H2: Final = _homogeneous(kinematics.COS_ROTATION[ARMS], np.zeros(3))
 #: Entries of the flattened chain (2, 7, 4, 4) that hold each joint's axis.
-_AXIS_ENTRIES: Final = (
-    16 * np.arange(14)[:, None] + 4 * np.arange(3) + _AXIS[:, None]
-).reshape(*_SHAPE, 3)
+_AXIS_ENTRIES: Final = (16 * np.arange(14)[:, None] + 4 * np.arange(3) + _AXIS[:, None]).reshape(
+    *_SHAPE, 3
+)
 
 REST: Final = np.array([[0.25, 0.2, 0.0, 0.75, 0, 0, 0], [0.25, -0.2, 0.0, 0.75, 0, 0, 0]])
 #: Share of each joint in reaching: the wrist helps little, its motors are weak.
@@ -124,7 +125,7 @@ def improve(joint_position: Array, target: Array) -> Array:
     solved = _solve_symmetric(normal, error)
     step = np.sum(weighted * solved[:, :, None], axis=-1) + pull
     step = np.minimum(np.maximum(step, -_MAX_STEP), _MAX_STEP)
-    return np.minimum(np.maximum(joint_position + step, _LIMIT_LOW), _LIMIT_HIGH)
+    return np.asarray(np.minimum(np.maximum(joint_position + step, _LIMIT_LOW), _LIMIT_HIGH))
 
 
 def _solve_symmetric(matrix: Array, vector: Array) -> Array:
@@ -132,9 +133,7 @@ def _solve_symmetric(matrix: Array, vector: Array) -> Array:
     r0, r1, r2 = matrix[..., 0, :], matrix[..., 1, :], matrix[..., 2, :]
     c0, c1, c2 = cross(r1, r2), cross(r2, r0), cross(r0, r1)
     det = np.sum(r0 * c0, axis=-1, keepdims=True)
-    combined: Array = (
-        c0 * vector[..., 0:1] + c1 * vector[..., 1:2] + c2 * vector[..., 2:3]
-    ) / det
+    combined: Array = (c0 * vector[..., 0:1] + c1 * vector[..., 1:2] + c2 * vector[..., 2:3]) / det
     return combined
 
 

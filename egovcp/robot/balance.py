@@ -66,11 +66,12 @@ class Balance:
         return np.asarray(self.reached[:, 18])
 
 
-def start(height: Array, table: StanceTable) -> Balance:
-    """Memory of a robot standing still at pelvis heights (B,)."""
+def start(height: Array, reach: Reach, table: StanceTable) -> Balance:
+    """Memory of a robot standing still at pelvis heights (B,) with its arms as in ``reach``."""
     batch, row = len(height), table.at(height)
+    moment = _turn(reach.moment, row.pelvis[:, 2])[:, :2]
     reference = np.zeros((batch, _WIDTH))
-    reference[:, _POSITIONS] = _positions(row, height, np.zeros((batch, 2)))
+    reference[:, _POSITIONS] = _positions(row, height, moment)
     return Balance(
         prediction=np.zeros((batch, NF)),
         correction=np.zeros((batch, NU)),

@@ -14,8 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.mjcf import robot_spec
-from egovcp.robot.stance_design import NU, StanceModel, balanced_pose, linearise, load_response, pitch_at
+from egovcp.robot.stance_design import (
+    StanceModel,
+    balanced_pose,
+    linearise,
+    load_response,
+    pitch_at,
+)
 from egovcp.robot.stance_gains import compensator
+from egovcp.robot.stance_table import NU
 from egovcp.spec import JOINT_NAMES
 
 PACKAGE = Path(__file__).parent
@@ -72,7 +79,8 @@ def write_stance(path: Path) -> None:
     """Write ``g1_stance.npz``."""
     stance = StanceModel(robot_spec().compile())
     rows = [stance_row(stance, height) for height in HEIGHTS]
-    np.savez(path, **{name: np.stack([row[name] for row in rows]) for name in rows[0]})
+    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0]}
+    np.savez(path, allow_pickle=False, **arrays)
 
 
 def main() -> None:

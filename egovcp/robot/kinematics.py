@@ -50,7 +50,9 @@ def _rotation_constants(rest: Array, axis: Array) -> tuple[Array, Array, Array]:
     return rest, rest @ k, rest @ k @ k
 
 
-REST_ROTATION, SIN_ROTATION, COS_ROTATION = _rotation_constants(np.array(_TABLE["rest"]), JOINT_AXIS)
+REST_ROTATION, SIN_ROTATION, COS_ROTATION = _rotation_constants(
+    np.array(_TABLE["rest"]), JOINT_AXIS
+)
 
 
 def joint_rotations(joint_position: Array, joints: slice = slice(None)) -> Array:
@@ -115,17 +117,16 @@ def quaternion(rotation: Array) -> Array:
     """
     m = rotation
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    wx, wy, wz = (m[..., 2, 1] - m[..., 1, 2], m[..., 0, 2] - m[..., 2, 0], m[..., 1, 0] - m[..., 0, 1])
-    xy, xz, yz = (m[..., 0, 1] + m[..., 1, 0], m[..., 0, 2] + m[..., 2, 0], m[..., 1, 2] + m[..., 2, 1])
-    outer = np.stack(
-        [
-            np.stack([1 + xx + yy + zz, wx, wy, wz], axis=-1),
-            np.stack([wx, 1 + xx - yy - zz, xy, xz], axis=-1),
-            np.stack([wy, xy, 1 - xx + yy - zz, yz], axis=-1),
-            np.stack([wz, xz, yz, 1 - xx - yy + zz], axis=-1),
-        ],
-        axis=-2,
+    wx, xy = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 1] + m[..., 1, 0]
+    wy, xz = m[..., 0, 2] - m[..., 2, 0], m[..., 0, 2] + m[..., 2, 0]
+    wz, yz = m[..., 1, 0] - m[..., 0, 1], m[..., 1, 2] + m[..., 2, 1]
+    rows = (
+        (1 + xx + yy + zz, wx, wy, wz),
+        (wx, 1 + xx - yy - zz, xy, xz),
+        (wy, xy, 1 - xx + yy - zz, yz),
+        (wz, xz, yz, 1 - xx - yy + zz),
     )
+    outer = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
     row = np.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
     out: Array = row / np.sqrt(np.sum(row * row, axis=-1, keepdims=True))

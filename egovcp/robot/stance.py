@@ -29,7 +29,7 @@ from egovcp.robot.kinematics import (
 )
 from egovcp.robot.reach import TORSO_ORIGIN, Reach, ReachConfig
 from egovcp.robot.stance_table import stance_table
-from egovcp.spec import STATE_SLICES
+from egovcp.spec import STATE_DIM, STATE_SLICES
 
 _SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the sole
 _FEET: Final = tuple(LINK_NAMES.index(f"{side}_ankle_roll_link") for side in ("left", "right"))
@@ -52,8 +52,7 @@ class StanceController:
     def __init__(self, config: StanceConfig | None = None) -> None:
         self.config = config or StanceConfig()
         self._table = stance_table()
-        self._balance = balance.start(np.zeros(0), self._table)
-        self._reach = reach.start(np.zeros((0, 14)))
+        self._balance, self._reach = self._start(np.zeros((0, STATE_DIM)))
 
     @property
     def id(self) -> str:
@@ -80,14 +79,14 @@ class StanceController:
             self._balance, self._reach = self._start(s)
             return
         fresh = self._start(s[rows])
-        for memory, new in zip((self._balance, self._reach), fresh, strict=True):
-            for entry in fields(memory):
-                getattr(memory, entry.name)[rows] = getattr(new, entry.name)
+        _replace_rows(self._balance, fresh[0], rows)
+        _replace_rows(self._reach, fresh[1], rows)
 
     def _start(self, state: Array) -> tuple[Balance, Reach]:
         q = state[:, STATE_SLICES["joint_position"]]
         height = _pelvis_height(q, state[:, STATE_SLICES["projected_gravity"]])
-        return balance.start(self._table.clamp(height), self._table), reach.start(q[:, ARMS])
+        arm_memory = reach.start(q[:, ARMS])
+        return balance.start(self._table.clamp(height), arm_memory, self._table), arm_memory
 
     def step(self, state: NDArray[np.floating]) -> Array:
         """(B, S) observations -> (B, J) joint position targets, rad."""
@@ -101,12 +100,17 @@ class StanceController:
         waist = joint_rotations(memory.prediction[:, 6:9], WAIST)
         torso = heading @ waist[:, 0] @ waist[:, 1] @ waist[:, 2]
         hands = s[:, STATE_SLICES["command_hands"]].reshape(-1, 2, 3)
-        hands = hands - rotate(heading, TORSO_ORIGIN)[:, None]
-        arm_target = reach.follow(self._reach, hands, torso, self.config.reach)
+        relative = hands - rotate(heading, TORSO_ORIGIN)[:, None]
+        arm_target = reach.follow(self._reach, relative, torso, self.config.reach)
         row = self._table.at(memory.height)
         body_target = balance.balance(memory, s, row, self._reach, self.config.balance)
         target = np.concatenate([body_target, arm_target], axis=1)
-        return np.minimum(np.maximum(target, _TARGET_LOW), _TARGET_HIGH)
+        return np.asarray(np.minimum(np.maximum(target, _TARGET_LOW), _TARGET_HIGH))
+
+
+def _replace_rows[M: (Balance, Reach)](memory: M, fresh: M, rows: NDArray[np.intp]) -> None:
+    for entry in fields(memory):
+        getattr(memory, entry.name)[rows] = getattr(fresh, entry.name)
 
 
 def _pelvis_height(joint_position: Array, gravity: Array) -> Array:

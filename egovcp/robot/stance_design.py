@@ -122,7 +122,13 @@ class StanceModel:
         self.place(qpos)
         torque = np.zeros(self.model.nv)
         torque[6:21] = STIFFNESS[:NU] * (target - qpos[7:22])
-        return self.basis().T @ (torque - self.data.qfrc_bias)
+        return np.asarray(self.basis().T @ (torque - self.data.qfrc_bias))
+
+    def inertia(self) -> Array:
+        """(35, 35) mass matrix at the configuration last placed."""
+        mass = np.zeros((self.model.nv, self.model.nv))
+        self.mj.mj_fullM(self.model, self.data, mass)
+        return mass
 
     def com(self) -> Array:
         """(3,) centre of mass at the configuration last placed, m."""
@@ -208,34 +214,27 @@ class Linear:
 
 
 def linearise(stance: StanceModel, pose: Pose) -> Linear:
-    """Central differences of the static force, exact zero-order hold over one tick."""
+    """Reduced dynamics at a pose, with an exact zero-order hold over one tick."""
     from scipy.linalg import expm
 
-    target = pose.qpos[7:22] + pose.torque / STIFFNESS[:NU]
-    step = 1e-4
-    spring = np.empty((NZ, NZ))
-    for i, unit in enumerate(np.eye(NZ) * step):
-        ahead = stance.force(stance.displaced(pose.qpos, unit), target)
-        behind = stance.force(stance.displaced(pose.qpos, -unit), target)
-        spring[:, i] = (ahead - behind) / (2 * step)
+    spring = _spring(stance, pose)
     stance.place(pose.qpos)
     basis = stance.basis()
-    mass = np.zeros((stance.model.nv, stance.model.nv))
-    stance.mj.mj_fullM(stance.model, stance.data, mass)
-    inverse = np.linalg.inv(basis.T @ mass @ basis)
     joints = basis[6:21]
+    inverse = np.asarray(np.linalg.inv(basis.T @ stance.inertia() @ basis), dtype=np.float64)
     kp, kd = np.diag(STIFFNESS[:NU]), np.diag(DAMPING[:NU])
-    continuous = np.zeros((NX + NU + NZ, NX + NU + NZ))
-    continuous[:NZ, NZ:NX] = np.eye(NZ)
-    continuous[NZ:NX, :NZ] = inverse @ spring
-    continuous[NZ:NX, NZ:NX] = -inverse @ joints.T @ kd @ joints
-    continuous[NZ:NX, NX : NX + NU] = inverse @ joints.T @ kp
-    continuous[NZ:NX, NX + NU :] = inverse
-    discrete = expm(continuous / CONTROLLER_HZ)
+    inputs, forces = slice(NX, NX + NU), slice(NX + NU, NX + NU + NZ)
+    rates = np.zeros((NX + NU + NZ, NX + NU + NZ))
+    rates[:NZ, NZ:NX] = np.eye(NZ)
+    rates[NZ:NX, :NZ] = inverse @ spring
+    rates[NZ:NX, NZ:NX] = -inverse @ joints.T @ kd @ joints
+    rates[NZ:NX, inputs] = inverse @ joints.T @ kp
+    rates[NZ:NX, forces] = inverse
+    discrete = expm(rates / CONTROLLER_HZ)
     return Linear(
         a=discrete[:NX, :NX],
-        b=discrete[:NX, NX : NX + NU],
-        force=discrete[:NX, NX + NU :],
+        b=discrete[:NX, inputs],
+        force=discrete[:NX, forces],
         c=sensor_matrix(pose, joints),
         legs=joints,
         torque_x=np.hstack([-kp @ joints, -kd @ joints]),
@@ -243,6 +242,18 @@ def linearise(stance: StanceModel, pose: Pose) -> Linear:
         rocking=rocking(pose),
         mobility=inverse,
     )
+
+
+def _spring(stance: StanceModel, pose: Pose) -> Array:
+    """(9, 9) derivative of the static force by z at constant targets, central differences."""
+    target = pose.qpos[7:22] + pose.torque / STIFFNESS[:NU]
+    step = 1e-4
+    out = np.empty((NZ, NZ))
+    for i, unit in enumerate(np.eye(NZ) * step):
+        ahead = stance.force(stance.displaced(pose.qpos, unit), target)
+        behind = stance.force(stance.displaced(pose.qpos, -unit), target)
+        out[:, i] = (ahead - behind) / (2 * step)
+    return out
 
 
 def rocking(pose: Pose) -> Array:

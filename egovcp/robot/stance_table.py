@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from egovcp.robot.g1 import ARMS, WAIST
 from egovcp.robot.arms import REST
+from egovcp.robot.g1 import ARMS, WAIST
 from egovcp.robot.kinematics import Array
 from egovcp.spec import NUM_JOINTS
 
