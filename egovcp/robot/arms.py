@@ -52,14 +52,17 @@ _LIMIT_LOW: Final = LOWER + _LIMIT_MARGIN
 _LIMIT_HIGH: Final = UPPER - _LIMIT_MARGIN
 _DAMPING: Final = 0.05  # m: damped least squares, lambda
 _MAX_STEP: Final = 0.3  # rad per joint and iteration
-_REST_PULL: Final = 0.12  # share of the way to REST per iteration, in the null space
+_MAX_ERROR: Final = 0.08  # m per iteration: beyond, the linear step leads into strange branches
+#: Share of the way to REST per iteration, in the null space. Strong enough that the
+#: posture depends on the target alone, not on the way there.
+_REST_PULL: Final = 0.25
 REACH: Final = 0.45  # m, shoulder to palm; a straight arm is 0.465
 _TRUNK_RADII: Final = (0.16, 0.15)  # m, keep-out ellipse around the trunk: forward, sideways
 #: Every choice above, for the controller's identity.
 IDENTITY: Final = (
     REST.tolist(),
     _SHARE.tolist(),
-    (_LIMIT_MARGIN, _DAMPING, _MAX_STEP, _REST_PULL, REACH, *_TRUNK_RADII),
+    (_LIMIT_MARGIN, _DAMPING, _MAX_STEP, _MAX_ERROR, _REST_PULL, REACH, *_TRUNK_RADII),
 )
 _CROSS: Final = (np.array([1, 2, 0]), np.array([2, 0, 1]))
 
@@ -109,8 +112,8 @@ def reachable(target: Array) -> Array:
 def improve(joint_position: Array, target: Array) -> Array:
     """One step of damped least squares towards palm targets.
 
-    dq = W J^T (J W J^T + lambda^2)^-1 (e - J n) + n, where n pulls towards REST; clipped
-    per joint and to the joint limits.
+    dq = W J^T (J W J^T + lambda^2)^-1 (e - J n) + n, where n pulls towards REST and the
+    error e is shortened; clipped per joint and to the joint limits.
 
     Args:
         joint_position: (B, 2, 7) rad.
@@ -119,13 +122,19 @@ def improve(joint_position: Array, target: Array) -> Array:
     pose = forward(joint_position)
     jac = cross(pose.axis, pose.palm[:, :, None] - pose.origin)  # (B, 2, 7, 3)
     pull = _REST_PULL * (REST - joint_position)
-    error = target - pose.palm - np.sum(jac * pull[..., None], axis=2)
+    error = _shortened(target - pose.palm) - np.sum(jac * pull[..., None], axis=2)
     weighted = jac * _SHARE[:, None]
     normal = np.swapaxes(weighted, -1, -2) @ jac + _DAMPING**2 * np.eye(3)
     solved = _solve_symmetric(normal, error)
     step = np.sum(weighted * solved[:, :, None], axis=-1) + pull
     step = np.minimum(np.maximum(step, -_MAX_STEP), _MAX_STEP)
     return np.asarray(np.minimum(np.maximum(joint_position + step, _LIMIT_LOW), _LIMIT_HIGH))
+
+
+def _shortened(vector: Array) -> Array:
+    """Vectors (..., 3) cut to a length of at most ``_MAX_ERROR``."""
+    length = np.sqrt(np.sum(vector * vector, axis=-1, keepdims=True))
+    return np.asarray(vector * np.minimum(1.0, _MAX_ERROR / np.maximum(length, 1e-9)))
 
 
 def _solve_symmetric(matrix: Array, vector: Array) -> Array:
