@@ -36,7 +36,7 @@ from egovcp_deploy.options import (
 )
 from egovcp_deploy.robots import Robot
 from egovcp_deploy.runner import RolloutSummary, Runner
-from egovcp_deploy.scenarios import eventful
+from egovcp_deploy.scenarios import eventful, held_out
 
 PROG: Final = "egovcp-deploy"
 ROBOTS: Final = ("sim",)
@@ -111,6 +111,9 @@ def _check(config: DeployConfig) -> None:
     check_choice("--task", config.task, TASKS)
     check_choice("--robot.type", config.robot.type, ROBOTS)
     check_positive("--episodes", config.episodes)
+    held_out(config.task, config.seed, 0)
+    if not config.policy.path:
+        raise UsageError("--policy.path is missing; name the artefact")
     if config.imagine < 0:
         raise UsageError(f"--imagine={config.imagine}: expected a number of ticks from 0")
     check_output_dir(config.output_dir)

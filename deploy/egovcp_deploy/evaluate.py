@@ -107,11 +107,11 @@ class EvalConfig:
             check_positive(f"--{flag}", getattr(self, flag))
         if self.num_workers < 0:
             raise UsageError(f"--num_workers={self.num_workers}: expected 0 or more")
+        held_out(self.tasks[0], self.seed, 0)
         if "planner" in self.players and not self.policy.path:
             raise UsageError(
                 "--policy.path is missing; name the artefact, or leave planner out of --controllers"
             )
-        held_out(self.tasks[0], self.seed, 0)
         check_output_dir(self.output_dir)
 
 

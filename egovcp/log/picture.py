@@ -127,8 +127,8 @@ def _depth(axes: Any, depth_m: NDArray[np.floating] | None) -> None:
         axes.set_box_aspect(48 / 64)
         return
     shown = np.where(np.asarray(depth_m) > 0.0, depth_m, np.nan)
-    image = axes.imshow(shown, cmap="viridis_r", vmin=0.3, vmax=DEPTH_MAX_M)
-    image.cmap.set_bad("0.15")
+    axes.set_facecolor("0.15")  # shows through where nothing was measured
+    axes.imshow(shown, cmap="viridis_r", vmin=0.3, vmax=DEPTH_MAX_M)
 
 
 def _curves(figure: Any, ticks: Sequence[Tick], moments: Sequence[int]) -> None:
@@ -145,7 +145,8 @@ def _curves(figure: Any, ticks: Sequence[Tick], moments: Sequence[int]) -> None:
         axes.set_xlabel("s", fontsize=9)
         axes.tick_params(labelsize=8)
         axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(fontsize=8, frameon=False, loc="upper left")
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize=8, frameon=False, loc="upper left")
 
 
 def _curve(

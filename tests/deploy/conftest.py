@@ -1,0 +1,37 @@
+"""An untrained policy and short episodes, so that whole commands run in seconds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from egovcp.artefact import save_artefact
+from egovcp.plan import PlannerConfig
+from egovcp.robot.stance import StanceController
+from egovcp.testing import toy_model
+
+
+@pytest.fixture(scope="session")
+def artefact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy artefact for the simulated robot, with random weights and a tiny planner."""
+    path = tmp_path_factory.mktemp("policy") / "policy"
+    save_artefact(path, toy_model(), _PLANNER, {"controller_id": StanceController().id})
+    return path
+
+
+@pytest.fixture(scope="session")
+def foreign_artefact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same for a robot with another low-level controller."""
+    path = tmp_path_factory.mktemp("foreign") / "policy"
+    save_artefact(path, toy_model(), _PLANNER, {"controller_id": "another-controller"})
+    return path
+
+
+@pytest.fixture
+def short() -> list[str]:
+    """Flags that make ball episodes 15 ticks long with the throw at tick 3."""
+    return ["--env.ball_episode.ticks=15", "--env.ball_episode.event_ticks=[3,3]"]
+
+
+_PLANNER = PlannerConfig(samples=16, horizon=3, iterations=2, elites=4)

@@ -1,0 +1,88 @@
+"""The search finds the best action of its grid, fairly."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egovcp.errors import DataError
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import ACTION_DIM, TASKS
+from egovcp_deploy.constant_search import Action, grid, load_constants, search_constant
+from egovcp_deploy.scenarios import held_out
+from egovcp_deploy.scores import EpisodeScore
+
+
+class Landscape:
+    """Reward falls with the distance from ``best``; noise depends on the scenario alone."""
+
+    def __init__(self, best: Action, noise: float) -> None:
+        self.best, self.noise = np.array(best), noise
+        self.played: list[tuple[Action, Scenario]] = []
+
+    def __call__(
+        self, actions: Sequence[Action], scenarios: Sequence[Scenario]
+    ) -> list[EpisodeScore]:
+        self.played += zip(actions, scenarios, strict=True)
+        return [self._score(*pair) for pair in zip(actions, scenarios, strict=True)]
+
+    def _score(self, action: Action, scenario: Scenario) -> EpisodeScore:
+        luck = np.random.default_rng(scenario.episode).normal(0, self.noise)
+        reward = float(luck - np.sum((np.array(action) - self.best) ** 2))
+        return EpisodeScore(scenario.episode, 10, reward, reward > -1, False, [0.1])
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("which", [0, 1, -1])
+def test_the_best_of_the_grid_wins_also_under_luck_that_all_share(task: str, which: int) -> None:
+    best = grid(task)[which]
+    land = Landscape(best, noise=5.0)
+    found = search_constant(task, 0, land)
+    assert found.action == best
+    assert found.episodes == sum(action == best for action, _ in land.played)
+
+
+def test_all_candidates_of_a_round_play_the_same_scenarios_and_none_of_the_evaluation() -> None:
+    land = Landscape(grid("ball")[3], noise=1.0)
+    search_constant("ball", 4, land)
+    by_action: dict[Action, list[Scenario]] = {}
+    for action, scenario in land.played:
+        by_action.setdefault(action, []).append(scenario)
+    first = min(map(len, by_action.values()))
+    assert len({tuple(played[:first]) for played in by_action.values()}) == 1
+    assert all(len(set(played)) == len(played) for played in by_action.values())
+    evaluated = {held_out("ball", 4, i) for i in range(1000)}
+    assert not evaluated & {scenario for _, scenario in land.played}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_grid_is_symmetric_inside_the_box_and_holds_the_neutral_pose(task: str) -> None:
+    actions = np.array(grid(task))
+    assert np.abs(actions).max() <= 1.0
+    np.testing.assert_array_equal(actions[:, [0, 2]], actions[:, [3, 5]])
+    np.testing.assert_array_equal(actions[:, 1], -actions[:, 4])
+    assert len(np.unique(actions, axis=0)) == len(actions)
+    assert (actions == 0).all(axis=1).sum() == 1
+
+
+def test_winners_are_read_back(tmp_path: Path) -> None:
+    entry = {"action": [0.1] * ACTION_DIM, "reward_mean": 0.2, "success_rate": 0.3, "episodes": 4}
+    path = tmp_path / "constant.json"
+    path.write_text(json.dumps({"ball": entry}))
+    assert load_constants(path)["ball"].action == (0.1,) * ACTION_DIM
+
+
+@pytest.mark.parametrize(
+    "content",
+    [None, "not json", "[1]", '{"ball": 3}', '{"ball": {"action": [1, 2]}}', '{"ball": {"a": 0}}'],
+)
+def test_a_file_that_is_no_result_is_refused(tmp_path: Path, content: str | None) -> None:
+    path = tmp_path / "constant.json"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(DataError, match=r"constant\.json"):
+        load_constants(path)

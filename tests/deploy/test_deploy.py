@@ -1,0 +1,113 @@
+"""`egovcp-deploy`: refuses bad input before any work, records what it plays."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egovcp.log.mcap_reader import read_recording
+from egovcp.spec import ACTION_RATE_LIMIT, COMMAND_SLICE
+from egovcp_deploy.deploy import main
+
+
+def run(*flags: str) -> int:
+    return main(list(flags))
+
+
+def test_rollouts_are_recorded_and_summed_up(
+    tmp_path: Path, artefact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    code = run(
+        f"--policy.path={artefact_dir}", "--episodes=2", "--seed=3", f"--output_dir={out}", *short
+    )
+    assert code == 0, capsys.readouterr().err
+    names = {path.name for path in out.iterdir()}
+    assert names == {
+        "deploy.json",
+        "rollout-0.png",
+        *(f"rollout-{i}.{kind}" for i in (0, 1) for kind in ("mcap", "rrd")),
+    }
+    report = json.loads((out / "deploy.json").read_text())
+    assert [row["episode"] for row in report["rollouts"]] == [0, 1]
+    for i, row in enumerate(report["rollouts"]):
+        recording = read_recording(out / row["mcap"])
+        assert recording.complete
+        assert (recording.info.seed, recording.info.episode) == (3, i)
+        assert "model.safetensors" in recording.info.hashes
+        assert len(recording.ticks) == row["steps"] == 15
+        assert np.mean([t.reward for t in recording.ticks]) == pytest.approx(row["reward_mean"])
+        assert recording.ticks[-1].success == row["success"]
+    text = capsys.readouterr().out
+    assert "rollout 0:" in text
+    assert "rollout-0.rrd" in text
+
+
+def test_a_recording_obeys_the_contract_of_the_data(
+    tmp_path: Path, artefact_dir: Path, short: list[str]
+) -> None:
+    out = tmp_path / "out"
+    run(f"--policy.path={artefact_dir}", "--episodes=1", f"--output_dir={out}", *short)
+    ticks = read_recording(out / "rollout-0.mcap").ticks
+    sent = np.array([tick.action_sent for tick in ticks])
+    steps = np.diff(sent, axis=0, prepend=np.zeros((1, 7)))
+    assert np.abs(steps).max() <= ACTION_RATE_LIMIT + 1e-6
+    commands = [tick.state[COMMAND_SLICE].tolist() for tick in ticks]
+    assert commands[0] != commands[2], "the command in o_t is the last one sent"
+    assert any("ball thrown" in tick.events for tick in ticks)
+    assert all(tick.base is not None for tick in ticks)
+    assert [len(tick.scene) for tick in ticks][-1] == 1
+    assert ticks[-1].truncated
+    assert not any(tick.truncated for tick in ticks[:-1])
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "message"),
+    [
+        (["--task=bal"], 2, "did you mean 'ball'"),
+        (["--robot.type=simm"], 2, "did you mean 'sim'"),
+        (["--episodes=0"], 2, "--episodes=0"),
+        (["--imagine=-1"], 2, "--imagine=-1"),
+        (["--no_such_flag=1"], 2, "--no_such_flag"),
+        (["--policy.path=/nowhere/policy"], 4, "/nowhere/policy"),
+        (["--policy.path="], 2, "--policy.path is missing"),
+        (["--seed=-1"], 2, "--seed=-1"),
+        (["--planner.samples=2"], 2, "elites"),
+        (["--output_dir="], 2, "--output_dir"),
+    ],
+)
+def test_bad_input_ends_with_one_line_before_any_work(
+    tmp_path: Path,
+    artefact_dir: Path,
+    capsys: pytest.CaptureFixture[str],
+    flags: list[str],
+    code: int,
+    message: str,
+) -> None:
+    out = tmp_path / "out"
+    assert run(f"--policy.path={artefact_dir}", f"--output_dir={out}", *flags) == code
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert len(captured.err.strip().splitlines()) == 1
+    assert not out.exists()
+
+
+def test_results_are_never_overwritten(
+    tmp_path: Path, artefact_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rollout-0.mcap").write_bytes(b"precious")
+    assert run(f"--policy.path={artefact_dir}", f"--output_dir={tmp_path}") == 2
+    assert "rollout-0.mcap" in capsys.readouterr().err
+    assert (tmp_path / "rollout-0.mcap").read_bytes() == b"precious"
+
+
+def test_an_artefact_of_another_controller_drives_nothing(
+    tmp_path: Path, foreign_artefact_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run(f"--policy.path={foreign_artefact_dir}", f"--output_dir={out}") == 4
+    assert "another-controller" in capsys.readouterr().err
+    assert not out.exists()

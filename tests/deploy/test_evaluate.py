@@ -1,0 +1,141 @@
+"""`egovcp-eval`: same scenarios for all, reproducible, documented keys, clear refusals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from egovcp.spec import ACTION_DIM
+from egovcp_deploy.evaluate import main
+
+KEYS = {
+    "episodes",
+    "success_rate",
+    "success_ci95",
+    "reward_mean",
+    "reward_ci95",
+    "plan_ms_p50",
+    "plan_ms_p99",
+}
+
+
+def run(out: Path, *flags: str) -> int:
+    return main([f"--output_dir={out}", "--num_workers=1", *flags])
+
+
+def played(out: Path) -> Any:
+    return json.loads((out / "eval_run.json").read_text())["episodes"]
+
+
+@pytest.fixture
+def constant_file(tmp_path: Path) -> Path:
+    best = {"action": [0.2] * ACTION_DIM, "reward_mean": 0.0, "success_rate": 0.5, "episodes": 9}
+    path = tmp_path / "constant.json"
+    path.write_text(json.dumps({"ball": best}))
+    return path
+
+
+def test_all_controllers_play_the_same_scenarios(
+    tmp_path: Path,
+    artefact_dir: Path,
+    short: list[str],
+    constant_file: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    out = tmp_path / "out"
+    code = run(
+        out,
+        f"--policy.path={artefact_dir}",
+        "--episodes=3",
+        "--num_envs=2",
+        f"--constant.path={constant_file}",
+        *short,
+    )
+    captured = capsys.readouterr()
+    assert code == 0, captured.err
+    figures = json.loads((out / "eval.json").read_text())
+    assert set(figures) == {"ball"}
+    assert set(figures["ball"]) == {"planner", "hold", "constant", "random", "oracle"}
+    for row in figures["ball"].values():
+        assert set(row) == KEYS
+        assert row["episodes"] == 3
+        assert row["success_ci95"][0] <= row["success_rate"] <= row["success_ci95"][1]
+        assert row["reward_ci95"][0] <= row["reward_mean"] <= row["reward_ci95"][1]
+    for scores in played(out)["ball"].values():
+        assert [score["episode"] for score in scores] == [0, 1, 2]
+    assert captured.out.count("ball") >= 5
+    assert "eval.json" in captured.out
+
+
+def test_results_do_not_depend_on_how_episodes_are_grouped(
+    tmp_path: Path, artefact_dir: Path, short: list[str]
+) -> None:
+    flags = [
+        f"--policy.path={artefact_dir}",
+        "--controllers=random,planner,oracle",
+        "--episodes=4",
+        *short,
+    ]
+    for size in (1, 3):
+        assert run(tmp_path / str(size), f"--num_envs={size}", *flags) == 0
+    one, three = played(tmp_path / "1")["ball"], played(tmp_path / "3")["ball"]
+    for name in one:
+        for a, b in zip(one[name], three[name], strict=True):
+            assert (a["episode"], a["steps"], a["success"]) == (
+                b["episode"],
+                b["steps"],
+                b["success"],
+            )
+            assert a["reward"] == pytest.approx(b["reward"], rel=1e-3, abs=1e-6)
+
+
+def test_worker_processes_give_the_same_scores(tmp_path: Path, short: list[str]) -> None:
+    flags = ["--controllers=hold", "--episodes=2", "--num_envs=1", *short]
+    for workers in (1, 2):
+        assert run(tmp_path / str(workers), *flags, f"--num_workers={workers}") == 0
+    assert played(tmp_path / "1") == played(tmp_path / "2")
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "message"),
+    [
+        (["--task=ball2"], 2, "did you mean 'ball'"),
+        (["--controllers=hold,planer"], 2, "did you mean 'planner'"),
+        (["--episodes=0"], 2, "--episodes=0"),
+        (["--num_envs=0"], 2, "--num_envs=0"),
+        (["--num_workers=-1"], 2, "--num_workers=-1"),
+        (["--controllers=planner"], 2, "--policy.path is missing"),
+        (["--policy.path=/nowhere/policy"], 4, "/nowhere/policy"),
+        (["--controllers=constant", "--constant.path=/nowhere.json"], 3, "/nowhere.json"),
+        (["--seed=-3"], 2, "--seed=-3"),
+        (["--env.ball.radiu=1"], 2, "unknown option"),
+    ],
+)
+def test_bad_input_ends_with_one_line_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], code: int, message: str
+) -> None:
+    out = tmp_path / "out"
+    assert run(out, *flags) == code
+    captured = capsys.readouterr()
+    assert message in captured.err
+    assert len(captured.err.strip().splitlines()) == 1
+    assert not out.exists()
+
+
+def test_results_are_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "eval.json").write_text("precious")
+    assert run(tmp_path, "--controllers=hold") == 2
+    assert "eval.json" in capsys.readouterr().err
+    assert (tmp_path / "eval.json").read_text() == "precious"
+
+
+def test_an_artefact_of_another_controller_is_not_evaluated(
+    tmp_path: Path, foreign_artefact_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run(out, f"--policy.path={foreign_artefact_dir}", "--controllers=planner") == 4
+    assert "another-controller" in capsys.readouterr().err
+    assert not out.exists()

@@ -1,0 +1,84 @@
+"""Output folders and result files: nothing overwritten, nothing half written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.plan import PlannerConfig
+from egovcp_deploy.options import (
+    PlannerOptions,
+    check_choice,
+    check_output_dir,
+    make_output_dir,
+    write_json,
+)
+from egovcp_deploy.scenarios import eventful, for_search, held_out
+
+
+def test_an_empty_folder_is_accepted_and_a_new_one_created(tmp_path: Path) -> None:
+    assert make_output_dir(str(tmp_path)) == tmp_path
+    assert make_output_dir(str(tmp_path / "a" / "b")).is_dir()
+
+
+def test_checking_creates_nothing(tmp_path: Path) -> None:
+    check_output_dir(str(tmp_path / "a"))
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_folder_with_results_is_refused_by_name(tmp_path: Path) -> None:
+    (tmp_path / "eval.json").write_text("{}")
+    with pytest.raises(UsageError, match=r"eval\.json"):
+        make_output_dir(str(tmp_path))
+    make_output_dir(str(tmp_path), reusable=("eval.json",))
+
+
+def test_missing_flag_and_file_in_the_way_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UsageError, match="is a file"):
+        make_output_dir(str(tmp_path / "file"))
+    with pytest.raises(EnvironmentFailure, match="cannot create"):
+        make_output_dir(str(tmp_path / "file" / "below"))
+    with pytest.raises(UsageError, match="missing"):
+        make_output_dir("")
+
+
+def test_json_is_complete_or_absent(tmp_path: Path) -> None:
+    path = tmp_path / "a.json"
+    write_json(path, {"a": 1})
+    assert json.loads(path.read_text()) == {"a": 1}
+    with pytest.raises(ValueError, match="JSON compliant"):
+        write_json(path, {"a": float("nan")})
+    assert json.loads(path.read_text()) == {"a": 1}
+
+
+def test_unknown_choices_name_the_near_one() -> None:
+    check_choice("--task", "ball", ("ball", "wall"))
+    with pytest.raises(UsageError, match=r"--task=bal; did you mean 'ball'"):
+        check_choice("--task", "bal", ("ball", "wall"))
+
+
+def test_planner_options_change_only_what_they_name() -> None:
+    own = PlannerConfig(samples=512, horizon=6)
+    assert PlannerOptions().apply(own) == own
+    changed = PlannerOptions(samples=128).apply(own)
+    assert (changed.samples, changed.horizon) == (128, 6)
+    with pytest.raises(UsageError):
+        PlannerOptions(samples=8).apply(own)  # fewer than the elites
+
+
+def test_played_scenarios_are_never_collected_ones_and_search_sees_none_of_them() -> None:
+    seeds = {held_out("ball", seed, 0).seed for seed in (0, 1, 10**8)}
+    searched = {for_search("ball", seed, 0).seed for seed in (0, 1, 10**8)}
+    assert min(seeds | searched) >= 10**9
+    assert not seeds & searched
+    for bad in (-1, 10**9):
+        with pytest.raises(UsageError, match="--seed"):
+            held_out("ball", bad, 0)
+
+
+def test_played_episodes_all_have_an_event() -> None:
+    assert {eventful().episode(t).empty_probability for t in ("ball", "wall", "arch")} == {0.0}

@@ -1,0 +1,184 @@
+"""The loop lines up observation, action and outcome, and keeps what really happened."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from egovcp.log.info import CameraView, RunInfo
+from egovcp.log.tick import Tick
+from egovcp.plan import PolicyStep
+from egovcp.rate import FixedRate, LockstepClock
+from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM
+from egovcp_deploy.robots import Outcome, Sensed
+from egovcp_deploy.runner import LOGGED_CANDIDATES, REJECTED, Runner
+
+
+class FakePolicy:
+    """Plans what it is told to; remembers what it saw and what it heard was sent."""
+
+    def __init__(self, actions: list[float]) -> None:
+        self.actions = actions
+        self.seen: list[int] = []
+        self.sent: list[NDArray[np.floating]] = []
+        self.resets = 0
+
+    def reset(self) -> None:
+        self.resets += 1
+        self.seen.clear()
+        self.sent.clear()
+
+    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+        assert depth.shape == (1, 48, 64)
+        assert state.shape == (1, STATE_DIM)
+        self.seen.append(int(depth[0, 0, 0]))
+        value = self.actions[len(self.seen) - 1]
+        plan = np.full((1, 4, ACTION_DIM), value, np.float32)
+        candidates = np.repeat(plan[:, None], 64, axis=1)
+        values = np.arange(64, 0, -1, dtype=np.float32)[None]
+        one = np.ones(1, np.float32)
+        return PolicyStep(plan[:, 0], plan, 0.5 * one, 0.1 * one, candidates, values, 3)
+
+    def advance(self, sent: NDArray[np.floating]) -> None:
+        self.sent.append(sent.copy())
+
+    def reconstruct(self) -> NDArray[np.float32]:
+        return np.full((1, 48, 64), float(self.seen[-1]), np.float32)
+
+    def imagine(self, plan: NDArray[np.floating], horizon: int) -> NDArray[np.float32]:
+        return np.full((1, horizon, 48, 64), float(self.seen[-1]), np.float32)
+
+
+class FakeRobot:
+    """Its picture counts its ticks; it halves every action, to tell sent from planned."""
+
+    controller_id = "fake"
+    camera = CameraView()
+
+    def __init__(self, limit: int = 5) -> None:
+        self.limit = limit
+        self.count = 0
+
+    def start(self, episode: int) -> None:
+        self.count = 0
+
+    def observe(self) -> Sensed:
+        picture = np.full((48, 64), 1000 + self.count, np.uint16)
+        return Sensed(picture, np.zeros(STATE_DIM, np.float32))
+
+    def act(self, action: NDArray[np.float64]) -> Outcome:
+        assert np.isfinite(action).all()
+        self.count += 1
+        return Outcome(
+            sent=action / 2,
+            reward=float(self.count),
+            truncated=self.count >= self.limit,
+            success=self.count == self.limit,
+        )
+
+    def close(self) -> None:
+        pass
+
+
+class Memory:
+    """Keeps the ticks."""
+
+    def __init__(self) -> None:
+        self.ticks: list[Tick] = []
+
+    def open(self, info: RunInfo) -> None:
+        pass
+
+    def write(self, tick: Tick) -> None:
+        self.ticks.append(tick)
+
+    def close(self) -> None:
+        pass
+
+
+def runner(policy: FakePolicy, robot: FakeRobot, **options: int | None) -> Runner:
+    return Runner(policy, robot, FixedRate(25, LockstepClock(time_ns=123)), **options)
+
+
+def test_a_tick_holds_the_observation_the_action_on_it_and_what_followed() -> None:
+    policy, robot, memory = FakePolicy([0.1, 0.2, 0.3, 0.2, 0.1]), FakeRobot(), Memory()
+    summary = runner(policy, robot, imagine=3).run(memory)
+    assert [tick.index for tick in memory.ticks] == [0, 1, 2, 3, 4]
+    assert [tick.time_ns for tick in memory.ticks] == [40_000_000 * k for k in range(5)]
+    assert [int(tick.depth[0, 0]) for tick in memory.ticks] == [1000, 1001, 1002, 1003, 1004]
+    assert [tick.reward for tick in memory.ticks] == [1, 2, 3, 4, 5]
+    for tick, planned in zip(memory.ticks, policy.actions, strict=True):
+        np.testing.assert_allclose(tick.action_planned, planned, rtol=1e-6)
+        np.testing.assert_allclose(tick.action_sent, planned / 2, rtol=1e-6)
+        assert tick.depth_reconstructed is not None
+        assert tick.depth_imagined is not None
+        assert tick.depth_reconstructed[0, 0] == tick.depth[0, 0]
+        assert tick.depth_imagined.shape == (3, 48, 64)
+        assert tick.depth_imagined[0, 0, 0] == tick.depth[0, 0]
+    assert (summary.steps, summary.reward, summary.success) == (5, 15.0, True)
+    assert len(summary.plan_ms) == 5
+
+
+def test_the_recurrence_advances_with_what_was_really_sent() -> None:
+    policy, memory = FakePolicy([0.3] * 5), Memory()
+    runner(policy, FakeRobot()).run(memory)
+    assert len(policy.sent) == 5
+    for sent, tick in zip(policy.sent, memory.ticks, strict=True):
+        np.testing.assert_array_equal(sent[0], tick.action_sent)
+
+
+def test_actions_pass_the_safety_filter_before_the_robot() -> None:
+    policy, memory = FakePolicy([5.0, np.nan, 5.0, 5.0, 5.0]), Memory()
+    summary = runner(policy, FakeRobot()).run(memory)
+    sent = [float(tick.action_sent[0]) * 2 for tick in memory.ticks]
+    np.testing.assert_allclose(sent, [0.32, 0.32, 0.64, 0.96, 1.0])
+    assert [REJECTED in tick.events for tick in memory.ticks] == [False, True, False, False, False]
+    assert summary.rejected == 1
+
+
+def test_a_robot_without_a_time_limit_is_stopped_by_the_runners() -> None:
+    memory = Memory()
+    robot = FakeRobot(limit=10**9)
+    summary = runner(FakePolicy([0.0] * 9), robot, max_ticks=7).run(memory)
+    assert summary.steps == robot.count == len(memory.ticks) == 7
+    assert not summary.over
+
+
+def test_every_rollout_starts_afresh() -> None:
+    policy, robot = FakePolicy([0.5] * 5), FakeRobot()
+    loop = runner(policy, robot)
+    actions = []
+    for episode in range(2):
+        robot.start(episode)
+        memory = Memory()
+        loop.run(memory)
+        actions.append([tick.action_sent.tolist() for tick in memory.ticks])
+        assert memory.ticks[0].time_ns == 0
+    assert actions[0] == actions[1]
+    assert policy.resets == 2
+
+
+def test_the_best_candidates_are_logged_as_hand_paths() -> None:
+    memory = Memory()
+    runner(FakePolicy([0.0] * 5), FakeRobot(), imagine=0).run(memory)
+    candidates = memory.ticks[0].candidates
+    assert candidates is not None
+    assert candidates.hands_b.shape == (LOGGED_CANDIDATES, 4, 2, 3)
+    assert candidates.values[0] == 64
+    expected = np.reshape(ACTION_BOX.neutral[:6], (2, 3))
+    np.testing.assert_allclose(candidates.hands_b[0, 0], expected)
+    assert memory.ticks[0].depth_imagined is None
+
+
+@pytest.mark.parametrize("late_ms", [0, 50])
+def test_overruns_are_counted(late_ms: int) -> None:
+    clock = LockstepClock()
+
+    class Slow(FakeRobot):
+        def act(self, action: NDArray[np.float64]) -> Outcome:
+            clock.advance(late_ms * 1_000_000)
+            return super().act(action)
+
+    loop = Runner(FakePolicy([0.0] * 5), Slow(), FixedRate(25, clock))
+    assert loop.run(Memory()).overruns == (5 if late_ms else 0)

@@ -1,0 +1,86 @@
+"""The statistics say what textbooks say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egovcp_deploy.report import gains, summary, table
+from egovcp_deploy.scores import (
+    EpisodeScore,
+    reward_interval,
+    reward_per_step,
+    success_gain,
+    summarise,
+    wilson,
+)
+
+
+def score(episode: int, success: bool, reward: float = 0.0, steps: int = 10) -> EpisodeScore:
+    return EpisodeScore(episode, steps, reward, success, False, [1.0 + episode])
+
+
+@pytest.mark.parametrize(
+    ("successes", "trials", "low", "high"),
+    [
+        (0, 10, 0.0, 0.2775),
+        (10, 10, 0.7225, 1.0),
+        (50, 100, 0.4038, 0.5962),
+        (1, 4, 0.0456, 0.6994),
+    ],
+)
+def test_wilson_agrees_with_published_values(
+    successes: int, trials: int, low: float, high: float
+) -> None:
+    assert wilson(successes, trials) == pytest.approx((low, high), abs=1e-4)
+
+
+def test_reward_per_step_weighs_episodes_by_their_length() -> None:
+    scores = [score(0, True, 1.0, steps=10), score(1, False, 0.0, steps=90)]
+    assert reward_per_step(scores) == pytest.approx(0.01)
+
+
+def test_the_reward_interval_covers_the_mean_about_as_often_as_it_says() -> None:
+    rng = np.random.default_rng(1)
+    covered = 0
+    for _ in range(60):
+        rewards = rng.normal(0.5, 1.0, 80)
+        low, high = reward_interval([score(i, True, r, 1) for i, r in enumerate(rewards)])
+        covered += low <= 0.5 <= high
+    assert 50 <= covered <= 60
+
+
+def test_the_gain_is_paired_by_scenario() -> None:
+    ours = [score(i, i % 2 == 0) for i in range(40)]
+    assert success_gain(ours, list(reversed(ours))) == (0.0, 0.0)
+    worse = [score(i, False) for i in range(40)]
+    low, high = success_gain(ours, worse)
+    assert 0.3 < low < 0.5 < high < 0.7
+
+
+def test_figures_have_the_documented_keys() -> None:
+    figures = summarise([score(0, True, 1.0), score(1, False, -1.0)])
+    assert list(figures) == [
+        "episodes",
+        "success_rate",
+        "success_ci95",
+        "reward_mean",
+        "reward_ci95",
+        "plan_ms_p50",
+        "plan_ms_p99",
+    ]
+    assert figures["plan_ms_p50"] == 1.5
+
+
+def test_the_table_has_one_aligned_line_per_controller() -> None:
+    played = {"ball": {"planner": [score(0, True)], "hold": [score(0, False)]}}
+    lines = table(summary(played)).splitlines()
+    assert len(lines) == 3
+    assert lines[1].split()[:3] == ["ball", "planner", "100.0%"]
+    assert len({len(line) for line in lines}) == 1
+
+
+def test_gains_compare_the_planner_with_every_reference() -> None:
+    played = {"ball": {"planner": [score(0, True)], "hold": [score(0, False)]}}
+    assert gains(played) == {"ball": {"hold": {"gain": 1.0, "ci95": [1.0, 1.0]}}}
+    assert gains({"ball": {"hold": [score(0, True)]}}) == {"ball": {}}

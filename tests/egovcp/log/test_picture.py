@@ -1,0 +1,109 @@
+"""The picture of a rollout shows the right moments and survives missing parts."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+from PIL import Image
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.log.info import RunInfo
+from egovcp.log.picture import AHEAD, PictureSink, imagined_of, key_moments
+from egovcp.log.sketch import Eye, Surface, paint, scene_surface
+from egovcp.log.tick import SceneObject
+
+
+def test_moments_span_the_events(make_tick: Any) -> None:
+    ticks = [make_tick(i, bare=True) for i in range(60)]
+    ticks[20] = replace(ticks[20], events=("ball thrown",))
+    ticks[38] = replace(ticks[38], events=("blocked",))
+    moments = key_moments(ticks, count=7)
+    assert len(moments) == 7
+    assert 15 <= moments[0] < 20
+    assert 38 < moments[-1] < 50
+    assert moments == sorted(moments)
+
+
+@pytest.mark.parametrize("length", [1, 3, 60])
+def test_without_events_the_moments_span_the_run(make_tick: Any, length: int) -> None:
+    moments = key_moments([make_tick(0, bare=True)] * length)
+    assert moments[0] == 0
+    assert moments[-1] == length - 1
+    assert len(set(moments)) == len(moments) == min(length, 7)
+
+
+def test_imagination_is_shown_for_the_moment_it_was_about(make_tick: Any) -> None:
+    bare = make_tick(0, bare=True)
+    film = lambda i: np.full((AHEAD, 48, 64), 100.0 * i) + np.arange(AHEAD)[:, None, None]  # noqa: E731
+    ticks = [replace(bare, depth_imagined=film(i)) for i in range(AHEAD + 3)]
+    shown = imagined_of(ticks, AHEAD + 2)
+    assert shown is not None
+    assert np.unique(shown).tolist() == [100.0 * 2 + AHEAD - 1]
+    assert imagined_of(ticks, AHEAD - 1) is None
+
+
+@pytest.mark.parametrize("bare", [False, True])
+def test_the_sink_writes_a_picture_when_closed(tmp_path: Path, make_tick: Any, bare: bool) -> None:
+    path = tmp_path / "a.png"
+    sink = PictureSink(path)
+    sink.open(RunInfo("ball"))
+    sink.write(make_tick(0, bare=bare))
+    assert not path.exists()
+    sink.close()
+    sink.close()
+    with Image.open(path) as image:
+        assert min(image.size) > 200
+        assert len(image.convert("L").getcolors()) > 20
+
+
+def test_a_picture_is_never_overwritten(tmp_path: Path) -> None:
+    (tmp_path / "a.png").write_bytes(b"precious")
+    with pytest.raises(EnvironmentFailure, match="exists already"):
+        PictureSink(tmp_path / "a.png").open(RunInfo("ball"))
+
+
+def test_the_eye_sees_its_target_in_the_middle_and_left_to_the_left() -> None:
+    eye = Eye(position=(-3.0, 0.0, 1.0), target=(0.0, 0.0, 1.0))
+    points, depth = eye.project(np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 1.0], [0.0, 0.0, 1.5]]))
+    np.testing.assert_allclose(points[0], 0.0, atol=1e-12)
+    assert depth[0] == pytest.approx(3.0)
+    assert points[1, 0] < 0
+    assert points[1, 1] == pytest.approx(0.0)
+    assert points[2, 1] > 0
+
+
+@pytest.mark.parametrize("shape", ["sphere", "box"])
+def test_solids_are_closed_and_face_outwards(shape: Any) -> None:
+    thing = SceneObject("a", shape, (1.0, 2.0, 3.0), (1.0, 0.0, 0.0, 0.0), (0.2, 0.2, 0.2))
+    (surface,) = scene_surface([thing])
+    outward = surface.corners_w.mean(axis=1) - (1.0, 2.0, 3.0)
+    areas = np.linalg.norm(
+        np.cross(
+            surface.corners_w[:, 1] - surface.corners_w[:, 0],
+            surface.corners_w[:, 2] - surface.corners_w[:, 0],
+        ),
+        axis=1,
+    )
+    assert np.all(np.sum(surface.normals * outward, axis=1)[areas > 1e-9] > 0)
+    volume = np.sum(np.linalg.det(surface.corners_w - np.array([1.0, 2.0, 3.0]))) / 6
+    assert volume == pytest.approx(0.4**3 if shape == "box" else 4.19 * 0.2**3, rel=0.1)
+
+
+def test_nearer_triangles_are_painted_over_farther_ones() -> None:
+    near = np.array([[[0.0, -1, 0], [0.0, 1, 0], [0.0, 0, 1]]])
+    far = near + np.array([1.0, 0.0, 0.0])
+    eye = Eye(position=(-3.0, 0.0, 0.3), target=(0.0, 0.0, 0.3))
+    surfaces = [
+        Surface(near[:, ::-1], np.array([[255.0, 0, 0]])),
+        Surface(far[:, ::-1], np.array([[0, 0, 255.0]])),
+    ]
+    axes = Figure().subplots()
+    paint(axes, surfaces, eye)
+    colours = axes.collections[0].get_facecolor()
+    assert colours[0][2] > colours[0][0], "the far, blue triangle comes first"
+    assert colours[-1][0] > colours[-1][2]
