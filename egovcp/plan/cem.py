@@ -73,6 +73,8 @@ class PlannerConfig:
             raise UsageError("samples, horizon, iterations and elites must be at least 1")
         if self.elites > self.samples:
             raise UsageError(f"elites ({self.elites}) exceed samples ({self.samples})")
+        if not 0 < self.eta <= 2:
+            raise UsageError(f"eta is {self.eta}; expected more than 0 and at most 2, the box")
 
 
 class Plan(NamedTuple):

@@ -79,7 +79,7 @@ class Policy:
         )
         self._warm = shift(plan.deltas)
         return PolicyStep(
-            plan.actions[:, 0].numpy(),
+            plan.actions[:, 0].numpy().copy(),
             plan.actions.numpy(),
             plan.value.numpy(),
             self.model.termination(self._carry).numpy(),

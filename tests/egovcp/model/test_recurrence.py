@@ -78,7 +78,7 @@ def test_is_first_inside_a_window_forgets_everything_before(
     model: WorldModel, batch: Batch
 ) -> None:
     batch = _restart(batch, 3)
-    other = random_batch(*batch.valid.shape, seed=1)
+    other = random_batch(size=3, length=7, seed=1)
     changed = Batch(
         *(torch.cat([b[:, :3], a[:, 3:]], 1) for a, b in zip(batch, other, strict=True))
     )

@@ -1,0 +1,328 @@
+"""The planner on worlds whose best plan is known."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.errors import UsageError
+from egovcp.model import Carry
+from egovcp.plan import Plan, PlannerConfig, plan_cem
+from egovcp.plan.cem import TerminationRule, evaluate, reflect, shift, walk
+from egovcp.testing import Point, PointWorld, ScriptedWorld, toy_model
+
+ETA = spec.ACTION_ETA
+SMALL = PlannerConfig(samples=256, elites=32, iterations=4)
+
+
+def _generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def _plan(
+    executed: Tensor,
+    goal: Tensor,
+    config: PlannerConfig = SMALL,
+    warm: Tensor | None = None,
+    world: PointWorld | None = None,
+    seed: int = 0,
+) -> Plan:
+    world = world or PointWorld()
+    return plan_cem(world, world.start(executed, goal), executed, config, _generator(seed), warm)
+
+
+def _random(rows: int, seed: int, scale: float = 1.0) -> Tensor:
+    return scale * (2 * torch.rand(rows, spec.ACTION_DIM, generator=_generator(seed)) - 1)
+
+
+# --- the action process -----------------------------------------------------------------
+def test_the_walk_stays_in_the_box_and_steps_within_eta() -> None:
+    start, deltas = _random(500, 0), 2 * torch.rand(500, 6, 7, generator=_generator(1)) - 1
+    actions = walk(start, deltas, ETA)
+    assert actions.abs().max() <= 1
+    before = torch.cat([start[:, None], actions[:, :-1]], 1)
+    assert (actions - before).abs().max() <= ETA + 1e-6
+
+
+def test_the_walk_far_from_the_walls_is_a_sum() -> None:
+    deltas = torch.full((1, 3, 7), 0.5)
+    steps = torch.arange(1, 4)[None, :, None] * 0.5 * ETA
+    torch.testing.assert_close(walk(torch.zeros(1, 7), deltas, ETA), steps.expand(1, 3, 7))
+
+
+@pytest.mark.parametrize(("x", "inside"), [(1.2, 0.8), (-1.3, -0.7), (0.4, 0.4), (1.0, 1.0)])
+def test_reflection_folds_at_the_walls(x: float, inside: float) -> None:
+    assert reflect(torch.tensor(x)).item() == pytest.approx(inside)
+
+
+# --- the search ---------------------------------------------------------------------------
+@pytest.mark.parametrize("seed", range(3))
+def test_the_best_reachable_plan_is_found(seed: int) -> None:
+    """A goal beyond one step: walk towards it as fast as the process allows, then stay."""
+    executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.5)
+    plan = _plan(executed, goal, PlannerConfig(iterations=6), seed=seed)
+    ideal = torch.tensor([ETA, 0.5, 0.5, 0.5])[None, :, None].expand(1, 4, 7)
+    regret = evaluate(PointWorld(), Point(executed, goal), ideal[:, None], SMALL) - evaluate(
+        PointWorld(), Point(executed, goal), plan.actions[:, None], SMALL
+    )
+    assert 0 <= regret.item() < 0.08
+    assert (plan.actions - ideal).abs().mean() < 0.08
+
+
+def test_a_goal_within_reach_is_met_at_once() -> None:
+    executed = _random(4, 2, scale=0.5)
+    goal = executed + 0.1
+    plan = _plan(executed, goal, PlannerConfig(horizon=2, iterations=6))
+    assert (plan.actions - goal[:, None]).abs().mean() < 0.04
+
+
+def test_more_iterations_find_better_plans() -> None:
+    executed, goal = _random(8, 3), _random(8, 4)
+    one, six = (_plan(executed, goal, dataclasses.replace(SMALL, iterations=n)) for n in (1, 6))
+    assert (six.value > one.value).all()
+
+
+def test_actions_stay_in_the_box_and_steps_within_eta() -> None:
+    executed, goal = _random(16, 5).sign() * 0.99, _random(16, 6).sign() * 3.0
+    plan = _plan(executed, goal)
+    for actions in (plan.actions[:, None], plan.candidates):
+        assert actions.abs().max() <= 1
+        start = executed[:, None, None].expand(-1, actions.shape[1], 1, -1)
+        steps = (actions - torch.cat([start, actions[:, :, :-1]], 2)).abs()
+        assert steps.max() <= ETA + 1e-6
+    torch.testing.assert_close(walk(executed, plan.deltas, ETA), plan.actions)
+
+
+def test_a_robots_plan_does_not_depend_on_the_others() -> None:
+    executed, goal = _random(5, 7), _random(5, 8)
+    together = _plan(executed, goal)
+    for e in range(5):
+        alone = _plan(executed[e : e + 1], goal[e : e + 1])
+        for name in ("actions", "deltas", "value", "candidates", "candidate_values"):
+            torch.testing.assert_close(
+                getattr(together, name)[e : e + 1], getattr(alone, name), rtol=0, atol=1e-6
+            )
+
+
+def test_a_robots_plan_in_a_world_model_does_not_depend_on_the_others() -> None:
+    model, executed = toy_model(), _random(3, 9)
+    rng = _generator(10)
+    carry = Carry(
+        torch.randn(3, model.config.hidden, generator=rng),
+        torch.randn(3, model.config.latent, generator=rng),
+    )
+    with torch.no_grad():
+        together = plan_cem(model, carry, executed, SMALL, _generator())
+        for e in range(3):
+            row = Carry(carry.h[e : e + 1], carry.z[e : e + 1])
+            alone = plan_cem(model, row, executed[e : e + 1], SMALL, _generator())
+            torch.testing.assert_close(
+                together.actions[e : e + 1], alone.actions, rtol=0, atol=0.02
+            )
+
+
+def test_a_generator_repeats_a_plan_and_another_seed_gives_another() -> None:
+    executed, goal = _random(2, 11), _random(2, 12)
+    assert torch.equal(_plan(executed, goal).actions, _plan(executed, goal).actions)
+    assert not torch.equal(_plan(executed, goal).actions, _plan(executed, goal, seed=1).actions)
+
+
+def test_the_global_random_stream_is_left_alone() -> None:
+    before = torch.random.get_rng_state()
+    _plan(_random(2, 11), _random(2, 12))
+    assert torch.equal(before, torch.random.get_rng_state())
+
+
+def test_the_inputs_are_left_alone() -> None:
+    executed, goal, warm = _random(2, 13), _random(2, 14), torch.full((2, 4, 7), 0.3)
+    copies = executed.clone(), goal.clone(), warm.clone()
+    _plan(executed, goal, warm=warm)
+    for now, before in zip((executed, goal, warm), copies, strict=True):
+        assert torch.equal(now, before)
+
+
+def test_the_elites_are_the_best_first_and_belong_to_their_values() -> None:
+    executed, goal = _random(3, 15), _random(3, 16)
+    plan = _plan(executed, goal)
+    assert (plan.candidate_values.diff(dim=1) <= 0).all()
+    world = PointWorld()
+    values = evaluate(world, world.start(executed, goal), plan.candidates, SMALL)
+    torch.testing.assert_close(values, plan.candidate_values)
+    torch.testing.assert_close(plan.value, plan.candidate_values.mean(1))
+    assert plan.iterations == SMALL.iterations
+
+
+def test_a_warm_start_helps_a_short_search() -> None:
+    executed, goal = _random(8, 17), _random(8, 18)
+    hasty = PlannerConfig(samples=32, elites=4, iterations=1)
+    best = _plan(executed, goal, PlannerConfig(iterations=6))
+    cold = _plan(executed, goal, hasty)
+    warm = _plan(executed, goal, hasty, warm=best.deltas)
+    assert (warm.value > cold.value).all()
+
+
+def test_the_previous_plan_itself_is_a_candidate() -> None:
+    """So that replanning never does worse than going on, as the model sees it."""
+    executed, goal = _random(4, 19), _random(4, 20)
+    best = _plan(executed, goal, PlannerConfig(iterations=8))
+    again = _plan(executed, goal, PlannerConfig(samples=8, elites=1, iterations=1), best.deltas)
+    world = PointWorld()
+    kept = evaluate(world, world.start(executed, goal), best.actions[:, None], SMALL)[:, 0]
+    assert (again.value >= kept - 1e-6).all()
+
+
+def test_the_shifted_plan_drops_its_first_step_and_ends_at_rest() -> None:
+    deltas = torch.arange(4.0)[None, :, None].expand(2, 4, 7)
+    expected = torch.tensor([1.0, 2.0, 3.0, 0.0])[None, :, None].expand(2, 4, 7)
+    assert torch.equal(shift(deltas), expected)
+
+
+def test_a_single_candidate_is_the_warm_start() -> None:
+    warm = torch.full((2, 4, 7), 0.25)
+    plan = _plan(torch.zeros(2, 7), torch.ones(2, 7), PlannerConfig(samples=1, elites=1), warm=warm)
+    torch.testing.assert_close(plan.deltas, warm)
+
+
+def test_a_horizon_of_one_is_greedy() -> None:
+    executed, goal = _random(4, 21, scale=0.5), _random(4, 22, scale=0.5)
+    plan = _plan(executed, goal, PlannerConfig(horizon=1, iterations=6))
+    nearest = executed + (goal - executed).clamp(-ETA, ETA)
+    assert plan.actions.shape == (4, 1, 7)
+    assert (plan.actions[:, 0] - nearest).abs().mean() < 0.03
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"samples": 0},
+        {"horizon": 0},
+        {"iterations": 0},
+        {"elites": 0},
+        {"samples": 8, "elites": 9},
+        {"eta": 0.0},
+        {"eta": 2.5},
+    ],
+)
+def test_senseless_settings_are_refused(change: dict[str, int]) -> None:
+    with pytest.raises(UsageError):
+        PlannerConfig(**change)  # type: ignore[arg-type]
+
+
+# --- the objective and termination ---------------------------------------------------------
+VALUES = [8.0, 4.0, -2.0, 6.0]
+FLOOR = -10.0
+
+
+def _objective(rule: TerminationRule, deaths: list[float], values: list[float] = VALUES) -> float:
+    world = ScriptedWorld(values, deaths, floor=FLOOR)
+    actions = torch.zeros(1, 1, len(values), 7)
+    config = PlannerConfig(termination_rule=rule)
+    return evaluate(world, world.start(), actions, config).item()
+
+
+@pytest.mark.parametrize("rule", ["paper", "shift", "survival"])
+def test_without_a_failure_the_objective_is_the_mean_value(rule: TerminationRule) -> None:
+    assert _objective(rule, [0.0] * 4) == pytest.approx(sum(VALUES) / 4)
+
+
+@pytest.mark.parametrize(
+    ("rule", "deaths", "expected"),
+    [
+        # The failed state's own value counts, later ones are lost.
+        ("paper", [0, 0.95, 0, 0], (8 + 4 + 0 + 0) / 4),
+        ("paper", [0, 0, 0.95, 0], (8 + 4 - 2 + 0) / 4),
+        ("shift", [0, 0.95, 0, 0], (8 + 4 - 10 - 10) / 4),
+        ("shift", [0, 0, 0.95, 0], (8 + 4 - 2 - 10) / 4),
+        # Each value above the floor, weighted with the probability of being alive.
+        ("survival", [0, 0.5, 0, 0], (8 + 4 + (0.5 * 8 - 10) + (0.5 * 16 - 10)) / 4),
+        ("survival", [0, 0.5, 0.5, 0], (8 + 4 + (0.5 * 8 - 10) + (0.25 * 16 - 10)) / 4),
+        ("survival", [0, 1.0, 0, 0], (8 + 4 - 10 - 10) / 4),
+        # At the threshold is not beyond it.
+        ("paper", [0, 0.9, 0, 0], sum(VALUES) / 4),
+        ("shift", [0, 0.9, 0, 0], sum(VALUES) / 4),
+        # The observed state is alive, whatever D says; after the last step nothing follows.
+        ("paper", [1.0, 0, 0, 0], sum(VALUES) / 4),
+        ("survival", [1.0, 0, 0, 1.0], sum(VALUES) / 4),
+        # Dead stays dead.
+        ("paper", [0, 0.95, 0.0, 0.0], (8 + 4) / 4),
+    ],
+)
+def test_the_objective_after_a_failure(
+    rule: TerminationRule, deaths: list[float], expected: float
+) -> None:
+    assert _objective(rule, deaths) == pytest.approx(expected)
+
+
+def test_only_the_papers_rule_rewards_falling_when_values_are_negative() -> None:
+    values, alive, dead = [-1.0, -1.0, -5.0, -5.0], [0.0] * 4, [0.0, 1.0, 0.0, 0.0]
+    assert _objective("paper", dead, values) > _objective("paper", alive, values)
+    assert _objective("shift", dead, values) < _objective("shift", alive, values)
+    assert _objective("survival", dead, values) < _objective("survival", alive, values)
+
+
+@pytest.mark.parametrize("rule", ["shift", "survival"])
+def test_the_plan_stops_before_the_cliff(rule: TerminationRule) -> None:
+    executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.9)
+    config = PlannerConfig(iterations=6, termination_rule=rule)
+    bold = _plan(executed, goal, config)
+    careful = _plan(executed, goal, config, world=PointWorld(cliff=0.5))
+    assert bold.actions[0, 1, 0] > 0.55
+    assert careful.actions[0, :2, 0].max() <= 0.5
+    assert careful.actions[0, 1, 1:].mean() > 0.5
+
+
+# --- numbers that are none -------------------------------------------------------------------
+class _Broken(PointWorld):
+    """Q is not a number wherever the first coordinate is positive."""
+
+    def __init__(self, value: float) -> None:
+        super().__init__()
+        self.broken = value
+
+    def value(self, carry: Point, action: Tensor) -> Tensor:
+        return super().value(carry, action).masked_fill(action[..., 0] > 0, self.broken)
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("elites", [4, 200])
+def test_plans_without_a_finite_value_are_never_chosen(value: float, elites: int) -> None:
+    """Even where fewer than the wanted elites have one."""
+    config = PlannerConfig(samples=256, elites=elites)
+    plan = _plan(torch.zeros(1, 7), torch.full((1, 7), 0.5), config, world=_Broken(value))
+    finite = plan.candidate_values.isfinite()
+    assert finite.any()
+    assert (plan.candidates[finite][..., 0] <= 0).all()
+    assert (plan.actions[..., 0] <= 1e-6).all()
+    assert plan.value.isfinite().all()
+
+
+def test_a_region_without_finite_values_does_not_stop_the_search() -> None:
+    goal = torch.full((1, 7), 0.3)
+    plan = _plan(torch.zeros(1, 7), goal, PlannerConfig(iterations=6), world=_Broken(math.nan))
+    assert plan.actions[..., 0].abs().max() < 0.15
+    assert (plan.actions[..., 1:] - 0.3).abs().mean() < 0.1
+
+
+def test_without_any_finite_value_the_plan_goes_on_as_before_and_says_so() -> None:
+    class Nan(PointWorld):
+        def value(self, carry: Point, action: Tensor) -> Tensor:
+            return torch.full(action.shape[:-1], math.nan)
+
+    warm = torch.full((2, 4, 7), 0.25)
+    plan = _plan(torch.zeros(2, 7), torch.ones(2, 7), warm=warm, world=Nan())
+    torch.testing.assert_close(plan.deltas, warm)
+    assert plan.actions.isfinite().all()
+    assert (plan.value == -math.inf).all()
+
+
+def test_a_robot_without_finite_values_does_not_harm_the_others() -> None:
+    executed, goal = torch.zeros(2, 7), torch.full((2, 7), 0.2)
+    broken = goal.clone()
+    broken[1] = math.nan
+    plan = _plan(executed, broken)
+    alone = _plan(executed[:1], goal[:1])
+    torch.testing.assert_close(plan.actions[:1], alone.actions, rtol=0, atol=1e-6)
+    assert plan.actions.isfinite().all()

@@ -1,0 +1,226 @@
+"""The policy: what the recurrence is told, what a reset forgets, what repeats."""
+
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.model import Carry, WorldModel
+from egovcp.plan import PlannerConfig, Policy, PolicyStep
+from egovcp.testing import CountingModel, toy_model
+
+CONFIG = PlannerConfig(samples=64, elites=8, iterations=2)
+A = spec.ACTION_DIM
+
+
+class Sight(NamedTuple):
+    """One tick's observation of E robots."""
+
+    depth: NDArray[np.uint16]
+    state: NDArray[np.float32]
+
+
+def _see(robots: int, tick: int) -> Sight:
+    rng = np.random.default_rng(tick)
+    depth = rng.integers(300, 5000, (robots, spec.DEPTH_ROWS, spec.DEPTH_COLS))
+    state = rng.normal(size=(robots, spec.STATE_DIM))
+    return Sight(depth.astype(np.uint16), state.astype(np.float32))
+
+
+def _rows(sight: Sight, rows: list[int]) -> Sight:
+    return Sight(sight.depth[rows], sight.state[rows])
+
+
+def _run(policy: Policy, ticks: int, robots: int = 2) -> list[PolicyStep]:
+    steps = []
+    for tick in range(ticks):
+        steps.append(policy.act(*_see(robots, tick)))
+        policy.advance(steps[-1].action)
+    return steps
+
+
+def _led(carry: Carry) -> Tensor:
+    """The action that led to the state of a `CountingModel`."""
+    return carry.z[:, :A]
+
+
+def test_the_recurrence_advances_with_the_action_sent_not_with_the_planned_one() -> None:
+    policy = Policy(CountingModel(drift=0.3), CONFIG, num_envs=2)
+    sent = np.zeros((2, A))
+    for tick in range(4):
+        step = policy.act(*_see(2, tick))
+        np.testing.assert_allclose(_led(policy.carry).numpy(), sent, atol=1e-6)
+        assert policy.carry.h[:, CountingModel.COUNT].tolist() == [tick + 1] * 2
+        assert np.abs(step.action - sent).max() > 0.01
+        sent = 0.5 * step.action + np.array([[0.1], [-0.1]])
+        policy.advance(sent)
+
+
+def test_the_plan_starts_from_the_action_sent() -> None:
+    policy = Policy(CountingModel(), CONFIG, num_envs=1)
+    policy.act(*_see(1, 0))
+    sent = np.full((1, A), 0.8)
+    policy.advance(sent)
+    step = policy.act(*_see(1, 1))
+    assert np.abs(step.action - sent).max() <= spec.ACTION_ETA + 1e-6
+    assert np.abs(step.candidates[:, :, 0] - sent[:, None]).max() <= spec.ACTION_ETA + 1e-6
+
+
+def test_the_policy_keeps_no_reference_to_the_callers_action() -> None:
+    policy = Policy(CountingModel(), CONFIG, num_envs=1)
+    policy.act(*_see(1, 0))
+    sent = np.full((1, A), 0.2, dtype=np.float32)
+    policy.advance(sent)
+    sent[:] = 9.0
+    policy.act(*_see(1, 1))
+    np.testing.assert_allclose(_led(policy.carry).numpy(), 0.2, atol=1e-6)
+
+
+def test_changing_the_action_reported_changes_nothing_else_that_was() -> None:
+    step = Policy(toy_model(), CONFIG, num_envs=1).act(*_see(1, 0))
+    plan = step.plan.copy()
+    step.action[:] = 9.0
+    np.testing.assert_array_equal(step.plan, plan)
+
+
+def test_a_run_starts_from_nothing_with_the_neutral_action() -> None:
+    policy = Policy(CountingModel(), CONFIG, num_envs=2)
+    policy.act(*_see(2, 0))
+    assert not _led(policy.carry).any()
+    assert policy.carry.h[:, CountingModel.COUNT].tolist() == [1, 1]
+
+
+def test_resetting_rows_forgets_them_and_only_them() -> None:
+    policy = Policy(CountingModel(), CONFIG, num_envs=3)
+    _run(policy, 3, robots=3)
+    policy.advance(np.full((3, A), 0.5))
+    policy.reset(np.array([1]))
+    policy.act(*_see(3, 3))
+    assert policy.carry.h[:, CountingModel.COUNT].tolist() == [4, 1, 4]
+    np.testing.assert_allclose(_led(policy.carry)[[0, 2]].numpy(), 0.5)
+    assert not _led(policy.carry)[1].any()
+
+
+def test_a_row_after_its_reset_filters_as_a_new_robot_does() -> None:
+    model = toy_model()
+    policy, new = Policy(model, CONFIG, num_envs=2), Policy(model, CONFIG, num_envs=1)
+    _run(policy, 3)
+    policy.reset(np.array([1]))
+    for tick in (3, 4):
+        sight = _see(2, tick)
+        policy.act(*sight)
+        new.act(*_rows(sight, [1]))
+        for mine, other in zip(policy.carry, new.carry, strict=True):
+            torch.testing.assert_close(mine[1:], other, rtol=1e-4, atol=1e-5)
+        sent = np.full((2, A), 0.1)
+        policy.advance(sent)
+        new.advance(sent[1:])
+
+
+def test_a_reset_heals_a_row_that_saw_no_numbers() -> None:
+    policy = Policy(toy_model(), CONFIG, num_envs=2)
+    sight = _see(2, 0)
+    sight.state[1] = np.nan
+    policy.act(*sight)
+    policy.advance(np.zeros((2, A)))
+    hurt = policy.act(*_see(2, 1))
+    assert np.isfinite(hurt.value[0])
+    assert not np.isfinite(hurt.value[1])
+    assert np.isfinite(hurt.action).all()
+    policy.advance(hurt.action)
+    policy.reset(np.array([1]))
+    assert np.isfinite(policy.act(*_see(2, 2)).value).all()
+
+
+def test_a_seed_repeats_a_run_and_a_full_reset_starts_it_again() -> None:
+    model = toy_model()
+    first = Policy(model, CONFIG, num_envs=2, seed=5)
+    one = _run(first, 3)
+    first.reset()
+    for steps in (_run(Policy(model, CONFIG, 2, seed=5), 3), _run(first, 3)):
+        for a, b in zip(one, steps, strict=True):
+            np.testing.assert_array_equal(a.plan, b.plan)
+            np.testing.assert_array_equal(a.candidates, b.candidates)
+    other = _run(Policy(model, CONFIG, num_envs=2, seed=6), 3)
+    assert not np.array_equal(one[0].plan, other[0].plan)
+
+
+def test_a_robot_acts_the_same_alone_and_in_a_crowd() -> None:
+    model = toy_model()
+    crowd, alone = Policy(model, CONFIG, num_envs=3), Policy(model, CONFIG, num_envs=1)
+    for tick in range(3):
+        sight = _see(3, tick)
+        together, single = crowd.act(*sight), alone.act(*_rows(sight, [2]))
+        np.testing.assert_allclose(together.plan[2:], single.plan, atol=0.02)
+        sent = np.tile(single.action, (3, 1))
+        crowd.advance(sent)
+        alone.advance(sent[2:])
+
+
+def test_what_is_reported_has_its_shapes_and_stays_in_the_box() -> None:
+    policy = Policy(toy_model(), CONFIG, num_envs=2)
+    for step in _run(policy, 3):
+        assert step.action.shape == (2, A)
+        assert step.plan.shape == (2, CONFIG.horizon, A)
+        assert step.value.shape == step.termination.shape == (2,)
+        assert step.candidates.shape == (2, CONFIG.elites, CONFIG.horizon, A)
+        assert step.candidate_values.shape == (2, CONFIG.elites)
+        assert np.abs(step.plan).max() <= 1
+        np.testing.assert_array_equal(step.action, step.plan[:, 0])
+        assert ((step.termination >= 0) & (step.termination <= 1)).all()
+
+
+def test_the_plan_goes_on_from_the_one_before() -> None:
+    """Warm start: with hardly any search, a drift is followed farther tick by tick."""
+    lazy = PlannerConfig(samples=32, elites=4, iterations=1)
+    policy = Policy(CountingModel(drift=0.25), lazy, num_envs=1, seed=1)
+    values = []
+    for tick in range(8):
+        values.append(float(policy.act(*_see(1, tick)).value[0]))
+        policy.advance(np.zeros((1, A)))
+    assert min(values[4:]) > values[0]
+
+
+@pytest.mark.parametrize("horizon", [1, 4, 7])
+def test_imagined_images_follow_the_plan_and_then_hold_its_last_action(horizon: int) -> None:
+    model = toy_model()
+    policy = Policy(model, CONFIG, num_envs=2)
+    plan = policy.act(*_see(2, 0)).plan
+    frames = policy.imagine(plan, horizon)
+    assert frames.shape == (2, horizon, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+    carry = policy.carry
+    held = np.concatenate([plan, np.repeat(plan[:, -1:], 3, axis=1)], axis=1)
+    with torch.no_grad():
+        for k in range(horizon):
+            carry = model.imagine(carry, torch.from_numpy(held[:, k]))
+        np.testing.assert_allclose(frames[:, -1], model.decode(carry)[0].numpy(), atol=1e-5)
+
+
+def test_looking_and_imagining_do_not_change_the_policy() -> None:
+    model = toy_model()
+    quiet, curious = (Policy(model, CONFIG, num_envs=1, seed=3) for _ in range(2))
+    for tick in range(3):
+        a, b = (p.act(*_see(1, tick)) for p in (quiet, curious))
+        curious.reconstruct()
+        curious.imagine(b.plan, 5)
+        np.testing.assert_array_equal(a.plan, b.plan)
+        quiet.advance(a.action)
+        curious.advance(b.action)
+
+
+def test_the_reconstruction_is_depth_in_metres() -> None:
+    policy = Policy(toy_model(), CONFIG, num_envs=2)
+    policy.act(*_see(2, 0))
+    depth = policy.reconstruct()
+    assert depth.shape == (2, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+    assert depth.min() >= 0
+    assert depth.max() <= spec.DEPTH_MAX_M
+
+
+def test_a_policy_puts_its_model_into_evaluation_mode() -> None:
+    model: WorldModel = toy_model().train()
+    assert not Policy(model, CONFIG, num_envs=1).model.training
