@@ -124,11 +124,11 @@ class ArchConfig:
     """Per metre of progress towards and through the arch."""
     pass_reward: float = 1.0
     """Once, when the arch has been passed without any contact."""
-    head_cost: float = 0.3
+    head_cost: float = 0.1
     """Per tick with the head on the arch."""
-    contact_cost: float = 0.1
+    contact_cost: float = 0.05
     """Per tick with any other part on the arch."""
-    crouch_cost: float = 0.02
+    crouch_cost: float = 0.01
     """Per tick, times the share of the crouch (0 standing, 1 lowest) away from the arch."""
     near: float = 0.9
     """Crouching is free while the arch is nearer than this, m."""

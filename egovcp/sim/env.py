@@ -100,6 +100,11 @@ class VectorEnv:
         return tuple(lane.scenario for lane in self.lanes)
 
     @property
+    def parameters(self) -> tuple[dict[str, float], ...]:
+        """What was drawn for each row's episode, for the record: physics, delays, geometry."""
+        return tuple(lane.parameters for lane in self.lanes)
+
+    @property
     def sent_action(self) -> Array:
         """(B, 7) the last action sent; neutral at the start of an episode."""
         return self._sent[:, 0].copy()

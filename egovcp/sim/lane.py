@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import asdict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +51,7 @@ class Lane:
         self.physics = draw_physics(self._config.randomise, scenario)
         apply_physics(self.physics, self.robot.scene, self.robot.model)
         self.task = make_task(self._config, scenario, self.robot)
+        self._drawn = self.task.parameters
         offset = initial_offset(self._config.randomise, scenario)
         self.robot.reset(self._standing.joints + offset, self._standing.pelvis)
         self.task.place()
@@ -77,6 +79,22 @@ class Lane:
         self._noise = DepthNoise(config.camera, noise)
         index = self.robot.index
         self._sensors = Proprioception(config.sensors, index, scenario.rng("proprioception"))
+
+    @property
+    def parameters(self) -> dict[str, float]:
+        """What was drawn for this episode, for the record; SI units, delays in 20 ms ticks.
+
+        ``event_tick`` is -1 in an episode without an event.
+        """
+        event = self.task.event_tick
+        return {
+            **asdict(self.physics),
+            **self._drawn,
+            "event_tick": -1 if event is None else event,
+            "action_delay_ticks": self.action_delay,
+            "image_age_ticks": self.image_age,
+            "camera_pitch": self.camera_pitch,
+        }
 
     @property
     def done(self) -> bool:

@@ -44,6 +44,18 @@ class ArchTask(Task):
         self._passed = False
         self._shape_arch()
 
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Arch and speed."""
+        return {
+            "clearance": self.clearance,
+            "width": 2 * self._half_width,
+            "depth": 2 * self._half_depth,
+            "distance": self._ahead,
+            "lateral": self._lateral,
+            "speed": self.speed,
+        }
+
     def _shape_arch(self) -> None:
         """Write the sizes of posts and lintel; the arch's origin is its centre on the ground."""
         post_half = (self.clearance + self.config.lintel_height) / 2

@@ -49,6 +49,20 @@ class BallTask(Task):
         self._new_hit = False
         self._shape_ball()
 
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Ball, release and aim."""
+        return {
+            "radius": self.radius,
+            "mass": self._mass,
+            "distance": self._distance,
+            "bearing": self._bearing,
+            "release_height": self._release_height,
+            "flight": self.flight,
+            "aim_lateral": float(self._aim_b[1]),
+            "aim_height": float(self._aim_b[2]),
+        }
+
     def _shape_ball(self) -> None:
         model, body = self.robot.model, self.robot.index.object_body
         self.robot.shape_geom(int(model.body_geomadr[body]), [self.radius], [0.0, 0.0, 0.0])

@@ -131,6 +131,11 @@ class Task(ABC):
     def achieved(self) -> bool:
         """`success`, falls aside."""
 
+    @property
+    @abstractmethod
+    def parameters(self) -> dict[str, float]:
+        """What was drawn for this episode, for the record; SI units."""
+
     @abstractmethod
     def place(self) -> None:
         """Put the objects where the episode starts; the robot already stands."""

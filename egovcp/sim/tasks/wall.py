@@ -41,6 +41,17 @@ class WallTask(Task):
         self._touched_otherwise = False
         robot.model.geom_friction[robot.index.is_object, 0] = self._friction
 
+    @property
+    def parameters(self) -> dict[str, float]:
+        """Wall and push."""
+        return {
+            "distance": self.distance,
+            "yaw": self._yaw,
+            "friction": self._friction,
+            "push_speed": self.push_speed,
+            "push_bearing": self._bearing,
+        }
+
     def place(self) -> None:
         """Stand the wall before the pelvis."""
         pelvis, heading = self.robot.data.qpos[:3], self.robot.heading

@@ -1,0 +1,101 @@
+"""Gymnasium's view of one simulated robot: ``gymnasium.make("egovcp/ball-v0")``."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.robot.controller import LowLevelController
+from egovcp.sim.config import EnvConfig
+from egovcp.sim.env import Observation, VectorEnv
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import (
+    ACTION_DIM,
+    DEPTH_COLS,
+    DEPTH_MAX_M,
+    DEPTH_ROWS,
+    PLANNER_HZ,
+    STATE_DIM,
+    TASKS,
+)
+
+GymObservation = dict[str, NDArray[Any]]
+
+_MAX_MM: Final = round(DEPTH_MAX_M * 1000)
+
+
+class EgovcpEnv(gymnasium.Env[GymObservation, NDArray[np.float32]]):
+    """One robot in one task, 25 Hz.
+
+    Observation: ``depth`` (H, W) uint16 mm, 0 invalid, and ``state`` (S,) float32. Action:
+    (7,) in [-1, 1]. ``info`` holds ``success``, ``sent_action`` and ``reward_terms``.
+    ``reset(seed=n)`` starts episode 0 of seed n, ``reset()`` the next episode of the seed.
+    """
+
+    observation_space: gymnasium.Space[Any]
+    action_space: gymnasium.Space[Any]
+
+    def __init__(
+        self,
+        task: str,
+        config: EnvConfig | None = None,
+        controller: LowLevelController | None = None,
+        seed: int = 0,
+    ) -> None:
+        self.metadata = {"render_modes": [], "render_fps": PLANNER_HZ}
+        self._next = Scenario(task, seed, 0)
+        self._env = VectorEnv(config or EnvConfig(), 1, controller)
+        self.observation_space = gymnasium.spaces.Dict(
+            {
+                "depth": gymnasium.spaces.Box(0, _MAX_MM, (DEPTH_ROWS, DEPTH_COLS), np.uint16),
+                "state": gymnasium.spaces.Box(-np.inf, np.inf, (STATE_DIM,), np.float32),
+            }
+        )
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[GymObservation, dict[str, Any]]:
+        """Start the next episode, or episode 0 of ``seed``."""
+        super().reset(seed=seed)
+        task = self._next.task
+        scenario = self._next if seed is None else Scenario(task, seed, 0)
+        self._next = Scenario(task, scenario.seed, scenario.episode + 1)
+        return _first_row(self._env.reset([scenario])), {"episode": scenario.episode}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[GymObservation, float, bool, bool, dict[str, Any]]:
+        """One planner tick of 40 ms."""
+        result = self._env.step(np.asarray(action)[None])
+        info = {
+            "success": bool(result.success[0]),
+            "sent_action": result.sent_action[0],
+            "reward_terms": {name: float(v[0]) for name, v in result.reward_terms.items()},
+        }
+        return (
+            _first_row(result.observation),
+            float(result.reward[0]),
+            bool(result.terminated[0]),
+            bool(result.truncated[0]),
+            info,
+        )
+
+    def close(self) -> None:
+        """End the threads of the simulation."""
+        self._env.close()
+
+
+def _first_row(observation: Observation) -> GymObservation:
+    return {"depth": observation.depth[0], "state": observation.state[0]}
+
+
+def register() -> None:
+    """Register ``egovcp/<task>-v0`` for every task; safe to call twice."""
+    for task in TASKS:
+        name = f"egovcp/{task}-v0"
+        if name not in gymnasium.registry:
+            gymnasium.register(name, entry_point="egovcp.sim.gym:EgovcpEnv", kwargs={"task": task})

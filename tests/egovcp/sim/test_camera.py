@@ -1,0 +1,88 @@
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from egovcp.sim.camera import DepthCamera, DepthNoise, discontinuity, pixel_rays
+from egovcp.sim.config import CameraConfig
+from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_MIN_M, DEPTH_ROWS
+
+NOISELESS = CameraConfig(
+    position=(0.0, 0.0, 0.0),
+    noise_per_z2=(0.0, 0.0),
+    hole_probability=(0.0, 0.0),
+    edge_probability=(0.0, 0.0),
+)
+
+
+def picture(xml: str, pitch: float = 0.0) -> np.ndarray:
+    """Depth seen from an invisible body at height 1 that looks along x."""
+    model = mujoco.MjModel.from_xml_string(
+        f"<mujoco><worldbody><body name='eye' pos='0 0 1'><geom size='.01' group='3'/></body>"
+        f"{xml}</worldbody></mujoco>"
+    )
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    return DepthCamera(NOISELESS).render(model, data, model.body("eye").id, pitch)
+
+
+def plate(x: float) -> str:
+    return f"<geom type='box' pos='{x + 0.01} 0 1' size='0.01 20 20'/>"
+
+
+def test_a_flat_wall_has_the_same_planar_depth_everywhere() -> None:
+    np.testing.assert_allclose(picture(plate(2.0)), 2.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("x", [DEPTH_MIN_M - 0.02, DEPTH_MAX_M + 0.02])
+def test_what_is_out_of_range_reads_zero(x: float) -> None:
+    assert not picture(plate(x)).any()
+
+
+def test_left_and_up_in_the_world_are_left_and_up_in_the_picture() -> None:
+    depth = picture("<geom type='sphere' pos='2 0.5 1.4' size='0.1'/>")
+    rows, columns = np.nonzero(depth)
+    assert rows.max() < DEPTH_ROWS / 2
+    assert columns.max() < DEPTH_COLS / 2
+
+
+def test_pitching_down_raises_what_lies_ahead() -> None:
+    ahead = "<geom type='sphere' pos='2 0 1' size='0.1'/>"
+    level, tilted = (np.nonzero(picture(ahead, pitch))[0].mean() for pitch in (0.0, 0.2))
+    assert tilted < level - 3
+
+
+def test_the_vertical_field_of_view_is_that_of_the_config() -> None:
+    rays = pixel_rays(DepthCamera(CameraConfig()).focal).reshape(DEPTH_ROWS, DEPTH_COLS, 3)
+    pixel = rays[0, 0, 2] - rays[1, 0, 2]
+    top = rays[0, 0, 2] + pixel / 2
+    assert 2 * np.arctan(top) == pytest.approx(CameraConfig().vertical_fov)
+
+
+def noisy(depth: float, seed: int = 0, **config: tuple[float, float]) -> np.ndarray:
+    flat = np.full((DEPTH_ROWS, DEPTH_COLS), depth, dtype=np.float32)
+    off = {"noise_per_z2": (0.0, 0.0), "hole_probability": (0.0, 0.0)}
+    noise = DepthNoise(CameraConfig(**(off | config)), np.random.default_rng(seed))
+    return noise.apply(flat)
+
+
+def test_without_faults_a_measurement_is_the_depth_in_millimetres() -> None:
+    assert (noisy(1.234) == 1234).all()
+
+
+def test_noise_grows_with_the_square_of_depth() -> None:
+    near, far = (noisy(z, noise_per_z2=(0.01, 0.01)).std() for z in (1.0, 2.0))
+    assert far / near == pytest.approx(4.0, rel=0.1)
+
+
+def test_holes_have_the_given_share() -> None:
+    lost = (noisy(1.0, hole_probability=(0.2, 0.2)) == 0).mean()
+    assert lost == pytest.approx(0.2, abs=0.03)
+
+
+def test_edges_are_found_on_both_sides_of_a_jump_only() -> None:
+    depth = np.full((4, 6), 2.0, dtype=np.float32)
+    depth[:, 3:] = 1.0
+    edge = discontinuity(depth, np.float32(0.12))
+    assert edge.any(axis=0).tolist() == [False, False, True, True, False, False]

@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from egovcp.errors import UsageError
+from egovcp.sim.env import VectorEnv
+from egovcp.sim.oracles import Oracle
+from egovcp.sim.policies import Constant, Hold, Policy, RandomWalk, reflect
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import ACTION_DIM, ACTION_ETA
+
+
+def walk(env: VectorEnv, policy: RandomWalk, ticks: int, first: int = 0) -> np.ndarray:
+    """(T, B, 7) wanted actions."""
+    scenarios = [Scenario("ball", 0, first + i) for i in range(env.num_envs)]
+    policy.reset(env, scenarios)
+    return np.array([policy.act(env) for _ in range(ticks)])
+
+
+@pytest.mark.parametrize("bounds", ["reflect", "clip"])
+def test_a_walk_stays_in_the_box_in_steps_of_eta_at_most(env: VectorEnv, bounds: str) -> None:
+    actions = walk(env, RandomWalk(bounds=bounds), 300)
+    assert np.abs(actions).max() <= 1.0
+    assert np.abs(np.diff(actions, axis=0)).max() <= ACTION_ETA
+
+
+def test_reflection_fills_the_box_evenly_and_clipping_piles_up(env: VectorEnv) -> None:
+    even, piled = (walk(env, RandomWalk(bounds=b), 2000)[100:] for b in ("reflect", "clip"))
+    assert np.mean(np.abs(even) > 0.9) == pytest.approx(0.1, abs=0.02)
+    assert np.mean(np.abs(piled) > 0.9) > 0.15
+
+
+def test_a_walk_is_its_scenarios(env: VectorEnv) -> None:
+    np.testing.assert_array_equal(
+        walk(env, RandomWalk(), 5, first=0)[:, 2], walk(env, RandomWalk(), 5, first=2)[:, 0]
+    )
+
+
+def test_reflection_is_a_mirror() -> None:
+    np.testing.assert_allclose(reflect(np.array([-1.3, 0.4, 1.2])), [-0.7, 0.4, 0.8])
+
+
+def test_constants_need_seven_numbers() -> None:
+    with pytest.raises(UsageError, match="expected 7"):
+        Constant([0.0] * 3)
+
+
+def outcome(env: VectorEnv, policy: Policy, task: str) -> tuple[float, float]:
+    """Success rate and mean return of one episode per row."""
+    scenarios = [Scenario(task, 0, i) for i in range(env.num_envs)]
+    env.reset(scenarios)
+    policy.reset(env, scenarios)
+    total = np.zeros(env.num_envs)
+    while not env.done.all():
+        result = env.step(policy.act(env))
+        total += result.reward
+    return float(result.success.mean()), float(total.mean())
+
+
+@pytest.mark.parametrize("task", ["ball", "wall", "arch"])
+def test_the_oracle_solves_what_holding_still_does_not(env: VectorEnv, task: str) -> None:
+    held, held_return = outcome(env, Hold(), task)
+    solved, solved_return = outcome(env, Oracle(), task)
+    assert solved > held
+    assert solved_return > held_return
+    assert solved >= 0.75
+
+
+def test_oracles_act_inside_the_box(env: VectorEnv) -> None:
+    env.reset([Scenario("ball", 0, i) for i in range(4)])
+    oracle = Oracle()
+    for _ in range(20):
+        action = oracle.act(env)
+        assert action.shape == (4, ACTION_DIM)
+        assert np.abs(action).max() <= 1.0
+        env.step(action)

@@ -1,0 +1,167 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egovcp.sim.config import ArchConfig, BallConfig, EnvConfig, WallConfig
+from egovcp.sim.env import VectorEnv
+from egovcp.sim.robot import Touch
+from egovcp.sim.scenario import Scenario
+from egovcp.sim.scene import HEAD, PARTS, TORSO, build_scene
+from egovcp.sim.tasks.ball import BallTask
+from egovcp.spec import ACTION_DIM, TASKS
+
+HOLD = np.zeros((4, ACTION_DIM))
+HAND, ARM = PARTS.index("left_hand"), PARTS.index("left_arm")
+
+
+def begin(env: VectorEnv, task: str) -> None:
+    env.reset([Scenario(task, 0, i) for i in range(env.num_envs)])
+
+
+def test_the_ball_flies_through_its_aim_after_its_flight_time(config: EnvConfig) -> None:
+    aside = BallConfig(aim_lateral_range=(1.0, 1.0), aim_height_range=(0.3, 0.3))
+    env = VectorEnv(replace(config, ball=aside), 4)
+    begin(env, "ball")
+    flight = np.array([p["flight"] for p in env.parameters])
+    nearest = np.full(4, np.inf)
+    for _ in range(35):
+        env.step(HOLD)
+        truth = env.snapshot()
+        left = flight - truth.since_event
+        path = truth.object_w + truth.object_velocity_w * left[:, None]
+        path[:, 2] -= 0.5 * 9.81 * left**2
+        aim = truth.pelvis_w[:, :3] + [aside.aim_forward, 1.0, 0.3]
+        flying = truth.object_active & (left > 0)
+        miss = np.linalg.norm(path - aim, axis=1)
+        nearest = np.where(flying, np.minimum(nearest, miss), nearest)
+    assert nearest.max() < 0.05
+
+
+def test_the_ball_is_out_of_sight_and_of_truth_before_the_throw(env: VectorEnv) -> None:
+    begin(env, "ball")
+    truth = env.snapshot()
+    assert np.isnan(truth.object_w).all()
+    assert truth.solids == ((),) * 4
+    assert not truth.object_active.any()
+
+
+def thrown(env: VectorEnv) -> BallTask:
+    begin(env, "ball")
+    for _ in range(8):
+        env.step(HOLD)
+    task = env.lanes[0].task
+    assert isinstance(task, BallTask)
+    return task
+
+
+@pytest.mark.parametrize(
+    ("parts", "blocked", "hit"),
+    [
+        ([HAND], True, False),
+        ([ARM], False, False),
+        ([TORSO], False, True),
+        ([HEAD, HAND], True, False),
+        ([ARM, HEAD], False, True),
+    ],
+)
+def test_first_contacts_are_judged_by_part(
+    env: VectorEnv, parts: list[int], blocked: bool, hit: bool
+) -> None:
+    task = thrown(env)
+    task.observe([Touch(part, 10.0) for part in parts])
+    assert (task.blocked, task.hit) == (blocked, hit)
+    terms = task.rewards(np.zeros(ACTION_DIM))
+    assert (terms["block"] > 0, terms["hit"] < 0) == (blocked, hit)
+    assert task.rewards(np.zeros(ACTION_DIM))["block"] == 0.0
+
+
+@pytest.mark.parametrize(("steps", "hit"), [(20, False), (80, True)])
+def test_contacts_soon_after_a_block_do_not_count(env: VectorEnv, steps: int, hit: bool) -> None:
+    task = thrown(env)
+    task.observe([Touch(HAND, 10.0)])
+    task.physics_steps += steps
+    task.observe([Touch(TORSO, 10.0)])
+    assert task.hit is hit
+    assert task.success is not hit
+
+
+def test_a_hand_after_a_hit_blocks_nothing(env: VectorEnv) -> None:
+    task = thrown(env)
+    task.observe([Touch(TORSO, 10.0)])
+    task.observe([Touch(HAND, 10.0)])
+    assert task.hit
+    assert not task.blocked
+
+
+def test_leaving_the_neutral_pose_costs(env: VectorEnv) -> None:
+    task = thrown(env)
+    assert task.rewards(np.zeros(ACTION_DIM))["pose"] == 0.0
+    assert task.rewards(np.ones(ACTION_DIM))["pose"] == pytest.approx(-task.config.pose_cost)
+
+
+def test_a_push_gives_the_base_its_speed(config: EnvConfig) -> None:
+    push = WallConfig(
+        push_speed_range=(0.4, 0.4), push_bearing_range=(0.0, 0.0), away_probability=0.0
+    )
+    env = VectorEnv(replace(config, wall=push), 4)
+    begin(env, "wall")
+    fastest = np.zeros(4)
+    for _ in range(10):
+        env.step(HOLD)
+        fastest = np.maximum(fastest, env.snapshot().pelvis_velocity_w[:, 0])
+    assert np.all((fastest > 0.2) & (fastest < 0.6))
+
+
+def test_an_unbraced_push_ends_at_the_wall_and_a_touch_is_remembered(config: EnvConfig) -> None:
+    push = WallConfig(push_speed_range=(0.55, 0.55), away_probability=0.0)
+    env = VectorEnv(replace(config, wall=push), 4)
+    begin(env, "wall")
+    distance = [p["distance"] for p in env.parameters]
+    gap = env.snapshot().object_b[:, 0]
+    np.testing.assert_allclose(gap, distance, atol=0.02)
+    for _ in range(45):
+        result = env.step(HOLD)
+    assert not result.success.any()
+
+
+def test_the_arch_moves_at_the_commanded_speed(env: VectorEnv) -> None:
+    begin(env, "arch")
+    for _ in range(8):
+        env.step(HOLD)
+    before = env.snapshot().object_w
+    env.step(HOLD)
+    moved = env.snapshot().object_w - before
+    speed = np.array([p["speed"] for p in env.parameters])
+    np.testing.assert_allclose(np.linalg.norm(moved, axis=1), speed * 0.04, rtol=1e-3)
+
+
+def test_an_upright_robot_hits_the_arch_with_its_head(config: EnvConfig) -> None:
+    near = ArchConfig(distance_range=(0.5, 0.6))
+    env = VectorEnv(replace(config, arch=near), 4)
+    begin(env, "arch")
+    head = np.zeros(4)
+    for _ in range(60):
+        head += env.step(HOLD).reward_terms["head"]
+    assert np.all(head < 0)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_object_is_seen_where_the_truth_says(env: VectorEnv, task: str) -> None:
+    """Empty-scene depth and the scene's differ, so the object is in the picture."""
+    begin(env, task)
+    for _ in range(14):
+        result = env.step(HOLD)
+    near = result.observation.depth[0] < 3600
+    assert np.mean(near & (result.observation.depth[0] > 0)) > 0.01
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_every_collision_geom_of_the_robot_has_a_part(task: str) -> None:
+    scene = build_scene(task, "points")
+    named = {PARTS[p] for p in scene.index.part if p >= 0}
+    assert named == set(PARTS)
+    assert scene.index.part[scene.index.floor] == -1
+    assert not np.any(scene.index.is_object & (scene.index.part >= 0))
