@@ -29,7 +29,7 @@ def test_a_wheel_without_the_model_is_an_environment_failure(
 ) -> None:
     spec = importlib.util.spec_from_file_location("mjlab", tmp_path / "__init__.py")
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: spec)
-    with pytest.raises(EnvironmentFailure, match="g1.xml"):
+    with pytest.raises(EnvironmentFailure, match=r"g1\.xml"):
         g1.model_path()
 
 

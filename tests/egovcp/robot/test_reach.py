@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from egovcp.robot import arms, reach
+from egovcp.robot.kinematics import Array
 from egovcp.robot.reach import DT, ReachConfig
 
-Array = arms.Array
 UPRIGHT = np.eye(3)[None]
 
 
