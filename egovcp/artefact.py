@@ -19,13 +19,18 @@ from pathlib import Path
 from typing import Any
 
 import draccus
+import httpx
 from huggingface_hub import snapshot_download
-from huggingface_hub.errors import HfHubHTTPError, HFValidationError
+from huggingface_hub.errors import (
+    HFValidationError,
+    RepositoryNotFoundError,
+    RevisionNotFoundError,
+)
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from egovcp import spec
-from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
 from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.plan import PlannerConfig, Policy
 
@@ -71,20 +76,26 @@ def feature_spec() -> dict[str, Any]:
         "depth": [spec.DEPTH_ROWS, spec.DEPTH_COLS],
         "state_names": list(spec.STATE_NAMES),
         "action_names": list(spec.ACTION_NAMES),
-        "action_box": dataclasses.asdict(spec.ACTION_BOX),
+        "action_box": {k: list(v) for k, v in dataclasses.asdict(spec.ACTION_BOX).items()},
     }
 
 
 def save_artefact(
     path: Path, model: WorldModel, planner: PlannerConfig, provenance: dict[str, Any]
 ) -> None:
-    """Write the artefact atomically: a temporary folder, then a rename.
+    """Write the artefact to a temporary folder, then rename it into place.
 
     Args:
-        path: folder to create; an older artefact there is replaced.
+        path: folder to create; an older artefact there is replaced once the new one is
+            complete, and stays if anything fails.
         provenance: JSON-able; must hold ``controller_id`` and says which data and
             command made the policy.
+
+    Raises:
+        ArtefactError: the provenance names no controller.
     """
+    if not isinstance(provenance.get("controller_id"), str):
+        raise ArtefactError(f"{path}: the provenance of a policy must hold its controller_id")
     work = path.with_name(path.name + ".partial")
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
@@ -99,14 +110,10 @@ def save_artefact(
             },
             spec.STATE_KEY: {"type": "STATE", "shape": [spec.STATE_DIM]},
         },
-        "output_features": {
-            spec.ACTION_KEY: {"type": "ACTION", "shape": [spec.ACTION_DIM]}
-        },
+        "output_features": {spec.ACTION_KEY: {"type": "ACTION", "shape": [spec.ACTION_DIM]}},
     }
     _write_json(work / CONFIG, config)
-    save_file(
-        {k: v.contiguous().cpu() for k, v in model.state_dict().items()}, work / WEIGHTS
-    )
+    save_file({k: v.contiguous().cpu() for k, v in model.state_dict().items()}, work / WEIGHTS)
     manifest = {
         "schema_version": SCHEMA_VERSION,
         "egovcp_version": version("egovcp"),
@@ -115,8 +122,22 @@ def save_artefact(
         **provenance,
     }
     _write_json(work / MANIFEST, manifest)
-    shutil.rmtree(path, ignore_errors=True)
-    work.rename(path)
+    _replace(path, work)
+
+
+def _replace(path: Path, new: Path) -> None:
+    """Put folder ``new`` in the place of ``path``, whose old content stays until it is there."""
+    old = path.with_name(path.name + ".old")
+    shutil.rmtree(old, ignore_errors=True)
+    if path.exists():
+        path.rename(old)
+    try:
+        new.rename(path)
+    except OSError:
+        if old.exists():
+            old.rename(path)
+        raise
+    shutil.rmtree(old, ignore_errors=True)
 
 
 def load_artefact(path: str, revision: str = "") -> Artefact:
@@ -131,20 +152,30 @@ def load_artefact(path: str, revision: str = "") -> Artefact:
     _check_manifest(folder, manifest)
     config = _read_json(folder / CONFIG)
     try:
-        model = WorldModel(draccus.decode(WorldModelConfig, config["world_model"]))
-        planner = draccus.decode(PlannerConfig, config["planner"])
+        model = WorldModel(_decode(WorldModelConfig, config, "world_model"))
+        planner = _decode(PlannerConfig, config, "planner")
         model.load_state_dict(load_file(folder / WEIGHTS))
     except (
         KeyError,
         RuntimeError,
         SafetensorError,
+        TypeError,
+        UsageError,
+        ValueError,
         draccus.utils.DraccusException,
     ) as error:
         reason = " ".join(str(error).split())[:300]
-        raise ArtefactError(
-            f"{folder}: weights and configuration disagree: {reason}"
-        ) from error
+        raise ArtefactError(f"{folder}: weights and configuration disagree: {reason}") from error
     return Artefact(folder, model.eval(), planner, manifest)
+
+
+def _decode[C](config_class: type[C], config: dict[str, Any], key: str) -> C:
+    """The dataclass under ``key``; raises KeyError, TypeError, UsageError or DraccusException."""
+    values = config[key]
+    if not isinstance(values, dict):
+        raise TypeError(f"{key} is {type(values).__name__}, expected an object")
+    decoded: C = draccus.decode(config_class, values)
+    return decoded
 
 
 def _locate(path: str, revision: str) -> Path:
@@ -158,12 +189,12 @@ def _locate(path: str, revision: str) -> Path:
         )
     try:
         return Path(snapshot_download(path, revision=revision or None))
-    except (HfHubHTTPError, HFValidationError) as error:
+    except (RepositoryNotFoundError, RevisionNotFoundError, HFValidationError) as error:
         reason = str(error).splitlines()[0]
         raise ArtefactError(
             f"{path!r} is neither a folder here nor a policy on the Hub: {reason}"
         ) from error
-    except (OSError, ValueError) as error:
+    except (OSError, httpx.HTTPError) as error:
         raise EnvironmentFailure(
             f"{path!r} is not a folder here, and the Hub cannot be reached: "
             f"{str(error).splitlines()[0]}"
@@ -178,18 +209,16 @@ def _check_manifest(folder: Path, manifest: dict[str, Any]) -> None:
             f"{SCHEMA_VERSION}; install the version that made it, or train again"
         )
     if manifest.get("features") != feature_spec():
-        ours, theirs = feature_spec(), manifest.get("features") or {}
+        ours, theirs = feature_spec(), _object(manifest, "features")
         differing = [k for k in ours if theirs.get(k) != ours[k]]
         raise ArtefactError(
             f"{folder / MANIFEST}: made for another feature spec (differs in "
             f"{', '.join(differing) or 'extra keys'}); train again on data of this version"
         )
     if not isinstance(manifest.get("controller_id"), str):
-        raise ArtefactError(
-            f"{folder / MANIFEST}: no controller_id; the file is damaged"
-        )
+        raise ArtefactError(f"{folder / MANIFEST}: no controller_id; the file is damaged")
     for name in (CONFIG, WEIGHTS):
-        expected, found = manifest.get("files", {}).get(name), _sha256(folder / name)
+        expected, found = _object(manifest, "files").get(name), _sha256(folder / name)
         if found != expected:
             raise ArtefactError(
                 f"{folder / name}: SHA-256 is {found[:12]}..., the manifest says "
@@ -197,31 +226,29 @@ def _check_manifest(folder: Path, manifest: dict[str, Any]) -> None:
             )
 
 
+def _object(manifest: dict[str, Any], key: str) -> dict[str, Any]:
+    """The object under ``key``; empty where the manifest has none."""
+    value = manifest.get(key)
+    return value if isinstance(value, dict) else {}
+
+
 def _sha256(path: Path) -> str:
     try:
         with path.open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
-        raise ArtefactError(
-            f"{path}: {error.strerror}; the artefact is incomplete"
-        ) from error
+        raise ArtefactError(f"{path}: {error.strerror}; the artefact is incomplete") from error
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ArtefactError(
-            f"{path}: {error.strerror}; not a policy artefact"
-        ) from error
+        raise ArtefactError(f"{path}: {error.strerror}; not a policy artefact") from error
     except ValueError as error:
-        raise ArtefactError(
-            f"{path}: not valid JSON ({error}); the file is damaged"
-        ) from error
+        raise ArtefactError(f"{path}: not valid JSON ({error}); the file is damaged") from error
     if not isinstance(content, dict):
-        raise ArtefactError(
-            f"{path}: expected a JSON object, found {type(content).__name__}"
-        )
+        raise ArtefactError(f"{path}: expected a JSON object, found {type(content).__name__}")
     return content
 
 

@@ -1,0 +1,343 @@
+"""The artefact: what is written is what is loaded, and anything else is refused by name."""
+
+import hashlib
+import json
+import pickle
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import torch
+from huggingface_hub.errors import (
+    HfHubHTTPError,
+    HFValidationError,
+    LocalEntryNotFoundError,
+    OfflineModeIsEnabled,
+    RepositoryNotFoundError,
+    RevisionNotFoundError,
+)
+
+from egovcp import artefact as module
+from egovcp import spec
+from egovcp.artefact import CONFIG, MANIFEST, WEIGHTS, load_artefact, save_artefact
+from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp.plan import PlannerConfig, Policy
+from egovcp.testing import toy_model
+
+PLANNER = PlannerConfig(samples=32, elites=4, iterations=1, termination_rule="survival")
+PROVENANCE = {"controller_id": "stance-1", "datasets": [{"repo_id": "me/ball"}]}
+
+type Json = dict[str, Any]
+
+
+@pytest.fixture(scope="module")
+def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An artefact that tests must not change."""
+    path = tmp_path_factory.mktemp("artefact") / "policy"
+    model = toy_model()
+    model.state_mean.uniform_(-1, 1)
+    model.return_floor.fill_(-7.0)
+    save_artefact(path, model, PLANNER, PROVENANCE)
+    return path
+
+
+@pytest.fixture
+def folder(original: Path, tmp_path: Path) -> Path:
+    """A copy to tamper with."""
+    return Path(shutil.copytree(original, tmp_path / "copy"))
+
+
+def _edit(path: Path, change: Callable[[Json], object]) -> None:
+    content = json.loads(path.read_text())
+    change(content)
+    path.write_text(json.dumps(content))
+
+
+def _sign(folder: Path) -> None:
+    """Make the manifest agree with whatever the files now hold."""
+    hashes = {
+        name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in (CONFIG, WEIGHTS)
+    }
+    _edit(folder / MANIFEST, lambda m: m["files"].update(hashes))
+
+
+# --- round trip ------------------------------------------------------------------------
+def test_the_loaded_policy_acts_as_the_saved_one(original: Path) -> None:
+    saved = toy_model()
+    loaded = load_artefact(str(original))
+    saved.load_state_dict(loaded.world_model.state_dict())
+    rng = np.random.default_rng(0)
+    depth = rng.integers(0, 5000, (2, spec.DEPTH_ROWS, spec.DEPTH_COLS)).astype(np.uint16)
+    state = rng.normal(size=(2, spec.STATE_DIM)).astype(np.float32)
+    mine = Policy(saved, PLANNER, num_envs=2, seed=4)
+    theirs = loaded.make_policy(num_envs=2, seed=4)
+    for _ in range(3):
+        a, b = (policy.act(depth, state) for policy in (mine, theirs))
+        for x, y in zip(a, b, strict=True):
+            np.testing.assert_array_equal(x, y)
+        mine.advance(a.action)
+        theirs.advance(b.action)
+        np.testing.assert_array_equal(mine.reconstruct(), theirs.reconstruct())
+
+
+def test_weights_statistics_and_settings_survive(tmp_path: Path) -> None:
+    model = toy_model()
+    model.state_std.uniform_(0.5, 2)
+    model.return_floor.fill_(-7.0)
+    save_artefact(tmp_path / "policy", model, PLANNER, PROVENANCE)
+    loaded = load_artefact(str(tmp_path / "policy"))
+    kept = loaded.world_model.state_dict()
+    assert kept.keys() == model.state_dict().keys()
+    for name, value in model.state_dict().items():
+        assert torch.equal(kept[name], value), name
+    assert loaded.world_model.config == model.config
+    assert loaded.planner == PLANNER
+    assert loaded.manifest["datasets"] == PROVENANCE["datasets"]
+    assert not loaded.world_model.training
+
+
+def test_saving_what_was_loaded_is_the_identity(original: Path, tmp_path: Path) -> None:
+    loaded = load_artefact(str(original))
+    save_artefact(tmp_path / "again", loaded.world_model, loaded.planner, PROVENANCE)
+    for name in (CONFIG, WEIGHTS, MANIFEST):
+        assert (tmp_path / "again" / name).read_bytes() == (original / name).read_bytes()
+
+
+def test_another_planner_can_be_asked_for(original: Path) -> None:
+    other = PlannerConfig(samples=8, elites=2, horizon=2)
+    assert load_artefact(str(original)).make_policy(planner=other).config == other
+
+
+# --- refusals --------------------------------------------------------------------------
+@pytest.mark.parametrize("name", [CONFIG, WEIGHTS, MANIFEST])
+def test_a_missing_file_is_named(folder: Path, name: str) -> None:
+    (folder / name).unlink()
+    with pytest.raises(ArtefactError, match=name):
+        load_artefact(str(folder))
+
+
+@pytest.mark.parametrize("name", [CONFIG, WEIGHTS])
+@pytest.mark.parametrize("where", [0, -1])
+def test_a_changed_byte_is_noticed(folder: Path, name: str, where: int) -> None:
+    content = bytearray((folder / name).read_bytes())
+    content[where] ^= 1
+    (folder / name).write_bytes(content)
+    with pytest.raises(ArtefactError, match=f"{name}.*SHA-256"):
+        load_artefact(str(folder))
+
+
+@pytest.mark.parametrize("name", [CONFIG, WEIGHTS, MANIFEST])
+def test_a_truncated_file_is_noticed(folder: Path, name: str) -> None:
+    content = (folder / name).read_bytes()
+    (folder / name).write_bytes(content[: len(content) // 2])
+    with pytest.raises(ArtefactError, match=name):
+        load_artefact(str(folder))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.update(schema_version=2), "schema version 2"),
+        (lambda m: m.pop("schema_version"), "schema version None"),
+        (lambda m: m["features"].update(planner_hz=50), "another feature spec.*planner_hz"),
+        (lambda m: m["features"]["action_box"].update(low=[0] * 7), "feature spec.*action_box"),
+        (lambda m: m["features"]["state_names"].pop(), "feature spec.*state_names"),
+        (lambda m: m["features"].update(smell=1), "another feature spec"),
+        (lambda m: m.update(features=[1]), "another feature spec"),
+        (lambda m: m.pop("features"), "another feature spec"),
+        (lambda m: m.pop("controller_id"), "no controller_id"),
+        (lambda m: m.update(controller_id=7), "no controller_id"),
+        (lambda m: m.pop("files"), "SHA-256"),
+        (lambda m: m.update(files=["a"]), "SHA-256"),
+        (lambda m: m["files"].pop(WEIGHTS), f"{WEIGHTS}.*SHA-256"),
+    ],
+)
+def test_a_manifest_of_something_else_is_refused(
+    folder: Path, change: Callable[[Json], object], message: str
+) -> None:
+    _edit(folder / MANIFEST, change)
+    with pytest.raises(ArtefactError, match=message):
+        load_artefact(str(folder))
+
+
+@pytest.mark.parametrize("content", ["[]", "3", "null", "not json", '{"a": ', "\xff\xfe"])
+def test_a_manifest_that_is_none_is_refused(folder: Path, content: str) -> None:
+    (folder / MANIFEST).write_text(content, encoding="latin-1")
+    with pytest.raises(ArtefactError, match=MANIFEST):
+        load_artefact(str(folder))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c.pop("world_model"),
+        lambda c: c.pop("planner"),
+        lambda c: c["world_model"].update(hidden=48),
+        lambda c: c["world_model"].update(hidden="wide"),
+        lambda c: c["world_model"].update(channels=[4, 8]),
+        lambda c: c["world_model"].update(surprise=1),
+        lambda c: c.update(world_model=[1, 2]),
+        lambda c: c["planner"].update(samples=0),
+        lambda c: c["planner"].update(termination_rule="never"),
+        lambda c: c.update(planner=None),
+    ],
+)
+def test_a_configuration_that_cannot_be_is_refused(
+    folder: Path, change: Callable[[Json], object]
+) -> None:
+    """Even where somebody has signed it again."""
+    _edit(folder / CONFIG, change)
+    _sign(folder)
+    with pytest.raises(ArtefactError, match="copy"):
+        load_artefact(str(folder))
+
+
+class _Bomb:
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[str]]:
+        return (pytest.fail, ("a pickle was executed",))
+
+
+def test_a_pickle_is_never_executed(folder: Path) -> None:
+    (folder / WEIGHTS).write_bytes(pickle.dumps(_Bomb()))
+    _sign(folder)
+    with pytest.raises(ArtefactError, match="weights"):
+        load_artefact(str(folder))
+    torch.save(_Bomb(), folder / WEIGHTS)
+    _sign(folder)
+    with pytest.raises(ArtefactError, match="weights"):
+        load_artefact(str(folder))
+
+
+def test_loading_never_unpickles(original: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        pytest.fail("unpickling")
+
+    for target in ("pickle.load", "pickle.loads", "pickle.Unpickler", "torch.load"):
+        monkeypatch.setattr(target, refuse)
+    load_artefact(str(original))
+
+
+def test_it_holds_only_json_and_safetensors(original: Path) -> None:
+    assert {path.name for path in original.iterdir()} == {CONFIG, WEIGHTS, MANIFEST}
+
+
+def test_another_controller_is_refused(original: Path) -> None:
+    loaded = load_artefact(str(original))
+    loaded.require_controller("stance-1")
+    with pytest.raises(ArtefactError, match=r"policy.*'stance-1'.*'walker-2'"):
+        loaded.require_controller("walker-2")
+
+
+# --- where it lies ---------------------------------------------------------------------
+@pytest.mark.parametrize("path", ["./absent", "/absent/policy", "absent", "a/b/c"])
+def test_a_path_without_artefact_is_refused_without_network(
+    path: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "snapshot_download", lambda *_, **__: pytest.fail("network"))
+    with pytest.raises(ArtefactError, match=f"no policy artefact at '{path}'"):
+        load_artefact(path)
+
+
+def test_a_file_is_no_artefact(original: Path) -> None:
+    with pytest.raises(ArtefactError, match="no policy artefact"):
+        load_artefact(str(original / WEIGHTS))
+
+
+def test_a_hub_id_is_fetched_at_its_revision(
+    original: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[str, str | None]] = []
+
+    def fake(repo_id: str, revision: str | None = None) -> str:
+        asked.append((repo_id, revision))
+        return str(original)
+
+    monkeypatch.setattr(module, "snapshot_download", fake)
+    assert load_artefact("me/policy", "abc").path == original
+    load_artefact("me/policy")
+    assert asked == [("me/policy", "abc"), ("me/policy", None)]
+
+
+def _refusal(kind: type[HfHubHTTPError], status: int) -> HfHubHTTPError:
+    """What the Hub client raises for an answer of this status."""
+    request = httpx.Request("GET", "https://hub.invalid/api/models/me/policy")
+    return kind(f"{status} from the Hub", response=httpx.Response(status, request=request))
+
+
+@pytest.mark.parametrize(
+    ("raised", "expected"),
+    [
+        (HFValidationError("bad id"), ArtefactError),
+        (_refusal(RepositoryNotFoundError, 404), ArtefactError),
+        (_refusal(RevisionNotFoundError, 404), ArtefactError),
+        (_refusal(HfHubHTTPError, 503), EnvironmentFailure),
+        (httpx.ReadTimeout("too slow"), EnvironmentFailure),
+        (LocalEntryNotFoundError("offline"), EnvironmentFailure),
+        (OSError("no route to host"), EnvironmentFailure),
+        (OfflineModeIsEnabled("offline"), EnvironmentFailure),
+    ],
+)
+def test_a_failing_hub_is_reported_as_what_it_is(
+    raised: Exception, expected: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise raised
+
+    monkeypatch.setattr(module, "snapshot_download", fail)
+    with pytest.raises(expected, match="'me/policy'"):
+        load_artefact("me/policy")
+
+
+# --- replacing -------------------------------------------------------------------------
+def test_an_older_artefact_is_replaced_and_nothing_is_left_over(folder: Path) -> None:
+    (folder / "stale").touch()
+    save_artefact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
+    assert {path.name for path in folder.iterdir()} == {CONFIG, WEIGHTS, MANIFEST}
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+    loaded = load_artefact(str(folder)).world_model.state_dict()
+    expected = toy_model(seed=1).state_dict()
+    assert all(torch.equal(loaded[name], expected[name]) for name in expected)
+
+
+@pytest.mark.parametrize("step", ["save_file", "_write_json", "_sha256"])
+def test_a_failure_while_writing_leaves_the_old_artefact(
+    folder: Path, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, step, fail)
+        with pytest.raises(OSError, match="No space left"):
+            save_artefact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    save_artefact(folder, toy_model(seed=1), PLANNER, PROVENANCE)  # leftovers do no harm
+    load_artefact(str(folder))
+
+
+def test_a_failing_rename_leaves_an_artefact(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the last moment, too: never neither the old one nor the new one."""
+    rename = Path.rename
+
+    def fail(self: Path, target: Path) -> Path:
+        if target == folder and self.name.endswith(".partial"):
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "rename", fail)
+        with pytest.raises(OSError, match="Input/output"):
+            save_artefact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
+    load_artefact(str(folder))
+
+
+def test_provenance_without_a_controller_is_refused_before_writing(tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match="controller_id"):
+        save_artefact(tmp_path / "policy", toy_model(), PLANNER, {"datasets": []})
+    assert not list(tmp_path.iterdir())
