@@ -69,7 +69,7 @@ def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
     """
     scores: dict[Action, list[EpisodeScore]] = {action: [] for action in grid(task)}
     left, count = list(scores), _FIRST_ROUND
-    while True:
+    while len(left) > 1:
         first = len(scores[left[0]])
         scenarios = [for_search(task, seed, first + i) for i in range(count)]
         pairs = list(itertools.product(left, scenarios))
@@ -77,9 +77,8 @@ def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
         for (action, _), score in zip(pairs, played, strict=True):
             scores[action].append(score)
         left.sort(key=lambda action: -reward_per_step(scores[action]))
-        if len(left) == 1:
-            return _best(left[0], scores[left[0]])
         left, count = left[: max(1, len(left) // _KEEP)], count * 2
+    return _best(left[0], scores[left[0]])
 
 
 def _best(action: Action, scores: Sequence[EpisodeScore]) -> BestConstant:
