@@ -1,0 +1,262 @@
+"""The public checks accept what conforms and name what does not."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.artefact import save_artefact
+from egovcp.checks import (
+    ConformanceError,
+    check_artefact,
+    check_dataset,
+    check_env,
+    check_world_model,
+)
+from egovcp.data import DatasetConfig, DatasetWriter, Episode, Provenance
+from egovcp.errors import ArtefactError, DataError
+from egovcp.model import Carry, WorldModel
+from egovcp.plan import PlannerConfig
+from egovcp.testing import CountingEnv, CountingModel, ToyObservation, ToyStep, toy_model
+
+DEBUG = toy_model().config
+
+
+# --- world models ----------------------------------------------------------------------
+def test_the_counting_model_conforms() -> None:
+    check_world_model(CountingModel())
+
+
+class _KeepsMemory(WorldModel):
+    def observe(
+        self, carry: Carry, action: Tensor, depth: Tensor, state: Tensor, is_first: Tensor
+    ) -> Carry:
+        return super().observe(carry, action, depth, state, torch.zeros_like(is_first))
+
+
+class _MultipliesByZero(WorldModel):
+    def advance(self, carry: Carry, action: Tensor, is_first: Tensor) -> Tensor:
+        keep = (~is_first).float()[:, None]
+        return self.transition(Carry(carry.h * keep, carry.z * keep), action * keep)
+
+
+class _ChangesItsInput(WorldModel):
+    def transition(self, carry: Carry, action: Tensor) -> Tensor:
+        h = super().transition(carry, action)
+        carry.h.add_(1.0)
+        return h
+
+
+class _MixesRows(WorldModel):
+    def embed(self, depth: Tensor, state: Tensor) -> Tensor:
+        embedding = super().embed(depth, state)
+        return embedding - embedding.mean(0)
+
+
+class _DrawsAtRandom(WorldModel):
+    def observe(
+        self, carry: Carry, action: Tensor, depth: Tensor, state: Tensor, is_first: Tensor
+    ) -> Carry:
+        h, z = super().observe(carry, action, depth, state, is_first)
+        return Carry(h, z + torch.randn_like(z))
+
+
+class _AnswersLogits(WorldModel):
+    def termination(self, carry: Carry) -> Tensor:
+        return self.termination_logit(carry) - 2.0
+
+
+class _KeepsADimension(WorldModel):
+    def value(self, carry: Carry, action: Tensor) -> Tensor:
+        return super().value(carry, action)[..., None]
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (_KeepsMemory, "does not forget the memory"),
+        (_MultipliesByZero, "does not forget a memory of NaN"),
+        (_ChangesItsInput, "changes its input"),
+        (_MixesRows, "rows of a batch influence"),
+        (_DrawsAtRandom, "second time"),
+        (_AnswersLogits, "not a probability"),
+        (_KeepsADimension, "value has shape"),
+    ],
+)
+def test_a_model_that_breaks_the_contract_is_named(broken: type[WorldModel], message: str) -> None:
+    model = broken(DEBUG).eval()
+    model.load_state_dict(toy_model().state_dict())
+    with pytest.raises(ConformanceError, match=message):
+        check_world_model(model)
+
+
+def test_weights_that_are_not_numbers_are_found() -> None:
+    model = toy_model()
+    with torch.no_grad():
+        model.gru.norm.weight.fill_(torch.nan)
+    with pytest.raises(ConformanceError):
+        check_world_model(model)
+
+
+# --- artefacts -------------------------------------------------------------------------
+def _save(path: Path, model: WorldModel) -> str:
+    planner = PlannerConfig(samples=16, elites=4)
+    save_artefact(path, model, planner, {"controller_id": "stance-1"})
+    return str(path)
+
+
+def test_a_good_artefact_passes(tmp_path: Path) -> None:
+    artefact = check_artefact(_save(tmp_path / "policy", toy_model()))
+    assert artefact.controller_id == "stance-1"
+
+
+@pytest.mark.parametrize("name", ["value_head", "gru"])
+def test_an_artefact_that_learned_nonsense_is_refused(tmp_path: Path, name: str) -> None:
+    model = toy_model()
+    with torch.no_grad():
+        for parameter in getattr(model, name).parameters():
+            parameter.fill_(torch.nan)
+    with pytest.raises(ArtefactError, match="policy: world model"):
+        check_artefact(_save(tmp_path / "policy", model))
+
+
+# --- environments ----------------------------------------------------------------------
+def test_the_counting_environment_conforms() -> None:
+    check_env(CountingEnv(3), [10, 4, 0])
+
+
+class _Altered(CountingEnv):
+    """Changes what the environment brings after its third tick."""
+
+    calls = 0
+
+    def step(self, action: NDArray[np.floating]) -> ToyStep:
+        step = super().step(action)
+        self.calls += 1
+        return self.alter(step) if self._tick.max() >= 3 else step
+
+    def alter(self, step: ToyStep) -> ToyStep:
+        raise NotImplementedError
+
+
+class _LateCommand(_Altered):
+    def alter(self, step: ToyStep) -> ToyStep:
+        state = step.observation.state.copy()
+        state[:, spec.STATE_SLICES["command_hands"]] += 0.01
+        return dataclasses.replace(step, observation=ToyObservation(step.observation.depth, state))
+
+
+class _Jumps(_Altered):
+    def step(self, action: NDArray[np.floating]) -> ToyStep:
+        if self._tick.max() >= 3:
+            self._sent = np.clip(np.asarray(action, dtype=np.float64), -1, 1)
+        return CountingEnv.step(self, action)
+
+
+class _WrongSum(_Altered):
+    def alter(self, step: ToyStep) -> ToyStep:
+        return dataclasses.replace(step, reward=step.reward + 1.0)
+
+
+class _BothEnds(_Altered):
+    def alter(self, step: ToyStep) -> ToyStep:
+        both = np.ones(self.num_envs, dtype=np.bool_)
+        return dataclasses.replace(step, terminated=both, truncated=both)
+
+
+class _RisesAgain(_Altered):
+    def alter(self, step: ToyStep) -> ToyStep:
+        nobody = np.zeros(self.num_envs, dtype=np.bool_)
+        return dataclasses.replace(step, terminated=nobody, truncated=nobody)
+
+
+class _Wanders(_Altered):
+    def alter(self, step: ToyStep) -> ToyStep:
+        depth = step.observation.depth + np.uint16(self.calls)
+        return dataclasses.replace(step, observation=ToyObservation(depth, step.observation.state))
+
+
+class _OtherShape(_Altered):
+    def alter(self, step: ToyStep) -> ToyStep:
+        seen = step.observation
+        return dataclasses.replace(
+            step, observation=ToyObservation(seen.depth[..., None], seen.state)
+        )
+
+
+class _NotANumber(_Altered):
+    def alter(self, step: ToyStep) -> ToyStep:
+        state = step.observation.state.copy()
+        state[0, 20] = np.nan
+        return dataclasses.replace(step, observation=ToyObservation(step.observation.depth, state))
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (_LateCommand, "tick 3: the command in the state is not the last one sent"),
+        (_Jumps, "rate limit"),
+        (_WrongSum, "tick 3: reward is not the sum of its terms"),
+        (_BothEnds, "tick 3: a row is terminated and truncated at once"),
+        (_RisesAgain, "an episode that was over goes on"),
+        (_Wanders, "depth is not repeatable"),
+        (_OtherShape, r"tick 3: depth is uint16 \(2, 48, 64, 1\)"),
+        (_NotANumber, "tick 3: state is not finite"),
+    ],
+)
+def test_an_environment_that_breaks_the_contract_is_named(
+    broken: type[CountingEnv], message: str
+) -> None:
+    with pytest.raises(ConformanceError, match=message):
+        check_env(broken(2), [10, 2])
+
+
+# --- datasets --------------------------------------------------------------------------
+def _walk(length: int, shift: int = 0) -> Episode:
+    """An episode of `CountingEnv`; ``shift`` moves its states in time."""
+    env, rng = CountingEnv(1), np.random.default_rng(0)
+    seen, steps, actions = env.reset([length]), [], rng.uniform(-0.9, 0.9, (length, 1, 7))
+    depths, states = [], []
+    for action in actions:
+        depths.append(seen.depth[0])
+        states.append(seen.state[0])
+        steps.append(env.step(action))
+        seen = steps[-1].observation
+    last = np.arange(length) == length - 1
+    return Episode(
+        depth=np.stack(depths),
+        state=np.roll(np.stack(states), shift, axis=0),
+        action=np.concatenate([s.sent_action for s in steps]).astype(np.float32),
+        reward=np.concatenate([s.reward for s in steps]).astype(np.float32),
+        done=last,
+        success=np.zeros(length, dtype=np.bool_),
+        truncated=last,
+        task="ball",
+        time_limit=length,
+    )
+
+
+def _write(root: Path, *episodes: Episode) -> DatasetConfig:
+    with DatasetWriter(root, Provenance("counting")) as writer:
+        for episode in episodes:
+            writer.add(episode)
+    return DatasetConfig(root=str(root))
+
+
+def test_a_dataset_whose_rows_line_up_passes(tmp_path: Path) -> None:
+    done: list[tuple[int, int]] = []
+    config = _write(tmp_path / "data", _walk(9), _walk(5))
+    check_dataset(config, lambda now, total: done.append((now, total)))
+    assert done == [(1, 2), (2, 2)]
+
+
+@pytest.mark.parametrize("shift", [-1, 1])
+def test_a_dataset_shifted_in_time_is_refused(tmp_path: Path, shift: int) -> None:
+    config = _write(tmp_path / "data", _walk(9), _walk(5, shift))
+    with pytest.raises(DataError, match=r"episode 1, frame \d: the command.*one tick before"):
+        check_dataset(config)
