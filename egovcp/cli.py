@@ -20,7 +20,7 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import draccus
 from draccus.argparsing import ArgumentParser
@@ -41,11 +41,25 @@ class DatasetConfig:
     """Branch, tag or commit SHA on the Hub; empty: the latest."""
 
 
+type Kind = Literal["switch", "text", "value"]
+
+
 class _Parser(ArgumentParser[Any]):
     """draccus' parser that raises `UsageError` instead of ending the process."""
 
-    def known_flags(self) -> list[str]:
-        return [o for a in self.parser._actions for o in a.option_strings if o.startswith("--")]
+    def flag_kinds(self) -> dict[str, Kind]:
+        """What each flag takes: "switch", "text" (used as it is written) or "value" (YAML)."""
+        actions = [a for a in self.parser._actions if a.option_strings[-1].startswith("--")]
+        names = [a.option_strings[-1] for a in actions]
+        kinds: dict[str, Kind] = {}
+        for name, action in zip(names, actions, strict=True):
+            group = any(other.startswith(f"{name}.") for other in names)
+            if action.type is bool or action.nargs == 0:
+                kinds[name] = "switch"
+            else:
+                text = action.type is str and not action.choices and not group
+                kinds[name] = "text" if text else "value"
+        return kinds
 
 
 class _TeachingHelp(argparse.ArgumentDefaultsHelpFormatter):
@@ -62,7 +76,7 @@ def parse_config[C](
 ) -> C:
     """Parse dotted flags into ``config_class``; raise `UsageError` naming the flag at fault.
 
-    A flag without a value is true (``--resume`` is ``--resume=true``). ``defaults`` maps
+    A switch without a value is true (``--resume`` is ``--resume=true``). ``defaults`` maps
     the flags to nested values that stand where no flag and no config file says otherwise.
     """
     parser = _Parser(
@@ -73,19 +87,12 @@ def parse_config[C](
         epilog=epilog,
         exit_on_error=False,
     )
-    known = parser.known_flags()
-    args = _bare_flags_are_true(argv)
-    for arg in args:
-        flag = arg.split("=", 1)[0]
-        if not flag.startswith("-"):
-            raise UsageError(f"unexpected argument {arg!r}; options are written --name=value")
-        if flag not in known and flag != "-h":
-            near = suggest(flag, known).split(" choose from")[0].rstrip(";")
-            raise UsageError(f"unknown option {flag}{near}; see {prog} --help")
+    kinds = parser.flag_kinds()
+    args = [_checked(arg, kinds, prog) for arg in _joined(argv)]
     try:
         with _defaults_file(defaults(args) if defaults else {}) as path:
             parser.config_path = path
-            config: C = parser.parse_args(args)
+            config: C = parser.parse_args([_verbatim(arg, kinds) for arg in args])
     except (DraccusException, argparse.ArgumentError, ValueError, TypeError) as error:
         raise UsageError(f"{' '.join(str(error).split())}; see {prog} --help") from error
     except OSError as error:
@@ -106,8 +113,8 @@ def _defaults_file(values: Mapping[str, Any]) -> Iterator[str | None]:
         yield file.name
 
 
-def _bare_flags_are_true(argv: Sequence[str]) -> list[str]:
-    """Join ``--a b`` to ``--a=b`` and turn a lone ``--a`` into ``--a=true``."""
+def _joined(argv: Sequence[str]) -> list[str]:
+    """``--a b`` as ``--a=b``."""
     out: list[str] = []
     for arg in argv:
         takes_value = bool(out) and out[-1].startswith("--") and "=" not in out[-1]
@@ -115,9 +122,30 @@ def _bare_flags_are_true(argv: Sequence[str]) -> list[str]:
             out[-1] += f"={arg}"
         else:
             out.append(arg)
-    return [
-        f"{a}=true" if a.startswith("--") and "=" not in a and a != "--help" else a for a in out
-    ]
+    return out
+
+
+def _checked(arg: str, kinds: Mapping[str, Kind], prog: str) -> str:
+    """The argument, a lone ``--a`` as ``--a=true``; raise `UsageError` for what is none."""
+    flag, equals, _ = arg.partition("=")
+    if arg in ("-h", "--help"):
+        return arg
+    if not flag.startswith("-"):
+        raise UsageError(f"unexpected argument {arg!r}; options are written --name=value")
+    if flag not in kinds:
+        near = suggest(flag, kinds).split(" choose from")[0].rstrip(";")
+        raise UsageError(f"unknown option {flag}{near}; see {prog} --help")
+    if not equals and kinds[flag] != "switch":
+        raise UsageError(f"option {flag} needs a value, {flag}=...; see {prog} --help")
+    return arg if equals else f"{arg}=true"
+
+
+def _verbatim(arg: str, kinds: Mapping[str, Kind]) -> str:
+    """Quote text, which draccus would read as YAML: a folder 007 is not the number 7."""
+    flag, equals, value = arg.partition("=")
+    if not equals or kinds[flag] != "text":
+        return arg
+    return f"{flag}={json.dumps(value, ensure_ascii=False)}"
 
 
 def run_command[C](
@@ -131,10 +159,11 @@ def run_command[C](
 ) -> int:
     """Parse ``argv``, call ``run`` and return the exit code; one line on an error."""
     args = list(sys.argv[1:] if argv is None else argv)
-    debug = "--debug" in args
+    switch = ("--debug", "--debug=true")
+    debug = any(a in switch for a in args)
     epilog = (epilog + "\n" if epilog else "") + "--debug prints the traceback of an error."
     try:
-        plain = [a for a in args if a != "--debug"]
+        plain = [a for a in args if a not in switch]
         config = parse_config(config_class, plain, prog, epilog, defaults)
         run(config)
     except KeyboardInterrupt:

@@ -1,0 +1,263 @@
+"""Command lines: what is accepted, what is refused with which words and exit code."""
+
+import errno
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import draccus
+import pytest
+
+from egovcp.cli import DatasetConfig, parse_config, run_command, save_config
+from egovcp.errors import (
+    ArtefactError,
+    DataError,
+    EgovcpError,
+    EnvironmentFailure,
+    SafetyStop,
+    UsageError,
+)
+
+PROG = "egovcp-test"
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A ball."""
+
+    radius: float = 0.1
+    """Radius, m."""
+    bounces: int = 3
+    """Bounces."""
+    colour: str = "red"
+    """Colour."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """A command for tests."""
+
+    name: str = "none"
+    """A name."""
+    count: int = 1
+    """How many."""
+    loud: bool = False
+    """Loud."""
+    quiet: bool = True
+    """Quiet."""
+    mode: Literal["fast", "slow"] = "fast"
+    """Mode."""
+    sizes: tuple[int, int, int] = (1, 2, 3)
+    """Sizes."""
+    preset: str = "small"
+    """Preset."""
+    ball: Ball = field(default_factory=Ball)
+    """The ball."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """The dataset."""
+
+
+def _parse(*argv: str) -> Config:
+    return parse_config(Config, argv, PROG)
+
+
+# --- what is accepted -------------------------------------------------------------------
+def test_without_flags_everything_has_its_default() -> None:
+    assert _parse() == Config()
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["--count=4", "--name=x", "--ball.radius=0.15"],
+        ["--count", "4", "--name", "x", "--ball.radius", "0.15"],
+        ["--ball.radius", "0.15", "--count=4", "--name", "x"],
+    ],
+)
+def test_flags_take_values_with_or_without_equals(argv: list[str]) -> None:
+    assert _parse(*argv) == Config(name="x", count=4, ball=Ball(radius=0.15))
+
+
+@pytest.mark.parametrize("count", ["-3", "+3", "0"])
+def test_a_negative_number_is_a_value(count: str) -> None:
+    assert _parse("--count", count).count == int(count)
+    assert _parse(f"--count={count}").count == int(count)
+
+
+@pytest.mark.parametrize("argv", [["--loud"], ["--loud=true"], ["--loud", "true"]])
+def test_a_bare_boolean_is_true(argv: list[str]) -> None:
+    assert _parse(*argv).loud is True
+    assert _parse(*argv, "--count=2") == Config(loud=True, count=2)
+    assert _parse("--count=2", *argv) == Config(loud=True, count=2)
+
+
+@pytest.mark.parametrize("value", ["false", "False", "no", "off"])
+def test_a_boolean_can_be_switched_off(value: str) -> None:
+    assert _parse(f"--quiet={value}").quiet is False
+
+
+def test_a_value_may_hold_an_equals_sign_and_spaces() -> None:
+    assert _parse("--name=a=b c").name == "a=b c"
+
+
+def test_sequences_are_written_in_brackets() -> None:
+    assert _parse("--sizes=[4,5,6]").sizes == (4, 5, 6)
+
+
+@pytest.mark.parametrize("text", ["007", "1e5", "12e4567", "2024", "true", "null", "1_000"])
+def test_text_stays_as_it_is_written(text: str) -> None:
+    """A folder called 007 or a commit 12e4567 must not turn into a number."""
+    assert _parse(f"--dataset.revision={text}").dataset.revision == text
+
+
+def test_what_is_saved_parses_to_the_same(tmp_path: Path) -> None:
+    config = Config(name="x: y", sizes=(9, 8, 7), loud=True, ball=Ball(radius=0.2))
+    save_config(config, str(tmp_path / "config.yaml"))
+    assert _parse(f"--config_path={tmp_path}/config.yaml") == config
+    changed = _parse(f"--config_path={tmp_path}/config.yaml", "--ball.bounces=9")
+    assert changed.ball == Ball(radius=0.2, bounces=9)
+
+
+# --- presets ----------------------------------------------------------------------------
+PRESETS = {"small": Ball(), "large": Ball(radius=0.5, bounces=7, colour="blue")}
+
+
+def _with_preset(*argv: str) -> Config:
+    def defaults(args: Sequence[str]) -> dict[str, Any]:
+        names = [a.split("=", 1)[1] for a in args if a.startswith("--preset=")]
+        return {"ball": draccus.encode(PRESETS[names[-1]])} if names else {}
+
+    return parse_config(Config, argv, PROG, defaults=defaults)
+
+
+def test_a_preset_sets_nested_values_and_a_flag_overrides_one_of_them() -> None:
+    assert _with_preset().ball == Ball()
+    assert _with_preset("--preset=large").ball == PRESETS["large"]
+    assert _with_preset("--preset", "large").ball == PRESETS["large"]
+    for argv in (["--preset=large", "--ball.bounces=1"], ["--ball.bounces=1", "--preset=large"]):
+        assert _with_preset(*argv).ball == Ball(radius=0.5, bounces=1, colour="blue")
+
+
+# --- what is refused --------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("flag", "near"),
+    [("--cuont=3", "--count"), ("--ball.raduis=1", "--ball.radius"), ("--lout", "--loud")],
+)
+def test_an_unknown_flag_is_refused_with_a_suggestion(flag: str, near: str) -> None:
+    with pytest.raises(UsageError, match=f"unknown option .* did you mean '{near}'.*--help"):
+        _parse(flag)
+
+
+def test_an_unknown_flag_like_nothing_else_is_refused_plainly() -> None:
+    with pytest.raises(UsageError, match="unknown option --xyzzy; see egovcp-test --help"):
+        _parse("--xyzzy=1")
+
+
+@pytest.mark.parametrize("argv", [["stray"], ["--count=1", "stray"], ["--count", "1", "stray"]])
+def test_a_stray_argument_is_refused(argv: list[str]) -> None:
+    with pytest.raises(UsageError, match="unexpected argument 'stray'"):
+        _parse(*argv)
+
+
+@pytest.mark.parametrize(
+    ("flag", "message"),
+    [
+        ("--count=many", "count"),
+        ("--count=1.5", "count"),
+        ("--ball.radius=wide", "ball.radius"),
+        ("--loud=maybe", "loud"),
+        ("--count", "count"),
+        ("--mode=sideways", "mode"),
+        ("--sizes=[1,2]", "sizes"),
+        ("--ball=3", "ball"),
+    ],
+)
+def test_a_value_of_the_wrong_type_is_refused_by_name(flag: str, message: str) -> None:
+    with pytest.raises(UsageError, match=f"{message}.*see egovcp-test --help"):
+        _parse(flag)
+
+
+def test_a_config_file_that_is_not_there_is_named() -> None:
+    with pytest.raises(UsageError, match=r"cannot read absent\.yaml"):
+        _parse("--config_path=absent.yaml")
+
+
+def test_a_config_file_with_an_unknown_key_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "config.yaml").write_text(json.dumps({"cuont": 3}))
+    with pytest.raises(UsageError, match="cuont"):
+        _parse(f"--config_path={tmp_path}/config.yaml")
+
+
+# --- exit codes -------------------------------------------------------------------------
+def _run(*argv: str, error: BaseException | None = None) -> int:
+    def run(config: Config) -> None:
+        if error is not None:
+            raise error
+
+    return run_command(Config, run, argv, prog=PROG)
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (None, 0),
+        (EgovcpError("x"), 1),
+        (UsageError("x"), 2),
+        (DataError("x"), 3),
+        (ArtefactError("x"), 4),
+        (EnvironmentFailure("x"), 5),
+        (SafetyStop("x"), 6),
+        (KeyboardInterrupt(), 130),
+        (PermissionError(errno.EACCES, "Permission denied", "/data"), 5),
+        (OSError(errno.ENOSPC, "No space left on device"), 5),
+    ],
+)
+def test_the_exit_code_tells_the_kind_of_failure(error: BaseException | None, code: int) -> None:
+    assert _run(error=error) == code
+
+
+def test_a_usage_error_of_the_parser_has_its_code(capsys: pytest.CaptureFixture[str]) -> None:
+    assert _run("--cuont=3") == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "error",
+    [DataError("the dataset is bad"), OSError(errno.ENOSPC, "the dataset is bad", "/data")],
+)
+def test_an_error_is_one_line_and_a_traceback_only_with_debug(
+    error: Exception, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _run(error=error) > 0
+    plain = capsys.readouterr()
+    assert plain.out == ""
+    assert plain.err.startswith(f"{PROG}: error: the dataset is bad")
+    assert plain.err.count("\n") == 1
+    for argv in (["--debug"], ["--count=2", "--debug"], ["--debug", "--loud"], ["--debug=true"]):
+        assert _run(*argv, error=error) > 0
+        assert "Traceback" in capsys.readouterr().err
+
+
+def test_debug_is_no_option_of_the_command_itself() -> None:
+    seen: list[Config] = []
+    assert run_command(Config, seen.append, ["--debug", "--loud"], prog=PROG) == 0
+    assert seen == [Config(loud=True)]
+
+
+@pytest.mark.parametrize(
+    "bug", [RuntimeError("bug"), KeyError("bug"), FileNotFoundError(errno.ENOENT, "gone", "x")]
+)
+def test_a_bug_is_not_dressed_up_as_a_users_error(bug: Exception) -> None:
+    with pytest.raises(type(bug)):
+        _run(error=bug)
+
+
+def test_help_ends_well_and_shows_defaults_and_units(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as end:
+        _run("--help")
+    assert end.value.code == 0
+    text = " ".join(capsys.readouterr().out.split())
+    for part in ("--ball.radius", "Radius, m", "0.1", "A command for tests", "--debug"):
+        assert part in text
