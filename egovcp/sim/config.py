@@ -64,7 +64,7 @@ class BallConfig:
 class WallConfig:
     """A wall before the robot, which is pushed towards it; only hands may touch."""
 
-    distance_range: Range = (0.55, 0.70)
+    distance_range: Range = (0.60, 0.70)
     """Wall surface before the pelvis, m."""
     yaw_range: Range = (-0.10, 0.10)
     """Turn of the wall about the vertical, rad; 0 faces the robot squarely."""
@@ -84,7 +84,7 @@ class WallConfig:
     """Time after a push in which bracing is rewarded, s; the stance cannot step back from a
     wall that it leans on, so by default this is the rest of the episode."""
     brace_reward: float = 0.03
-    """Per tick upright with a hand on the wall while disturbed."""
+    """Per tick upright with a hand and nothing else on the wall while disturbed."""
     upright_reward: float = 0.02
     """Per tick upright while disturbed."""
     contact_cost: float = 0.1

@@ -69,7 +69,7 @@ class BallOracle:
 class WallOracleConfig:
     """How the wall oracle braces, m, heading frame."""
 
-    press: float = 0.10
+    press: float = 0.05
     """How far beyond the wall's surface the hands aim, so that they push."""
     lateral: float = 0.20
     """Hands left and right of the middle."""

@@ -86,11 +86,12 @@ class WallTask(Task):
         c = self.config
         hand_force = float(self.forces[_HANDS].max())
         upright = math.cos(self.robot.tilt) if self.disturbed else 0.0
-        braced = self.disturbed and not self.away and hand_force > _BRACE_FORCE
+        leaning = bool(self.forces[_OTHERS].any())
+        braced = hand_force > _BRACE_FORCE and not leaning and not self.away
         return {
             "brace": c.brace_reward * upright * braced,
             "upright": c.upright_reward * upright,
-            "contact": -c.contact_cost * bool(self.forces[_OTHERS].any()),
+            "contact": -c.contact_cost * leaning,
             "impact": -c.impact_cost * min(1.0, hand_force / c.impact_force),
             "pose": -c.pose_cost * float(np.mean(action**2)),
         }
