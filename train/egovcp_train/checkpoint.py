@@ -45,7 +45,8 @@ def finish_checkpoint(partial: Path, state: dict[str, Any]) -> Path:
 def begin_checkpoint(output_dir: Path, step: int) -> Path:
     """An empty NNNNNN.partial folder to fill; leftovers of a killed run are removed."""
     partial = checkpoint_dir(output_dir, step).with_suffix(".partial")
-    shutil.rmtree(partial, ignore_errors=True)
+    for leftover in partial.parent.glob("*.partial"):
+        shutil.rmtree(leftover, ignore_errors=True)
     partial.mkdir(parents=True)
     return partial
 
@@ -64,6 +65,10 @@ def load_training_state(output_dir: Path) -> dict[str, Any]:
         )
     try:
         state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, pickle.UnpicklingError) as error:
-        raise ArtefactError(f"{path}: cannot be read ({str(error).splitlines()[0]})") from error
+    except (EOFError, OSError, RuntimeError, pickle.UnpicklingError) as error:
+        reason = (str(error) or type(error).__name__).splitlines()[0]
+        raise ArtefactError(
+            f"{path}: cannot be read ({reason}); point {output_dir}/checkpoints/last at an older "
+            "checkpoint, or start again"
+        ) from error
     return state

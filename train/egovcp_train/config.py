@@ -75,7 +75,7 @@ class TrainConfig:
     seed: int = 0
     """Seed of initialisation, batches and sampling."""
     resume: bool = False
-    """Continue the run in output_dir from its last checkpoint."""
+    """Continue the run in output_dir from its last checkpoint, with its options unless given."""
     log_freq: int = 50
     """Steps between TensorBoard records."""
     eval_freq: int = 500

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import signal
 import sys
 import tempfile
@@ -12,33 +13,45 @@ from typing import Any
 
 import draccus
 import torch
+from draccus import cfgparsing
 from tqdm import tqdm
 
 from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
 from egovcp.data import DatasetReader, EpisodeStore, SequenceStream, StreamConfig
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
 from egovcp.model import PRESETS, WorldModel
 from egovcp_train.batches import set_normalisation, to_tensors
-from egovcp_train.checkpoint import begin_checkpoint, finish_checkpoint, load_training_state
+from egovcp_train.checkpoint import (
+    begin_checkpoint,
+    checkpoint_dir,
+    finish_checkpoint,
+    load_training_state,
+)
 from egovcp_train.config import TrainConfig
 from egovcp_train.evaluation import evaluate
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.records import Recorder
 
 PROG = "egovcp-train"
+CONFIG_FILE = "train_config.yaml"
 EVALUATION_BATCHES = 8
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return run_command(TrainConfig, train, argv, prog=PROG, defaults=preset_defaults)
+    return run_command(TrainConfig, train, argv, prog=PROG, defaults=option_defaults)
 
 
-def preset_defaults(argv: Sequence[str]) -> dict[str, Any]:
-    """The --policy options that --preset stands for."""
-    names = [a.split("=", 1)[1] for a in argv if a.startswith("--preset=")]
-    preset = PRESETS.get(names[-1]) if names else None
+def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
+    """What stands where no flag says otherwise: the options of the run that is resumed, or the
+    --policy options that --preset stands for."""
+    given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
+    saved = Path(given.get("output_dir", "")) / CONFIG_FILE
+    if given.get("resume", "").lower() == "true" and saved.is_file():
+        options: dict[str, Any] = cfgparsing.load_config(saved.read_text("utf-8"), file=saved)
+        return options
+    preset = PRESETS.get(given.get("preset", ""))
     return {"policy": draccus.encode(preset)} if preset else {}
 
 
@@ -55,11 +68,9 @@ def train(config: TrainConfig) -> None:
     learner = Learner(model.to(device), config.optimizer, config.seed)
     stream = SequenceStream(learning, _stream_config(config, config.seed))
     if config.resume:
-        state = load_training_state(output)
-        learner.load_state_dict(state["learner"])
-        stream.load_state_dict(state["stream"])
+        _restore(output, learner, stream)
     output.mkdir(parents=True, exist_ok=True)
-    save_config(config, str(output / "train_config.yaml"))
+    save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
     run = Run(config, output, learner, stream, heldout, device, _provenance(reader, config))
     run.execute()
 
@@ -86,6 +97,7 @@ class Run:
         """Train until the budget or a signal ends it; the last state is always saved."""
         config, learner = self.config, self.learner
         budget = Budget(config.steps, config.max_minutes)
+        start = learner.step
         frames = config.batch_size * (config.sampling.length + config.sampling.burn_in)
         with (
             _stop_on_signal() as stopped,
@@ -94,6 +106,8 @@ class Run:
             ) as bar,
         ):
             while budget.progress(learner.step) < 1.0 and not stopped:
+                if learner.step > start and learner.step % config.save_freq == 0:
+                    self.save()
                 batch = to_tensors(next(self.stream), self.device)
                 terms = learner.update(batch, budget.progress(learner.step))
                 bar.update()
@@ -102,10 +116,10 @@ class Run:
                     bar.set_postfix(self._summary(terms, bar, frames))
                 if config.eval_freq and learner.step % config.eval_freq == 0:
                     self.evaluate()
-                if learner.step % config.save_freq == 0:
-                    self.save()
         self.evaluate()
-        final = self.save()
+        final = checkpoint_dir(self.output, learner.step)
+        if learner.step > start or not final.exists():
+            self.save()
         self.recorder.close()
         print(self._last_words(final, bool(stopped)))
 
@@ -137,14 +151,16 @@ class Run:
 
     def _last_words(self, final: Path, stopped: bool) -> str:
         lines = [f"  {name:<20} {value:.4f}" for name, value in sorted(self.metrics.items())]
-        state = "stopped early; --resume continues" if stopped else "done"
+        state = "stopped early" if stopped else "done"
         artefact = final / "pretrained_model"
         return "\n".join(
             [
                 f"{PROG}: {state} at step {self.learner.step}; on held-out episodes:",
                 *lines,
                 f"artefact: {artefact}",
-                f"next: egovcp-eval --policy.path={artefact} --task=... --output_dir=...",
+                f"continue: {PROG} --output_dir={self.output} --resume"
+                if stopped
+                else f"next: egovcp-eval --policy.path={artefact} --task=... --output_dir=...",
             ]
         )
 
@@ -169,6 +185,26 @@ def _prepare_output(config: TrainConfig) -> Path:
     except OSError as error:
         raise EnvironmentFailure(f"cannot write to {parent}: {error.strerror}") from error
     return output
+
+
+def _restore(output: Path, learner: Learner, stream: SequenceStream) -> None:
+    """Continue from the last checkpoint.
+
+    Raises:
+        ArtefactError: its networks are not those of the options.
+        DataError: the dataset is another one.
+        UsageError: the windows are others.
+    """
+    state = load_training_state(output)
+    try:
+        learner.load_state_dict(state["learner"])
+        stream.load_state_dict(state["stream"])
+    except (KeyError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ArtefactError(
+            f"{output}: its checkpoint does not fit the --policy options given ({reason}); resume "
+            "without them, or start a new run"
+        ) from error
 
 
 def _device(name: str) -> torch.device:

@@ -1,0 +1,147 @@
+"""One optimiser step, the schedule and the budget."""
+
+import dataclasses
+import itertools
+
+import pytest
+import torch
+
+from egovcp.errors import DataError
+from egovcp.model import Batch
+from egovcp.testing import random_batch, toy_model
+from egovcp_train.config import OptimizerConfig
+from egovcp_train.loop import Budget, Learner
+
+CONFIG = OptimizerConfig(warmup_steps=0)
+
+
+def _learner(config: OptimizerConfig = CONFIG) -> Learner:
+    return Learner(toy_model(), config, seed=0)
+
+
+def _weights(learner: Learner) -> dict[str, torch.Tensor]:
+    return {k: v.clone() for k, v in learner.model.state_dict().items()}
+
+
+def _same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return all(torch.equal(a[k], b[k]) for k in a)
+
+
+def _bad() -> Batch:
+    batch = random_batch(2, 3)
+    batch.mc_return[0, 0] = torch.nan
+    return batch
+
+
+# --- numbers that are none ------------------------------------------------------------------
+def test_a_step_that_is_not_finite_changes_nothing() -> None:
+    learner = _learner()
+    learner.update(random_batch(2, 3), 0.0)
+    before, averaged = _weights(learner), learner.averaged.state_dict()
+    averaged = {k: v.clone() for k, v in averaged.items()}
+    learner.update(_bad(), 0.0)
+    assert _same(before, _weights(learner))
+    assert _same(averaged, learner.averaged.state_dict())
+
+
+def test_the_third_such_step_in_a_row_ends_the_run() -> None:
+    learner = _learner()
+    learner.update(_bad(), 0.0)
+    learner.update(_bad(), 0.0)
+    with pytest.raises(DataError, match="not finite for 3 steps in a row"):
+        learner.update(_bad(), 0.0)
+
+
+def test_a_good_step_in_between_is_forgiven() -> None:
+    learner = _learner()
+    for _ in range(3):
+        learner.update(_bad(), 0.0)
+        learner.update(_bad(), 0.0)
+        learner.update(random_batch(2, 3), 0.0)
+    assert learner.step == 9
+    assert all(v.isfinite().all() for v in _weights(learner).values())
+
+
+# --- learning -------------------------------------------------------------------------------
+def test_updates_bring_the_loss_down() -> None:
+    learner, batch = _learner(dataclasses.replace(CONFIG, lr=4e-3)), random_batch(4, 4)
+    losses = [float(learner.update(batch, 0.0)["loss/total"]) for _ in range(25)]
+    assert losses[-1] < 0.8 * losses[0]
+
+
+def test_a_seed_repeats_the_updates_bit_for_bit() -> None:
+    one, two = _learner(), _learner()
+    for seed in range(3):
+        one.update(random_batch(2, 3, seed), 0.0)
+        two.update(random_batch(2, 3, seed), 0.0)
+    assert _same(_weights(one), _weights(two))
+
+
+def test_the_state_restores_a_learner_bit_for_bit() -> None:
+    straight, stopped, other = _learner(), _learner(), Learner(toy_model(seed=5), CONFIG, seed=9)
+    for seed in range(2):
+        straight.update(random_batch(2, 3, seed), 0.0)
+        stopped.update(random_batch(2, 3, seed), 0.0)
+    other.load_state_dict(stopped.state_dict())
+    for seed in range(2, 4):
+        straight.update(random_batch(2, 3, seed), 0.5)
+        other.update(random_batch(2, 3, seed), 0.5)
+    assert _same(_weights(straight), _weights(other))
+    assert _same(straight.averaged.state_dict(), other.averaged.state_dict())
+    assert straight.step == other.step == 4
+
+
+# --- averaging ------------------------------------------------------------------------------
+def test_without_averaging_the_average_is_the_model() -> None:
+    learner = _learner(dataclasses.replace(CONFIG, ema=0.0))
+    learner.update(random_batch(2, 3), 0.0)
+    assert _same(_weights(learner), learner.averaged.state_dict())
+
+
+def test_the_average_lags_between_start_and_now() -> None:
+    learner = _learner(dataclasses.replace(CONFIG, ema=0.9))
+    start = dict(_weights(learner))
+    for _ in range(5):
+        learner.update(random_batch(2, 3), 0.0)
+    now, mean = _weights(learner), learner.averaged.state_dict()
+    name = "gru.norm.bias"
+    travelled, lag = (now[name] - start[name]).norm(), (now[name] - mean[name]).norm()
+    assert 0 < lag < travelled
+    assert not any(p.requires_grad for p in learner.averaged.parameters())
+
+
+# --- schedule -------------------------------------------------------------------------------
+def test_the_rate_warms_up_and_decays_to_a_tenth() -> None:
+    learner = _learner(OptimizerConfig(lr=1.0, warmup_steps=10))
+    rates = []
+    for step in range(100):
+        learner.step = step
+        rates.append(learner.learning_rate(step / 99))
+    assert rates[0] == pytest.approx(0.1, rel=0.01)
+    assert max(rates) == rates[9]
+    assert all(a >= b for a, b in itertools.pairwise(rates[9:]))
+    assert rates[-1] == pytest.approx(0.1)
+
+
+class _Clock:
+    now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def test_a_budget_of_steps_ignores_the_clock() -> None:
+    clock = _Clock()
+    budget = Budget(200, 0.0, clock)
+    clock.now += 1e6
+    assert [budget.progress(step) for step in (0, 50, 200, 300)] == [0.0, 0.25, 1.0, 1.0]
+
+
+def test_a_budget_of_minutes_ends_with_whichever_comes_first() -> None:
+    clock = _Clock()
+    budget = Budget(200, 2.0, clock)
+    clock.now += 60.0
+    assert budget.progress(10) == pytest.approx(0.5)
+    assert budget.progress(150) == pytest.approx(0.75)
+    clock.now += 61.0
+    assert budget.progress(10) == 1.0

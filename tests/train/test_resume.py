@@ -1,0 +1,256 @@
+"""Stopped, killed, resumed: the run goes on as if nothing had happened."""
+
+import contextlib
+import os
+import shutil
+import signal
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from egovcp.artefact import load_artefact
+from egovcp.errors import ArtefactError
+from egovcp.model import Batch
+from egovcp_train import checkpoint
+from egovcp_train.checkpoint import begin_checkpoint, finish_checkpoint, load_training_state
+from egovcp_train.loop import Learner
+from egovcp_train.train import main
+
+type Arguments = Callable[..., list[str]]
+
+
+def _stop_after(monkeypatch: pytest.MonkeyPatch, step: int, number: int) -> None:
+    """Send this process a signal during the given update."""
+    update = Learner.update
+
+    def interrupted(self: Learner, batch: Batch, progress: float) -> dict[str, torch.Tensor]:
+        if self.step + 1 == step:
+            signal.raise_signal(number)
+        return update(self, batch, progress)
+
+    monkeypatch.setattr(Learner, "update", interrupted)
+
+
+def _state(output: Path) -> dict[str, Any]:
+    return load_training_state(output)
+
+
+def _equal(a: object, b: object) -> bool:
+    """Bit for bit, through dictionaries and lists."""
+    if isinstance(a, torch.Tensor):
+        return isinstance(b, torch.Tensor) and torch.equal(a, b)
+    if isinstance(a, dict):
+        return isinstance(b, dict) and a.keys() == b.keys() and all(_equal(a[k], b[k]) for k in a)
+    if isinstance(a, list):
+        return isinstance(b, list) and len(a) == len(b) and all(map(_equal, a, b))
+    return a == b
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, arguments: Arguments) -> Path:
+    """A run of six steps with checkpoints at 3 and 6; tests must not change it."""
+    output = tmp_path_factory.mktemp("resume") / "straight"
+    assert main(arguments(output)) == 0
+    return output
+
+
+# --- going on -------------------------------------------------------------------------------
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_stopped_run_that_is_resumed_equals_an_uninterrupted_one(
+    arguments: Arguments,
+    finished: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    number: int,
+) -> None:
+    output = tmp_path / "run"
+    handlers = [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
+    with monkeypatch.context() as patched:
+        _stop_after(patched, 4, number)
+        assert main(arguments(output)) == 0
+    said = capsys.readouterr().out
+    assert "stopped early at step 4" in said
+    command = next(line for line in said.splitlines() if line.startswith("continue: "))
+    assert _state(output)["learner"]["step"] == 4
+    load_artefact(str(output / "checkpoints" / "last" / "pretrained_model"))
+    assert [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+    assert main(command.removeprefix("continue: egovcp-train ").split()) == 0
+    assert _equal(_state(output), _state(finished))
+    weights = "checkpoints/last/pretrained_model/model.safetensors"
+    assert (output / weights).read_bytes() == (finished / weights).read_bytes()
+
+
+def test_a_second_signal_is_obeyed_at_once(
+    arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def twice(self: Learner, batch: Batch, progress: float) -> dict[str, torch.Tensor]:
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+        pytest.fail("went on")
+
+    monkeypatch.setattr(Learner, "update", twice)
+    assert main(arguments(tmp_path / "run")) == 130
+
+
+def test_a_finished_run_can_be_extended(finished: Path, tmp_path: Path) -> None:
+    output = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
+    assert main([f"--output_dir={output}", "--resume", "--steps=8"]) == 0
+    state = _state(output)
+    assert state["learner"]["step"] == 8
+    assert not _equal(state["learner"]["model"], _state(finished)["learner"]["model"])
+
+
+def test_resuming_a_finished_run_changes_no_checkpoint(finished: Path, tmp_path: Path) -> None:
+    output = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
+    assert main([f"--output_dir={output}", "--resume"]) == 0
+    assert _equal(_state(output), _state(finished))
+    before = sorted(p.name for p in (finished / "checkpoints").iterdir())
+    assert sorted(p.name for p in (output / "checkpoints").iterdir()) == before
+
+
+# --- refusals -------------------------------------------------------------------------------
+def _refused(argv: list[str], code: int, capsys: pytest.CaptureFixture[str], message: str) -> None:
+    capsys.readouterr()
+    assert main(argv) == code
+    last_line = capsys.readouterr().err.splitlines()[-1]
+    assert last_line.startswith("egovcp-train: error: ")
+    assert message in last_line
+
+
+def test_without_a_checkpoint_there_is_nothing_to_resume(
+    arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _refused(arguments(tmp_path / "run", "--resume"), 4, capsys, "no checkpoint to resume from")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("damage", [b"", b"not a checkpoint", None])
+def test_a_damaged_checkpoint_is_named(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], damage: bytes | None
+) -> None:
+    output = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
+    path = output / "checkpoints" / "last" / "training_state" / checkpoint.STATE_FILE
+    path.write_bytes(path.read_bytes()[:5000] if damage is None else damage)
+    _refused([f"--output_dir={output}", "--resume"], 4, capsys, checkpoint.STATE_FILE)
+
+
+@pytest.mark.parametrize(
+    ("flag", "code", "message"),
+    [
+        ("--policy.hidden=48", 4, "does not fit the --policy options"),
+        ("--sampling.length=5", 2, "length 6 -> 5"),
+        ("--dataset.root=/absent", 3, "no dataset at /absent"),
+    ],
+)
+def test_resuming_with_what_does_not_fit_is_refused(
+    finished: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    flag: str,
+    code: int,
+    message: str,
+) -> None:
+    output = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
+    kept = (output / "train_config.yaml").read_bytes()
+    _refused([f"--output_dir={output}", "--resume", flag], code, capsys, message)
+    assert (output / "train_config.yaml").read_bytes() == kept
+    assert _equal(_state(output), _state(finished))
+
+
+# --- killed while a checkpoint is written -----------------------------------------------------
+class _Killed(BaseException):
+    """The process is gone: nothing after it runs."""
+
+
+CALLS = ("mkdir", "rename", "replace", "symlink_to", "unlink", "open")
+
+
+@contextlib.contextmanager
+def _killed_at(call: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
+    """Die before the ``call``-th change to the file system; lists the changes made."""
+    made: list[str] = []
+
+    def mortal(name: str, original: Callable[..., Any]) -> Callable[..., Any]:
+        def run(*args: Any, **kwargs: Any) -> Any:
+            if len(made) == call:
+                raise _Killed
+            made.append(name)
+            return original(*args, **kwargs)
+
+        return run
+
+    with monkeypatch.context() as patched:
+        for name in CALLS:
+            patched.setattr(Path, name, mortal(name, getattr(Path, name)))
+        for module, name in ((shutil, "rmtree"), (torch, "save"), (os, "fsync")):
+            patched.setattr(module, name, mortal(name, getattr(module, name)))
+        yield made
+
+
+def _write(output: Path, step: int) -> None:
+    partial = begin_checkpoint(output, step)
+    (partial / "pretrained_model").mkdir()
+    (partial / "pretrained_model" / "config.json").write_text(str(step))
+    finish_checkpoint(partial, {"step": step})
+
+
+def _complete(output: Path) -> int:
+    """The step of the last checkpoint, which must be whole."""
+    step = int(load_training_state(output)["step"])
+    folder = output / "checkpoints" / "last" / "pretrained_model"
+    assert (folder / "config.json").read_text() == str(step)
+    return step
+
+
+def test_killed_at_any_moment_the_last_checkpoint_is_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    outcomes = []
+    for call in range(100):
+        output = tmp_path / str(call)
+        _write(output, 1)
+        with _killed_at(call, monkeypatch) as made:
+            try:
+                _write(output, 2)
+                survived = True
+            except _Killed:
+                survived = False
+        outcomes.append(_complete(output))
+        _write(output, 3)  # leftovers do no harm
+        assert _complete(output) == 3
+        assert not list((output / "checkpoints").glob("*.partial"))
+        if survived:
+            break
+    assert outcomes[0] == 1
+    assert outcomes[-1] == 2
+    assert outcomes == sorted(outcomes)
+    assert {"mkdir", "save", "fsync", "rename", "symlink_to", "replace"} <= set(made)
+
+
+def test_a_checkpoint_left_over_by_a_killed_run_is_written_again(tmp_path: Path) -> None:
+    """Complete, but not yet the last when the run died."""
+    _write(tmp_path, 1)
+    _write(tmp_path, 2)
+    link = tmp_path / "checkpoints" / "last"
+    link.unlink()
+    link.symlink_to("000001")
+    assert _complete(tmp_path) == 1
+    _write(tmp_path, 2)
+    assert _complete(tmp_path) == 2
+
+
+def test_the_training_state_is_read_without_executing_code(tmp_path: Path) -> None:
+    class Bomb:
+        def __reduce__(self) -> tuple[Callable[..., object], tuple[str]]:
+            return (pytest.fail, ("a pickle was executed",))
+
+    _write(tmp_path, 1)
+    path = tmp_path / "checkpoints" / "last" / "training_state" / checkpoint.STATE_FILE
+    torch.save({"step": Bomb()}, path)
+    with pytest.raises(ArtefactError, match="cannot be read"):
+        load_training_state(tmp_path)

@@ -1,0 +1,249 @@
+"""egovcp-train from its command line: what it writes, what it refuses."""
+
+import os
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import draccus
+import numpy as np
+import pytest
+
+from egovcp import spec
+from egovcp.artefact import MANIFEST, load_artefact
+from egovcp.checks import check_artefact
+from egovcp.data import DatasetWriter, Episode, Provenance
+from egovcp_train.config import TrainConfig
+from egovcp_train.train import main
+
+type Arguments = Callable[..., list[str]]
+
+
+def _files(root: Path) -> dict[str, bytes]:
+    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+
+def _last(output: Path) -> Path:
+    return output / "checkpoints" / "last"
+
+
+# --- a run ------------------------------------------------------------------------------
+def test_a_run_writes_checkpoints_and_an_artefact_that_plans(
+    arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "run"
+    assert main(arguments(output, sampling__length=16)) == 0
+    assert sorted(p.name for p in (output / "checkpoints").iterdir()) == [
+        "000003",
+        "000006",
+        "last",
+    ]
+    assert _last(output).resolve().name == "000006"
+    artefact = check_artefact(str(_last(output) / "pretrained_model"))
+    assert artefact.controller_id == "stance-test"
+    assert artefact.planner.samples == 16
+    assert artefact.manifest["step"] == 6
+    assert {"value/r2", "latent/kl"} <= artefact.manifest["heldout"].keys()
+    printed = capsys.readouterr().out
+    assert "done at step 6" in printed
+    assert str(output / "checkpoints" / "000006" / "pretrained_model") in printed
+
+
+def test_the_options_of_a_run_are_kept_and_repeat_it(arguments: Arguments, tmp_path: Path) -> None:
+    one, two = tmp_path / "one", tmp_path / "two"
+    assert main(arguments(one)) == 0
+    saved = one / "train_config.yaml"
+    with saved.open(encoding="utf-8") as file:
+        config = draccus.load(TrainConfig, file)
+    assert (config.steps, config.policy.hidden, config.planner.samples) == (6, 32, 16)
+    assert main([f"--config_path={saved}", f"--output_dir={two}"]) == 0
+    weights = "pretrained_model/model.safetensors"
+    assert (_last(one) / weights).read_bytes() == (_last(two) / weights).read_bytes()
+
+
+def test_another_seed_gives_other_weights(arguments: Arguments, tmp_path: Path) -> None:
+    weights = []
+    for seed in (0, 1):
+        assert main(arguments(tmp_path / str(seed), seed=seed, steps=2)) == 0
+        path = _last(tmp_path / str(seed)) / "pretrained_model" / "model.safetensors"
+        weights.append(path.read_bytes())
+    assert weights[0] != weights[1]
+
+
+def test_the_statistics_are_those_of_the_training_episodes(
+    arguments: Arguments, tmp_path: Path
+) -> None:
+    assert main(arguments(tmp_path / "run", steps=1)) == 0
+    model = load_artefact(str(_last(tmp_path / "run") / "pretrained_model")).world_model
+    assert model.state_mean.abs().max() < 0.5
+    assert ((model.state_std - 1).abs() < 0.5).all()
+    ceiling = sum(spec.GAMMA**i for i in range(5))
+    assert 0 <= model.return_floor <= model.return_mean <= ceiling
+
+
+def test_a_preset_is_where_the_policy_options_start(arguments: Arguments, tmp_path: Path) -> None:
+    assert main(arguments(tmp_path / "run", "--policy.latent=5", "--policy.loss.value=2.5")) == 0
+    config = load_artefact(str(_last(tmp_path / "run") / "pretrained_model")).world_model.config
+    assert (config.hidden, config.latent, config.loss.value) == (32, 5, 2.5)
+
+
+def test_scalars_go_to_tensorboard(arguments: Arguments, tmp_path: Path) -> None:
+    assert main(arguments(tmp_path / "run", tensorboard="true", eval_freq=2, steps=4)) == 0
+    (events,) = (tmp_path / "run" / "tensorboard").iterdir()
+    content = events.read_bytes()
+    for name in (b"loss/total", b"loss/value", b"heldout/value/r2", b"grad_norm"):
+        assert name in content
+
+
+def test_a_run_under_a_clock_ends_early_and_whole(arguments: Arguments, tmp_path: Path) -> None:
+    output = tmp_path / "run"
+    assert main(arguments(output, steps=10**6, save_freq=10**6, max_minutes=0.005)) == 0
+    step = load_artefact(str(_last(output) / "pretrained_model")).manifest["step"]
+    assert 0 < step < 10**6
+
+
+def test_an_empty_folder_is_a_fine_place(arguments: Arguments, tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    assert main(arguments(tmp_path / "run", steps=1)) == 0
+
+
+# --- refusals ---------------------------------------------------------------------------
+def _refused(argv: list[str], code: int, capsys: pytest.CaptureFixture[str], message: str) -> None:
+    assert main(argv) == code
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.startswith("egovcp-train: error: ")
+    assert message in printed.err
+    assert printed.err.count("\n") == 1
+
+
+def test_an_output_folder_that_exists_is_left_alone(
+    arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "run"
+    output.mkdir()
+    (output / "notes.txt").write_text("mine")
+    _refused(arguments(output), 2, capsys, "exists and is not empty")
+    assert _files(output) == {"notes.txt": b"mine"}
+
+
+def test_an_output_that_is_a_file_is_left_alone(
+    arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "run"
+    output.write_text("mine")
+    _refused(arguments(output), 2, capsys, "exists")
+    assert output.read_text() == "mine"
+
+
+def test_a_missing_dataset_is_named_before_anything_is_written(
+    arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = arguments(tmp_path / "run", dataset__root=tmp_path / "nothing")
+    _refused(argv, 3, capsys, f"no dataset at {tmp_path}/nothing")
+    assert not (tmp_path / "run").exists()
+
+
+def test_no_dataset_at_all_is_a_question_of_usage(
+    arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _refused(arguments(tmp_path / "run", dataset__root=None), 2, capsys, "which dataset?")
+
+
+def test_a_damaged_dataset_is_named(
+    arguments: Arguments, dataset_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = Path(shutil.copytree(dataset_root, tmp_path / "broken"))
+    (data,) = (broken / "data").rglob("*.parquet")
+    data.write_bytes(data.read_bytes()[:1000])
+    _refused(arguments(tmp_path / "run", dataset__root=broken), 3, capsys, "broken")
+    assert not (tmp_path / "run").exists()
+
+
+def test_episodes_shorter_than_the_return_are_refused(
+    arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    _refused(arguments(tmp_path / "run", returns__steps=50), 3, capsys, "--returns.steps")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("parent", ["file", "locked"])
+def test_a_place_that_cannot_be_written_is_a_matter_of_the_surroundings(
+    arguments: Arguments,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    parent: str,
+) -> None:
+    place = tmp_path / parent
+    if parent == "file":
+        place.write_text("mine")
+    else:
+        place.mkdir(mode=0o500)
+        if os.access(place, os.W_OK):
+            pytest.skip("the superuser may write anywhere")
+    _refused(arguments(place / "run"), 5, capsys, f"cannot write to {place}")
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        ({"steps": 0}, "--steps"),
+        ({"batch_size": 0}, "--batch_size"),
+        ({"save_freq": 0}, "--save_freq"),
+        ({"device": "abacus"}, "--device"),
+        ({"preset": "huge"}, "preset"),
+        ({"planner__elites": 99}, "elites"),
+        ({"sampling__length": 0}, "length"),
+        ({"stpes": 3}, "did you mean '--steps'"),
+    ],
+)
+def test_senseless_options_are_refused_before_anything_is_written(
+    arguments: Arguments,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    flags: dict[str, object],
+    message: str,
+) -> None:
+    _refused(arguments(tmp_path / "run", **flags), 2, capsys, message)
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_loss_that_is_not_a_number_ends_the_run_at_once(
+    tmp_path: Path, arguments: Arguments, capsys: pytest.CaptureFixture[str]
+) -> None:
+    explosive = {"lr": 1e12, "warmup_steps": 0, "grad_clip": 1e30}
+    options = {f"optimizer__{name}": value for name, value in explosive.items()}
+    assert main(arguments(tmp_path / "run", steps=100, save_freq=100, **options)) == 3
+    last_line = capsys.readouterr().err.splitlines()[-1]
+    assert re.match(r"egovcp-train: error: the loss was not finite for 3 steps", last_line)
+    assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+def test_the_controller_of_the_data_goes_into_the_artefact(
+    arguments: Arguments, tmp_path: Path
+) -> None:
+    rows = 12
+    last = np.arange(rows) == rows - 1
+    with DatasetWriter(tmp_path / "other", Provenance("walker-7")) as writer:
+        for number in range(2):
+            writer.add(
+                Episode(
+                    depth=np.zeros((rows, spec.DEPTH_ROWS, spec.DEPTH_COLS), dtype=np.uint16),
+                    state=np.zeros((rows, spec.STATE_DIM), dtype=np.float32),
+                    action=np.zeros((rows, spec.ACTION_DIM), dtype=np.float32),
+                    reward=np.zeros(rows, dtype=np.float32),
+                    done=last,
+                    success=np.zeros(rows, dtype=np.bool_),
+                    truncated=last,
+                    task="wall",
+                    time_limit=rows,
+                    metadata={"seed": 0, "episode": number},
+                )
+            )
+    argv = arguments(tmp_path / "run", dataset__root=tmp_path / "other", steps=2)
+    assert main(argv) == 0
+    folder = _last(tmp_path / "run") / "pretrained_model"
+    assert (folder / MANIFEST).is_file()
+    assert load_artefact(str(folder)).controller_id == "walker-7"
