@@ -6,12 +6,21 @@ Frozen data only. Ranges are (low, high) and drawn uniformly once per episode.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, is_dataclass
 from typing import Literal
 
 from egovcp.errors import UsageError, suggest
 
 Range = tuple[float, float]
+
+
+def _check_ranges(where: str, part: object) -> None:
+    """Refuse a (low, high) pair that is the wrong way round."""
+    for name, value in vars(part).items():
+        if isinstance(value, tuple) and len(value) == 2 and value[0] > value[1]:
+            raise UsageError(
+                f"expected low <= high, found {value[0]} > {value[1]} in env.{where}.{name}"
+            )
 
 
 @dataclass(frozen=True)
@@ -228,6 +237,11 @@ class EnvConfig:
     """Physical parameters."""
     threads: int = 1
     """Threads that step physics and cast rays; results do not depend on it."""
+
+    def __post_init__(self) -> None:
+        for name, part in vars(self).items():
+            if is_dataclass(part):
+                _check_ranges(name, part)
 
     def episode(self, task: str) -> EpisodeConfig:
         """Length and timing of an episode of ``task``.

@@ -14,11 +14,13 @@ from egovcp.sim.sensors import base_rotation
 
 Array = NDArray[np.float64]
 
-_BAD_STATE = (
-    mujoco.mjtWarning.mjWARN_BADQPOS,
-    mujoco.mjtWarning.mjWARN_BADQVEL,
-    mujoco.mjtWarning.mjWARN_BADQACC,
-)
+_BAD_STATE = [
+    int(mujoco.mjtWarning.mjWARN_BADQPOS),
+    int(mujoco.mjtWarning.mjWARN_BADQVEL),
+    int(mujoco.mjtWarning.mjWARN_BADQACC),
+]
+
+_LYING_HEIGHT = 0.5  # m, pelvis; above it no part of the trunk reaches the floor
 
 
 @dataclass(frozen=True)
@@ -99,8 +101,7 @@ class SimulatedRobot:
     @property
     def broken(self) -> bool:
         """Whether the physics has diverged since the last reset."""
-        warnings = self.data.warning
-        return any(warnings[w].number > 0 for w in _BAD_STATE) or not self.finite
+        return bool(self.data.warning.number[_BAD_STATE].any()) or not self.finite
 
     @property
     def finite(self) -> bool:
@@ -141,7 +142,9 @@ class SimulatedRobot:
 
     @property
     def on_floor(self) -> bool:
-        """Whether torso, pelvis or head touches the floor."""
+        """Whether torso, pelvis or head touches the floor; a high pelvis says no by itself."""
+        if self.pelvis_height > _LYING_HEIGHT:
+            return False
         geoms = self.data.contact.geom
         touching = geoms[(geoms == self.index.floor).any(axis=1)]
         return bool(np.isin(self.index.part[touching], (TORSO, HEAD)).any())

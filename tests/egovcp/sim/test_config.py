@@ -1,0 +1,40 @@
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import pytest
+
+from egovcp.cli import parse_config
+from egovcp.errors import UsageError
+from egovcp.sim.config import BallConfig, EnvConfig
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command with an environment."""
+
+    env: EnvConfig = EnvConfig()
+
+
+def test_every_parameter_is_a_dotted_flag() -> None:
+    flags = [
+        "--env.ball.radius_range=[0.15,0.16]",
+        "--env.ball_episode.event_ticks=[2,10]",
+        "--env.camera.position=[0.1,0.0,0.4]",
+        "--env.feet=stock",
+    ]
+    env = parse_config(Command, flags, "test").env
+    assert env.ball.radius_range == (0.15, 0.16)
+    assert env.ball_episode.event_ticks == (2, 10)
+    assert env.camera.position == (0.1, 0.0, 0.4)
+    assert env.feet == "stock"
+
+
+def test_a_range_the_wrong_way_round_is_refused_by_name() -> None:
+    with pytest.raises(UsageError, match=r"0.3 > 0.2 in env.ball.radius_range"):
+        EnvConfig(ball=BallConfig(radius_range=(0.3, 0.2)))
+
+
+def test_an_unknown_task_has_no_episode() -> None:
+    with pytest.raises(UsageError, match="choose from: arch, ball, wall"):
+        EnvConfig().episode("stairs")
