@@ -30,7 +30,9 @@ def blueprint(imagined: tuple[int, ...] = ()) -> rrb.Blueprint:
             rrb.Vertical(*_pictures(imagined), *_curves(), row_shares=_shares(imagined)),
             column_shares=[3, 2],
         ),
-        rrb.TimePanel(state="collapsed", timeline="time", fps=25.0),
+        rrb.TimePanel(
+            state="collapsed", timeline="time", fps=25.0, play_state="playing", loop_mode="all"
+        ),
         collapse_panels=True,
     )
 
@@ -47,7 +49,7 @@ def _scene() -> rrb.View:
         contents=[f"{WORLD}/**"],
         background=[24, 26, 32],
         eye_controls=rrb.EyeControls3D(
-            position=(2.1, 1.7, 1.4), look_target=(0.5, 0.0, 0.75), eye_up=(0.0, 0.0, 1.0)
+            position=(1.9, 1.5, 1.2), look_target=(0.45, 0.0, 0.68), eye_up=(0.0, 0.0, 1.0)
         ),
     )
 
@@ -67,7 +69,10 @@ def _pictures(imagined: tuple[int, ...]) -> list[rrb.Container]:
 
 def _curves() -> list[rrb.View | rrb.Container]:
     return [
-        rrb.TimeSeriesView(name="value and termination", origin=PLAN),
+        rrb.Horizontal(
+            rrb.TimeSeriesView(name="value of the plan", origin=f"{PLAN}/value"),
+            rrb.TimeSeriesView(name="termination probability", origin=f"{PLAN}/termination"),
+        ),
         rrb.TimeSeriesView(name="reward", origin=REWARD),
         rrb.Tabs(
             rrb.TextLogView(name="events", origin=EVENTS),

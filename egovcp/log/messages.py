@@ -16,7 +16,15 @@ from egovcp.robot.kinematics import LINK_NAMES, quaternion
 from egovcp.spec import ACTION_NAMES, JOINT_NAMES, STATE_NAMES, STATE_SLICES
 
 CAMERA_FRAME: Final = "head_camera_optical"
+_NO_FRAME: Final = ""  # with the camera's, viewers would mix decoded points into the scene
 HEADING_FRAME: Final = "pelvis_heading"
+_FRAMES: Final = (
+    *LINK_NAMES,
+    CAMERA_FRAME,
+    HEADING_FRAME,
+    "left_hand_target",
+    "right_hand_target",
+)
 CANDIDATE_FIELDS: Final = ("x", "y", "z", "value")
 
 
@@ -80,10 +88,10 @@ def _camera_messages(tick: Tick, view: CameraView) -> dict[Topic, bytes]:
     }
     if tick.depth_reconstructed is not None:
         image = to_millimetres(tick.depth_reconstructed)
-        messages[Topic.RECONSTRUCTED] = ros2.image_16uc1(t, CAMERA_FRAME, image)
+        messages[Topic.RECONSTRUCTED] = ros2.image_16uc1(t, _NO_FRAME, image)
     if tick.depth_imagined is not None:
         strip = np.concatenate(list(to_millimetres(tick.depth_imagined)), axis=1)
-        messages[Topic.IMAGINED] = ros2.image_16uc1(t, CAMERA_FRAME, strip)
+        messages[Topic.IMAGINED] = ros2.image_16uc1(t, _NO_FRAME, strip)
     return messages
 
 
@@ -91,11 +99,11 @@ def _transform_tree(tick: Tick, pose: RobotPose, view: CameraView) -> bytes:
     """Every link, the camera, the heading frame and both hand targets, each in the world."""
     camera_position, camera_rotation = pose.camera(view)
     targets = pose.from_heading(tick.state[STATE_SLICES["command_hands"]].reshape(2, 3))
-    names = (*LINK_NAMES, CAMERA_FRAME, HEADING_FRAME, "left_hand_target", "right_hand_target")
-    positions = [*pose.positions_w, camera_position, pose.positions_w[0], *targets]
+    pelvis = pose.positions_w[0]
+    positions = [*pose.positions_w, camera_position, pelvis, *targets]
     extra = np.stack([camera_rotation, *[pose.heading_w] * 3])
     rotations = np.concatenate([pose.quaternions_w, quaternion(extra)])
-    return ros2.transforms(tick.time_ns, names, positions, rotations)
+    return ros2.transforms(tick.time_ns, _FRAMES, positions, rotations)
 
 
 def _robot_messages(tick: Tick) -> dict[Topic, bytes]:

@@ -132,29 +132,28 @@ def _depth(axes: Any, depth_m: NDArray[np.floating] | None) -> None:
 
 
 def _curves(figure: Any, ticks: Sequence[Tick], moments: Sequence[int]) -> None:
-    grid = figure.add_gridspec(1, 2, left=0.05, right=0.995, bottom=0.06, top=0.25, wspace=0.08)
-    left, right = grid.subplots()
-    time = [tick.index * PLANNER_DT for tick in ticks]
-    _curve(left, time, [tick.value for tick in ticks], "value of the plan", "C0")
-    _curve(left, time, [tick.termination for tick in ticks], "termination probability", "C3")
-    right.plot(time, np.cumsum([tick.reward for tick in ticks]), color="C2", label="return so far")
-    for axes in (left, right):
+    place = {"left": 0.05, "right": 0.995, "bottom": 0.06, "top": 0.235}
+    plots = figure.add_gridspec(1, 3, wspace=0.13, **place).subplots()
+    curves = {
+        "value of the plan": [tick.value for tick in ticks],
+        "termination probability": [tick.termination for tick in ticks],
+        "return so far": np.cumsum([tick.reward for tick in ticks]).tolist(),
+    }
+    for axes, (name, values), style in zip(plots, curves.items(), ("C0", "C3", "C2"), strict=True):
+        _curve(axes, ticks, values, style)
+        axes.set_title(name, fontsize=9, loc="left")
         for i in moments:
-            axes.axvline(time[i], color="0.9", linewidth=1, zorder=0)
-        _mark_events(axes, ticks, time)
-        axes.set_xlabel("s", fontsize=9)
-        axes.tick_params(labelsize=8)
-        axes.spines[["top", "right"]].set_visible(False)
-        if axes.get_legend_handles_labels()[0]:
-            axes.legend(fontsize=8, frameon=False, loc="upper left")
+            axes.axvline(ticks[i].index * PLANNER_DT, color="0.9", linewidth=1, zorder=0)
 
 
-def _curve(
-    axes: Any, time: list[float], values: list[float | None], label: str, style: str
-) -> None:
-    if any(value is not None for value in values):
-        known = [np.nan if value is None else value for value in values]
-        axes.plot(time, known, color=style, label=label)
+def _curve(axes: Any, ticks: Sequence[Tick], values: list[float | None], style: str) -> None:
+    time = [tick.index * PLANNER_DT for tick in ticks]
+    axes.plot(time, [np.nan if value is None else value for value in values], color=style)
+    axes.margins(x=0.01, y=0.18)
+    _mark_events(axes, ticks, time)
+    axes.set_xlabel("s", fontsize=9, labelpad=0)
+    axes.tick_params(labelsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _mark_events(axes: Any, ticks: Sequence[Tick], time: list[float]) -> None:

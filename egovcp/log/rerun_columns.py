@@ -78,17 +78,18 @@ def _robot(frames: Sequence[Frame]) -> Iterator[Columns]:
 
 def skeleton_columns(frames: Sequence[Frame]) -> Columns:
     """The robot as line strips between joints, where no meshes are installed."""
-    strips = [strip for frame in frames for strip in skeleton(frame.pose)]
+    strips = np.concatenate([skeleton(frame.pose) for frame in frames])
     count = len(strips) // len(frames)
     columns = rr.LineStrips3D.columns(strips=strips).partition([count] * len(frames))
     return Columns(paths.SKELETON, [frame.tick for frame in frames], columns)
 
 
-def skeleton(pose: RobotPose) -> list[Array]:
-    """(2, 3) lines from each link to its parent, and from each wrist to its palm."""
+def skeleton(pose: RobotPose) -> Array:
+    """(n, 2, 3) lines from each link to its parent, and from each wrist to its palm."""
     p = pose.positions_w
     bones = [p[[parent, child]] for child, parent in enumerate(PARENT) if parent >= 0]
-    return bones + [np.stack([p[w], palm]) for w, palm in zip(WRISTS, pose.palms_w, strict=True)]
+    hands = [np.stack([p[w], palm]) for w, palm in zip(WRISTS, pose.palms_w, strict=True)]
+    return np.stack(bones + hands)
 
 
 def _camera(frames: Sequence[Frame], view: CameraView) -> Columns:
@@ -135,29 +136,28 @@ def _plans(frames: Sequence[Frame]) -> Iterator[Columns]:
         yield _candidates(weighed)
     planned = [frame for frame in frames if frame.tick.plan is not None]
     if planned:
-        strips = [strip for frame in planned for strip in _best(frame)]
+        strips = np.concatenate([_best(frame) for frame in planned])
         columns = rr.LineStrips3D.columns(strips=strips).partition([2] * len(planned))
         yield Columns(paths.BEST, [frame.tick for frame in planned], columns)
 
 
-def _best(frame: Frame) -> list[Array]:
-    """Path of each hand along the chosen plan, world frame: two (N, 3)."""
+def _best(frame: Frame) -> Array:
+    """(2, N, 3) path of each hand along the chosen plan, world frame."""
     hands = ACTION_BOX.to_metric(np.asarray(frame.tick.plan))[:, :6].reshape(-1, 2, 3)
-    paths_w = frame.pose.from_heading(hands)
-    return [paths_w[:, 0], paths_w[:, 1]]
+    return frame.pose.from_heading(hands).swapaxes(0, 1)
 
 
 def _candidates(frames: Sequence[Frame]) -> Columns:
-    strips: list[Array] = []
-    colours, counts = [], []
+    strips, colours, counts = [], [], []
     for frame in frames:
         candidates = frame.tick.candidates
         assert candidates is not None
         hands = frame.pose.from_heading(candidates.hands_b)  # (n, N, 2, 3)
-        strips += [*hands[:, :, 0], *hands[:, :, 1]]
+        strips += [hands[:, :, 0], hands[:, :, 1]]
         colours.append(np.tile(value_colours(candidates.values), (2, 1)))
         counts.append(2 * len(hands))
-    columns = rr.LineStrips3D.columns(strips=strips, colors=np.concatenate(colours))
+    # one array, not a list of strips: an order of magnitude faster
+    columns = rr.LineStrips3D.columns(strips=np.concatenate(strips), colors=np.concatenate(colours))
     return Columns(paths.CANDIDATES, [f.tick for f in frames], columns.partition(counts))
 
 
