@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import pytest
 
@@ -13,7 +13,7 @@ from egovcp.sim.config import BallConfig, EnvConfig
 class Command:
     """A command with an environment."""
 
-    env: EnvConfig = EnvConfig()
+    env: EnvConfig = field(default_factory=EnvConfig)
 
 
 def test_every_parameter_is_a_dotted_flag() -> None:
