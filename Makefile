@@ -23,6 +23,30 @@ install: .venv/installed
 test: install
 	pytest -m "not slow and not gpu"
 
+# Laptop scale: the throw comes at once, so that each simulated second teaches something.
+SCENES := --env.ball_episode.ticks=46 --env.ball_episode.event_ticks="[4,10]"
+POLICY := $(OUT)/policy/checkpoints/last/pretrained_model
+
+quickstart: install
+	@test ! -e $(OUT) || { echo "quickstart: error: $(OUT) exists; remove it or choose another: make quickstart OUT=..." >&2; exit 2; }
+	egovcp-collect --task=ball --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
+	  --episodes=4000 --seed=0 $(SCENES)
+	egovcp-train --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
+	  --output_dir=$(OUT)/policy --returns.steps=16 --max_minutes=7 --seed=0
+	egovcp-eval --policy.path=$(POLICY) --task=ball --episodes=80 --planner.samples=256 \
+	  --output_dir=$(OUT)/eval $(SCENES)
+	egovcp-deploy --policy.path=$(POLICY) --robot.type=sim --task=ball --episodes=1 \
+	  --output_dir=$(OUT)/rollouts $(SCENES)
+	@cd $(OUT) && for kind in mcap rrd png; do cp rollouts/rollout-0.$$kind rollout.$$kind; done
+	@echo
+	@echo "dataset   $(OUT)/dataset          lerobot-dataset-viz --repo-id me/egovcp-ball --root $(OUT)/dataset --episode-index 0"
+	@echo "policy    $(POLICY)"
+	@echo "figures   $(OUT)/eval/eval.json"
+	@echo "rollout   $(OUT)/rollout.rrd      .venv/bin/rerun $(OUT)/rollout.rrd"
+	@echo "          $(OUT)/rollout.mcap     Foxglove or Rerun"
+	@echo "          $(OUT)/rollout.png"
+	@echo "next      train longer (make train-longer), or another task: egovcp-collect --task=wall --help"
+
 check: install
 	ruff check .
 	ruff format --check .

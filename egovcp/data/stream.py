@@ -88,7 +88,7 @@ class SequenceStream:
         )
         batch["valid"] &= ~warm_up
         if config.mirror:
-            _mirror_rows(batch, np.flatnonzero(rng.random(config.batch_size) < 0.5))
+            mirror_rows(batch, np.flatnonzero(rng.random(config.batch_size) < 0.5))
         self._batches += 1
         return batch
 
@@ -180,7 +180,8 @@ def gather(
     return batch
 
 
-def _mirror_rows(batch: Batch, rows: NDArray[np.intp]) -> None:
+def mirror_rows(batch: Batch, rows: NDArray[np.intp]) -> None:
+    """Reflect the windows ``rows`` of a batch left to right, in place."""
     batch["depth"][rows] = mirror_depth(batch["depth"][rows])
     batch["state"][rows] = mirror_state(batch["state"][rows])
     for name in ("action", "prev_action"):

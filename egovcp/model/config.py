@@ -11,12 +11,14 @@ from egovcp import spec
 class LossConfig:
     """Weights of the terms of equations 6 to 9, and what each averages over."""
 
-    depth: float = 100.0
+    depth: float = 30.0
     """Weight of the depth reconstruction, per pixel mean of 0.5 (x - x_hat)^2."""
-    moving: float = 30.0
+    moving: float = 100.0
     """Extra weight of pixels that changed since the previous frame; 0: none."""
     moving_threshold: float = 0.04
     """Change of nearness (fraction of the depth range) that counts as moving."""
+    motion: float = 10.0
+    """Weight of the place of what approaches, mean squared error in half images; 0: none."""
     state: float = 1.0
     """Weight of the proprioception reconstruction, mean over the 74 standardised values."""
     kl_prior: float = 1.0
@@ -61,6 +63,7 @@ class WorldModelConfig:
 PAPER_LOSS = LossConfig(
     depth=float(spec.DEPTH_ROWS * spec.DEPTH_COLS),
     moving=0.0,
+    motion=0.0,
     state=float(spec.STATE_DIM),
     kl_posterior=1.0,
     free_nats=0.0,

@@ -40,3 +40,45 @@ def network_image(near: Tensor) -> Tensor:
 def to_metres(near: Tensor, max_m: float) -> Tensor:
     """Nearness -> planar depth in metres; 0 (nothing in range) where nearness vanishes."""
     return torch.where(near > 0.01, (1.0 - near).clamp(0.0, 1.0) * max_m, 0.0)
+
+
+#: Nearness below which a change is noise at the end of the range, and above which it is the
+#: robot's own arm: 4 m and 0.9 m of a range of 5 m.
+OBJECT_NEARNESS = (0.2, 0.82)
+MIN_PIXELS = 2  # that came nearer, for something to count as seen
+CLOSER = 0.12  # change of nearness, 0.6 m of a range of 5 m, that is no noise
+
+
+def approaching(near: Tensor) -> tuple[Tensor, Tensor]:
+    """Where something beyond the arms' reach has come nearer since the previous frame.
+
+    Args:
+        near: (B, T, H, W) nearness.
+
+    Returns:
+        (B, T, 3) column and row of the centre of the pixels that changed, in [-1, 1], and
+        their mean nearness; and (B, T) whether there were any. Derived from the images
+        alone: no simulator truth, no knowledge of the tasks.
+    """
+    low, high = OBJECT_NEARNESS
+    before = near[:, :-1].flatten(0, 1)
+    # Against the nearest of the previous neighbourhood: the robot's own sway moves edges by a
+    # pixel, and pixels at an edge come and go.
+    before = _extreme_3x3(before, torch.maximum).view_as(near[:, 1:])
+    change = near[:, 1:] - before > CLOSER
+    mask = (change & (near[:, 1:] > low) & (near[:, 1:] < high)).to(near.dtype)
+    count = mask.sum((-2, -1))
+    rows = torch.linspace(-1, 1, near.shape[-2], device=near.device)
+    cols = torch.linspace(-1, 1, near.shape[-1], device=near.device)
+    sums = torch.stack(
+        [
+            (mask.sum(-2) * cols).sum(-1),
+            (mask.sum(-1) * rows).sum(-1),
+            (mask * near[:, 1:]).sum((-2, -1)),
+        ],
+        -1,
+    )
+    centre = sums / count.clamp_min(1.0)[..., None]
+    first = torch.zeros_like(centre[:, :1])
+    seen = count >= MIN_PIXELS
+    return torch.cat([first, centre], 1), torch.cat([torch.zeros_like(seen[:, :1]), seen], 1)

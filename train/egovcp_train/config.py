@@ -8,6 +8,7 @@ from typing import Literal
 from egovcp.data import DatasetConfig, ReturnConfig
 from egovcp.model import WorldModelConfig
 from egovcp.plan import PlannerConfig
+from egovcp_train.value_fit import ValueFitConfig
 
 
 @dataclass(frozen=True)
@@ -30,7 +31,7 @@ class OptimizerConfig:
 class SamplingConfig:
     """Which windows of which episodes make a batch."""
 
-    length: int = 24
+    length: int = 20
     """Ticks per window."""
     burn_in: int = 0
     """Leading ticks of a window that only fill the memory and are not trained on."""
@@ -65,12 +66,14 @@ class TrainConfig:
     """Batches."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Optimiser."""
+    value_fit: ValueFitConfig = field(default_factory=ValueFitConfig)
+    """Final fit of Q."""
     steps: int = 20_000
     """Gradient steps."""
     max_minutes: float = 0.0
     """Wall-clock limit in minutes after which the run ends early, its learning rate decayed on
     the clock; 0: none. A run under a limit is not repeatable step for step."""
-    batch_size: int = 32
+    batch_size: int = 16
     """Windows per gradient step."""
     seed: int = 0
     """Seed of initialisation, batches and sampling."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import signal
 import sys
@@ -32,6 +33,7 @@ from egovcp_train.config import TrainConfig
 from egovcp_train.evaluation import evaluate
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.records import Recorder
+from egovcp_train.value_fit import fit_value
 
 PROG = "egovcp-train"
 CONFIG_FILE = "train_config.yaml"
@@ -107,7 +109,7 @@ class Run:
         ):
             while budget.progress(learner.step) < 1.0 and not stopped:
                 if learner.step > start and learner.step % config.save_freq == 0:
-                    self.save()
+                    self.save(learner.averaged)
                 batch = to_tensors(next(self.stream), self.device)
                 terms = learner.update(batch, budget.progress(learner.step))
                 bar.update()
@@ -115,29 +117,36 @@ class Run:
                     self.recorder.scalars(learner.step, {k: float(v) for k, v in terms.items()})
                     bar.set_postfix(self._summary(terms, bar, frames))
                 if config.eval_freq and learner.step % config.eval_freq == 0:
-                    self.evaluate()
-        self.evaluate()
+                    self.evaluate(learner.averaged)
         final = checkpoint_dir(self.output, learner.step)
         if learner.step > start or not final.exists():
-            self.save()
+            self.finish(fit=not stopped)
         self.recorder.close()
         print(self._last_words(final, bool(stopped)))
 
-    def evaluate(self) -> None:
-        """Measure the averaged weights on held-out episodes."""
+    def finish(self, fit: bool) -> None:
+        """Fit Q on the states of the finished model, evaluate, and save what is shipped."""
+        shipped = copy.deepcopy(self.learner.averaged)
+        if fit:
+            sampling, seed = self.config.sampling, self.config.seed
+            fit_value(shipped, self.stream.store, self.config.value_fit, sampling.mirror, seed)
+        self.evaluate(shipped)
+        self.save(shipped)
+
+    def evaluate(self, model: WorldModel) -> None:
+        """Measure a model on held-out episodes."""
         fresh = SequenceStream(self.heldout, _stream_config(self.config, seed=12345, mirror=False))
         batches = (to_tensors(next(fresh), self.device) for _ in range(EVALUATION_BATCHES))
-        self.metrics = evaluate(self.learner.averaged, batches)
+        self.metrics = evaluate(model, batches)
         self.recorder.scalars(
             self.learner.step, {f"heldout/{k}": v for k, v in self.metrics.items()}
         )
 
-    def save(self) -> Path:
-        """Write a checkpoint: artefact and training state, complete or not at all."""
+    def save(self, model: WorldModel) -> Path:
+        """Write a checkpoint: the model as artefact, and the training state."""
         partial = begin_checkpoint(self.output, self.learner.step)
         provenance = self.provenance | {"step": self.learner.step, "heldout": self.metrics}
-        averaged = self.learner.averaged
-        save_artefact(partial / "pretrained_model", averaged, self.config.planner, provenance)
+        save_artefact(partial / "pretrained_model", model, self.config.planner, provenance)
         state = {"learner": self.learner.state_dict(), "stream": self.stream.state_dict()}
         return finish_checkpoint(partial, state)
 
