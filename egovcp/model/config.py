@@ -13,6 +13,9 @@ class LossConfig:
 
     depth: float = 30.0
     """Weight of the depth reconstruction, per pixel mean of 0.5 (x - x_hat)^2."""
+    decode_every: int = 2
+    """Reconstruct every n-th image of a window, the first one drawn at random: the decoder is
+    the dearest part of a step, and neighbouring images teach it the same."""
     moving: float = 100.0
     """Extra weight of pixels that changed since the previous frame; 0: none."""
     moving_threshold: float = 0.04
@@ -31,7 +34,7 @@ class LossConfig:
     """Weight of the termination cross entropy."""
     value: float = 1.0
     """Weight of (Q - Monte Carlo return)^2, in units of the return's standard deviation."""
-    imagined_steps: int = 3
+    imagined_steps: int = 1
     """Also regress Q on states imagined this many steps ahead of the posterior; 0: never."""
     imagined_value: float = 1.0
     """Weight of the value loss on imagined states."""
@@ -62,6 +65,7 @@ class WorldModelConfig:
 #: The paper's plain sum: likelihoods summed over pixels and joints, unit variances, nothing added.
 PAPER_LOSS = LossConfig(
     depth=float(spec.DEPTH_ROWS * spec.DEPTH_COLS),
+    decode_every=1,
     moving=0.0,
     motion=0.0,
     state=float(spec.STATE_DIM),

@@ -88,7 +88,7 @@ def world_model_loss(
     config = model.config.loss
     rollout = filter_sequence(model, batch, generator=generator)
     terms = {
-        "depth": config.depth * depth_loss(model, rollout, batch, config),
+        "depth": config.depth * depth_loss(model, rollout, batch, config, generator),
         "motion": config.motion * motion_loss(model, rollout, batch),
         "state": config.state * state_loss(model, rollout, batch),
         **kl_losses(rollout, batch.valid, config),
@@ -104,14 +104,23 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     return (x * weight).sum() / weight.sum().clamp_min(1.0)
 
 
-def depth_loss(model: WorldModel, rollout: Rollout, batch: Batch, config: LossConfig) -> Tensor:
+def depth_loss(
+    model: WorldModel,
+    rollout: Rollout,
+    batch: Batch,
+    config: LossConfig,
+    generator: torch.Generator | None = None,
+) -> Tensor:
     """Gaussian negative log likelihood of the image, moving pixels weighted up."""
-    image = model.decode_depth(rollout.carry.features.flatten(0, 1))
-    error = 0.5 * (image.float() - rollout.near.flatten(0, 1)).square()
+    every = min(config.decode_every, batch.valid.shape[1])
+    first = int(torch.randint(every, (), generator=generator, device=batch.state.device))
+    rows = (slice(None), slice(first, None, every))
+    image = model.decode_depth(rollout.carry.features[rows].flatten(0, 1)).float()
+    error = 0.5 * (image - rollout.near[rows].flatten(0, 1)).square()
     if config.moving > 0:
-        weight = 1.0 + config.moving * moving_pixels(rollout.near, config.moving_threshold)
-        error = error * weight.flatten(0, 1)
-    return masked_mean(error.mean((-2, -1)), batch.valid.flatten())
+        moving = moving_pixels(rollout.near, config.moving_threshold)[rows]
+        error = error * (1.0 + config.moving * moving.flatten(0, 1))
+    return masked_mean(error.mean((-2, -1)), batch.valid[rows].flatten())
 
 
 def moving_pixels(near: Tensor, threshold: float) -> Tensor:

@@ -31,6 +31,8 @@ class ValueFitConfig:
 
     steps: int = 1500
     """Gradient steps; 0: no fit."""
+    imagined_steps: int = 3
+    """States are imagined 0 to this many ticks ahead, as far as the planner looks."""
     rows: int = 1024
     """States per step."""
     lr: float = 1e-3
@@ -60,7 +62,7 @@ def fit_value(
     if config.steps == 0:
         return
     generator = torch.Generator().manual_seed(seed)
-    rows = collect_rows(model, store, mirror, generator)
+    rows = collect_rows(model, store, config.imagined_steps, mirror, generator)
     head = model.value_head.requires_grad_(True)
     optimizer = torch.optim.AdamW(head.parameters(), lr=config.lr, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=config.steps)
@@ -77,15 +79,19 @@ def fit_value(
 
 @torch.no_grad()
 def collect_rows(
-    model: WorldModel, store: EpisodeStore, mirror: bool, generator: torch.Generator
+    model: WorldModel,
+    store: EpisodeStore,
+    imagined_steps: int,
+    mirror: bool,
+    generator: torch.Generator,
 ) -> Rows:
     """Every row with a complete return, as the planner would meet it.
 
     The planner judges filtered states (k = 0) and states imagined k < N steps ahead, so
-    each row is reached by a k drawn from 0 .. ``loss.imagined_steps``.
+    each row is reached by a k drawn from 0 .. ``imagined_steps``.
     """
     parts = [
-        _rows_of(model, batch, generator)
+        _rows_of(model, batch, imagined_steps, generator)
         for batch in _episodes(store, mirror, model.state_mean.device)
     ]
     return Rows(*(torch.cat(column) for column in zip(*parts, strict=True)))
@@ -103,13 +109,15 @@ def _episodes(store: EpisodeStore, mirror: bool, device: torch.device) -> Iterat
             yield to_tensors(arrays, device)
 
 
-def _rows_of(model: WorldModel, batch: Batch, generator: torch.Generator) -> Rows:
+def _rows_of(
+    model: WorldModel, batch: Batch, imagined_steps: int, generator: torch.Generator
+) -> Rows:
     """States of one batch of episodes, each imagined a random number of steps ahead."""
     carry = filter_sequence(model, batch, sample=False).carry
     target = (batch.mc_return - model.return_mean) / model.return_std
     usable = batch.valid & batch.mc_valid
     length = batch.valid.shape[1]
-    depth = min(model.config.loss.imagined_steps, length - 1)
+    depth = min(imagined_steps, length - 1)
     steps = torch.randint(depth + 1, usable.shape, generator=generator).to(usable.device)
     found: list[tuple[Tensor, ...]] = []
     for k in range(depth + 1):
