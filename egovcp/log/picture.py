@@ -149,7 +149,7 @@ def _curves(figure: Any, ticks: Sequence[Tick], moments: Sequence[int]) -> None:
 def _curve(axes: Any, ticks: Sequence[Tick], values: list[float | None], style: str) -> None:
     time = [tick.index * PLANNER_DT for tick in ticks]
     axes.plot(time, [np.nan if value is None else value for value in values], color=style)
-    axes.margins(x=0.01, y=0.18)
+    axes.margins(x=0.01, y=0.25)
     _mark_events(axes, ticks, time)
     axes.set_xlabel("s", fontsize=9, labelpad=0)
     axes.tick_params(labelsize=8)
@@ -157,18 +157,19 @@ def _curve(axes: Any, ticks: Sequence[Tick], values: list[float | None], style: 
 
 
 def _mark_events(axes: Any, ticks: Sequence[Tick], time: list[float]) -> None:
-    """A dashed line and its text per event, the text at the top of the plot."""
-    for tick, moment in zip(ticks, time, strict=True):
-        if tick.events:
-            axes.axvline(moment, color="0.4", linewidth=0.8, linestyle="--")
-            text = "\n".join(tick.events)
-            axes.annotate(
-                text,
-                (moment, 1.0),
-                xycoords=("data", "axes fraction"),
-                fontsize=7,
-                xytext=(3, -2),
-                textcoords="offset points",
-                va="top",
-                rotation=0,
-            )
+    """A dashed line and its text per event, one below the other at the top of the plot."""
+    eventful = [(t, tick.events) for t, tick in zip(time, ticks, strict=True) if tick.events]
+    lines = [(t, text) for t, events in eventful for text in events]
+    for row, (moment, text) in enumerate(lines):
+        axes.axvline(moment, color="0.4", linewidth=0.8, linestyle="--")
+        late = moment > 0.6 * time[-1]
+        axes.annotate(
+            text,
+            (moment, 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(-3 if late else 3, -2 - 9 * row),
+            textcoords="offset points",
+            ha="right" if late else "left",
+            va="top",
+            fontsize=7,
+        )

@@ -16,10 +16,13 @@ from egovcp_deploy.robots.base import Outcome, Sensed
 from egovcp_deploy.scenarios import held_out
 
 _BEGINS: Final = {"ball": "ball thrown", "wall": "robot pushed", "arch": "arch starts to move"}
-#: Reward terms that are paid once, and what it means when they are.
-_ONCE: Final = {
+#: Reward terms, and what it means when one is first paid in an episode.
+_MEANS: Final = {
     "block": "ball blocked by a hand",
     "hit": "ball hit the body",
+    "brace": "hand braces on the wall",
+    "contact": "body touches the obstacle",
+    "head": "head touches the arch",
     "pass": "arch passed",
     "fall": "robot fell",
 }
@@ -35,7 +38,7 @@ class SimRobot:
         self._task = task
         self._seed = seed
         self._observation: Observation | None = None
-        self._before_event = True
+        self._reported: set[str] = set()
 
     @property
     def controller_id(self) -> str:
@@ -51,7 +54,7 @@ class SimRobot:
     def start(self, episode: int) -> None:
         """Reset to scenario ``episode``."""
         self._observation = self._env.reset([held_out(self._task, self._seed, episode)])
-        self._before_event = True
+        self._reported = set()
 
     def observe(self) -> Sensed:
         """The observation, with pelvis pose and scene as the simulator has them."""
@@ -81,12 +84,13 @@ class SimRobot:
         )
 
     def _events(self, terms: dict[str, float]) -> list[str]:
-        happened = [text for name, text in _ONCE.items() if terms.get(name, 0.0) != 0.0]
+        """What happened for the first time in this episode."""
         begun = float(self._env.snapshot().since_event[0]) >= 0.0
-        if begun and self._before_event:
-            self._before_event = False
-            return [_BEGINS[self._task], *happened]
-        return happened
+        happened = [_BEGINS[self._task]] if begun else []
+        happened += [text for name, text in _MEANS.items() if terms.get(name, 0.0) != 0.0]
+        fresh = [text for text in happened if text not in self._reported]
+        self._reported.update(fresh)
+        return fresh
 
     def close(self) -> None:
         """End the simulator's threads."""
