@@ -111,3 +111,18 @@ def test_an_artefact_of_another_controller_drives_nothing(
     assert run(f"--policy.path={foreign_artefact_dir}", f"--output_dir={out}") == 4
     assert "another-controller" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_each_event_of_an_episode_is_told_once(tmp_path: Path, artefact_dir: Path) -> None:
+    out = tmp_path / "out"
+    flags = ["--env.ball_episode.ticks=40", "--env.ball_episode.event_ticks=[2,2]", "--imagine=0"]
+    run(f"--policy.path={artefact_dir}", "--episodes=1", f"--output_dir={out}", *flags)
+    ticks = read_recording(out / "rollout-0.mcap").ticks
+    events = [event for tick in ticks for event in tick.events]
+    assert "ball thrown" in ticks[2].events
+    assert len(set(events)) == len(events)
+    paid = {"block": "ball blocked by a hand", "hit": "ball hit the body"}
+    for term, text in paid.items():
+        first = next((t for t in ticks if t.reward_terms[term] != 0), None)
+        assert (text in events) == (first is not None)
+        assert first is None or text in first.events
