@@ -15,7 +15,7 @@ from egovcp.robot.arms import cross
 from egovcp.robot.g1 import DAMPING, EFFORT_LIMIT, STIFFNESS
 from egovcp.robot.kinematics import Array
 from egovcp.robot.reach import DT, TORSO_ORIGIN, Reach
-from egovcp.robot.stance_table import NF, NU, NX, NZ, StanceRow, StanceTable
+from egovcp.robot.stance_table import NF, NR, NU, NX, NZ, StanceRow, StanceTable
 from egovcp.spec import STATE_SLICES
 
 LOWER_BODY: Final = slice(0, NU)
@@ -43,6 +43,8 @@ class BalanceConfig:
     """m/s."""
     correction_limit: float = 0.8
     """Bound of each balance correction, as a share of effort limit / stiffness."""
+    force_limit: float = 20.0
+    """Bound of each estimated constant force, N; in N m for moments, half of it."""
     fade_from: float = 0.35
     """rad of tilt away from the reference at which corrections begin to fade."""
     fade_to: float = 0.8
@@ -107,11 +109,13 @@ def balance(m: Balance, state: Array, row: StanceRow, reach: Reach, config: Bala
     m.prediction = out[:, NU:]
     m.prediction[:, NZ:NX] += recoil
     m.prediction[:, :NZ] += 0.5 * DT * recoil
-    m.correction = _bounded(out[:, :NU], m.prediction, config)
-    m.reached, m.sent = m.sent, reference
+    _bound_forces(m.prediction, config)
     torque = row.torque + _apply(row.torque_per_moment, moment)
     feed_forward = (torque + _KD * reference[:, _JOINT_RATES]) / _KP
-    return np.asarray(reference[:, _JOINTS] + feed_forward + m.correction)
+    base = reference[:, _JOINTS] + feed_forward
+    m.correction = _bounded(out[:, :NU], m.prediction, config)
+    m.reached, m.sent = m.sent, reference
+    return np.asarray(base + m.correction)
 
 
 def _positions(row: StanceRow, height: Array, moment: Array) -> Array:
@@ -165,6 +169,13 @@ def _bounded(correction: Array, estimate: Array, config: BalanceConfig) -> Array
     keep = (config.fade_to - tilt) / (config.fade_to - config.fade_from)
     keep = np.minimum(np.maximum(keep, 0.0), 1.0)
     return np.asarray(keep * np.minimum(np.maximum(correction, -limit), limit))
+
+
+def _bound_forces(prediction: Array, config: BalanceConfig) -> None:
+    """Limit the estimated constant forces, in place: a robot on its toes must not wind up."""
+    limit = config.force_limit * np.repeat([1.0, 0.5], [3, 6])
+    forces = prediction[:, NX + NR :]
+    np.minimum(np.maximum(forces, -limit, out=forces), limit, out=forces)
 
 
 def _gravity(pitch: Array) -> Array:

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 _MOMENT_STEP: Final = 0.5  # kg m, of the difference quotient
 
 SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the ground
-FOOT_CENTRE: Final = 0.039  # m, middle of the foot's support, forward of the ankle
+FOOT_CENTRE: Final = 0.034  # m, forward of the ankle: the middle between toe and heel points
 FOOT_SPACING: Final = 0.1185  # m, ankle to the midline: the G1's hips, legs vertical
 
 #: Natural pelvis pitch (rad) against height (m): below 0.61 m the ankle's limit tips it.
