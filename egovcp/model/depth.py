@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 
@@ -79,6 +80,5 @@ def approaching(near: Tensor) -> tuple[Tensor, Tensor]:
         -1,
     )
     centre = sums / count.clamp_min(1.0)[..., None]
-    first = torch.zeros_like(centre[:, :1])
     seen = count >= MIN_PIXELS
-    return torch.cat([first, centre], 1), torch.cat([torch.zeros_like(seen[:, :1]), seen], 1)
+    return F.pad(centre, (0, 0, 1, 0)), F.pad(seen, (1, 0))  # nothing comes before the first

@@ -118,7 +118,8 @@ def depth_loss(
     image = model.decode_depth(rollout.carry.features[rows].flatten(0, 1)).float()
     error = 0.5 * (image - rollout.near[rows].flatten(0, 1)).square()
     if config.moving > 0:
-        moving = moving_pixels(rollout.near, config.moving_threshold)[rows]
+        moving = moving_pixels(rollout.near, config.moving_threshold)
+        moving = moving.masked_fill(batch.is_first[..., None, None], 0.0)[rows]
         error = error * (1.0 + config.moving * moving.flatten(0, 1))
     return masked_mean(error.mean((-2, -1)), batch.valid[rows].flatten())
 
@@ -135,6 +136,7 @@ def motion_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
     In the image itself a distant ball is 10 of 3072 pixels; here it is the whole target.
     """
     centre, seen = approaching(rollout.near)
+    seen = seen & ~batch.is_first  # the image before belongs to another episode
     output = model.decode_motion(rollout.carry.h, rollout.carry.z).float()
     error = (output[..., :3] - centre).square().sum(-1)
     place = masked_mean(error, batch.valid & seen)

@@ -62,6 +62,8 @@ def arguments(dataset_root: Path) -> Arguments:
             "batch_size": 2,
             "sampling__length": 6,
             "returns__steps": 5,
+            "value_fit__steps": 4,
+            "value_fit__rows": 32,
             "planner__samples": 16,
             "planner__elites": 4,
             "tensorboard": "false",

@@ -97,16 +97,25 @@ class Run:
 
     def execute(self) -> None:
         """Train until the budget or a signal ends it; the last state is always saved."""
-        config, learner = self.config, self.learner
-        budget = Budget(config.steps, config.max_minutes)
+        learner = self.learner
+        budget = Budget(self.config.steps, self.config.max_minutes)
         start = learner.step
+        with _stop_on_signal() as stopped:
+            self._learn(budget, stopped)
+            finished = budget.progress(learner.step) >= 1.0
+            final = checkpoint_dir(self.output, learner.step)
+            if learner.step > start or not final.exists():
+                self.finish(fit=finished)
+        self.recorder.close()
+        print(self._last_words(final, stopped=not finished))
+
+    def _learn(self, budget: Budget, stopped: list[int]) -> None:
+        """Step until the budget is spent or ``stopped`` fills."""
+        config, learner, start = self.config, self.learner, self.learner.step
         frames = config.batch_size * (config.sampling.length + config.sampling.burn_in)
-        with (
-            _stop_on_signal() as stopped,
-            tqdm(
-                total=config.steps, initial=learner.step, unit="step", desc="train", mininterval=1.0
-            ) as bar,
-        ):
+        with tqdm(
+            total=config.steps, initial=start, unit="step", desc="train", mininterval=1.0
+        ) as bar:
             while budget.progress(learner.step) < 1.0 and not stopped:
                 if learner.step > start and learner.step % config.save_freq == 0:
                     self.save(learner.averaged)
@@ -118,11 +127,6 @@ class Run:
                     bar.set_postfix(self._summary(terms, bar, frames))
                 if config.eval_freq and learner.step % config.eval_freq == 0:
                     self.evaluate(learner.averaged)
-        final = checkpoint_dir(self.output, learner.step)
-        if learner.step > start or not final.exists():
-            self.finish(fit=not stopped)
-        self.recorder.close()
-        print(self._last_words(final, bool(stopped)))
 
     def finish(self, fit: bool) -> None:
         """Fit Q on the states of the finished model, evaluate, and save what is shipped."""
