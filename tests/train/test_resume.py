@@ -18,6 +18,7 @@ from egovcp_train import checkpoint
 from egovcp_train.checkpoint import begin_checkpoint, finish_checkpoint, load_training_state
 from egovcp_train.loop import Learner
 from egovcp_train.train import main
+from egovcp_train.value_fit import fit_value
 
 type Arguments = Callable[..., list[str]]
 
@@ -83,6 +84,30 @@ def test_a_stopped_run_that_is_resumed_equals_an_uninterrupted_one(
     assert _equal(_state(output), _state(finished))
     weights = "checkpoints/last/pretrained_model/model.safetensors"
     assert (output / weights).read_bytes() == (finished / weights).read_bytes()
+
+
+def test_a_signal_in_the_last_step_or_the_final_fit_loses_nothing(
+    arguments: Arguments,
+    finished: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def interrupted(*args: Any) -> None:
+        signal.raise_signal(signal.SIGINT)
+        fit_value(*args)
+
+    weights = "checkpoints/last/pretrained_model/model.safetensors"
+    for name in ("step", "fit"):
+        output = tmp_path / name
+        with monkeypatch.context() as patched:
+            if name == "step":
+                _stop_after(patched, 6, signal.SIGINT)
+            else:
+                patched.setattr("egovcp_train.train.fit_value", interrupted)
+            assert main(arguments(output)) == 0
+        assert "done at step 6" in capsys.readouterr().out
+        assert (output / weights).read_bytes() == (finished / weights).read_bytes()
 
 
 def test_a_second_signal_is_obeyed_at_once(

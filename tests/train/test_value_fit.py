@@ -1,0 +1,123 @@
+"""The final fit of Q: which states it sees, what it changes, and that it helps."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from egovcp.data import (
+    DatasetConfig,
+    DatasetReader,
+    EpisodeStore,
+    ReturnConfig,
+    SequenceStream,
+    StreamConfig,
+)
+from egovcp.model import Batch, Carry, WorldModel
+from egovcp.testing import CountingModel, toy_model
+from egovcp_train.batches import set_normalisation, to_tensors
+from egovcp_train.value_fit import Rows, ValueFitConfig, collect_rows, fit_value
+
+COUNT, IMAGINED = CountingModel.COUNT, CountingModel.IMAGINED
+
+
+@pytest.fixture(scope="module")
+def store(dataset_root: Path) -> EpisodeStore:
+    reader = DatasetReader.open(DatasetConfig(root=str(dataset_root)))
+    return EpisodeStore.load([reader], "train", ReturnConfig(steps=5))
+
+
+class _Counting(CountingModel):
+    """Counts through whole sequences, too."""
+
+    def advance(self, carry: Carry, action: Tensor, is_first: Tensor) -> Tensor:
+        h = carry.h.masked_fill(is_first[:, None], 0.0).clone()
+        h[:, COUNT] += 1.0
+        return h
+
+
+def _collect(model: WorldModel, store: EpisodeStore, ahead: int) -> Rows:
+    return collect_rows(model, store, ahead, False, torch.Generator().manual_seed(0))
+
+
+def test_every_row_with_a_complete_return_is_collected_once(store: EpisodeStore) -> None:
+    model = _Counting()
+    rows = _collect(model, store, ahead=0)
+    assert len(rows.target) == store.mc_valid.sum()
+    expected = torch.from_numpy(store.mc_return[store.mc_valid])
+    torch.testing.assert_close(rows.target.sort().values, expected.sort().values)
+    assert not rows.h[:, IMAGINED].any()
+    mirrored = collect_rows(model, store, 0, True, torch.Generator().manual_seed(0))
+    assert len(mirrored.target) == 2 * len(rows.target)
+
+
+def test_states_are_imagined_as_far_as_the_planner_looks(store: EpisodeStore) -> None:
+    """A state k ticks ahead of row t has the action of row t + k and the return of row t + k."""
+    rows = _collect(_Counting(), store, ahead=3)
+    ahead, tick = rows.h[:, IMAGINED], rows.h[:, COUNT] - 1
+    assert set(ahead.tolist()) == {0.0, 1.0, 2.0, 3.0}
+    at = (tick + ahead).long()
+    index = {
+        (t, round(float(a), 3)): i
+        for t, i, a in (
+            (int(i - first), int(i), store.action[i, 0])
+            for first, length in zip(store.start, store.length, strict=True)
+            for i in range(first, first + length)
+        )
+    }
+    matched = 0
+    for t, action, target, led, k in zip(at, rows.action, rows.target, rows.z, ahead, strict=True):
+        i = index.get((int(t), round(float(action[0]), 3)))
+        if i is None:
+            continue  # rounded to half precision across the third digit
+        matched += 1
+        assert store.mc_return[i] == pytest.approx(float(target))
+        if k > 0:
+            before = torch.from_numpy(store.action[i - 1])
+            torch.testing.assert_close(led[:7].float(), before, atol=1e-3, rtol=0)
+    assert matched > 0.5 * len(rows.target)
+
+
+def _error(model: WorldModel, rows: Rows) -> float:
+    carry = Carry(rows.h.float(), rows.z.float())
+    with torch.no_grad():
+        return float(
+            (model.standardised_value(carry, rows.action.float()) - rows.target).square().mean()
+        )
+
+
+def test_the_fit_improves_q_and_touches_nothing_else(store: EpisodeStore) -> None:
+    model = toy_model()
+    set_normalisation(model, store)
+    before = {k: v.clone() for k, v in model.state_dict().items()}
+    rows = _collect(model, store, ahead=3)
+    start = _error(model, rows)
+    fit_value(model, store, ValueFitConfig(steps=60, rows=64), mirror=False, seed=0)
+    assert _error(model, rows) < 0.5 * start
+    changed = {k for k, v in model.state_dict().items() if not torch.equal(v, before[k])}
+    assert changed
+    assert all(name.startswith("value_head.") for name in changed)
+
+
+def test_a_seed_repeats_the_fit_and_no_steps_leave_the_model_alone(store: EpisodeStore) -> None:
+    def fitted(steps: int, seed: int) -> dict[str, Tensor]:
+        model = toy_model()
+        fit_value(model, store, ValueFitConfig(steps=steps, rows=16), mirror=True, seed=seed)
+        return model.state_dict()
+
+    def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:
+        return all(torch.equal(a[k], b[k]) for k in a)
+
+    assert same(fitted(3, 0), fitted(3, 0))
+    assert not same(fitted(3, 0), fitted(3, 1))
+    assert same(fitted(0, 0), dict(toy_model().state_dict()))
+
+
+def test_a_batch_of_the_stream_becomes_the_models_tensors(store: EpisodeStore) -> None:
+    arrays = next(SequenceStream(store, StreamConfig(batch_size=3, length=6)))
+    batch = to_tensors(arrays, torch.device("cpu"))
+    for name in Batch._fields:
+        tensor = getattr(batch, name)
+        assert tensor.shape == arrays[name].shape
+        torch.testing.assert_close(tensor.double(), torch.from_numpy(arrays[name].astype(float)))
