@@ -52,6 +52,8 @@ class WorldModelConfig:
     """Width of every MLP."""
     channels: tuple[int, int, int] = (32, 64, 64)
     """Channels of the three layers of the depth CNN; the decoder uses the last."""
+    motion_ahead: tuple[int, ...] = (0, 3, 6, 9)
+    """Ticks ahead at which the place of what approaches is predicted straight from the state."""
     min_std: float = 0.1
     """Floor of the latent standard deviation."""
     update_bias: float = -1.0

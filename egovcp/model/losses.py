@@ -131,21 +131,37 @@ def moving_pixels(near: Tensor, threshold: float) -> Tensor:
 
 
 def motion_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
-    """Where something approaches, and whether: a summary of the image that a ball dominates.
+    """Where something approaches, now and some ticks ahead, and whether it is seen at all.
 
-    In the image itself a distant ball is 10 of 3072 pixels; here it is the whole target.
+    A summary of the image that a ball dominates: in the image itself a distant ball is 10
+    of 3072 pixels, here it is the whole target. Asked for the future too, the state must
+    hold the path, not only the place, and keep it while the ball is out of the picture.
     """
     centre, seen = approaching(rollout.near)
     seen = seen & ~batch.is_first  # the image before belongs to another episode
+    ahead = model.config.motion_ahead
     output = model.decode_motion(rollout.carry.h, rollout.carry.z).float()
-    error = (output[..., :3] - centre).square().sum(-1)
-    place = masked_mean(error, batch.valid & seen)
+    losses = [
+        _motion_loss_at(prediction, centre, seen, batch, k)
+        for prediction, k in zip(output.chunk(len(ahead), -1), ahead, strict=True)
+        if k < seen.shape[1]
+    ]
+    return torch.stack(losses).sum()
+
+
+def _motion_loss_at(output: Tensor, centre: Tensor, seen: Tensor, batch: Batch, k: int) -> Tensor:
+    """Squared error of the place ``k`` ticks ahead, and cross entropy of its being seen."""
+    length = seen.shape[1]
+    output, centre, seen = output[:, : length - k], centre[:, k:], seen[:, k:]
+    known = _unbroken(batch, k)
+    place = masked_mean((output[..., :3] - centre).square().sum(-1), known & seen)
     presence = F.binary_cross_entropy_with_logits(
         output[..., 3], seen.to(output.dtype), reduction="none"
     )
-    known = batch.valid & ~batch.is_first
-    known[:, 0] = False  # no previous frame in the window
-    return place + 0.1 * masked_mean(presence, known)
+    judged = known & ~batch.is_first[:, k:]
+    if k == 0:
+        judged[:, 0] = False  # no previous image in the window
+    return place + 0.1 * masked_mean(presence, judged)
 
 
 def state_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
@@ -207,5 +223,6 @@ def value_and_termination_losses(
 def _unbroken(batch: Batch, k: int) -> Tensor:
     """(B, T - k): row t and row t + k are valid and of the same episode."""
     start = batch.is_first.long().cumsum(1)
-    same = start[:, k:] == start[:, :-k]
-    return same & batch.valid[:, k:] & batch.valid[:, :-k]
+    length = start.shape[1]
+    same = start[:, k:] == start[:, : length - k]
+    return same & batch.valid[:, k:] & batch.valid[:, : length - k]

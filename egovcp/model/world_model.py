@@ -81,7 +81,7 @@ class WorldModel(nn.Module):
         self.prior = SplitMlp((c.hidden,), c.units, 2 * c.latent)
         self.decode_depth = DepthDecoder(sum(state), c.channels[-1])
         self.decode_state = SplitMlp(state, c.units, spec.STATE_DIM)
-        self.decode_motion = SplitMlp(state, c.units, 4)
+        self.decode_motion = SplitMlp(state, c.units, 4 * len(c.motion_ahead))
         self.termination_head = SplitMlp(state, c.units, 1)
         self.value_head = SplitMlp((*state, spec.ACTION_DIM), c.units, 1, hidden_layers=2)
         self._start_at_zero()
