@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import draccus
 import pytest
 import torch
 
@@ -16,6 +17,7 @@ from egovcp.errors import ArtefactError
 from egovcp.model import Batch
 from egovcp_train import checkpoint
 from egovcp_train.checkpoint import begin_checkpoint, finish_checkpoint, load_training_state
+from egovcp_train.config import TrainConfig
 from egovcp_train.loop import Learner
 from egovcp_train.train import main
 from egovcp_train.value_fit import fit_value
@@ -127,6 +129,9 @@ def test_a_finished_run_can_be_extended(finished: Path, tmp_path: Path) -> None:
     assert main([f"--output_dir={output}", "--resume", "--steps=8"]) == 0
     state = _state(output)
     assert state["learner"]["step"] == 8
+    with (output / "train_config.yaml").open(encoding="utf-8") as file:
+        kept = draccus.load(TrainConfig, file)
+    assert (kept.steps, kept.resume, kept.policy.hidden) == (8, False, 32)
     assert not _equal(state["learner"]["model"], _state(finished)["learner"]["model"])
 
 

@@ -155,6 +155,14 @@ def test_the_elites_are_the_best_first_and_belong_to_their_values() -> None:
     assert plan.iterations == SMALL.iterations
 
 
+def test_the_search_never_narrows_below_its_floor() -> None:
+    executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.1)
+    for floor in (0.1, 0.4):
+        config = PlannerConfig(samples=512, elites=64, iterations=10, min_std=floor)
+        first_steps = _plan(executed, goal, config).candidates[:, :, 0] / ETA
+        assert 0.5 * floor < first_steps.std(1).mean() < 1.5 * floor
+
+
 def test_a_warm_start_helps_a_short_search() -> None:
     executed, goal = _random(8, 17), _random(8, 18)
     hasty = PlannerConfig(samples=32, elites=4, iterations=1)

@@ -1,5 +1,6 @@
 """The policy: what the recurrence is told, what a reset forgets, what repeats."""
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,8 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.model import Carry, WorldModel
-from egovcp.plan import PlannerConfig, Policy, PolicyStep
+from egovcp.plan import Plan, PlannerConfig, Policy, PolicyStep, plan_cem
+from egovcp.plan.cem import shift
 from egovcp.testing import CountingModel, toy_model
 
 CONFIG = PlannerConfig(samples=64, elites=8, iterations=2)
@@ -103,6 +105,57 @@ def test_resetting_rows_forgets_them_and_only_them() -> None:
     assert policy.carry.h[:, CountingModel.COUNT].tolist() == [4, 1, 4]
     np.testing.assert_allclose(_led(policy.carry)[[0, 2]].numpy(), 0.5)
     assert not _led(policy.carry)[1].any()
+
+
+class _Asked(NamedTuple):
+    """What the planner was asked, and answered."""
+
+    executed: Tensor
+    warm: Tensor
+    plan: Plan
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[_Asked]:
+    """Every call of the planner by a policy."""
+    calls: list[_Asked] = []
+
+    def record(
+        model: WorldModel,
+        carry: Carry,
+        executed: Tensor,
+        config: PlannerConfig,
+        generator: torch.Generator,
+        warm: Tensor,
+    ) -> Plan:
+        plan = plan_cem(model, carry, executed, config, generator, warm)
+        calls.append(_Asked(executed.clone(), warm.clone(), plan))
+        return plan
+
+    monkeypatch.setattr("egovcp.plan.policy.plan_cem", record)
+    return calls
+
+
+def test_each_plan_starts_at_the_shifted_one_before(asked: list[_Asked]) -> None:
+    _run(Policy(CountingModel(drift=0.3), CONFIG, num_envs=2), 4)
+    assert not asked[0].warm.any()
+    for before, now in itertools.pairwise(asked):
+        assert torch.equal(now.warm, shift(before.plan.deltas))
+        assert before.plan.deltas.any()
+
+
+def test_a_row_after_its_reset_plans_from_the_neutral_action_at_rest(
+    asked: list[_Asked],
+) -> None:
+    policy = Policy(CountingModel(drift=0.3), CONFIG, num_envs=2)
+    _run(policy, 3)
+    policy.advance(np.full((2, A), 0.9))
+    policy.reset(np.array([1]))
+    step = policy.act(*_see(2, 3))
+    assert asked[-1].warm[0].any()
+    assert not asked[-1].warm[1].any()
+    np.testing.assert_allclose(asked[-1].executed.numpy(), [[0.9] * A, [0.0] * A], atol=1e-6)
+    assert np.abs(step.action[1]).max() <= spec.ACTION_ETA + 1e-6
 
 
 def test_a_row_after_its_reset_filters_as_a_new_robot_does() -> None:
