@@ -141,12 +141,13 @@ def motion_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
     seen = seen & ~batch.is_first  # the image before belongs to another episode
     ahead = model.config.motion_ahead
     output = model.decode_motion(rollout.carry.h, rollout.carry.z).float()
+    predictions = output.unflatten(-1, (len(ahead), 4)).unbind(-2)
     losses = [
         _motion_loss_at(prediction, centre, seen, batch, k)
-        for prediction, k in zip(output.chunk(len(ahead), -1), ahead, strict=True)
+        for prediction, k in zip(predictions, ahead, strict=True)
         if k < seen.shape[1]
     ]
-    return torch.stack(losses).sum()
+    return torch.stack([output.new_zeros(()), *losses]).sum()
 
 
 def _motion_loss_at(output: Tensor, centre: Tensor, seen: Tensor, batch: Batch, k: int) -> Tensor:

@@ -249,6 +249,17 @@ def test_a_window_of_one_row_is_trainable(model: WorldModel) -> None:
     assert all(torch.isfinite(torch.tensor(list(terms.values()))))
 
 
+@pytest.mark.filterwarnings("ignore:Initializing zero-element tensors")
+@pytest.mark.parametrize("ahead", [(), (0,), (2, 9), (9,)])
+def test_motion_may_be_foretold_for_any_ticks_ahead_or_none(ahead: tuple[int, ...]) -> None:
+    """Ticks beyond the window ask for nothing."""
+    torch.manual_seed(0)
+    model = WorldModel(dataclasses.replace(PRESETS["debug"], motion_ahead=ahead))
+    batch = random_batch(2, 4)
+    motion = _loss(model, batch)["loss/motion"]
+    assert (motion > 0) == any(k < 4 for k in ahead)
+
+
 def _leaves(seed: int) -> Gaussian:
     rng = torch.Generator().manual_seed(seed)
     mean = torch.randn(2, 3, 4, generator=rng).requires_grad_()
