@@ -1,11 +1,12 @@
 # Everything a newcomer needs: `make quickstart` and `make test`.
 SHELL := /bin/bash
+.SHELLFLAGS := -o pipefail -c
 BIN := .venv/bin
 PATH := $(CURDIR)/$(BIN):$(PATH)
 OUT ?= outputs/quickstart
 export PATH
-# Threads that spin at barriers slow each other down tenfold beside any other program.
-export OMP_WAIT_POLICY := passive
+# Threads that spin at barriers for long slow each other down tenfold beside any other program.
+export GOMP_SPINCOUNT := 20000
 
 .PHONY: help install quickstart test check bench build clean
 
@@ -32,22 +33,22 @@ POLICY := $(OUT)/policy/checkpoints/last/pretrained_model
 quickstart: install
 	@test ! -e $(OUT) || { echo "quickstart: error: $(OUT) exists; remove it or choose another: make quickstart OUT=..." >&2; exit 2; }
 	egovcp-collect --task=ball --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
-	  --episodes=4000 --seed=0 $(SCENES)
+	  --episodes=5000 --seed=0 $(SCENES)
 	egovcp-train --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
-	  --output_dir=$(OUT)/policy --returns.steps=16 --max_minutes=7 --seed=0
+	  --output_dir=$(OUT)/policy --returns.steps=16 --max_minutes=6.5 --seed=0
 	egovcp-eval --policy.path=$(POLICY) --task=ball --episodes=80 --planner.samples=256 \
-	  --output_dir=$(OUT)/eval $(SCENES)
+	  --output_dir=$(OUT)/eval $(SCENES) --env.ball_episode.empty_probability=0 | tee $(OUT)/table.txt
 	egovcp-deploy --policy.path=$(POLICY) --robot.type=sim --task=ball --episodes=1 \
-	  --output_dir=$(OUT)/rollouts $(SCENES)
+	  --output_dir=$(OUT)/rollouts $(SCENES) --env.ball_episode.empty_probability=0
 	@cd $(OUT) && for kind in mcap rrd png; do cp rollouts/rollout-0.$$kind rollout.$$kind; done
-	@echo
+	@echo; cat $(OUT)/table.txt; echo
 	@echo "dataset   $(OUT)/dataset          lerobot-dataset-viz --repo-id me/egovcp-ball --root $(OUT)/dataset --episode-index 0"
 	@echo "policy    $(POLICY)"
 	@echo "figures   $(OUT)/eval/eval.json"
 	@echo "rollout   $(OUT)/rollout.rrd      .venv/bin/rerun $(OUT)/rollout.rrd"
 	@echo "          $(OUT)/rollout.mcap     Foxglove or Rerun"
 	@echo "          $(OUT)/rollout.png"
-	@echo "next      train longer (make train-longer), or another task: egovcp-collect --task=wall --help"
+	@echo "next      train longer with more data (README), or another task: egovcp-collect --task=wall --help"
 
 check: install
 	ruff check .

@@ -151,9 +151,9 @@ class ArchConfig:
 class CameraConfig:
     """Depth camera on the head, and the noise of its pictures."""
 
-    position: tuple[float, float, float] = (0.058, 0.018, 0.42)
+    position: tuple[float, float, float] = (0.058, 0.0, 0.42)
     """Mount in the torso frame, m."""
-    pitch_range: Range = (math.radians(1.0), math.radians(5.0))
+    pitch_range: Range = (math.radians(-5.0), 0.0)
     """Tilt below the torso's horizontal, rad, drawn per episode."""
     vertical_fov: float = math.radians(58.0)
     """Vertical field of view, rad; pixels are square."""

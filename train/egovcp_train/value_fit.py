@@ -29,7 +29,7 @@ EPISODES_AT_ONCE = 32
 class ValueFitConfig:
     """Fit of the value head on fixed states at the end of training."""
 
-    steps: int = 1500
+    steps: int = 600
     """Gradient steps; 0: no fit."""
     imagined_steps: int = 3
     """States are imagined 0 to this many ticks ahead, as far as the planner looks."""
