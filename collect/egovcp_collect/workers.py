@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
-import signal
 from collections import deque
-from collections.abc import Callable, Generator, Iterator
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.sharedctypes import Synchronized
 
@@ -18,12 +15,12 @@ from egovcp.errors import EnvironmentFailure
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
+from egovcp.workers import inherited_by_workers
 from egovcp_collect.config import CollectConfig
 from egovcp_collect.rollout import Interrupted, simulate
 
 _AHEAD = 2  # groups in flight per worker: one being simulated, one waiting
 _POLL = 0.25  # s between looks at the stop request
-_THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -68,7 +65,7 @@ def run_groups(
     groups = iter(config.groups())
     pending: deque[Future[list[Episode] | None]] = deque()
     try:
-        with _inherited_by_workers():
+        with inherited_by_workers():
             for _, group in zip(range(_AHEAD * config.workers), groups, strict=False):
                 pending.append(executor.submit(_run_group, group))
         while pending:
@@ -108,20 +105,6 @@ def _killed(error: BaseException) -> BaseException:
     return EnvironmentFailure(
         "a worker process was killed (out of memory?); try fewer --num_workers"
     )
-
-
-@contextmanager
-def _inherited_by_workers() -> Iterator[None]:
-    """Workers start deaf to Ctrl-C, which the main process answers, and with one thread each."""
-    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    limits = {name: "1" for name in _THREAD_LIMITS if name not in os.environ}
-    os.environ.update(limits)
-    try:
-        yield
-    finally:
-        for name in limits:
-            del os.environ[name]
-        signal.signal(signal.SIGINT, previous)
 
 
 class _Worker:

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
 import multiprocessing
 import os
-import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.synchronize import Event
-from typing import Final
 
 import numpy as np
 import torch
@@ -23,12 +20,11 @@ from egovcp.errors import EnvironmentFailure
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
+from egovcp.workers import inherited_by_workers
 from egovcp_deploy.controllers import Constants, Controller, Planned, reference
 from egovcp_deploy.options import PlannerOptions
 from egovcp_deploy.safety import SafetyFilter
 from egovcp_deploy.scores import EpisodeScore
-
-_THREAD_LIMITS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 @dataclass(frozen=True)
@@ -172,7 +168,7 @@ class Stage:
             ) from error
 
     def _submit(self, groups: Sequence[Group]) -> dict[Future[list[EpisodeScore]], int]:
-        with _inherited_by_workers():
+        with inherited_by_workers():
             if self._executor is None:
                 context = multiprocessing.get_context("spawn")
                 self._stop = context.Event()
@@ -188,20 +184,6 @@ class Stage:
             self._stop.set()
             self._executor.shutdown(wait=True, cancel_futures=True)
             self._executor = None
-
-
-@contextlib.contextmanager
-def _inherited_by_workers() -> Iterator[None]:
-    """Workers start deaf to Ctrl-C, which the main process answers, and with one thread each."""
-    previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    limits = {name: "1" for name in _THREAD_LIMITS if name not in os.environ}
-    os.environ.update(limits)
-    try:
-        yield
-    finally:
-        for name in limits:
-            del os.environ[name]
-        signal.signal(signal.SIGINT, previous)
 
 
 class _Worker:
