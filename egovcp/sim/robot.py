@@ -130,11 +130,6 @@ class SimulatedRobot:
         c, s = forward / max(float(np.hypot(*forward)), 1e-9)
         return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
-    def to_heading(self, point_w: Array) -> Array:
-        """World points (..., 3) -> pelvis heading frame (..., 3), m."""
-        out: Array = (point_w - self.data.qpos[:3]) @ self.heading
-        return out
-
     @property
     def palms_w(self) -> Array:
         """(2, 3) palm sites, left and right, m."""

@@ -13,9 +13,11 @@ import pytest
 from egovcp import spec
 from egovcp.artefact import MANIFEST, load_artefact
 from egovcp.checks import check_artefact
+from egovcp.cli import parse_config
 from egovcp.data import DatasetWriter, Episode, Provenance
+from egovcp.model import PRESETS
 from egovcp_train.config import TrainConfig
-from egovcp_train.train import main
+from egovcp_train.train import main, option_defaults
 
 type Arguments = Callable[..., list[str]]
 
@@ -247,3 +249,15 @@ def test_the_controller_of_the_data_goes_into_the_artefact(
     folder = _last(tmp_path / "run") / "pretrained_model"
     assert (folder / MANIFEST).is_file()
     assert load_artefact(str(folder)).controller_id == "walker-7"
+
+
+def test_the_paper_preset_adds_nothing_to_the_paper() -> None:
+    """Also outside the world model; a single flag still overrides it."""
+    argv = ["--output_dir=x", "--preset=paper", "--planner.samples=64", "--optimizer.ema=0.9"]
+    config = parse_config(TrainConfig, argv, "egovcp-train", "", option_defaults)
+    assert config.policy == PRESETS["paper"]
+    assert not config.sampling.mirror
+    assert config.value_fit.steps == 0
+    assert config.returns.keep_truncated
+    assert config.planner.termination_rule == "paper"
+    assert (config.planner.samples, config.optimizer.ema) == (64, 0.9)

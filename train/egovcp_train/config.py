@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 from egovcp.data import DatasetConfig, ReturnConfig
 from egovcp.model import WorldModelConfig
@@ -55,7 +55,7 @@ class TrainConfig:
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Dataset to train on."""
     preset: Literal["default", "paper", "debug"] = "default"
-    """Starting point of the --policy options."""
+    """Starting point of all options; paper: equal weights, nothing added to the paper."""
     policy: WorldModelConfig = field(default_factory=WorldModelConfig)
     """World model and losses."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
@@ -91,3 +91,17 @@ class TrainConfig:
     """cpu, cuda, or auto (cuda if there is one)."""
     tensorboard: bool = True
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
+
+
+#: What a preset says beyond the world model itself (`egovcp.model.PRESETS`). The paper knows no
+#: mirrored episodes, averaged weights or final fit, keeps returns that the time limit cuts short
+#: (their bias is that of its section III-D), and sets the values after a termination to zero.
+TRAINING_PRESETS: dict[str, dict[str, Any]] = {
+    "paper": {
+        "sampling": {"mirror": False},
+        "optimizer": {"ema": 0.0},
+        "value_fit": {"steps": 0},
+        "returns": {"keep_truncated": True},
+        "planner": {"termination_rule": "paper"},
+    },
+}

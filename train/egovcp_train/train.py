@@ -29,7 +29,7 @@ from egovcp_train.checkpoint import (
     finish_checkpoint,
     load_training_state,
 )
-from egovcp_train.config import TrainConfig
+from egovcp_train.config import TRAINING_PRESETS, TrainConfig
 from egovcp_train.evaluation import evaluate
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.records import Recorder
@@ -46,15 +46,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
-    """What stands where no flag says otherwise: the options of the run that is resumed, or the
-    --policy options that --preset stands for."""
+    """What stands where no flag says otherwise: the options of the run that is resumed, or those
+    that --preset stands for."""
     given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
     saved = Path(given.get("output_dir", "")) / CONFIG_FILE
     if given.get("resume", "").lower() == "true" and saved.is_file():
         options: dict[str, Any] = cfgparsing.load_config(saved.read_text("utf-8"), file=saved)
         return options
-    preset = PRESETS.get(given.get("preset", ""))
-    return {"policy": draccus.encode(preset)} if preset else {}
+    name = given.get("preset", "")
+    policy = {"policy": draccus.encode(PRESETS[name])} if name in PRESETS else {}
+    return policy | TRAINING_PRESETS.get(name, {})
 
 
 def train(config: TrainConfig) -> None:
