@@ -36,7 +36,7 @@ quickstart: install
 	  --episodes=5000 --seed=0 $(SCENES)
 	egovcp-train --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
 	  --output_dir=$(OUT)/policy --returns.steps=16 --max_minutes=6.5 --seed=0
-	egovcp-eval --policy.path=$(POLICY) --task=ball --episodes=80 --planner.samples=256 \
+	egovcp-eval --policy.path=$(POLICY) --task=ball --episodes=80 --planner.samples=256 --planner.elites=16 \
 	  --output_dir=$(OUT)/eval $(SCENES) --env.ball_episode.empty_probability=0 | tee $(OUT)/table.txt
 	egovcp-deploy --policy.path=$(POLICY) --robot.type=sim --task=ball --episodes=1 \
 	  --output_dir=$(OUT)/rollouts $(SCENES) --env.ball_episode.empty_probability=0

@@ -50,7 +50,7 @@ def main() -> None:
     args = p.parse_args()
     torch.manual_seed(0)
     model = WorldModel(WorldModelConfig()).eval()
-    torch.nn.init.normal_(model.value_head.rest[-1].weight, std=0.1)
+    torch.nn.init.normal_(model.value_head.mlp.rest[-1].weight, std=0.1)
     config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))
     carry = Carry(torch.randn(1, model.config.hidden), torch.randn(1, model.config.latent))
     executed = torch.zeros(1, spec.ACTION_DIM)

@@ -88,6 +88,10 @@ STATE_DIM: Final = 74
 COMMAND_SLICE: Final = slice(6, 16)  # velocity 3, hands 6, height 1
 COMMAND_DIM: Final = 10
 
+#: Label of a row about what is on its way: y, z (m), time left (s), whether there is something
+#: (0 or 1), and whether this is known (0 or 1).
+PASSING_DIM: Final = 5
+
 STATE_NAMES: Final = (
     *(f"angular_velocity.{a}" for a in "xyz"),
     *(f"projected_gravity.{a}" for a in "xyz"),

@@ -17,6 +17,7 @@ from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.model import PRESETS, Batch, Carry, WorldModel
+from egovcp.model.nets import ValueHead
 
 
 # --- planning ----------------------------------------------------------------------
@@ -94,8 +95,10 @@ def toy_model(preset: str = "debug", seed: int = 0) -> WorldModel:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = WorldModel(PRESETS[preset])
-        for head in (model.value_head, model.termination_head):
-            last = head.rest[-1]
+        for head in (model.value_head, model.passing_value_head, model.termination_head):
+            if head is None:
+                continue
+            last = (head.mlp if isinstance(head, ValueHead) else head).rest[-1]
             assert isinstance(last, nn.Linear)
             nn.init.normal_(last.weight, std=0.3)
     return model.eval()
@@ -161,6 +164,7 @@ def random_batch(size: int = 4, length: int = 8, seed: int = 0) -> Batch:
         mc_return=torch.randn(shape, generator=rng),
         mc_valid=torch.ones(shape, dtype=torch.bool),
         terminal_next=torch.zeros(shape, dtype=torch.bool),
+        passing=torch.rand((*shape, spec.PASSING_DIM), generator=rng).round(),
     )
 
 
@@ -182,6 +186,7 @@ def memory_batch(size: int = 32, length: int = 6, seed: int = 0) -> Batch:
         depth=depth,
         state=torch.zeros_like(batch.state),
         mc_return=side + batch.action[..., 0],
+        passing=torch.zeros_like(batch.passing),
     )
 
 

@@ -55,6 +55,10 @@ class EpisodeStore:
     """(N,)."""
     mc_valid: NDArray[np.bool_]
     """(N,)."""
+    passing: NDArray[np.float32]
+    """(N, 5) what is on its way: where it will pass the plane before the robot (y, z in m) and
+    in how long (s), whether anything is, and whether that is known; zeros, not known, until
+    somebody labels them."""
     start: NDArray[np.int64]
     """(E,) first frame of each episode."""
     length: NDArray[np.int64]
@@ -139,6 +143,7 @@ def _allocate(frames: int) -> dict[str, NDArray[Any]]:
         "terminal_next": np.empty(frames, dtype=np.bool_),
         "mc_return": np.empty(frames, dtype=np.float32),
         "mc_valid": np.empty(frames, dtype=np.bool_),
+        "passing": np.zeros((frames, spec.PASSING_DIM), dtype=np.float32),
     }
 
 

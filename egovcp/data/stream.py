@@ -161,7 +161,7 @@ def gather(
     """Windows of ``span`` rows, each from one episode, as arrays ``[B, span, ...]``.
 
     Keys: depth (uint16 mm), state, action, prev_action, reward, done, success, is_first,
-    valid, mc_return, mc_valid, terminal_next; episode [B] and t [B, span] for reports.
+    valid, mc_return, mc_valid, passing, terminal_next; episode [B] and t [B, span] for reports.
     Past the episode's end the last row is repeated with ``valid``, ``mc_valid`` and the
     flags false.
     """
@@ -172,7 +172,7 @@ def gather(
     t = rows - store.start[episode][:, None]
     batch: Batch = {
         name: getattr(store, name)[rows]
-        for name in ("depth", "state", "action", "prev_action", "reward", "mc_return")
+        for name in ("depth", "state", "action", "prev_action", "reward", "mc_return", "passing")
     }
     for name in ("done", "success", "terminal_next", "mc_valid"):
         batch[name] = getattr(store, name)[rows] & valid
@@ -186,3 +186,4 @@ def mirror_rows(batch: Batch, rows: NDArray[np.intp]) -> None:
     batch["state"][rows] = mirror_state(batch["state"][rows])
     for name in ("action", "prev_action"):
         batch[name][rows] = mirror_action(batch[name][rows])
+    batch["passing"][rows, :, 0] *= -1.0  # y

@@ -22,6 +22,9 @@ class LossConfig:
     """Change of nearness (fraction of the depth range) that counts as moving."""
     motion: float = 10.0
     """Weight of the place of what approaches, mean squared error in half images; 0: none."""
+    passing: float = 3.0
+    """Weight of where and when something thrown will pass, Huber loss in units of
+    `PASSING_UNIT`; 0: none, and Q is not told."""
     state: float = 1.0
     """Weight of the proprioception reconstruction, mean over the 74 standardised values."""
     kl_prior: float = 1.0
@@ -54,6 +57,8 @@ class WorldModelConfig:
     """Channels of the three layers of the depth CNN; the decoder uses the last."""
     motion_ahead: tuple[int, ...] = (0, 3, 6, 9)
     """Ticks ahead at which the place of what approaches is predicted straight from the state."""
+    value_state: int = 8
+    """Numbers to which (h, z) is reduced for Q; 0: Q reads all of it."""
     min_std: float = 0.1
     """Floor of the latent standard deviation."""
     update_bias: float = -1.0
@@ -70,6 +75,7 @@ PAPER_LOSS = LossConfig(
     decode_every=1,
     moving=0.0,
     motion=0.0,
+    passing=0.0,
     state=float(spec.STATE_DIM),
     kl_posterior=1.0,
     free_nats=0.0,
@@ -78,6 +84,6 @@ PAPER_LOSS = LossConfig(
 
 PRESETS = {
     "default": WorldModelConfig(),
-    "paper": WorldModelConfig(loss=PAPER_LOSS),
+    "paper": WorldModelConfig(value_state=0, loss=PAPER_LOSS),
     "debug": WorldModelConfig(hidden=32, latent=8, units=32, channels=(4, 8, 8)),
 }

@@ -16,7 +16,7 @@ from torch import Tensor
 from egovcp.model.config import LossConfig
 from egovcp.model.depth import approaching, nearness
 from egovcp.model.gaussian import Gaussian, kl_divergence
-from egovcp.model.world_model import Carry, WorldModel
+from egovcp.model.world_model import PASSING_UNIT, Carry, WorldModel
 
 
 class Batch(NamedTuple):
@@ -31,6 +31,7 @@ class Batch(NamedTuple):
     mc_return: Tensor  # (B, T)
     mc_valid: Tensor  # (B, T) bool
     terminal_next: Tensor  # (B, T) bool: a_t ended the episode in failure
+    passing: Tensor  # (B, T, 5), see `egovcp.data.EpisodeStore`
 
 
 class Rollout(NamedTuple):
@@ -90,6 +91,7 @@ def world_model_loss(
     terms = {
         "depth": config.depth * depth_loss(model, rollout, batch, config, generator),
         "motion": config.motion * motion_loss(model, rollout, batch),
+        "passing": config.passing * passing_loss(model, rollout, batch),
         "state": config.state * state_loss(model, rollout, batch),
         **kl_losses(rollout, batch.valid, config),
         **value_and_termination_losses(model, rollout, batch, config),
@@ -163,6 +165,21 @@ def _motion_loss_at(output: Tensor, centre: Tensor, seen: Tensor, batch: Batch, 
     if k == 0:
         judged[:, 0] = False  # no previous image in the window
     return place + 0.1 * masked_mean(presence, judged)
+
+
+def passing_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
+    """Where and when something thrown will pass the plane before the robot, and if anything will.
+
+    Unlike a prediction some ticks ahead this stays the same target over a whole throw, seen
+    or unseen, and it is what a decision needs.
+    """
+    output = model.decode_passing(rollout.carry.h, rollout.carry.z).float()
+    place, on, known = batch.passing[..., :3], batch.passing[..., 3], batch.passing[..., 4] > 0
+    known = known & batch.valid
+    unit = place.new_tensor(PASSING_UNIT)
+    error = F.huber_loss(output[..., :3], place / unit, reduction="none", delta=0.5).sum(-1)
+    presence = F.binary_cross_entropy_with_logits(output[..., 3], on, reduction="none")
+    return masked_mean(error, known & (on > 0)) + masked_mean(presence, known)
 
 
 def state_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:

@@ -21,11 +21,18 @@ class SplitLinear(nn.Module):
 
     def __init__(self, inputs: Sequence[int], outputs: int, bias: bool = False) -> None:
         super().__init__()
+        self.inputs = sum(inputs)
         self.parts = nn.ModuleList(nn.Linear(n, outputs, bias=False) for n in inputs)
         self.bias = nn.Parameter(torch.zeros(outputs)) if bias else None
-        bound = sum(inputs) ** -0.5  # of one Linear on all inputs
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Start like one Linear on all inputs."""
+        bound = self.inputs**-0.5
         for part in self.parts:
             nn.init.uniform_(part.weight, -bound, bound)  # type: ignore[arg-type]
+        if self.bias is not None:
+            nn.init.zeros_(self.bias)
 
     def forward(self, *inputs: Tensor) -> Tensor:
         """One tensor (..., n_i) per part -> (..., outputs)."""
@@ -50,10 +57,54 @@ class SplitMlp(nn.Module):
             *layers, nn.LayerNorm(units), nn.SiLU(), nn.Linear(units, outputs)
         )
 
+    def restart(self) -> None:
+        """Forget everything and answer zero."""
+        for module in self.modules():
+            if isinstance(module, nn.Linear | nn.LayerNorm | SplitLinear):
+                module.reset_parameters()
+        self.start_at_zero()
+
+    def start_at_zero(self) -> None:
+        """Make the last layer zero."""
+        last = self.rest[-1]
+        assert isinstance(last, nn.Linear)
+        nn.init.zeros_(last.weight)
+        nn.init.zeros_(last.bias)
+
     def forward(self, *inputs: Tensor) -> Tensor:
         """One tensor (..., n_i) per input -> (..., outputs)."""
         outputs: Tensor = self.rest(self.first(*inputs))
         return outputs
+
+
+class ValueHead(nn.Module):
+    """(h, z) reduced to ``width`` numbers, then an MLP on those and the action.
+
+    A regression that sees all of (h, z) learns a few thousand episodes by heart, and what it
+    has learned by heart it takes for an effect of the action.
+    """
+
+    def __init__(self, state: Sequence[int], width: int, units: int) -> None:
+        super().__init__()
+        self.reduce = SplitLinear(state, width) if width else None
+        inputs = (width,) if width else state
+        self.mlp = SplitMlp((*inputs, spec.ACTION_DIM), units, 1, hidden_layers=2)
+
+    def restart(self) -> None:
+        """Forget everything and answer zero."""
+        if self.reduce is not None:
+            self.reduce.reset_parameters()
+        self.mlp.restart()
+
+    def start_at_zero(self) -> None:
+        """Make the last layer zero."""
+        self.mlp.start_at_zero()
+
+    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
+        """(..., hidden), (..., latent), (..., 7) -> (..., 1)."""
+        state = (h, z) if self.reduce is None else (self.reduce(h, z),)
+        q: Tensor = self.mlp(*state, action)
+        return q
 
 
 class GruCell(nn.Module):

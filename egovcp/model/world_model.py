@@ -31,7 +31,11 @@ from egovcp.model.nets import (
     GruCell,
     SplitLinear,
     SplitMlp,
+    ValueHead,
 )
+
+#: The head's units of y, z (m) and of the time left (s): about their spread.
+PASSING_UNIT = (0.25, 0.25, 0.25)
 
 
 class Carry(NamedTuple):
@@ -82,8 +86,14 @@ class WorldModel(nn.Module):
         self.decode_depth = DepthDecoder(sum(state), c.channels[-1])
         self.decode_state = SplitMlp(state, c.units, spec.STATE_DIM)
         self.decode_motion = SplitMlp(state, c.units, 4 * len(c.motion_ahead))
+        self.decode_passing = SplitMlp(state, c.units, 4)
         self.termination_head = SplitMlp(state, c.units, 1)
-        self.value_head = SplitMlp((*state, spec.ACTION_DIM), c.units, 1, hidden_layers=2)
+        self.value_head = ValueHead(state, c.value_state, c.units)
+        self.passing_value_head = (
+            SplitMlp((4, spec.ACTION_DIM), c.units // 2, 1, hidden_layers=2)
+            if c.loss.passing
+            else None
+        )
         self._start_at_zero()
         self.register_buffer("state_mean", torch.zeros(spec.STATE_DIM))
         self.register_buffer("state_std", torch.ones(spec.STATE_DIM))
@@ -93,11 +103,9 @@ class WorldModel(nn.Module):
 
     def _start_at_zero(self) -> None:
         """Value and termination start as constants, so that early plans are not random."""
-        for head in (self.value_head, self.termination_head):
-            last = head.rest[-1]
-            assert isinstance(last, nn.Linear)
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+        for head in (self.value_head, self.passing_value_head, self.termination_head):
+            if head is not None:
+                head.start_at_zero()
 
     # --- observation -----------------------------------------------------------------
     def embed(self, depth: Tensor, state: Tensor) -> Tensor:
@@ -179,9 +187,29 @@ class WorldModel(nn.Module):
         return self.standardised_value(carry, action) * self.return_std + self.return_mean
 
     def standardised_value(self, carry: Carry, action: Tensor) -> Tensor:
-        """Q in units of the return's deviation from its mean, (...,)."""
+        """Q in units of the return's deviation from its mean, (...,).
+
+        The sum of what an action is worth in view of what is on its way, and of what the rest
+        of the state adds. The first part sees neither hands nor their targets: those are so
+        close to the action, a step of the same random walk, that a regression on both cannot
+        tell which of them earned the reward, and then ranks actions badly however well it
+        predicts the return (`docs/log.md`).
+        """
         q: Tensor = self.value_head(carry.h, carry.z, action)
+        if self.passing_value_head is not None:
+            q = q + self.passing_value_head(self.passing(carry), action)
         return q.squeeze(-1).float()
+
+    def passing(self, carry: Carry) -> Tensor:
+        """Is something on its way, and if so where and when will it pass, (..., 4).
+
+        The probability p, and p times y, z and time left in `PASSING_UNIT`: a smooth summary
+        that is zero where nothing comes.
+        """
+        out: Tensor = self.decode_passing(carry.h, carry.z)
+        out = out.detach()  # what is on its way is learned from labels, not from returns
+        coming = torch.sigmoid(out[..., 3:])
+        return torch.cat([coming, coming * out[..., :3]], -1)
 
     def termination_logit(self, carry: Carry) -> Tensor:
         """Log-odds that the episode has failed at this state, (...,); equation 4."""

@@ -45,7 +45,7 @@ class BallConfig:
     """Mass of the ball, kg."""
     distance_range: Range = (2.5, 3.5)
     """Horizontal distance of the release point from the pelvis, m."""
-    bearing_range: Range = (-0.35, 0.35)
+    bearing_range: Range = (-0.30, 0.30)
     """Direction of the release point seen from the pelvis, rad, 0 is straight ahead."""
     release_height_range: Range = (0.7, 1.4)
     """Height of the release point above ground, m."""
@@ -53,9 +53,9 @@ class BallConfig:
     """Time from release to the aim point, s."""
     aim_forward: float = 0.10
     """Aim point in front of the pelvis, m, heading frame."""
-    aim_lateral_range: Range = (-0.36, 0.36)
+    aim_lateral_range: Range = (-0.40, 0.40)
     """Aim point left of the pelvis, m, heading frame."""
-    aim_height_range: Range = (0.04, 0.50)
+    aim_height_range: Range = (0.10, 0.50)
     """Aim point above the pelvis, m."""
     grace: float = 0.3
     """Contacts within this time after a block do not count, s."""

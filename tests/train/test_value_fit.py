@@ -17,7 +17,7 @@ from egovcp.data import (
 from egovcp.model import Batch, Carry, WorldModel
 from egovcp.testing import CountingModel, toy_model
 from egovcp_train.batches import set_normalisation, to_tensors
-from egovcp_train.value_fit import Rows, ValueFitConfig, collect_rows, fit_value
+from egovcp_train.value_fit import Rows, ValueFitConfig, _fit_heads, collect_rows, fit_value
 
 COUNT, IMAGINED = CountingModel.COUNT, CountingModel.IMAGINED
 
@@ -97,7 +97,30 @@ def test_the_fit_improves_q_and_touches_nothing_else(store: EpisodeStore) -> Non
     assert _error(model, rows) < 0.5 * start
     changed = {k for k, v in model.state_dict().items() if not torch.equal(v, before[k])}
     assert changed
-    assert all(name.startswith("value_head.") for name in changed)
+    assert {name.split(".")[0] for name in changed} == {"value_head", "passing_value_head"}
+
+
+def test_what_an_action_earns_is_not_credited_to_the_state_that_goes_with_it() -> None:
+    """Return = -(a - p)^2 with p on its way, and a state that holds a itself: Q must use a."""
+    model = toy_model()
+    rng = torch.Generator().manual_seed(0)
+    count, config = 4096, model.config
+    h = torch.randn(count, config.hidden, generator=rng)
+    z = torch.randn(count, config.latent, generator=rng)
+    action = torch.rand((count, 7), generator=rng) * 2 - 1
+    h[:, 0] = action[:, 0]
+    with torch.no_grad():
+        place = model.passing(Carry(h, z))[:, 1]
+    target = -((action[:, 0] - place) ** 2)
+    rows = Rows(h, z, action, (target - target.mean()) / target.std())
+    _fit_heads(model, rows, ValueFitConfig(steps=300, rows=512, lr=3e-3), rng)
+    with torch.no_grad():
+        good, bad = action.clone(), action.clone()
+        good[:, 0], bad[:, 0] = place, torch.where(place > 0, -1.0, 1.0)
+        better = model.standardised_value(Carry(h, z), good) > model.standardised_value(
+            Carry(h, z), bad
+        )
+    assert better.float().mean() > 0.95
 
 
 def test_a_seed_repeats_the_fit_and_no_steps_leave_the_model_alone(store: EpisodeStore) -> None:

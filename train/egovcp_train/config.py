@@ -8,6 +8,7 @@ from typing import Any, Literal
 from egovcp.data import DatasetConfig, ReturnConfig
 from egovcp.model import WorldModelConfig
 from egovcp.plan import PlannerConfig
+from egovcp_train.passing import PassingConfig
 from egovcp_train.value_fit import ValueFitConfig
 
 
@@ -62,6 +63,8 @@ class TrainConfig:
     """Planner settings stored in the artefact."""
     returns: ReturnConfig = field(default_factory=ReturnConfig)
     """Monte Carlo target of Q."""
+    passing: PassingConfig = field(default_factory=PassingConfig)
+    """Labels of what is on its way."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     """Batches."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)

@@ -10,6 +10,7 @@ from torch import Tensor
 from egovcp.model import Batch, Carry, WorldModel
 from egovcp.model.gaussian import kl_divergence
 from egovcp.model.losses import filter_sequence, moving_pixels
+from egovcp.model.world_model import PASSING_UNIT
 
 OPEN_LOOP_HORIZONS = (1, 4, 8)
 CONTEXT = 4  # frames filtered before an open-loop prediction starts
@@ -24,12 +25,15 @@ def evaluate(model: WorldModel, batches: Iterable[Batch]) -> dict[str, float]:
     value/slope      regression of the return on Q: 1 is calibrated
     depth/moving_hK  RMS error, metres, on moving pixels, K ticks ahead without observation
     depth/repeat_hK  the same for repeating the last image
+    passing/r2_X     variance of where (y, z) and when (time) something will pass that is foreseen
+    passing/seen     share of the rows in which it is right whether anything is on its way
     latent/active    dimensions of z that carry information
     """
     model.eval()
     totals: dict[str, list[float]] = {}
     values: list[Tensor] = []
     returns: list[Tensor] = []
+    passing: list[tuple[Tensor, Tensor]] = []
     for batch in batches:
         rollout = filter_sequence(model, batch, generator=_fixed(batch))
         kl = kl_divergence(rollout.posterior, rollout.prior)[batch.valid].mean(0)
@@ -38,10 +42,30 @@ def evaluate(model: WorldModel, batches: Iterable[Batch]) -> dict[str, float]:
         usable = batch.valid & batch.mc_valid
         values.append(model.value(rollout.carry, batch.action)[usable])
         returns.append(batch.mc_return[usable])
+        passing.append((model.decode_passing(rollout.carry.h, rollout.carry.z), batch.passing))
         for name, error in _open_loop(model, batch, rollout.carry, rollout.near).items():
             totals.setdefault(name, []).append(error)
     metrics = {name: sum(v) / len(v) for name, v in totals.items()}
-    return {**metrics, **_calibration(torch.cat(values), torch.cat(returns))}
+    foreseen, labels = (
+        torch.cat([x.flatten(0, 1) for x in xs]) for xs in zip(*passing, strict=True)
+    )
+    return {
+        **metrics,
+        **_passing(foreseen, labels),
+        **_calibration(torch.cat(values), torch.cat(returns)),
+    }
+
+
+def _passing(output: Tensor, label: Tensor) -> dict[str, float]:
+    known, on = label[:, 4] > 0, label[:, 3] > 0
+    if not on.any():
+        return {}
+    right = ((output[:, 3] > 0) == on)[known].float().mean()
+    error = output[on, :3] - label[on, :3] / label.new_tensor(PASSING_UNIT)
+    spread = (label[on, :3] / label.new_tensor(PASSING_UNIT)).var(0, correction=0)
+    r2 = 1 - error.square().mean(0) / spread.clamp_min(1e-12)
+    names = ("passing/r2_y", "passing/r2_z", "passing/r2_time")
+    return {"passing/seen": float(right), **dict(zip(names, r2.tolist(), strict=True))}
 
 
 def _fixed(batch: Batch) -> torch.Generator:

@@ -32,6 +32,7 @@ from egovcp_train.checkpoint import (
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
 from egovcp_train.evaluation import evaluate
 from egovcp_train.loop import Budget, Learner
+from egovcp_train.passing import label
 from egovcp_train.records import Recorder
 from egovcp_train.value_fit import fit_value
 
@@ -68,8 +69,12 @@ def train(config: TrainConfig) -> None:
     torch.manual_seed(config.seed)
     model = WorldModel(config.policy)
     set_normalisation(model, learning)
+    sampling = _stream_config(config, config.seed)
+    sampling.check()
+    if config.policy.loss.passing:
+        learning, heldout = label(learning, config.passing), label(heldout, config.passing)
     learner = Learner(model.to(device), config.optimizer, config.seed)
-    stream = SequenceStream(learning, _stream_config(config, config.seed))
+    stream = SequenceStream(learning, sampling)
     if config.resume:
         _restore(output, learner, stream)
     output.mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,130 @@
+"""Labels of what is on its way, from pictures alone."""
+
+import numpy as np
+import pytest
+
+from egovcp import spec
+from egovcp.data.mirror import mirror_depth, mirror_state
+from egovcp.robot.kinematics import LINK_NAMES, link_transforms
+from egovcp_train.passing import PassingConfig, fit_path, label_episode, to_ground
+
+CONFIG = PassingConfig(camera_pitch=0.0)
+TICKS, THROW = 40, 8
+GRAVITY = np.array([0.0, 0.0, -9.81])
+
+
+def standing(ticks: int = TICKS) -> np.ndarray:
+    """A robot with all joints at zero that does not move."""
+    state = np.zeros((ticks, spec.STATE_DIM))
+    state[:, spec.STATE_SLICES["projected_gravity"]] = (0.0, 0.0, -1.0)
+    return state
+
+
+def camera_origin(state: np.ndarray) -> np.ndarray:
+    """Of the standing robot, in the frame of the labels."""
+    return to_ground(np.zeros((len(state), 3)), state, CONFIG)[0]
+
+
+def photograph(ball: np.ndarray, radius: float = 0.1) -> np.ndarray:
+    """(48, 64) mm: a disc where a ball at (3,) m in the camera frame is seen, 0 elsewhere."""
+    focal = spec.DEPTH_ROWS / 2 / np.tan(CONFIG.vertical_fov / 2)
+    rows, cols = np.mgrid[: spec.DEPTH_ROWS, : spec.DEPTH_COLS]
+    left = -(cols - (spec.DEPTH_COLS - 1) / 2) / focal * ball[0]
+    up = -(rows - (spec.DEPTH_ROWS - 1) / 2) / focal * ball[0]
+    inside = np.hypot(left - ball[1], up - ball[2]) < radius
+    return np.where(inside, round(1000 * (ball[0] - radius)), 0).astype(np.uint16)
+
+
+def throw(where: tuple[float, float], flight: float = 0.7) -> np.ndarray:
+    """(T, 48, 64) mm: from 3 m ahead through (plane, *where) in ``flight`` seconds."""
+    origin = camera_origin(standing())
+    start = np.array([3.0, 0.2, 0.3])
+    target = np.array([CONFIG.plane, *where])
+    velocity = (target - start) / flight - 0.5 * GRAVITY * flight
+    depth = np.zeros((TICKS, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16)
+    for t in range(THROW, TICKS):
+        s = (t - THROW) * spec.PLANNER_DT
+        ball = start + velocity * s + 0.5 * GRAVITY * s * s - origin
+        if ball[0] > spec.DEPTH_MIN_M + 0.1:
+            depth[t] = photograph(ball)
+    return depth
+
+
+@pytest.mark.parametrize("where", [(0.0, 0.3), (0.35, 0.1), (-0.3, 0.45)])
+def test_a_throw_is_labelled_with_where_and_when_it_will_pass(where: tuple[float, float]) -> None:
+    label = label_episode(throw(where), standing(), CONFIG)
+    on = label[:, 3] > 0
+    first = int(np.flatnonzero(on)[0])
+    assert THROW <= first <= THROW + 3
+    assert on[first : THROW + 17].all()
+    np.testing.assert_allclose(label[on, :2], np.tile(where, (on.sum(), 1)), atol=0.06)
+    passes = label[on, 2] + np.flatnonzero(on) * spec.PLANNER_DT
+    np.testing.assert_allclose(passes, THROW * spec.PLANNER_DT + 0.7, atol=0.04)
+    assert label[:, 4].all()
+    assert not on[:THROW].any()
+    assert not on[THROW + 19 :].any()
+
+
+def test_a_mirrored_throw_has_the_mirrored_label() -> None:
+    depth, state = throw((0.3, 0.2)), standing()
+    label = label_episode(depth, state, CONFIG)
+    mirrored = label_episode(mirror_depth(depth).copy(), mirror_state(state), CONFIG)
+    expected = label.copy()
+    expected[:, 0] *= -1
+    np.testing.assert_allclose(mirrored, expected, atol=1e-3)
+
+
+def test_an_empty_scene_is_known_to_be_empty() -> None:
+    empty = np.zeros((TICKS, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16)
+    label = label_episode(empty, standing(), CONFIG)
+    assert label[:, 4].all()
+    assert not label[:, :4].any()
+
+
+def test_sightings_without_a_path_are_not_known() -> None:
+    """Things that flash up here and there: no label pretends to know what they do."""
+    rng = np.random.default_rng(0)
+    depth = np.zeros((TICKS, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16)
+    for t in range(10, 20, 2):
+        depth[t] = photograph(np.array([*rng.uniform(1.5, 3.5, 1), *rng.uniform(-0.6, 0.6, 2)]))
+    label = label_episode(depth, standing(), CONFIG)
+    assert not label[:, 3].any()
+    assert not label[10:19, 4].any()
+    assert label[:10, 4].all()
+
+
+def test_the_robot_s_own_turning_does_not_bend_the_path() -> None:
+    state = standing()
+    state[:, spec.STATE_SLICES["angular_velocity"].start + 2] = 1.0  # rad/s about the vertical
+    point = np.tile([2.0, 0.0, 0.0], (TICKS, 1))
+    ground = to_ground(point, state, CONFIG)
+    angle = np.arctan2(ground[:, 1], ground[:, 0])
+    np.testing.assert_allclose(angle[2:] - angle[1], np.arange(TICKS - 2) * 0.04 + 0.04, atol=1e-6)
+
+
+def test_the_robot_s_own_sinking_does_not_bend_the_path() -> None:
+    """A crouch lowers the camera: measured by the legs, it does not lower what is seen."""
+    state = standing(2)
+    for joint, angle in (("hip_pitch", -0.6), ("knee", 1.2), ("ankle_pitch", -0.6)):
+        for side in ("left", "right"):
+            index = spec.JOINT_NAMES.index(f"{side}_{joint}_joint")
+            state[:, spec.STATE_SLICES["joint_position"].start + index] = angle
+    position, _ = link_transforms(state[:, spec.STATE_SLICES["joint_position"]])
+    upright, _ = link_transforms(standing(2)[:, spec.STATE_SLICES["joint_position"]])
+    foot = LINK_NAMES.index("left_ankle_roll_link")
+    sunk = position[0, foot, 2] - upright[0, foot, 2]
+    assert sunk > 0.05
+    point = np.array([[2.0, 0.0, 0.0]] * 2)
+    lower = to_ground(point, state, CONFIG)[0, 2]
+    assert to_ground(point, standing(2), CONFIG)[0, 2] - lower == pytest.approx(sunk, abs=1e-6)
+
+
+def test_flickers_are_outvoted() -> None:
+    t = np.arange(12) * spec.PLANNER_DT
+    path = np.array([3.0, 0.0, 0.4]) + np.outer(t, [-4.0, 0.3, 2.5])
+    path += 0.5 * GRAVITY * (t * t)[:, None]
+    path[[2, 5, 9]] += np.array([1.5, -1.0, 0.5])
+    found = fit_path(t, path, CONFIG)
+    assert found is not None
+    np.testing.assert_allclose(found.velocity, [-4.0, 0.3, 2.5], atol=1e-6)
+    assert set(found.seen) == set(np.delete(t, [2, 5, 9]))
