@@ -32,7 +32,7 @@ Array = NDArray[np.float64]
 _GRAVITY: Final = np.array([0.0, 0.0, -9.81])  # m/s^2
 _TORSO: Final = LINK_NAMES.index("torso_link")
 _FEET: Final = [LINK_NAMES.index(f"{side}_ankle_roll_link") for side in ("left", "right")]
-_STANDING: Final = 0.70
+_STANDING: Final = 0.70  # m, about the height of the pelvis above the ankles in the neutral pose
 
 
 @dataclass(frozen=True)
