@@ -6,6 +6,11 @@ import pytest
 from egovcp import spec
 from egovcp.data.mirror import mirror_depth, mirror_state
 from egovcp.robot.kinematics import LINK_NAMES, link_transforms
+from egovcp.sim.config import EnvConfig, EpisodeConfig
+from egovcp.sim.env import VectorEnv
+from egovcp.sim.policies import RandomWalk
+from egovcp.sim.scenario import Scenario
+from egovcp.sim.truth import Truth
 from egovcp_train.passing import PassingConfig, fit_path, label_episode, to_ground
 
 CONFIG = PassingConfig(camera_pitch=0.0)
@@ -128,3 +133,41 @@ def test_flickers_are_outvoted() -> None:
     assert found is not None
     np.testing.assert_allclose(found.velocity, [-4.0, 0.3, 2.5], atol=1e-6)
     assert set(found.seen) == set(np.delete(t, [2, 5, 9]))
+
+
+def test_labels_of_simulated_throws_agree_with_the_truth() -> None:
+    """Sway, crouches, noise, holes and delays included; the truth only judges."""
+    count = 32
+    throws = EpisodeConfig(ticks=34, event_ticks=(2, 4), empty_probability=0.0)
+    env = VectorEnv(EnvConfig(ball_episode=throws), count)
+    scenarios = [Scenario("ball", 5, i) for i in range(count)]
+    observation, walk = env.reset(scenarios), RandomWalk()
+    walk.reset(env, scenarios)
+    depth, state, truth = [], [], []
+    for _ in range(throws.ticks):
+        depth.append(observation.depth)
+        state.append(observation.state)
+        truth.append(env.snapshot())
+        observation = env.step(walk.act(env)).observation
+    errors = []
+    for row in range(count):
+        label = label_episode(
+            np.array([d[row] for d in depth]), np.array([s[row] for s in state]), PassingConfig()
+        )
+        on = np.flatnonzero(label[:, 3])
+        if len(on):
+            first = next(t for t in truth if t.object_active[row])
+            errors.append(label[on[0], :2] - _true_crossing(first, row))
+    assert len(errors) > 0.9 * count
+    centred = np.abs(np.array(errors) - np.median(errors, 0))
+    across, up = np.median(centred, 0)
+    assert across < 0.06
+    assert up < 0.10
+    assert (centred.max(1) < 0.25).mean() > 0.75
+
+
+def _true_crossing(truth: Truth, row: int) -> np.ndarray:
+    """(y, z above the neutral pelvis) of the ballistic path at the plane."""
+    flight = (CONFIG.plane - truth.object_b[row, 0]) / truth.object_velocity_b[row, 0]
+    at = truth.object_b[row] + truth.object_velocity_b[row] * flight + 0.5 * GRAVITY * flight**2
+    return np.array([at[1], at[2] + truth.pelvis_w[row, 2] - spec.ACTION_BOX.neutral[-1]])
