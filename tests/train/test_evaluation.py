@@ -86,3 +86,36 @@ def test_windows_too_short_to_look_ahead_are_no_error() -> None:
     metrics = evaluate(toy_model(), [random_batch(2, 5)])
     assert {"value/r2", "latent/kl", "latent/active"} <= metrics.keys()
     assert 0 <= metrics["latent/active"] <= PRESETS["debug"].latent
+
+
+class _Foreseeing(WorldModel):
+    """Foresees the passing that the carry's first coordinates name."""
+
+    answer: Tensor
+
+    def __init__(self) -> None:
+        super().__init__(PRESETS["debug"])
+        self.decode_passing.forward = lambda h, z: self.answer.expand(*h.shape[:-1], 4)  # type: ignore
+
+
+def _throws(y: tuple[float, ...]) -> list[Batch]:
+    batch = random_batch(len(y), 16)
+    label = torch.zeros_like(batch.passing)
+    label[..., 0] = torch.tensor(y)[:, None]
+    label[..., 1] = torch.linspace(0.1, 0.4, 16)
+    label[..., 2] = torch.linspace(0.6, 0.0, 16)
+    label[..., 3:] = 1.0
+    return [batch._replace(passing=label)]
+
+
+def test_always_the_mean_foresees_nothing_and_one_throw_has_no_share() -> None:
+    model = _Foreseeing()
+    model.answer = torch.tensor([0.0, 1.0, 1.2, 5.0])
+    metrics = evaluate(model, _throws((-0.3, 0.3)))
+    assert metrics["passing/seen"] == pytest.approx(1.0)
+    for name in ("y", "z", "time"):
+        assert metrics[f"passing/r2_{name}"] == pytest.approx(0.0, abs=1e-3)
+    model.answer = torch.tensor([0.0, 1.0, 1.2, -5.0])
+    alone = evaluate(model, _throws((0.3,)))
+    assert alone["passing/seen"] == pytest.approx(0.0)
+    assert "passing/r2_y" not in alone

@@ -14,6 +14,7 @@ from egovcp.model.world_model import PASSING_UNIT
 
 OPEN_LOOP_HORIZONS = (1, 4, 8)
 CONTEXT = 4  # frames filtered before an open-loop prediction starts
+MIN_SPREAD = 0.01  # squared units; one throw alone has no spread of which a share could be foreseen
 ACTIVE_NATS = 0.01  # a latent dimension with less KL than this carries nothing
 
 
@@ -63,7 +64,9 @@ def _passing(output: Tensor, label: Tensor) -> dict[str, float]:
     right = ((output[:, 3] > 0) == on)[known].float().mean()
     error = output[on, :3] - label[on, :3] / label.new_tensor(PASSING_UNIT)
     spread = (label[on, :3] / label.new_tensor(PASSING_UNIT)).var(0, correction=0)
-    r2 = 1 - error.square().mean(0) / spread.clamp_min(1e-12)
+    if spread.min() < MIN_SPREAD:
+        return {"passing/seen": float(right)}
+    r2 = 1 - error.square().mean(0) / spread
     names = ("passing/r2_y", "passing/r2_z", "passing/r2_time")
     return {"passing/seen": float(right), **dict(zip(names, r2.tolist(), strict=True))}
 
