@@ -190,10 +190,8 @@ class WorldModel(nn.Module):
         """Q in units of the return's deviation from its mean, (...,).
 
         The sum of what an action is worth in view of what is on its way, and of what the rest
-        of the state adds. The first part sees neither hands nor their targets: those are so
-        close to the action, a step of the same random walk, that a regression on both cannot
-        tell which of them earned the reward, and then ranks actions badly however well it
-        predicts the return (`docs/log.md`).
+        of the state adds. The first part sees little else than the action: a regression on
+        the whole state predicts the return better and ranks actions worse (`docs/log.md`).
         """
         q: Tensor = self.value_head(carry.h, carry.z, action)
         if self.passing_value_head is not None:

@@ -6,7 +6,7 @@ import pytest
 from egovcp import spec
 from egovcp.data.mirror import mirror_depth, mirror_state
 from egovcp.robot.kinematics import LINK_NAMES, link_transforms
-from egovcp.sim.config import EnvConfig, EpisodeConfig
+from egovcp.sim.config import CameraConfig, EnvConfig, EpisodeConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
@@ -133,6 +133,13 @@ def test_flickers_are_outvoted() -> None:
     assert found is not None
     np.testing.assert_allclose(found.velocity, [-4.0, 0.3, 2.5], atol=1e-6)
     assert set(found.seen) == set(np.delete(t, [2, 5, 9]))
+
+
+def test_the_labels_assume_the_simulator_s_camera() -> None:
+    camera, assumed = CameraConfig(), PassingConfig()
+    assert assumed.camera_position == camera.position
+    assert assumed.vertical_fov == camera.vertical_fov
+    assert assumed.camera_pitch == pytest.approx(np.mean(camera.pitch_range))
 
 
 def test_labels_of_simulated_throws_agree_with_the_truth() -> None:
