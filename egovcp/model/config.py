@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from egovcp import spec
+from egovcp.errors import UsageError
 
 
 @dataclass(frozen=True)
@@ -24,7 +25,7 @@ class LossConfig:
     """Weight of the place of what approaches, mean squared error in half images; 0: none."""
     passing: float = 3.0
     """Weight of where and when something thrown will pass, Huber loss in units of
-    `PASSING_UNIT`; 0: none, and Q is not told."""
+    `PASSING_UNIT`; 0: none."""
     state: float = 1.0
     """Weight of the proprioception reconstruction, mean over the 74 standardised values."""
     kl_prior: float = 1.0
@@ -59,6 +60,8 @@ class WorldModelConfig:
     """Ticks ahead at which the place of what approaches is predicted straight from the state."""
     value_state: int = 8
     """Numbers to which (h, z) is reduced for Q; 0: Q reads all of it."""
+    value_of_passing: bool = True
+    """Q is told what is on its way (`loss.passing` teaches it) by a head of its own."""
     min_std: float = 0.1
     """Floor of the latent standard deviation."""
     update_bias: float = -1.0
@@ -67,6 +70,13 @@ class WorldModelConfig:
     """Depth, in metres, at which nearness is 0."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Loss weights."""
+
+    def __post_init__(self) -> None:
+        if self.value_of_passing and self.loss.passing <= 0:
+            raise UsageError(
+                "value_of_passing needs loss.passing above 0: nothing else teaches Q what is on "
+                "its way; set --policy.value_of_passing=false, or a weight"
+            )
 
 
 #: The paper's plain sum: likelihoods summed over pixels and joints, unit variances, nothing added.
@@ -84,6 +94,6 @@ PAPER_LOSS = LossConfig(
 
 PRESETS = {
     "default": WorldModelConfig(),
-    "paper": WorldModelConfig(value_state=0, loss=PAPER_LOSS),
+    "paper": WorldModelConfig(value_state=0, value_of_passing=False, loss=PAPER_LOSS),
     "debug": WorldModelConfig(hidden=32, latent=8, units=32, channels=(4, 8, 8)),
 }

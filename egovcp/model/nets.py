@@ -59,7 +59,7 @@ class SplitMlp(nn.Module):
 
     def restart(self) -> None:
         """Forget everything and answer zero."""
-        for module in self.modules():
+        for module in (self.first, *self.rest):
             if isinstance(module, nn.Linear | nn.LayerNorm | SplitLinear):
                 module.reset_parameters()
         self.start_at_zero()

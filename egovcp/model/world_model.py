@@ -91,7 +91,7 @@ class WorldModel(nn.Module):
         self.value_head = ValueHead(state, c.value_state, c.units)
         self.passing_value_head = (
             SplitMlp((4, spec.ACTION_DIM), c.units // 2, 1, hidden_layers=2)
-            if c.loss.passing
+            if c.value_of_passing
             else None
         )
         self._start_at_zero()
