@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -18,18 +19,24 @@ def nearness(depth_mm: Tensor, max_m: float) -> Tensor:
     without touching the outline of a near object: left in, one per cent of random holes
     outweighs a distant ball a hundredfold in the reconstruction.
     """
-    near = (1.0 - depth_mm.to(torch.float32) * (1e-3 / max_m)).clamp_(0.0, 1.0)
-    near.masked_fill_(depth_mm == 0, 0.0)
-    return _extreme_3x3(_extreme_3x3(near, torch.maximum), torch.minimum)
+    # In whole millimetres, where what is nearest is the minimum: half the memory to go through.
+    far = math.ceil(1e3 * max_m)
+    dtype = torch.int16 if far <= torch.iinfo(torch.int16).max else torch.int32
+    depth = torch.where(depth_mm == 0, far, depth_mm.clamp(0, far)).to(dtype)
+    depth = _extreme_3x3(_extreme_3x3(depth, torch.minimum), torch.maximum)
+    return (1.0 - depth.to(torch.float32) * (1e-3 / max_m)).clamp_(0.0, 1.0)
 
 
-def _extreme_3x3(x: Tensor, extreme: Callable[[Tensor, Tensor], Tensor]) -> Tensor:
-    """(B, H, W) -> maximum or minimum over each pixel's 3 x 3 neighbourhood."""
+def _extreme_3x3(x: Tensor, extreme: Callable[..., Tensor]) -> Tensor:
+    """(B, H, W) -> maximum or minimum over each pixel's 3 x 3 neighbourhood; no gradient."""
     for dim in (1, 2):
         size = x.shape[dim]
-        inner = extreme(x.narrow(dim, 0, size - 1), x.narrow(dim, 1, size - 1))
-        first, last = x.narrow(dim, 0, 1), x.narrow(dim, size - 1, 1)
-        x = extreme(torch.cat([first, inner], dim), torch.cat([inner, last], dim))
+        pair = extreme(x.narrow(dim, 0, size - 1), x.narrow(dim, 1, size - 1))
+        x = torch.empty_like(x)
+        x.narrow(dim, 0, 1).copy_(pair.narrow(dim, 0, 1))
+        x.narrow(dim, size - 1, 1).copy_(pair.narrow(dim, size - 2, 1))
+        inner = x.narrow(dim, 1, size - 2)
+        extreme(pair.narrow(dim, 0, size - 2), pair.narrow(dim, 1, size - 2), out=inner)
     return x
 
 
@@ -71,14 +78,9 @@ def approaching(near: Tensor) -> tuple[Tensor, Tensor]:
     count = mask.sum((-2, -1))
     rows = torch.linspace(-1, 1, near.shape[-2], device=near.device)
     cols = torch.linspace(-1, 1, near.shape[-1], device=near.device)
-    sums = torch.stack(
-        [
-            (mask.sum(-2) * cols).sum(-1),
-            (mask.sum(-1) * rows).sum(-1),
-            (mask * near[:, 1:]).sum((-2, -1)),
-        ],
-        -1,
-    )
+    place = torch.stack([cols.expand(near.shape[-2:]), rows[:, None].expand(near.shape[-2:])], -1)
+    nearest = (mask * near[:, 1:]).sum((-2, -1))
+    sums = torch.cat([mask.flatten(-2) @ place.flatten(0, 1), nearest[..., None]], -1)
     centre = sums / count.clamp_min(1.0)[..., None]
     seen = count >= MIN_PIXELS
     return F.pad(centre, (0, 0, 1, 0)), F.pad(seen, (1, 0))  # nothing comes before the first

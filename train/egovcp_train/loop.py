@@ -23,7 +23,7 @@ class Learner:
         self.config = config
         self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
-            model.parameters(), lr=config.lr, weight_decay=config.weight_decay, eps=1e-8
+            model.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True
         )
         device = model.state_mean.device
         self.generator = torch.Generator(device=device).manual_seed(seed)
@@ -67,8 +67,9 @@ class Learner:
     @torch.no_grad()
     def _average(self) -> None:
         decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
-        for mean, value in zip(self.averaged.parameters(), self.model.parameters(), strict=True):
-            mean.lerp_(value, 1 - decay)
+        means: list[Tensor] = list(self.averaged.parameters())
+        values: list[Tensor] = list(self.model.parameters())
+        torch._foreach_lerp_(means, values, 1 - decay)
 
     def state_dict(self) -> dict[str, object]:
         return {
