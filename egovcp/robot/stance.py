@@ -34,8 +34,8 @@ from egovcp.spec import STATE_DIM, STATE_SLICES
 _SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the sole
 _FEET: Final = tuple(LINK_NAMES.index(f"{side}_ankle_roll_link") for side in ("left", "right"))
 _TARGET_SLACK: Final = 0.6  # rad that a target may pass a joint limit by, to make torque there
-_TARGET_LOW: Final = JOINT_LOWER - _TARGET_SLACK
-_TARGET_HIGH: Final = JOINT_UPPER + _TARGET_SLACK
+TARGET_LOW: Final = JOINT_LOWER - _TARGET_SLACK
+TARGET_HIGH: Final = JOINT_UPPER + _TARGET_SLACK
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class StanceController:
 
     def _start(self, state: Array) -> tuple[Balance, Reach]:
         q = state[:, STATE_SLICES["joint_position"]]
-        height = _pelvis_height(q, state[:, STATE_SLICES["projected_gravity"]])
+        height = pelvis_height(q, state[:, STATE_SLICES["projected_gravity"]])
         arm_memory = reach.start(q[:, ARMS])
         return balance.start(self._table.clamp(height), arm_memory, self._table), arm_memory
 
@@ -105,7 +105,7 @@ class StanceController:
         row = self._table.at(memory.height)
         body_target = balance.balance(memory, s, row, self._reach, self.config.balance)
         target = np.concatenate([body_target, arm_target], axis=1)
-        return np.asarray(np.minimum(np.maximum(target, _TARGET_LOW), _TARGET_HIGH))
+        return np.asarray(np.minimum(np.maximum(target, TARGET_LOW), TARGET_HIGH))
 
 
 def _replace_rows[M: (Balance, Reach)](memory: M, fresh: M, rows: NDArray[np.intp]) -> None:
@@ -113,7 +113,7 @@ def _replace_rows[M: (Balance, Reach)](memory: M, fresh: M, rows: NDArray[np.int
         getattr(memory, entry.name)[rows] = getattr(fresh, entry.name)
 
 
-def _pelvis_height(joint_position: Array, gravity: Array) -> Array:
+def pelvis_height(joint_position: Array, gravity: Array) -> Array:
     """(B,) pelvis above the lower foot's sole, m."""
     position, _ = link_transforms(joint_position)
     feet = rotate(heading_rotation(gravity)[:, None], position[:, _FEET])

@@ -95,7 +95,7 @@ class Scene:
 def build_scene(task: Literal["ball", "wall", "arch"] | str, feet: FootModel) -> Scene:
     """The scene of ``task``, compiled once per process."""
     spec = robot_spec(feet)
-    _strip_visuals(spec)
+    strip_visuals(spec)
     spec.worldbody.add_geom(
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0
     )
@@ -104,7 +104,7 @@ def build_scene(task: Literal["ball", "wall", "arch"] | str, feet: FootModel) ->
     return Scene(model, _index(model, task))
 
 
-def _strip_visuals(spec: mujoco.MjSpec) -> None:
+def strip_visuals(spec: mujoco.MjSpec) -> None:
     """Drop the meshes; masses and inertias are explicit in the model and stay."""
     for geom in list(spec.geoms):
         if geom.type == mujoco.mjtGeom.mjGEOM_MESH:

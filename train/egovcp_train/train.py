@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import copy
 import dataclasses
-import signal
 import sys
-import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import draccus
 import torch
-from draccus import cfgparsing
 from tqdm import tqdm
 
 from egovcp.artefact import save_artefact
@@ -32,12 +28,12 @@ from egovcp_train.checkpoint import (
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
 from egovcp_train.evaluation import evaluate
 from egovcp_train.loop import Budget, Learner
+from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options, stop_on_signal
 from egovcp_train.passing import label
 from egovcp_train.records import Recorder
 from egovcp_train.value_fit import fit_value
 
 PROG = "egovcp-train"
-CONFIG_FILE = "train_config.yaml"
 EVALUATION_BATCHES = 8
 
 
@@ -49,11 +45,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
     """What stands where no flag says otherwise: the options of the run that is resumed, or those
     that --preset stands for."""
-    given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
-    saved = Path(given.get("output_dir", "")) / CONFIG_FILE
-    if given.get("resume", "").lower() == "true" and saved.is_file():
-        options: dict[str, Any] = cfgparsing.load_config(saved.read_text("utf-8"), file=saved)
+    if options := resumed_options(argv):
         return options
+    given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
     name = given.get("preset", "")
     policy = {"policy": draccus.encode(PRESETS[name])} if name in PRESETS else {}
     return policy | TRAINING_PRESETS.get(name, {})
@@ -106,7 +100,7 @@ class Run:
         learner = self.learner
         budget = Budget(self.config.steps, self.config.max_minutes)
         start = learner.step
-        with _stop_on_signal() as stopped:
+        with stop_on_signal() as stopped:
             self._learn(budget, stopped)
             finished = budget.progress(learner.step) >= 1.0
             final = checkpoint_dir(self.output, learner.step)
@@ -188,22 +182,7 @@ def _prepare_output(config: TrainConfig) -> Path:
     """Refuse a bad destination before any work starts."""
     if min(config.steps, config.batch_size, config.log_freq, config.save_freq) < 1:
         raise UsageError("--steps, --batch_size, --log_freq and --save_freq must be at least 1")
-    output = Path(config.output_dir)
-    if config.resume:
-        load_training_state(output)
-        return output
-    if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise UsageError(
-            f"output folder {output} exists and is not empty; choose another, or continue the run "
-            "in it with --resume"
-        )
-    parent = next(p for p in [output, *output.absolute().parents] if p.exists())
-    try:
-        with tempfile.TemporaryFile(dir=parent):
-            pass
-    except OSError as error:
-        raise EnvironmentFailure(f"cannot write to {parent}: {error.strerror}") from error
-    return output
+    return prepare_output(config.output_dir, config.resume)
 
 
 def _restore(output: Path, learner: Learner, stream: SequenceStream) -> None:
@@ -264,21 +243,3 @@ def _provenance(reader: DatasetReader, config: TrainConfig) -> dict[str, Any]:
         "train_config": draccus.encode(config),
         "command": [PROG, *sys.argv[1:]],
     }
-
-
-@contextlib.contextmanager
-def _stop_on_signal() -> Iterator[list[int]]:
-    """A list that fills when SIGINT or SIGTERM asks for the end; a second one is obeyed at once."""
-    received: list[int] = []
-
-    def note(number: int, frame: object) -> None:
-        if received:
-            raise KeyboardInterrupt
-        received.append(number)
-
-    previous = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

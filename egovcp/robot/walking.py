@@ -1,0 +1,222 @@
+"""Stands, squats, reaches and walks: the stance law, a gait and a trained residual.
+
+The targets of legs and waist are
+
+    q* = q_ref(h) + (1 - g) u_lqr + g q_gait(phi, v) + s a
+
+with the reference pose of the height h, the stance law's correction u_lqr, the gait's leg
+motion (`gait`), how much of the gait is in, g, and the action a of a policy trained by PPO
+(``egovcp-train-lowlevel``) times a scale s. The arms follow inverse kinematics as in standing.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field, fields
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.robot import arms, balance, gait, reach
+from egovcp.robot.balance import Balance, BalanceConfig
+from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS, WAIST
+from egovcp.robot.gait import Gait, GaitConfig
+from egovcp.robot.kinematics import Array, heading_rotation, joint_rotations, rotate
+from egovcp.robot.reach import TORSO_ORIGIN, Reach, ReachConfig
+from egovcp.robot.stance import TARGET_HIGH, TARGET_LOW, pelvis_height
+from egovcp.robot.stance_table import NU, stance_table
+from egovcp.spec import NUM_JOINTS, STATE_DIM, STATE_SLICES
+
+ACTIONS: Final = NU  # legs and waist
+OBSERVATION_DIM: Final = STATE_DIM + 3 + ACTIONS  # state; g sin phi, g cos phi, g; last action
+
+
+@dataclass(frozen=True)
+class WalkConfig:
+    """All that the policy was trained with."""
+
+    balance: BalanceConfig = field(default_factory=BalanceConfig)
+    reach: ReachConfig = field(default_factory=ReachConfig)
+    gait: GaitConfig = field(default_factory=GaitConfig)
+    action_scale: float = 0.3
+    """rad per unit of the policy's action."""
+    action_limit: float = 4.0
+    """Bound of the policy's action."""
+
+
+@dataclass
+class _Memory:
+    balance: Balance
+    reach: Reach
+    gait: Gait
+    action: Array  # (B, 15) last action
+
+
+class Walk:
+    """What surrounds the policy, the same in training and on the robot; batched over B robots.
+
+    Each tick: ``observe`` gives what the policy sees, ``targets`` turns its answer into joint
+    targets.
+    """
+
+    def __init__(self, config: WalkConfig | None = None) -> None:
+        self.config = config or WalkConfig()
+        self._table = stance_table()
+        self._memory = self._start(np.zeros((0, STATE_DIM)))
+        self._nominal: Array = np.zeros((0, NUM_JOINTS))
+
+    @property
+    def height(self) -> Array:
+        """(B,) m, the pelvis height that should be reached by now."""
+        return self._memory.balance.height
+
+    @property
+    def pitch(self) -> Array:
+        """(B,) rad, the natural pitch at that height."""
+        return self._memory.balance.pitch
+
+    @property
+    def gait(self) -> Gait:
+        """The clock."""
+        return self._memory.gait
+
+    def reset(self, state: NDArray[np.floating], rows: NDArray[np.intp] | None = None) -> None:
+        """Forget ``rows`` (None: all) and start standing in the measured posture."""
+        s = np.asarray(state, dtype=np.float64)
+        if rows is None or len(self._memory.action) != len(s):
+            self._memory = self._start(s)
+        else:
+            _replace_rows(self._memory, self._start(s[rows]), rows)
+
+    def _start(self, state: Array) -> _Memory:
+        q = state[:, STATE_SLICES["joint_position"]]
+        height = pelvis_height(q, state[:, STATE_SLICES["projected_gravity"]])
+        hands = reach.start(q[:, ARMS])
+        standing = balance.start(self._table.clamp(height), hands, self._table)
+        return _Memory(standing, hands, gait.start(len(state)), np.zeros((len(state), ACTIONS)))
+
+    def observe(self, state: NDArray[np.floating]) -> NDArray[np.float32]:
+        """(B, 74) measurements -> (B, 92) what the policy sees; the memory advances."""
+        s = np.asarray(state, dtype=np.float64)
+        m = self._memory
+        command = s[:, STATE_SLICES["command_height"]][:, 0]
+        balance.follow_height(m.balance, self._table.clamp(command), self.config.balance)
+        self._restart_standing(gait.advance(m.gait, s, self._tilt(s), self.config.gait))
+        amount = m.gait.amount[:, None]
+        arm_targets = self._reach(s, amount[:, 0] > 0)
+        row = self._table.at(m.balance.height)
+        body = balance.balance(m.balance, s, row, m.reach, self.config.balance)
+        body -= amount * m.balance.correction
+        velocity = s[:, STATE_SLICES["command_velocity"]]
+        body += gait.leg_motion(m.gait, row.joints, velocity, self.config.gait)
+        self._nominal = np.asarray(np.concatenate([body, arm_targets], axis=1))
+        clock = np.stack([np.sin(m.gait.phase), np.cos(m.gait.phase), np.ones(len(s))], axis=1)
+        return np.concatenate([s, amount * clock, m.action], axis=1, dtype=np.float32)
+
+    def targets(self, action: NDArray[np.floating]) -> Array:
+        """The policy's answer (B, 15) -> joint position targets (B, 29), rad."""
+        limit = self.config.action_limit
+        self._memory.action = np.clip(np.asarray(action, dtype=np.float64), -limit, limit)
+        out = self._nominal.copy()
+        out[:, :ACTIONS] += self.config.action_scale * self._memory.action
+        return np.asarray(np.clip(out, TARGET_LOW, TARGET_HIGH))
+
+    def _tilt(self, state: Array) -> Array:
+        """(B, 2) roll and pitch of the pelvis off the reference, rad, to first order."""
+        gravity = state[:, STATE_SLICES["projected_gravity"]]
+        pitch = self._memory.balance.pitch
+        forward = gravity[:, 0] * np.cos(pitch) + gravity[:, 2] * np.sin(pitch)
+        return np.stack([-gravity[:, 1], forward], axis=1)
+
+    def _reach(self, state: Array, walking: NDArray[np.bool_]) -> Array:
+        """(B, 14) arm targets; the torso's attitude as estimated, or as measured in walking."""
+        m = self._memory
+        waist = np.where(
+            walking[:, None],
+            state[:, STATE_SLICES["joint_position"]][:, WAIST],
+            m.balance.prediction[:, 6:9],
+        )
+        gravity = np.where(
+            walking[:, None],
+            state[:, STATE_SLICES["projected_gravity"]],
+            balance.gravity_estimate(m.balance),
+        )
+        heading = heading_rotation(gravity)
+        turns = joint_rotations(waist, WAIST)
+        torso = heading @ turns[:, 0] @ turns[:, 1] @ turns[:, 2]
+        hands = state[:, STATE_SLICES["command_hands"]].reshape(-1, 2, 3)
+        relative = hands - rotate(heading, TORSO_ORIGIN)[:, None]
+        return reach.follow(m.reach, relative, torso, self.config.reach)
+
+    def _restart_standing(self, which: NDArray[np.bool_]) -> None:
+        """The stance law's filter believes in planted feet: after steps it starts anew."""
+        rows = np.flatnonzero(which)
+        if len(rows) == 0:
+            return
+        m = self._memory.balance
+        hands = Reach(*(getattr(self._memory.reach, n)[rows] for n in ("goal", "joints", "rate")))
+        fresh = balance.start(m.height[rows], hands, self._table)
+        fresh.height_rate = m.height_rate[rows]
+        _replace_rows(m, fresh, rows)
+
+
+class Residual(Protocol):
+    """The trained part (`walk_policy.WalkPolicy`): observations (B, 92) -> actions (B, 15)."""
+
+    @property
+    def config(self) -> WalkConfig: ...
+
+    @property
+    def digest(self) -> str: ...
+
+    def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]: ...
+
+
+class WalkingController:
+    """`LowLevelController` that stands, squats, reaches and walks; see the module's docstring."""
+
+    def __init__(self, policy: Residual) -> None:
+        self._policy = policy
+        self._walk = Walk(policy.config)
+        self._rows = 0
+
+    @property
+    def id(self) -> str:
+        """Changes with every number of the policy, the stance law, the gait and the servos."""
+        digest = hashlib.sha256(repr((self._policy.digest, arms.IDENTITY)).encode())
+        digest.update(stance_table().fingerprint().encode())
+        digest.update(np.concatenate([STIFFNESS, DAMPING]).tobytes())
+        return f"g1-walk-ppo-{digest.hexdigest()[:8]}"
+
+    @property
+    def stiffness(self) -> Array:
+        """(J,) N m/rad."""
+        return STIFFNESS
+
+    @property
+    def damping(self) -> Array:
+        """(J,) N m s/rad."""
+        return DAMPING
+
+    def reset(self, state: NDArray[np.floating], rows: NDArray[np.intp] | None = None) -> None:
+        """Forget the memory of ``rows`` (None: all) and stand in the measured posture."""
+        self._walk.reset(state, rows)
+        self._rows = len(state)
+
+    def step(self, state: NDArray[np.floating]) -> Array:
+        """(B, 74) observations -> (B, 29) joint position targets, rad."""
+        if len(state) != self._rows:
+            self.reset(state)
+        return self._walk.targets(self._policy(self._walk.observe(state)))
+
+
+def _replace_rows[M: (Balance, Reach, Gait, _Memory)](
+    memory: M, fresh: M, rows: NDArray[np.intp]
+) -> None:
+    for entry in fields(memory):
+        old, new = getattr(memory, entry.name), getattr(fresh, entry.name)
+        if isinstance(old, np.ndarray):
+            old[rows] = new
+        else:
+            _replace_rows(old, new, rows)

@@ -1,0 +1,115 @@
+"""The controller's file: what is written is what is read, and nothing else is accepted."""
+
+import itertools
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import save_file
+
+from egovcp.errors import ArtefactError
+from egovcp.robot.gait import GaitConfig
+from egovcp.robot.walk_policy import SCHEMA, WalkPolicy
+from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
+
+SIZES = (OBSERVATION_DIM, 16, 8, ACTIONS)
+
+
+@pytest.fixture
+def policy() -> WalkPolicy:
+    rng = np.random.default_rng(0)
+
+    def array(*shape: int) -> np.ndarray:
+        return rng.standard_normal(shape).astype(np.float32)
+
+    layers = tuple(
+        (array(after, before), array(after)) for before, after in itertools.pairwise(SIZES)
+    )
+    config = WalkConfig(gait=GaitConfig(period=0.7))
+    std = np.abs(array(OBSERVATION_DIM)) + 0.1
+    return WalkPolicy(array(OBSERVATION_DIM), std, layers, config, {"seed": 3})
+
+
+def test_saved_and_loaded_it_is_the_same(policy: WalkPolicy, tmp_path: Path):
+    path = tmp_path / "walk.safetensors"
+    policy.save(path)
+    loaded = WalkPolicy.load(path)
+    x = np.random.default_rng(1).standard_normal((4, OBSERVATION_DIM)).astype(np.float32)
+    np.testing.assert_array_equal(loaded(x), policy(x))
+    assert loaded.digest == policy.digest
+    assert loaded.config == policy.config
+    assert loaded.provenance == {"seed": 3}
+
+
+def test_it_is_the_network_that_torch_makes_of_the_same_numbers(policy: WalkPolicy):
+    modules: list[torch.nn.Module] = []
+    for weight, bias in policy.layers:
+        linear = torch.nn.Linear(weight.shape[1], weight.shape[0])
+        linear.load_state_dict({"weight": torch.tensor(weight), "bias": torch.tensor(bias)})
+        modules += [linear, torch.nn.ELU()]
+    network = torch.nn.Sequential(*modules[:-1])
+    x = np.random.default_rng(1).standard_normal((4, OBSERVATION_DIM)).astype(np.float32)
+    with torch.no_grad():
+        scaled = (torch.tensor(x) - torch.tensor(policy.mean)) / torch.tensor(policy.std)
+        expected = network(scaled.clamp(-10, 10)).numpy()
+    np.testing.assert_allclose(policy(x), expected, rtol=1e-4, atol=1e-4)
+
+
+def test_a_rows_bits_do_not_depend_on_the_batch(policy: WalkPolicy):
+    x = np.random.default_rng(1).standard_normal((33, OBSERVATION_DIM)).astype(np.float32)
+    np.testing.assert_array_equal(policy(x)[7:8], policy(x[7:8]))
+
+
+def test_the_digest_follows_every_number(policy: WalkPolicy):
+    other = replace(policy, mean=policy.mean + np.float32(1e-3))
+    walk = replace(policy, config=WalkConfig(action_scale=0.31))
+    assert len({policy.digest, other.digest, walk.digest}) == 3
+
+
+def test_a_missing_file_is_named(tmp_path: Path):
+    with pytest.raises(ArtefactError, match=r"none\.safetensors.*egovcp-train-lowlevel"):
+        WalkPolicy.load(tmp_path / "none.safetensors")
+
+
+def _tensors(policy: WalkPolicy) -> dict[str, np.ndarray]:
+    out = {"mean": policy.mean, "std": policy.std}
+    for i, (weight, bias) in enumerate(policy.layers):
+        out |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
+    return out
+
+
+GOOD = {"schema": SCHEMA, "content": json.dumps({"config": {}, "provenance": {}})}
+
+
+@pytest.mark.parametrize(
+    ("change", "metadata", "reason"),
+    [
+        ({}, {}, "schema is None"),
+        ({}, GOOD | {"schema": "egovcp-walk-0"}, "egovcp-walk-0"),
+        ({}, {"schema": SCHEMA}, "content"),
+        ({}, GOOD | {"content": "{"}, "double quotes"),
+        ({}, GOOD | {"content": '{"config": {"gaits": 1}, "provenance": {}}'}, "gaits"),
+        ({"mean": np.zeros(91, np.float32)}, GOOD, r"mean has shape \(91,\)"),
+        ({"mean": np.full(OBSERVATION_DIM, np.nan, np.float32)}, GOOD, "finite"),
+        ({"mean": np.zeros(OBSERVATION_DIM)}, GOOD, "float32"),
+        ({"std": np.zeros(OBSERVATION_DIM, np.float32)}, GOOD, "not positive"),
+        ({"layers.0.bias": np.zeros(5, np.float32)}, GOOD, "layer 0"),
+        ({"layers.3.weight": np.zeros((ACTIONS, 3), np.float32)}, GOOD, "layers.3.bias"),
+    ],
+)
+def test_anything_else_is_refused(policy, tmp_path, change, metadata, reason):
+    path = tmp_path / "walk.safetensors"
+    save_file(_tensors(policy) | change, path, metadata=metadata or None)
+    with pytest.raises(ArtefactError, match=reason):
+        WalkPolicy.load(path)
+
+
+def test_a_torn_file_is_refused(policy: WalkPolicy, tmp_path: Path):
+    path = tmp_path / "walk.safetensors"
+    policy.save(path)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ArtefactError, match="not a controller"):
+        WalkPolicy.load(path)

@@ -1,0 +1,265 @@
+"""The environment of the low-level policy: physics, commands, rewards, mirror, episodes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from egovcp.robot.stance_table import standing_pose
+from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
+from egovcp.sim.config import SensorConfig
+from egovcp.spec import ACTION_BOX, STATE_SLICES
+from egovcp_train.lowlevel import rewards
+from egovcp_train.lowlevel.commands import Commands, between
+from egovcp_train.lowlevel.env import PRIVILEGED_DIM, LowLevelEnv, mirrored
+from egovcp_train.lowlevel.task import CommandConfig, DisturbanceConfig, LowLevelTask
+
+SILENT = SensorConfig(0.0, 0.0, 0.0, 0.0)
+STANDING = CommandConfig(standing=1.0, still_hands=1.0)
+PLAIN = DisturbanceConfig(
+    push=(0.0, 0.0),
+    payload=(0.0, 0.0),
+    mass_scale=(1.0, 1.0),
+    stiffness_scale=(1.0, 1.0),
+    damping_scale=(1.0, 1.0),
+    delay=(0.0, 0.0),
+    models=1,
+)
+
+
+def _env(robots: int = 4, seed: int = 0, **task: object) -> LowLevelEnv:
+    return LowLevelEnv(robots, LowLevelTask(**task), WalkConfig(), SILENT, seed=seed)
+
+
+def _zero(env: LowLevelEnv) -> torch.Tensor:
+    return torch.zeros(env.num_envs, ACTIONS)
+
+
+def test_without_a_residual_it_stands_and_earns_nearly_everything():
+    env = _env(commands=STANDING, disturbances=PLAIN)
+    for _ in range(100):
+        obs, reward, done, extras = env.step(_zero(env))
+        assert not done.any()
+    assert obs["policy"].shape == (4, OBSERVATION_DIM)
+    assert obs["privileged"].shape == (4, PRIVILEGED_DIM)
+    for term in ("velocity", "turning", "height", "upright", "contact"):
+        assert extras["log"][f"/reward/{term}"] > 0.8, term
+    weights = env.task.rewards
+    best = weights.alive + weights.velocity + weights.turning + weights.height
+    best += weights.upright + weights.contact
+    assert float(reward.mean()) == pytest.approx(best / 50, rel=0.1)
+
+
+def test_told_to_walk_without_a_trained_residual_it_falls_and_starts_again():
+    env = _env(8, commands=CommandConfig(standing=0.0, interval=(10.0, 10.0)))
+    fell = 0
+    for _ in range(200):
+        _, reward, done, extras = env.step(_zero(env))
+        for row in torch.nonzero(done):
+            assert float(reward[row]) < -1
+            assert int(env.episode_length_buf[row]) == 0
+            assert env.walk.gait.amount[row] == 0
+            assert not extras["time_outs"][row]
+        fell += int(done.sum())
+    assert fell >= 8
+
+
+def test_an_episode_is_cut_at_its_time_limit():
+    env = _env(2, commands=STANDING, disturbances=PLAIN, episode=0.5)
+    for tick in range(1, 26):
+        _, _, done, extras = env.step(_zero(env))
+        assert bool(done.all()) == (tick == 25)
+    assert bool(extras["time_outs"].all())
+
+
+def test_the_same_seed_gives_the_same_run_whatever_the_threads():
+    def run(seed: int, threads: int) -> torch.Tensor:
+        env = LowLevelEnv(
+            4, LowLevelTask(), WalkConfig(), SensorConfig(), threads=threads, seed=seed
+        )
+        env.difficulty = 1.0
+        for _ in range(40):
+            obs, *_ = env.step(_zero(env))
+        env.close()
+        return obs["policy"]
+
+    assert torch.equal(run(1, 1), run(1, 2))
+    assert not torch.equal(run(1, 1), run(2, 1))
+
+
+def test_new_targets_act_after_the_delay():
+    """Two robots get the same new targets, one of them 20 ms later."""
+    env = _env(2, commands=STANDING, disturbances=PLAIN)
+    physics = env.physics
+    target = physics.qpos[:, 7:] + 0.3
+    physics.step(target, np.array([0, 4]))
+    moved = np.abs(physics.qvel[:, 6:]).max(axis=1)
+    assert moved[0] > 3 * moved[1]
+
+
+def test_a_push_is_a_change_of_the_horizontal_velocity():
+    push = replace(PLAIN, push=(0.5, 0.5), push_interval=(0.1, 0.1))
+    env = _env(16, commands=STANDING, disturbances=push)
+    fastest = 0.0
+    for _ in range(8):
+        env.step(_zero(env))
+        fastest = max(fastest, float(np.linalg.norm(env.physics.qvel[:, :2], axis=1).max()))
+    assert 0.3 < fastest < 0.7
+
+
+def test_robots_differ_within_the_ranges():
+    env = _env(64, disturbances=DisturbanceConfig(models=64))
+    friction = env.physics.floor_friction
+    low, high = DisturbanceConfig().friction
+    assert low <= friction.min() < friction.max() <= high
+    assert len(np.unique(friction)) == 64
+
+
+# --- commands ----------------------------------------------------------------------
+
+
+def _run_commands(config: CommandConfig, difficulty: float, ticks: int = 3000) -> np.ndarray:
+    commands = Commands(8, config, np.random.default_rng(0))
+    commands.difficulty = difficulty
+    commands.reset(np.arange(8))
+    out = []
+    for _ in range(ticks):
+        commands.advance()
+        out.append(commands.vector)
+    return np.array(out)
+
+
+@pytest.mark.parametrize("difficulty", [0.0, 1.0])
+def test_commands_stay_in_their_ranges(difficulty):
+    config = CommandConfig()
+    c = _run_commands(config, difficulty)
+    fastest = between(*config.forward, difficulty)[1]
+    assert -fastest / 2 - 1e-9 <= c[..., 0].min() < 0 < c[..., 0].max() <= fastest + 1e-9
+    assert np.abs(c[..., 1]).max() <= difficulty * config.sideways + 1e-9
+    assert np.abs(c[..., 2]).max() <= difficulty * config.turning + 1e-9
+    low = between(*config.standing_height, difficulty)[0]
+    assert c[..., 9].min() >= min(low, ACTION_BOX.neutral[-1]) - 1e-9
+    assert (ACTION_BOX.to_normalised(c[..., 3:]) <= 1 + 1e-9).all()
+
+
+def test_velocities_change_no_faster_than_their_ramp():
+    config = CommandConfig()
+    change = np.abs(np.diff(_run_commands(config, 1.0)[..., :3], axis=0)).max()
+    assert change <= config.acceleration / 50 + 1e-9
+
+
+def test_hands_move_like_those_of_the_data_or_rest():
+    c = ACTION_BOX.to_normalised(_run_commands(CommandConfig(standing=1.0), 1.0)[..., 3:])
+    step = np.abs(np.diff(c[1::2], axis=0))[..., :6]
+    assert step.max() <= 0.32 + 1e-9
+    assert (step.max(axis=2) == 0).mean() > 0.1
+    still = _run_commands(CommandConfig(still_hands=1.0), 1.0)[..., 3:9]
+    assert np.ptp(still, axis=0).max() == 0
+
+
+# --- mirror ------------------------------------------------------------------------
+
+
+def test_mirrored_twice_is_the_same():
+    env = _env(3)
+    obs, actions = env.get_observations(), torch.randn(3, ACTIONS)
+    once = mirrored(env, obs, actions)
+    twice = mirrored(env, once[0][3:], once[1][3:])
+    for group in ("policy", "privileged"):
+        torch.testing.assert_close(twice[0][group][3:], obs[group])
+    torch.testing.assert_close(twice[1][3:], actions)
+
+
+def test_a_mirrored_robot_under_mirrored_commands_does_the_mirrored_thing():
+    """Robot 1 gets everything in the mirror, tick by tick; what is observed stays a mirror."""
+    env = _env(2, commands=STANDING, disturbances=PLAIN)
+    pose = standing_pose(ACTION_BOX.neutral[-1])  # itself its mirror image
+    qpos = np.tile(np.concatenate([pose.position, pose.quaternion, pose.joints]), (2, 1))
+    env.physics.place(np.arange(2), qpos, qpos[:, 7:])
+    env.commands.velocity[:] = env.commands._goal[:] = [[0.2, 0.1, 0.2], [0.2, -0.1, -0.2]]
+    env.commands._ticks_left[:] = 1000
+    for _ in range(2):  # the second time with the state of the first
+        env.walk.reset(env.state)
+        env._observe(env.physics.snapshot())
+    _, action = mirrored(env, None, torch.randn(1, ACTIONS, generator=torch.manual_seed(0)))
+    for _ in range(15):
+        obs, *_ = env.step(0.1 * action)
+    both, _ = mirrored(env, obs, None)
+    for group, tolerance in (("policy", 0.1), ("privileged", 0.01)):  # joints turn at 5 rad/s
+        np.testing.assert_allclose(both[group][2], both[group][1], atol=tolerance)
+        assert np.abs(obs[group][0] - obs[group][1]).max() > 5 * tolerance
+
+
+# --- rewards -----------------------------------------------------------------------
+
+
+def _terms(env: LowLevelEnv, **change: np.ndarray) -> dict[str, np.ndarray]:
+    x = replace(env.physics.snapshot(), **change)
+    n = env.num_envs
+    action = np.zeros((n, ACTIONS))
+    walk = env.walk
+    return rewards.terms(
+        x,
+        env.commands.vector,
+        walk.height,
+        walk.pitch,
+        walk.gait.phase,
+        walk.gait.amount,
+        action,
+        action,
+    )
+
+
+@pytest.fixture(scope="module")
+def stood() -> LowLevelEnv:
+    env = _env(1, commands=STANDING, disturbances=PLAIN)
+    for _ in range(50):
+        env.step(_zero(env))
+    return env
+
+
+@pytest.mark.parametrize(
+    ("change", "term"),
+    [
+        ({"velocity": np.array([[0.3, 0.0, 0.0]])}, "velocity"),
+        ({"angular_velocity": np.array([[0.0, 0.0, 0.6]])}, "turning"),
+        ({"position": np.array([[0.0, 0.0, 0.65]])}, "height"),
+        ({"quaternion": np.array([[0.98, 0.199, 0.0, 0.0]])}, "upright"),
+        ({"feet": np.array([[[0.0, 0.12, 0.2], [0.0, -0.12, 0.035]]])}, "contact"),
+    ],
+)
+def test_what_is_wanted_earns_less_when_it_is_missed(stood, change, term):
+    assert _terms(stood, **change)[term] < 0.7 * _terms(stood)[term]
+
+
+@pytest.mark.parametrize(
+    ("change", "term"),
+    [
+        ({"feet_velocity": np.array([[[0.5, 0, 0], [0, 0, 0.0]]])}, "slip"),
+        ({"feet": np.array([[[0, 0.02, 0.035], [0, -0.02, 0.035]]])}, "stance_width"),
+        ({"feet_forward": np.array([[[0.8, 0.6, 0], [0.8, -0.6, 0.0]]])}, "foot_heading"),
+        ({"torque": np.full((1, 29), 50.0)}, "torque"),
+    ],
+)
+def test_what_is_not_wanted_is_counted(stood, change, term):
+    x = stood.physics.snapshot()
+    yaw = 2 * np.arctan2(x.quaternion[0, 3], x.quaternion[0, 0])
+    turn = np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+    for name in ("feet", "feet_forward"):
+        if name in change:  # given in the heading frame
+            flat = change[name][..., :2] @ turn.T
+            change = {name: np.concatenate([flat, change[name][..., 2:]], axis=-1)}
+            if name == "feet":
+                change[name] = change[name] + np.array([*x.position[0, :2], 0.0])
+    assert _terms(stood, **change)[term] > _terms(stood)[term] + 0.05
+
+
+def test_the_observed_state_is_what_a_robot_measures(stood):
+    state = stood.state[0]
+    x = stood.physics.snapshot()
+    np.testing.assert_allclose(state[STATE_SLICES["joint_position"]], x.joints[0])
+    np.testing.assert_allclose(state[STATE_SLICES["angular_velocity"]], x.angular_velocity[0])
+    gravity = state[STATE_SLICES["projected_gravity"]]
+    assert gravity @ gravity == pytest.approx(1.0)
+    assert gravity[2] < -0.99

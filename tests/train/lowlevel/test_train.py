@@ -1,0 +1,122 @@
+"""``egovcp-train-lowlevel``: runs, resumes, refuses."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from egovcp.robot.walk_policy import WalkPolicy
+from egovcp.robot.walking import OBSERVATION_DIM, WalkConfig, WalkingController
+from egovcp.sim.config import SensorConfig
+from egovcp.spec import STATE_DIM
+from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig, PpoConfig
+from egovcp_train.lowlevel.env import LowLevelEnv
+from egovcp_train.lowlevel.learn import PpoLearner
+from egovcp_train.lowlevel.task import LowLevelTask, RewardConfig
+from egovcp_train.lowlevel.train import main
+
+SMALL = ["--robots=8", "--threads=1", "--ppo.num_steps_per_env=8", "--save_freq=2"]
+LAST = Path("checkpoints/last/pretrained_model/walk.safetensors")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("lowlevel") / "run"
+    assert main([f"--output_dir={folder}", "--steps=192", *SMALL]) == 0
+    return folder
+
+
+def test_a_run_leaves_a_controller_that_drives_the_robot(run: Path):
+    policy = WalkPolicy.load(run / LAST)
+    assert policy.provenance["steps"] == 192
+    assert policy.config == WalkConfig()
+    state = np.zeros((1, STATE_DIM))
+    state[:, 5] = -1.0
+    assert np.isfinite(WalkingController(policy).step(state)).all()
+    assert (run / LAST).stat().st_size < 2_000_000
+
+
+def test_it_goes_on_where_it_stopped(run: Path, capsys: pytest.CaptureFixture[str]):
+    assert main([f"--output_dir={run}", "--resume", "--steps=320"]) == 0
+    assert "done after 320 steps" in capsys.readouterr().out
+    assert WalkPolicy.load(run / LAST).provenance["steps"] == 320
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "message"),
+    [
+        (["--robots=0"], 2, "--robots"),
+        (["--robot=8"], 2, "robot"),
+        (["--resume"], 4, "no checkpoint to resume from"),
+    ],
+)
+def test_bad_options_are_refused(tmp_path, capsys, flags, code, message):
+    assert main([f"--output_dir={tmp_path / 'new'}", *flags]) == code
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_folder_with_something_in_it_is_left_alone(tmp_path, capsys):
+    (tmp_path / "mine.txt").write_text("mine")
+    assert main([f"--output_dir={tmp_path}", *SMALL]) == 2
+    assert [p.name for p in tmp_path.iterdir()] == ["mine.txt"]
+
+
+def test_another_network_does_not_continue_the_run(run: Path, capsys):
+    assert main([f"--output_dir={run}", "--resume", "--network.actor=[8]"]) == 4
+    assert "does not fit" in capsys.readouterr().err
+
+
+def _learner(**curriculum: float) -> PpoLearner:
+    env = LowLevelEnv(4, LowLevelTask(), WalkConfig(), SensorConfig())
+    return PpoLearner(
+        env,
+        NetworkConfig(actor=(16,), critic=(16,)),
+        PpoConfig(num_steps_per_env=4),
+        CurriculumConfig(**curriculum),
+    )
+
+
+def test_the_exported_policy_is_the_trained_one():
+    learner = _learner()
+    learner.iterate()
+    policy = learner.policy(WalkConfig(), {})
+    x = learner.env.get_observations()
+    learner.ppo.eval_mode()
+    with torch.no_grad():
+        expected = learner.ppo.get_policy()(x).numpy()
+    np.testing.assert_allclose(policy(x["policy"].numpy()), expected, atol=1e-3)
+    assert policy.mean.shape == (OBSERVATION_DIM,)
+
+
+def test_it_becomes_harder_with_success_and_easier_with_falls():
+    learner = _learner(step=0.1)
+    learner._adapt({"falls_per_second": 0.0, "reward/velocity": 0.9})
+    assert learner.env.difficulty == pytest.approx(0.1)
+    learner._adapt({"falls_per_second": 0.0, "reward/velocity": 0.1})
+    assert learner.env.difficulty == pytest.approx(0.1)
+    learner._adapt({"falls_per_second": 1.0, "reward/velocity": 0.9})
+    assert learner.env.difficulty == pytest.approx(0.0)
+
+
+def test_ppo_learns_what_a_term_rewards():
+    """With nothing but the cost of acting, it acts less and less boldly."""
+    task = LowLevelTask(rewards=_only_action(RewardConfig()))
+    env = LowLevelEnv(32, task, WalkConfig(), SensorConfig())
+    learner = PpoLearner(
+        env,
+        NetworkConfig(actor=(16,), critic=(16,)),
+        PpoConfig(entropy_coef=0.0, desired_kl=0.05),
+        CurriculumConfig(),
+    )
+    torch.manual_seed(0)
+    for _ in range(12):
+        scalars = learner.iterate()
+    assert scalars["ppo/action_std"] < 0.98 * NetworkConfig().initial_std
+
+
+def _only_action(rewards: RewardConfig) -> RewardConfig:
+    none = {f.name: 0.0 for f in fields(rewards)}
+    return replace(rewards, **(none | {"action": -1.0}))

@@ -1,0 +1,1 @@
+"""Training and evaluation of the low-level controller (``egovcp-train-lowlevel``)."""

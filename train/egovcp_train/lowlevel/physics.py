@@ -1,0 +1,177 @@
+"""Many robots on a floor, stepped by threads (`mujoco.rollout`); state as arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import mujoco
+import numpy as np
+from mujoco.rollout import Rollout
+from numpy.typing import NDArray
+
+from egovcp.robot.mjcf import FootModel, robot_spec
+from egovcp.sim.scene import FLOOR, strip_visuals
+from egovcp.spec import JOINT_NAMES, PHYSICS_STEPS_PER_CONTROLLER_TICK
+from egovcp_train.lowlevel.task import DisturbanceConfig
+
+Array = NDArray[np.float64]
+SIDES: Final = ("left", "right")
+_STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
+#: What the sensors read per body: foot place and velocity, its x and z axis, palm place.
+_SENSORS: Final = (
+    ("ankle_roll_link", mujoco.mjtSensor.mjSENS_FRAMEPOS),
+    ("ankle_roll_link", mujoco.mjtSensor.mjSENS_FRAMELINVEL),
+    ("ankle_roll_link", mujoco.mjtSensor.mjSENS_FRAMEXAXIS),
+    ("palm", mujoco.mjtSensor.mjSENS_FRAMEPOS),
+)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """The true state of N robots, world frame; feet and palms as of 5 ms before."""
+
+    position: Array  # (N, 3) pelvis, m
+    quaternion: Array  # (N, 4) pelvis, wxyz
+    velocity: Array  # (N, 3) pelvis, m/s
+    angular_velocity: Array  # (N, 3) rad/s, pelvis frame
+    joints: Array  # (N, J) rad
+    joint_rates: Array  # (N, J) rad/s
+    feet: Array  # (N, 2, 3) ankle-roll frames, m
+    feet_velocity: Array  # (N, 2, 3) m/s
+    feet_forward: Array  # (N, 2, 3) x axes
+    palms: Array  # (N, 2, 3) m
+    torque: Array  # (N, J) N m, of the servos
+    broken: NDArray[np.bool_]  # (N,) the simulation diverged
+
+
+class Physics:
+    """N robots; robot i has the physical parameters of model i modulo the number of models."""
+
+    def __init__(
+        self, robots: int, feet: FootModel, config: DisturbanceConfig, threads: int, seed: int
+    ) -> None:
+        base = _compile(feet)
+        rng = np.random.default_rng(seed)
+        pool = [_randomised(base, config, rng) for _ in range(min(robots, config.models))]
+        self._models = [pool[i % len(pool)] for i in range(robots)]
+        self._data = [mujoco.MjData(base) for _ in range(max(1, threads))]
+        self._rollout = Rollout(nthread=threads if threads > 1 else 0)
+        self.state = np.zeros((robots, mujoco.mj_stateSize(base, _STATE)))
+        self._nq, self._nv = base.nq, base.nv
+        steps = PHYSICS_STEPS_PER_CONTROLLER_TICK
+        self._states = np.zeros((robots, steps, self.state.shape[1]))
+        self._readings = np.zeros((robots, steps, base.nsensordata))
+        self._control = np.zeros((robots, steps, base.nu))
+        self._warm = np.zeros((robots, base.nv))
+        self._target = np.zeros((robots, base.nu))
+        self.floor_friction = np.array([m.geom_friction[_feet(m)[0], 0] for m in self._models])
+
+    @property
+    def qpos(self) -> Array:
+        """(N, 36) pelvis position and quaternion, joints; a view to write to."""
+        return self.state[:, 1 : 1 + self._nq]
+
+    @property
+    def qvel(self) -> Array:
+        """(N, 35) pelvis velocity (world) and rates (pelvis frame), joint rates; a view."""
+        return self.state[:, 1 + self._nq : 1 + self._nq + self._nv]
+
+    def place(self, rows: NDArray[np.intp], qpos: Array, target: Array) -> None:
+        """Put robots at rest at ``qpos``, their servos holding ``target``."""
+        self.state[rows] = 0.0
+        self.qpos[rows] = qpos
+        self._target[rows] = target
+
+    def step(self, target: Array, delay: NDArray[np.intp]) -> None:
+        """One controller tick: the new targets (N, J) act after ``delay`` (N,) physics steps."""
+        for k in range(self._control.shape[1]):
+            self._control[:, k] = np.where((k < delay)[:, None], self._target, target)
+        self._target = target.copy()
+        self._rollout.rollout(
+            self._models,
+            self._data,
+            self.state,
+            self._control,
+            skip_checks=True,
+            nstep=self._control.shape[1],
+            initial_warmstart=self._warm,
+            state=self._states,
+            sensordata=self._readings,
+        )
+        self.state[:] = self._states[:, -1]
+
+    def snapshot(self) -> Snapshot:
+        """Where everything is now."""
+        qpos, qvel = self.qpos, self.qvel
+        readings = self._readings[:, -1, : 3 * 2 * len(_SENSORS)]
+        place, speed, forward, palms = np.moveaxis(readings.reshape(-1, len(_SENSORS), 2, 3), 1, 0)
+        torque = self._readings[:, -1, 3 * 2 * len(_SENSORS) :]
+        broken = ~np.isfinite(self.state).all(axis=1)
+        broken |= np.abs(qvel).max(axis=1) > 100.0
+        return Snapshot(
+            position=qpos[:, :3],
+            quaternion=qpos[:, 3:7],
+            velocity=qvel[:, :3],
+            angular_velocity=qvel[:, 3:6],
+            joints=qpos[:, 7:],
+            joint_rates=qvel[:, 6:],
+            feet=place,
+            feet_velocity=speed,
+            feet_forward=forward,
+            palms=palms,
+            torque=torque,
+            broken=broken,
+        )
+
+    def close(self) -> None:
+        """End the threads."""
+        self._rollout.close()
+
+
+def _compile(feet: FootModel) -> mujoco.MjModel:
+    spec = robot_spec(feet)
+    strip_visuals(spec)
+    for sensor in list(spec.sensors):
+        spec.delete(sensor)
+    spec.worldbody.add_geom(
+        name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0
+    )
+    for name, kind in _SENSORS:
+        for side in SIDES:
+            on_site = name == "palm"
+            spec.add_sensor(
+                type=kind,
+                objtype=mujoco.mjtObj.mjOBJ_SITE if on_site else mujoco.mjtObj.mjOBJ_XBODY,
+                objname=f"{side}_{name}",
+            )
+    for joint in JOINT_NAMES:
+        spec.add_sensor(
+            type=mujoco.mjtSensor.mjSENS_ACTUATORFRC,
+            objtype=mujoco.mjtObj.mjOBJ_ACTUATOR,
+            objname=joint,
+        )
+    return spec.compile()
+
+
+def _feet(model: mujoco.MjModel) -> list[int]:
+    return [i for i in range(model.ngeom) if "_foot" in model.geom(i).name]
+
+
+def _randomised(
+    base: mujoco.MjModel, config: DisturbanceConfig, rng: np.random.Generator
+) -> mujoco.MjModel:
+    """A copy of ``base`` with drawn physical parameters; gains are drawn joint by joint."""
+    model = mujoco.MjModel.__copy__(base)
+    model.geom_friction[_feet(model), 0] = rng.uniform(*config.friction)
+    scale = rng.uniform(*config.mass_scale)
+    model.body_mass[1:] *= scale
+    model.body_inertia[1:] *= scale
+    torso = model.body("torso_link").id
+    model.body_mass[torso] += rng.uniform(*config.payload)
+    stiffness = rng.uniform(*config.stiffness_scale, model.nu)
+    model.actuator_gainprm[:, 0] *= stiffness
+    model.actuator_biasprm[:, 1] *= stiffness
+    model.actuator_biasprm[:, 2] *= rng.uniform(*config.damping_scale, model.nu)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model

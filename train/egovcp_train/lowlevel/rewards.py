@@ -1,0 +1,106 @@
+"""The reward terms of the low-level policy, each (N,) per second; weights in `task`."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.robot.g1 import EFFORT_LIMIT
+from egovcp.robot.stance_table import NU
+from egovcp_train.lowlevel.physics import Snapshot
+
+Array = NDArray[np.float64]
+SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the floor when the foot is flat
+_CONTACT: Final = 0.012  # m above that, below which a foot counts as standing
+_LEAST_WIDTH: Final = 0.16  # m between the feet, across
+
+
+def rotation(quaternion: Array) -> Array:
+    """(N, 4) wxyz -> (N, 3, 3) from the pelvis to the world."""
+    w, x, y, z = quaternion.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def heading(turn: Array) -> Array:
+    """(N, 3, 3) rotations -> (N, 2) unit vector of the horizontal forward direction."""
+    forward = turn[:, :2, 0]
+    return np.asarray(forward / np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-6))
+
+
+def in_heading(vector: Array, forward: Array) -> Array:
+    """World vectors (N, ..., 2 or 3) -> their x and y in the heading frame (N, ..., 2)."""
+    shape = (len(forward), *(1,) * (vector.ndim - 2))
+    c, s = forward[:, 0].reshape(shape), forward[:, 1].reshape(shape)
+    x, y = vector[..., 0], vector[..., 1]
+    return np.stack([c * x + s * y, c * y - s * x], axis=-1)
+
+
+def standing_feet(x: Snapshot) -> NDArray[np.bool_]:
+    """(N, 2) which feet are on the floor."""
+    on: NDArray[np.bool_] = x.feet[..., 2] < SOLE_HEIGHT + _CONTACT
+    return on
+
+
+def terms(
+    x: Snapshot,
+    command: Array,
+    height: Array,
+    pitch: Array,
+    phase: Array,
+    gait: Array,
+    action: Array,
+    last_action: Array,
+) -> dict[str, Array]:
+    """All terms but the fall.
+
+    Args:
+        x: the true state.
+        command: (N, 10) v, hands, height.
+        height: (N,) m, where the pelvis should be by now.
+        pitch: (N,) rad, the natural pitch at that height.
+        phase: (N,) rad of the gait's clock.
+        gait: (N,) how much of the gait is in.
+        action: (N, 15) of the policy.
+        last_action: (N, 15) of the tick before.
+    """
+    turn = rotation(x.quaternion)
+    forward = heading(turn)
+    velocity = in_heading(x.velocity, forward)
+    up = turn[:, 2]  # the world's vertical in the pelvis frame
+    off = np.stack([up[:, 0] + np.sin(pitch), up[:, 1], up[:, 2] - np.cos(pitch)], axis=1)
+    on = standing_feet(x)
+    feet = in_heading(x.feet - x.position[:, None], forward)
+    ahead = in_heading(x.feet_forward, forward)
+    width = feet[:, 0, 1] - feet[:, 1, 1]
+    torque = x.torque[:, :NU] / EFFORT_LIMIT[:NU]
+    slipping = np.sum(x.feet_velocity[..., :2] ** 2, axis=-1) * on
+    return {
+        "alive": np.ones(len(height)),
+        "velocity": np.exp(-np.sum((velocity - command[:, :2]) ** 2, axis=1) / 0.05),
+        "turning": np.exp(-((x.angular_velocity[:, 2] - command[:, 2]) ** 2) / 0.25),
+        "height": np.exp(-((x.position[:, 2] - height) ** 2) / 0.001),
+        "upright": np.exp(-np.sum(off**2, axis=1) / 0.03),
+        "contact": _in_step(on, phase, gait),
+        "slip": np.sum(np.minimum(slipping, 4.0), axis=1),
+        "stance_width": np.maximum(_LEAST_WIDTH - width, 0.0),
+        "foot_heading": np.sum(ahead[..., 1] ** 2, axis=1),
+        "action": np.sum(action**2, axis=1),
+        "action_rate": np.sum((action - last_action) ** 2, axis=1),
+        "torque": np.mean(torque**2, axis=1),
+    }
+
+
+def _in_step(on: NDArray[np.bool_], phase: Array, gait: Array) -> Array:
+    """Share of the feet that stand or swing as the clock says; standing, all feet stand."""
+    swing = np.stack([np.sin(phase), -np.sin(phase)], axis=1) * gait[:, None]
+    undecided = np.abs(swing) < 0.25
+    undecided &= gait[:, None] > 0.5
+    right = np.where(undecided, True, on == (swing < 0.25))
+    return np.asarray(np.mean(right, axis=1))

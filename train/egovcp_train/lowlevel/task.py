@@ -1,0 +1,94 @@
+"""What the low-level policy is asked to do and rewarded for; one place for CPU and GPU training.
+
+The difficulty is a number in [0, 1] that rises with success. Ranges are given at both ends
+and interpolated.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+Range = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class CommandConfig:
+    """The commands of training episodes; a new one every few seconds."""
+
+    interval: Range = (2.0, 6.0)
+    """s between changes of velocity and of how hands and height move."""
+    standing: float = 0.35
+    """Share of commands with zero velocity."""
+    forward: tuple[Range, Range] = ((0.1, 0.3), (0.1, 0.6))
+    """m/s, easy and hard."""
+    backward: float = 0.1
+    """Share of the walking commands that go backwards, at up to half the speed."""
+    sideways: float = 0.15
+    """m/s at the hardest, either way, in a third of the walking commands."""
+    turning: float = 0.4
+    """rad/s at the hardest, either way, in a third of the walking commands."""
+    standing_height: tuple[Range, Range] = ((0.65, 0.75), (0.50, 0.76))
+    """m, easy and hard."""
+    walking_height: tuple[Range, Range] = ((0.70, 0.75), (0.55, 0.75))
+    """m, easy and hard."""
+    acceleration: float = 0.8
+    """m/s^2 and rad/s^2 at which the commanded velocity changes."""
+    still_hands: float = 0.3
+    """Share of commands whose hands rest; the others follow the data's random walk."""
+
+
+@dataclass(frozen=True)
+class DisturbanceConfig:
+    """Pushes, physical parameters, delay and noise."""
+
+    push_interval: Range = (3.0, 8.0)
+    """s between pushes."""
+    push: Range = (0.1, 0.7)
+    """m/s of horizontal velocity at most, easy and hard."""
+    friction: Range = (0.5, 1.1)
+    """Sliding friction of the feet."""
+    payload: Range = (-0.5, 2.0)
+    """kg on the torso."""
+    mass_scale: Range = (0.95, 1.05)
+    """Factor on every mass."""
+    stiffness_scale: Range = (0.8, 1.2)
+    """Factor on the stiffness of every servo."""
+    damping_scale: Range = (0.8, 1.2)
+    """Factor on the damping of every servo."""
+    delay: Range = (0.0, 0.02)
+    """s from a measurement to the new targets' effect, in physics steps."""
+    models: int = 64
+    """Robots of different physical parameters."""
+
+
+@dataclass(frozen=True)
+class RewardConfig:
+    """Weights of the reward terms, per second; see `rewards`."""
+
+    alive: float = 1.0
+    velocity: float = 2.0
+    turning: float = 1.0
+    height: float = 1.0
+    upright: float = 1.0
+    contact: float = 0.5
+    slip: float = -0.5
+    stance_width: float = -5.0
+    foot_heading: float = -1.0
+    action: float = -0.02
+    action_rate: float = -0.02
+    torque: float = -1.0
+    fall: float = -100.0
+
+
+@dataclass(frozen=True)
+class LowLevelTask:
+    """Commands, disturbances and rewards."""
+
+    commands: CommandConfig = field(default_factory=CommandConfig)
+    """What is commanded."""
+    disturbances: DisturbanceConfig = field(default_factory=DisturbanceConfig)
+    """What disturbs."""
+    rewards: RewardConfig = field(default_factory=RewardConfig)
+    """What is rewarded."""
+    episode: float = 20.0
+    """s after which an episode is cut."""

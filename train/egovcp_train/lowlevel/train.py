@@ -1,0 +1,211 @@
+"""``egovcp-train-lowlevel``: the controller that stands, squats, reaches and walks."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import draccus
+import torch
+from tqdm import tqdm
+
+from egovcp.cli import run_command, save_config
+from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.robot.walking import WalkConfig
+from egovcp.sim.config import SensorConfig
+from egovcp_train.checkpoint import (
+    begin_checkpoint,
+    checkpoint_dir,
+    finish_checkpoint,
+    load_training_state,
+)
+from egovcp_train.loop import Budget
+from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig, PpoConfig
+from egovcp_train.lowlevel.task import LowLevelTask
+from egovcp_train.output import (
+    CONFIG_FILE,
+    prepare_output,
+    resumed_options,
+    stop_on_signal,
+)
+from egovcp_train.records import Recorder
+
+PROG = "egovcp-train-lowlevel"
+POLICY_FILE = "walk.safetensors"
+
+
+@dataclass(frozen=True)
+class LowLevelTrainConfig:
+    """Train the low-level controller with PPO (rsl-rl) in MuJoCo on the CPU.
+
+    The result, OUTPUT_DIR/checkpoints/last/pretrained_model/walk.safetensors, is a controller
+    for egovcp-eval-lowlevel and for the simulator. Stop it at any time (Ctrl-C) and go on with
+    --resume.
+    """
+
+    output_dir: str
+    """Folder of the run; must not exist unless --resume."""
+    task: LowLevelTask = field(default_factory=LowLevelTask)
+    """Commands, disturbances and rewards."""
+    walk: WalkConfig = field(default_factory=WalkConfig)
+    """What surrounds the policy: stance law, gait, arms."""
+    sensors: SensorConfig = field(default_factory=SensorConfig)
+    """Noise of proprioception."""
+    network: NetworkConfig = field(default_factory=NetworkConfig)
+    """Policy and critic."""
+    ppo: PpoConfig = field(default_factory=PpoConfig)
+    """Proximal policy optimisation."""
+    curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
+    """When the task becomes harder."""
+    robots: int = 512
+    """Robots simulated side by side."""
+    feet: Literal["points", "stock"] = "points"
+    """Foot collision model; four points are twice as fast."""
+    steps: int = 50_000_000
+    """Control steps of 20 ms, over all robots."""
+    max_minutes: float = 0.0
+    """Wall-clock limit in minutes; 0: none."""
+    seed: int = 0
+    """Seed of networks, commands, disturbances and noise."""
+    threads: int = 0
+    """CPU threads; 0: all cores."""
+    resume: bool = False
+    """Continue the run in output_dir from its last checkpoint, with its options unless given."""
+    save_freq: int = 50
+    """Iterations between checkpoints; one is always written at the end."""
+    tensorboard: bool = True
+    """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run_command(LowLevelTrainConfig, train, argv, prog=PROG, defaults=resumed_options)
+
+
+def train(config: LowLevelTrainConfig) -> None:
+    """Run PPO to its end, or to the first SIGINT or SIGTERM, and write the controller."""
+    if min(config.robots, config.steps, config.save_freq) < 1:
+        raise UsageError("--robots, --steps and --save_freq must be at least 1")
+    output = prepare_output(config.output_dir, config.resume)
+    threads = config.threads or len(os.sched_getaffinity(0))
+    torch.set_num_threads(threads)
+    torch.manual_seed(config.seed)
+    learner = _build(config, threads)
+    if config.resume:
+        _restore(output, learner)
+    output.mkdir(parents=True, exist_ok=True)
+    save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
+    try:
+        _Run(config, output, learner).execute()
+    finally:
+        learner.env.close()
+
+
+def _build(config: LowLevelTrainConfig, threads: int) -> Any:
+    """The environment and PPO; imported here, so that --help needs neither."""
+    try:
+        from egovcp_train.lowlevel.env import LowLevelEnv
+        from egovcp_train.lowlevel.learn import PpoLearner
+    except ImportError as error:
+        raise EnvironmentFailure(
+            f"{PROG} needs the package {error.name}, which is not installed here: "
+            "pip install 'egovcp-train[lowlevel]'"
+        ) from error
+    env = LowLevelEnv(
+        config.robots,
+        config.task,
+        config.walk,
+        config.sensors,
+        feet=config.feet,
+        threads=threads,
+        seed=config.seed,
+    )
+    return PpoLearner(env, config.network, config.ppo, config.curriculum)
+
+
+def _restore(output: Path, learner: Any) -> None:
+    state = load_training_state(output)
+    try:
+        learner.load_state_dict(state)
+    except (KeyError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ArtefactError(
+            f"{output}: its checkpoint does not fit the options given ({reason}); resume "
+            "without them, or start a new run"
+        ) from error
+
+
+class _Run:
+    """Iterations, records and checkpoints of one run."""
+
+    def __init__(self, config: LowLevelTrainConfig, output: Path, learner: Any) -> None:
+        self.config, self.output, self.learner = config, output, learner
+        self.recorder = Recorder(output, enabled=config.tensorboard)
+
+    def execute(self) -> None:
+        """Learn until the budget or a signal ends it; the last state is always saved."""
+        config, learner, start = self.config, self.learner, self.learner.iteration
+        budget = Budget(config.steps, config.max_minutes)
+        with (
+            stop_on_signal() as stopped,
+            tqdm(
+                total=config.steps,
+                initial=learner.steps,
+                unit="step",
+                unit_scale=True,
+                desc="ppo",
+                mininterval=2.0,
+            ) as bar,
+        ):
+            while budget.progress(learner.steps) < 1.0 and not stopped:
+                scalars = learner.iterate()
+                self.recorder.scalars(learner.steps, scalars)
+                bar.set_postfix(_summary(scalars), refresh=False)
+                bar.update(learner.steps - bar.n)
+                if learner.iteration % config.save_freq == 0:
+                    self.save()
+        if learner.iteration > start and learner.iteration % config.save_freq:
+            self.save()
+        self.recorder.close()
+        final = checkpoint_dir(self.output, learner.iteration) / "pretrained_model" / POLICY_FILE
+        state = "done" if budget.progress(learner.steps) >= 1.0 else "stopped early"
+        print(f"{PROG}: {state} after {learner.steps} steps, difficulty {self._difficulty:.2f}")
+        print(f"controller: {final}")
+        print(f"next: egovcp-eval-lowlevel --controller={final} --output_dir=...")
+
+    @property
+    def _difficulty(self) -> float:
+        return float(self.learner.env.difficulty)
+
+    def save(self) -> None:
+        """Write a checkpoint: the controller's file, and the training state."""
+        partial = begin_checkpoint(self.output, self.learner.iteration)
+        folder = partial / "pretrained_model"
+        folder.mkdir(parents=True)
+        provenance = {
+            "command": [PROG, *sys.argv[1:]],
+            "seed": self.config.seed,
+            "steps": self.learner.steps,
+            "difficulty": self._difficulty,
+            "train_config": draccus.encode(self.config),
+        }
+        self.learner.policy(self.config.walk, provenance).save(folder / POLICY_FILE)
+        finish_checkpoint(partial, self.learner.state_dict())
+
+
+def _summary(scalars: dict[str, float]) -> dict[str, str]:
+    return {
+        "difficulty": f"{scalars['episode/difficulty']:.2f}",
+        "falls/s": f"{scalars['falls_per_second']:.3f}",
+        "v": f"{scalars['reward/velocity']:.2f}",
+        "reward": f"{scalars['reward/total']:.2f}",
+    }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

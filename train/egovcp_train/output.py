@@ -1,0 +1,72 @@
+"""Where a run writes, and how it is asked to stop; shared by all training commands."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from draccus import cfgparsing
+
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp_train.checkpoint import load_training_state
+
+CONFIG_FILE = "train_config.yaml"
+
+
+def resumed_options(argv: Sequence[str]) -> dict[str, Any]:
+    """What stands where no flag says otherwise: the options of the run that is resumed."""
+    given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
+    saved = Path(given.get("output_dir", "")) / CONFIG_FILE
+    resume = "--resume" in argv or given.get("resume", "").lower() == "true"
+    if not (resume and saved.is_file()):
+        return {}
+    options: dict[str, Any] = cfgparsing.load_config(saved.read_text("utf-8"), file=saved)
+    return options
+
+
+def prepare_output(output_dir: str, resume: bool) -> Path:
+    """Refuse a bad destination before any work starts.
+
+    Raises:
+        ArtefactError: there is nothing to resume.
+        UsageError: the folder exists and is not empty.
+        EnvironmentFailure: it cannot be written to.
+    """
+    output = Path(output_dir)
+    if resume:
+        load_training_state(output)
+        return output
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        raise UsageError(
+            f"output folder {output} exists and is not empty; choose another, or continue the run "
+            "in it with --resume"
+        )
+    parent = next(p for p in [output, *output.absolute().parents] if p.exists())
+    try:
+        with tempfile.TemporaryFile(dir=parent):
+            pass
+    except OSError as error:
+        raise EnvironmentFailure(f"cannot write to {parent}: {error.strerror}") from error
+    return output
+
+
+@contextlib.contextmanager
+def stop_on_signal() -> Iterator[list[int]]:
+    """A list that fills when SIGINT or SIGTERM asks for the end; a second one is obeyed at once."""
+    received: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        if received:
+            raise KeyboardInterrupt
+        received.append(number)
+
+    previous = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
