@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
 
-_Z: Final = 1.959964  # two-sided 95 % quantile of the normal distribution
-_RESAMPLES: Final = 4000
+from egovcp.intervals import Interval, wilson
 
-type Interval = tuple[float, float]
+_RESAMPLES: Final = 4000
 
 
 @dataclass(frozen=True)
@@ -29,18 +27,6 @@ class EpisodeScore:
     terminated: bool
     plan_ms: list[float] = field(default_factory=list)
     """Time per tick to decide on one action, ms; shared by robots planned together."""
-
-
-def wilson(successes: int, trials: int) -> Interval:
-    """Wilson's score interval of a rate; it stays inside [0, 1] and is honest at 0 and 1.
-
-    (p + z^2/2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)
-    """
-    p, n = successes / trials, trials
-    middle = p + _Z**2 / (2 * n)
-    half = _Z * math.sqrt(p * (1 - p) / n + _Z**2 / (4 * n * n))
-    scale = 1 + _Z**2 / n
-    return max(0.0, (middle - half) / scale), min(1.0, (middle + half) / scale)
 
 
 def reward_per_step(scores: Sequence[EpisodeScore]) -> float:

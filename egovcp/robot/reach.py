@@ -84,6 +84,23 @@ def follow(memory: Reach, hands: Array, torso: Array, config: ReachConfig) -> Ar
     return np.asarray(target.reshape(len(target), -1))
 
 
+def nearest_reachable(hands: Array, heading: Array, torso: Array) -> Array:
+    """Where the palms can go for targets that may lie beyond reach or inside the trunk.
+
+    Args:
+        hands: (B, 2, 3) targets, pelvis heading frame, m.
+        heading: (B, 3, 3) rotation from the pelvis to the heading frame.
+        torso: (B, 3, 3) rotation from the torso to the heading frame.
+
+    Returns:
+        (B, 2, 3) in the heading frame, m.
+    """
+    origin = rotate(heading, TORSO_ORIGIN)[:, None]
+    inverse = np.swapaxes(torso, 1, 2)
+    goal = arms.reachable(rotate(inverse[:, None], hands - origin))
+    return np.asarray(rotate(torso[:, None], goal) + origin)
+
+
 def _smooth(m: Reach, config: ReachConfig) -> None:
     """Second-order reference: bounded speed and acceleration, no overshoot."""
     wanted = config.bandwidth * (m.goal - m.joints)

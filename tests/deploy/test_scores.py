@@ -12,27 +12,11 @@ from egovcp_deploy.scores import (
     reward_per_step,
     success_gain,
     summarise,
-    wilson,
 )
 
 
 def score(episode: int, success: bool, reward: float = 0.0, steps: int = 10) -> EpisodeScore:
     return EpisodeScore(episode, steps, reward, success, False, [1.0 + episode])
-
-
-@pytest.mark.parametrize(
-    ("successes", "trials", "low", "high"),
-    [
-        (0, 10, 0.0, 0.2775),
-        (10, 10, 0.7225, 1.0),
-        (50, 100, 0.4038, 0.5962),
-        (1, 4, 0.0456, 0.6994),
-    ],
-)
-def test_wilson_agrees_with_published_values(
-    successes: int, trials: int, low: float, high: float
-) -> None:
-    assert wilson(successes, trials) == pytest.approx((low, high), abs=1e-4)
 
 
 def test_reward_per_step_weighs_episodes_by_their_length() -> None:

@@ -22,7 +22,6 @@ from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, Walk, WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import (
     ACTION_BOX,
-    COMMAND_SLICE,
     CONTROLLER_HZ,
     PHYSICS_DT,
     STATE_DIM,
@@ -30,7 +29,9 @@ from egovcp.spec import (
 )
 from egovcp_train.lowlevel import rewards
 from egovcp_train.lowlevel.commands import Commands, between
+from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
 from egovcp_train.lowlevel.physics import Physics, Snapshot
+from egovcp_train.lowlevel.sensing import measure, noise
 from egovcp_train.lowlevel.task import LowLevelTask
 
 Array = NDArray[np.float64]
@@ -63,7 +64,7 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self.commands = Commands(robots, task.commands, self.rng)
         self.walk = Walk(walk)
         self.episode_length_buf = torch.zeros(robots, dtype=torch.long)
-        self._noise = _noise(sensors)
+        self._noise = noise(sensors)
         self._delay = np.zeros(robots, dtype=np.intp)
         self._next_push = np.zeros(robots, dtype=np.intp)
         self._action = np.zeros((robots, ACTIONS))
@@ -139,7 +140,7 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
     # --- inside ----------------------------------------------------------------------
     def fallen(self, x: Snapshot) -> NDArray[np.bool_]:
         """(N,) tilted or sunk far off the reference, or the simulation diverged."""
-        up = rewards.rotation(x.quaternion)[:, 2]
+        up = rotation(x.quaternion)[:, 2]
         pitch = self.walk.pitch
         cosine = up[:, 2] * np.cos(pitch) - up[:, 0] * np.sin(pitch)
         low = x.position[:, 2] < self.walk.height - _FALLEN_HEIGHT
@@ -170,8 +171,7 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self._delay[rows] = self.rng.integers(low, high + 1, n)
         self._schedule_push(rows)
         self._action[rows] = 0.0
-        state = np.zeros((self.num_envs, STATE_DIM))
-        self._measure(self.physics.snapshot(), state)
+        state = self._measure(self.physics.snapshot())
         self.walk.reset(state, None if n == self.num_envs else rows)
 
     def _schedule_push(self, rows: NDArray[np.intp]) -> None:
@@ -192,21 +192,11 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self.physics.qvel[rows, 1] += speed * np.sin(angle)
         self._schedule_push(rows)
 
-    def _measure(self, x: Snapshot, out: Array) -> None:
-        """Noisy proprioception and the command, (N, 74)."""
-        out[:, STATE_SLICES["angular_velocity"]] = x.angular_velocity
-        out[:, STATE_SLICES["projected_gravity"]] = -rewards.rotation(x.quaternion)[:, 2]
-        out[:, STATE_SLICES["joint_position"]] = x.joints
-        out[:, STATE_SLICES["joint_velocity"]] = x.joint_rates
-        out += self._noise * self.rng.standard_normal(out.shape)
-        gravity = out[:, STATE_SLICES["projected_gravity"]]
-        gravity /= np.linalg.norm(gravity, axis=1, keepdims=True)
-        out[:, COMMAND_SLICE] = self.commands.vector
-        np.nan_to_num(out, copy=False, posinf=0.0, neginf=0.0)
+    def _measure(self, x: Snapshot) -> Array:
+        return measure(x, self.commands.vector, self._noise, self.rng)
 
     def _observe(self, x: Snapshot) -> None:
-        self.state = np.zeros((self.num_envs, STATE_DIM))
-        self._measure(x, self.state)
+        self.state = self._measure(x)
         policy = self.walk.observe(self.state)
         privileged = self._privileged(x)
         self._observations = TensorDict(
@@ -217,10 +207,10 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
     def _privileged(self, x: Snapshot) -> NDArray[np.float32]:
         """True velocity 3, height error 1, feet on the floor 2, their heights 2, their places
         across and along 4, friction 1."""
-        turn = rewards.rotation(x.quaternion)
-        forward = rewards.heading(turn)
-        velocity = rewards.in_heading(x.velocity, forward)
-        feet = rewards.in_heading(x.feet - x.position[:, None], forward)
+        turn = rotation(x.quaternion)
+        forward = heading(turn)
+        velocity = in_heading(x.velocity, forward)
+        feet = in_heading(x.feet - x.position[:, None], forward)
         columns = [
             velocity,
             x.velocity[:, 2:],
@@ -242,15 +232,6 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
             log["/episode/fell"] = float(fallen[done].mean())
         log["/episode/difficulty"] = self.difficulty
         return log
-
-
-def _noise(config: SensorConfig) -> Array:
-    out = np.zeros(STATE_DIM)
-    out[STATE_SLICES["angular_velocity"]] = config.angular_velocity
-    out[STATE_SLICES["projected_gravity"]] = config.gravity
-    out[STATE_SLICES["joint_position"]] = config.joint_position
-    out[STATE_SLICES["joint_velocity"]] = config.joint_velocity
-    return out
 
 
 # --- left and right ------------------------------------------------------------------

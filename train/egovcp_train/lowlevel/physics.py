@@ -17,6 +17,7 @@ from egovcp_train.lowlevel.task import DisturbanceConfig
 
 Array = NDArray[np.float64]
 SIDES: Final = ("left", "right")
+_HEAD: Final = "head_collision"  # a sphere
 _STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
 #: What the sensors read per body: foot place and velocity, its x and z axis, palm place.
 _SENSORS: Final = (
@@ -42,6 +43,7 @@ class Snapshot:
     feet_forward: Array  # (N, 2, 3) x axes
     palms: Array  # (N, 2, 3) m
     torque: Array  # (N, J) N m, of the servos
+    head_top: Array  # (N,) m
     broken: NDArray[np.bool_]  # (N,) the simulation diverged
 
 
@@ -59,6 +61,7 @@ class Physics:
         self._rollout = Rollout(nthread=threads if threads > 1 else 0)
         self.state = np.zeros((robots, mujoco.mj_stateSize(base, _STATE)))
         self._nq, self._nv = base.nq, base.nv
+        self._head_radius = float(base.geom(_HEAD).size[0])
         steps = PHYSICS_STEPS_PER_CONTROLLER_TICK
         self._states = np.zeros((robots, steps, self.state.shape[1]))
         self._readings = np.zeros((robots, steps, base.nsensordata))
@@ -106,7 +109,7 @@ class Physics:
         qpos, qvel = self.qpos, self.qvel
         readings = self._readings[:, -1, : 3 * 2 * len(_SENSORS)]
         place, speed, forward, palms = np.moveaxis(readings.reshape(-1, len(_SENSORS), 2, 3), 1, 0)
-        torque = self._readings[:, -1, 3 * 2 * len(_SENSORS) :]
+        torque = self._readings[:, -1, 3 * 2 * len(_SENSORS) : -3]
         broken = ~np.isfinite(self.state).all(axis=1)
         broken |= np.abs(qvel).max(axis=1) > 100.0
         return Snapshot(
@@ -121,6 +124,7 @@ class Physics:
             feet_forward=forward,
             palms=palms,
             torque=torque,
+            head_top=self._readings[:, -1, -1] + self._head_radius,
             broken=broken,
         )
 
@@ -151,6 +155,9 @@ def _compile(feet: FootModel) -> mujoco.MjModel:
             objtype=mujoco.mjtObj.mjOBJ_ACTUATOR,
             objname=joint,
         )
+    spec.add_sensor(
+        type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=_HEAD
+    )
     return spec.compile()
 
 

@@ -1,0 +1,104 @@
+"""``egovcp-eval-lowlevel``: what is commanded, what is measured, what is written."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egovcp.robot.controllers import make_controller
+from egovcp.sim.config import SensorConfig
+from egovcp.spec import ACTION_BOX, ACTION_ETA
+from egovcp_train.lowlevel import skills
+from egovcp_train.lowlevel.evaluate import main
+from egovcp_train.lowlevel.skills import SKILLS, Skill
+from egovcp_train.lowlevel.task import DisturbanceConfig
+from egovcp_train.lowlevel.trial import _lag, _velocity_error, play
+
+
+def _rng() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+@pytest.mark.parametrize("skill", SKILLS, ids=lambda s: s.name)
+def test_every_skill_commands_what_its_line_says(skill: Skill):
+    commands = skill.script(skill.ticks, 16, _rng())
+    assert commands.shape == (skill.ticks, 16, 10)
+    hands = ACTION_BOX.to_normalised(commands[..., 3:])[..., :6]
+    assert (np.abs(hands) <= 1 + 1e-9).all()
+    walks = skill.name in ("walk", "crouch", "low")
+    assert commands[..., :3].any() == walks
+    ranges = {"squat": (0.50, 0.74), "walk": (0.70, 0.74), "crouch": (0.58, 0.62), "low": (0.55, 0.55)}
+    if skill.name in ranges:
+        low, high = ranges[skill.name]
+        assert low - 1e-9 <= commands[-1, :, -1].min() <= commands[-1, :, -1].max() <= high + 1e-9
+
+
+def test_the_random_walk_is_that_of_the_data():
+    actions = ACTION_BOX.to_normalised(skills.random_walk(1000, 8, _rng())[..., 3:])
+    steps = np.abs(np.diff(actions[::2], axis=0))
+    assert steps.max() <= ACTION_ETA + 1e-9
+    assert np.abs(actions).max() <= 1 + 1e-9
+    assert actions.std() > 0.4  # it visits the whole box
+    np.testing.assert_allclose(actions[::2], actions[1::2])
+
+
+def test_the_lag_of_a_delayed_copy_is_its_delay():
+    targets = np.cumsum(_rng().standard_normal((200, 3, 2, 3)), axis=0)
+    hands = np.concatenate([np.repeat(targets[:1], 7, axis=0), targets[:-7]])
+    assert _lag(hands, targets, np.ones((200, 3), dtype=bool)) == pytest.approx(7 / 50)
+
+
+def test_swinging_with_each_step_is_no_velocity_error_but_being_slow_is():
+    time = np.arange(200) / 50
+    wanted = np.tile([0.4, 0.0], (200, 2, 1))
+    velocity = wanted.copy()
+    velocity[:, 0, 1] = 0.2 * np.sin(2 * np.pi * time / 0.8)
+    velocity[:, 1, 0] = 0.3
+    error = _velocity_error(velocity, wanted, np.ones((200, 2), dtype=bool))
+    assert error == pytest.approx([0.0, 0.1], abs=1e-6)
+
+
+def _play(script: str, seconds: float, **options: float):
+    skill = Skill("trial", "", seconds, getattr(skills, script), **options)
+    return play(make_controller("stance"), skill, 4, 0, DisturbanceConfig(models=4), SensorConfig())
+
+
+def test_the_stance_law_stands_and_reaches():
+    outcome = _play("held_targets", 2.4, settled_only=True)
+    assert outcome.survived.all()
+    assert (outcome.hand_error < 0.03).all()
+    assert (outcome.height_error < 0.02).all()
+    assert np.isnan(outcome.velocity_error).all()
+
+
+def test_a_robot_that_is_thrown_down_has_fallen():
+    outcome = _play("neutral", 3.0, push=2.0)
+    assert not outcome.survived.any()
+
+
+def test_it_writes_a_line_per_skill(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    flags = [f"--output_dir={tmp_path / 'out'}", "--skills=squat", "--episodes=2", "--threads=1"]
+    assert main(flags) == 0
+    figures = json.loads((tmp_path / "out" / "lowlevel.json").read_text())
+    assert figures["squat"]["episodes"] == 2
+    assert figures["squat"]["survival"] == 1.0
+    assert figures["squat"]["height_error_m"] < 0.02
+    assert figures["squat"]["velocity_error_mps"] is None
+    assert figures["_run"]["controller"] == make_controller("stance").id
+    assert "squat" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("flag", "code", "message"),
+    [
+        ("--skills=squad", 2, "did you mean 'squat'"),
+        ("--episodes=0", 2, "--episodes"),
+        ("--controller=stans", 2, "expected stance"),
+        ("--controller=none.safetensors", 4, "no such controller"),
+    ],
+)
+def test_bad_options_are_refused(tmp_path, capsys, flag, code, message):
+    assert main([f"--output_dir={tmp_path / 'out'}", flag]) == code
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()

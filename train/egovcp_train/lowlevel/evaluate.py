@@ -1,0 +1,168 @@
+"""``egovcp-eval-lowlevel``: how well a controller stands, reaches, squats, walks and is pushed."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from egovcp.cli import run_command
+from egovcp.errors import EnvironmentFailure, UsageError, suggest
+from egovcp.intervals import wilson
+from egovcp.robot.controllers import make_controller
+from egovcp.sim.config import SensorConfig
+from egovcp_train.lowlevel.skills import SKILLS, Skill
+from egovcp_train.lowlevel.task import DisturbanceConfig
+
+PROG = "egovcp-eval-lowlevel"
+RESULT = "lowlevel.json"
+_BATCH: Final = 200  # robots side by side
+_FIGURES: Final = {
+    "hand_error_m": "hand_error",
+    "hand_lag_s": "hand_lag",
+    "height_error_m": "height_error",
+    "velocity_error_mps": "velocity_error",
+    "head_top_m": "head_top",
+}
+
+
+@dataclass(frozen=True)
+class LowLevelEvalConfig:
+    """Judge a low-level controller under randomised physics on the stock collision model.
+
+    Every skill is played by --episodes robots of different mass, friction and gains, with
+    delay and sensor noise. A fall is a tilt of more than 1 rad or a pelvis below 0.35 m.
+    Errors are means over the time before a fall.
+    """
+
+    output_dir: str
+    """Folder for lowlevel.json; its other files are left alone."""
+    controller: str = "stance"
+    """stance, or the walk.safetensors that egovcp-train-lowlevel wrote."""
+    skills: str = ",".join(skill.name for skill in SKILLS)
+    """Which skills, separated by commas."""
+    episodes: int = 400
+    """Robots per skill."""
+    disturbances: DisturbanceConfig = field(default_factory=lambda: DisturbanceConfig(models=400))
+    """Ranges of the physical parameters and of the delay."""
+    sensors: SensorConfig = field(default_factory=SensorConfig)
+    """Noise of proprioception."""
+    feet: Literal["stock", "points"] = "stock"
+    """Foot collision model."""
+    seed: int = 1000
+    """Seed of robots, commands, pushes and noise."""
+    threads: int = 0
+    """CPU threads; 0: all cores."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run_command(LowLevelEvalConfig, evaluate, argv, prog=PROG)
+
+
+def evaluate(config: LowLevelEvalConfig) -> None:
+    """Play, print the table, write the JSON."""
+    if config.episodes < 1:
+        raise UsageError(f"--episodes is {config.episodes}; expected at least 1")
+    skills = _chosen(config.skills)
+    controller = make_controller(config.controller)
+    output = _writable(Path(config.output_dir))
+    figures = {}
+    with tqdm(total=len(skills) * config.episodes, unit="robot", desc="skills") as bar:
+        for skill in skills:
+            bar.set_postfix_str(skill.name)
+            figures[skill.name] = _figures(skill, _play(config, skill, bar))
+    print(table(figures))
+    run = {"controller": controller.id, "command": [PROG, *sys.argv[1:]], "seed": config.seed}
+    (output / RESULT).write_text(json.dumps(figures | {"_run": run}, indent=2))
+    print(f"figures: {output / RESULT}")
+
+
+def _chosen(names: str) -> list[Skill]:
+    by_name = {skill.name: skill for skill in SKILLS}
+    for name in names.split(","):
+        if name not in by_name:
+            raise UsageError(f"unknown skill {name!r} in --skills{suggest(name, by_name)}")
+    return [by_name[name] for name in names.split(",")]
+
+
+def _writable(folder: Path) -> Path:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise EnvironmentFailure(f"cannot write to {folder}: {error.strerror}") from error
+    return folder
+
+
+def _play(config: LowLevelEvalConfig, skill: Skill, bar: Any) -> dict[str, NDArray[Any]]:
+    from egovcp_train.lowlevel.trial import play  # MuJoCo; --help needs none
+
+    threads = config.threads or len(os.sched_getaffinity(0))
+    parts: list[Any] = []
+    for first in range(0, config.episodes, _BATCH):
+        robots = min(_BATCH, config.episodes - first)
+        parts.append(
+            play(
+                make_controller(config.controller),
+                skill,
+                robots,
+                config.seed + first,
+                config.disturbances,
+                config.sensors,
+                config.feet,
+                threads,
+            )
+        )
+        bar.update(robots)
+    names = ("survived", *_FIGURES.values())
+    return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+
+
+def _figures(skill: Skill, outcome: dict[str, NDArray[Any]]) -> dict[str, Any]:
+    survived = outcome["survived"]
+    low, high = wilson(int(survived.sum()), len(survived))
+    out: dict[str, Any] = {
+        "about": skill.about,
+        "episodes": len(survived),
+        "survival": float(survived.mean()),
+        "survival_ci95": [low, high],
+    }
+    for key, name in _FIGURES.items():
+        known = outcome[name][np.isfinite(outcome[name])]
+        out[key] = float(known.mean()) if len(known) else None
+    return out
+
+
+def table(figures: dict[str, dict[str, Any]]) -> str:
+    """One line per skill."""
+    head = f"{'skill':<8}{'survival':>9}  {'95 %':<18}{'hand':>8}{'lag':>8}{'height':>9}"
+    lines = [head + f"{'velocity':>11}{'head top':>10}"]
+    for name, f in figures.items():
+        low, high = f["survival_ci95"]
+        lines.append(
+            f"{name:<8}{f['survival']:>9.1%}  {f'{low:.1%} to {high:.1%}':<18}"
+            f"{_cell(f['hand_error_m'], 100, 'cm'):>8}{_cell(f['hand_lag_s'], 1000, 'ms', 0):>8}"
+            f"{_cell(f['height_error_m'], 100, 'cm'):>9}"
+            f"{_cell(f['velocity_error_mps'], 1, 'm/s', 2):>11}"
+            f"{_cell(f['head_top_m'], 1, 'm', 2):>10}"
+        )
+    return "\n".join(lines)
+
+
+def _cell(value: float | None, scale: float, unit: str, digits: int = 1) -> str:
+    return "" if value is None else f"{value * scale:.{digits}f} {unit}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

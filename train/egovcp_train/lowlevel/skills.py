@@ -1,0 +1,112 @@
+"""The skills that a low-level controller is judged by: what is commanded, tick by tick."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.spec import (
+    ACTION_BOX,
+    ACTION_DIM,
+    ACTION_ETA,
+    CONTROLLER_HZ,
+    CONTROLLER_TICKS_PER_PLAN,
+)
+
+Array = NDArray[np.float64]
+HOLD: Final = 60  # ticks for which a held target stays
+SETTLED: Final = 30  # ticks after which a held target should be reached
+_RAMP: Final = 25  # ticks from standing to the commanded velocity
+_HEIGHT: Final = ACTION_DIM - 1
+
+
+@dataclass(frozen=True)
+class Skill:
+    """One line of the table."""
+
+    name: str
+    about: str
+    seconds: float
+    script: Callable[[int, int, np.random.Generator], Array]
+    """(ticks, robots, generator) -> commands (ticks, robots, 10)."""
+    settled_only: bool = False
+    """Judge hands and height only where their target has been held for 0.6 s."""
+    push: float = 0.0
+    """m/s of an impulse in any horizontal direction, after 1 s."""
+
+    @property
+    def ticks(self) -> int:
+        return round(self.seconds * CONTROLLER_HZ)
+
+
+def _commands(actions: Array, velocity: Array | None = None) -> Array:
+    """Normalised actions (T, N, 7) and velocities (T, N, 3) -> commands (T, N, 10)."""
+    still = np.zeros((*actions.shape[:2], 3))
+    v = still if velocity is None else velocity
+    return np.concatenate([v, ACTION_BOX.to_metric(actions)], axis=-1)
+
+
+def random_walk(ticks: int, robots: int, rng: np.random.Generator) -> Array:
+    """The data's own: a += eta delta each 40 ms, reflected at the box, from neutral."""
+    steps = ACTION_ETA * rng.uniform(-1, 1, (ticks // CONTROLLER_TICKS_PER_PLAN, robots, 7))
+    free = np.cumsum(steps, axis=0)
+    folded = np.abs((free - 1.0) % 4.0 - 2.0) - 1.0  # the walk between mirrors at -1 and 1
+    return _commands(np.repeat(folded, CONTROLLER_TICKS_PER_PLAN, axis=0))
+
+
+def held_targets(ticks: int, robots: int, rng: np.random.Generator) -> Array:
+    """A new target of hands and height every 1.2 s, anywhere in the box."""
+    held = rng.uniform(-1, 1, (-(-ticks // HOLD), robots, ACTION_DIM))
+    return _commands(np.repeat(held, HOLD, axis=0)[:ticks])
+
+
+def squats(ticks: int, robots: int, rng: np.random.Generator) -> Array:
+    """A new height between 0.50 and 0.74 m every 1.2 s, hands neutral."""
+    heights = np.repeat(rng.uniform(0.50, 0.74, (-(-ticks // HOLD), robots)), HOLD, axis=0)[:ticks]
+    return _at_height(heights)
+
+
+def _at_height(heights: Array, velocity: Array | None = None) -> Array:
+    command = _commands(np.zeros((*heights.shape, ACTION_DIM)), velocity)
+    command[..., -1] = heights
+    return command
+
+
+def walking(
+    speed: tuple[float, float], height: tuple[float, float]
+) -> Callable[[int, int, np.random.Generator], Array]:
+    """Straight on at one speed and one height per robot, hands neutral."""
+
+    def script(ticks: int, robots: int, rng: np.random.Generator) -> Array:
+        ramp = np.minimum(1.0, np.arange(ticks) / _RAMP)[:, None]
+        velocity = np.zeros((ticks, robots, 3))
+        velocity[..., 0] = ramp * rng.uniform(*speed, robots)
+        start = ACTION_BOX.neutral[_HEIGHT]
+        goal = rng.uniform(*height, robots)
+        return _at_height(start + ramp * (goal - start), velocity)
+
+    return script
+
+
+def neutral(ticks: int, robots: int, rng: np.random.Generator) -> Array:
+    """Stand still."""
+    return _commands(np.zeros((ticks, robots, ACTION_DIM)))
+
+
+SKILLS: Final = (
+    Skill("stand", "20 s of the data's random walk of hands and height", 20.0, random_walk),
+    Skill("reach", "targets held for 1.2 s, judged after 0.6 s", 12.0, held_targets, True),
+    Skill("squat", "heights of 0.50 to 0.74 m, judged after 0.6 s", 12.0, squats, True),
+    Skill(
+        "walk", "10 s at 0.1 to 0.6 m/s, 0.70 to 0.74 m", 10.0, walking((0.1, 0.6), (0.70, 0.74))
+    ),
+    Skill(
+        "crouch", "10 s at 0.2 to 0.4 m/s, 0.58 to 0.62 m", 10.0, walking((0.2, 0.4), (0.58, 0.62))
+    ),
+    Skill("low", "10 s at 0.2 to 0.4 m/s, 0.55 m", 10.0, walking((0.2, 0.4), (0.55, 0.55))),
+    Skill("push", "an impulse of 0.5 m/s while standing", 6.0, neutral, push=0.5),
+)

@@ -1,0 +1,187 @@
+"""Plays a skill with many robots at once and measures what came of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.robot.controller import LowLevelController
+from egovcp.robot.g1 import WAIST
+from egovcp.robot.kinematics import joint_rotations
+from egovcp.robot.mjcf import FootModel
+from egovcp.robot.reach import nearest_reachable
+from egovcp.robot.stance_table import standing_pose
+from egovcp.sim.config import SensorConfig
+from egovcp.spec import ACTION_BOX, CONTROLLER_HZ, PHYSICS_DT
+from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
+from egovcp_train.lowlevel.physics import Physics, Snapshot
+from egovcp_train.lowlevel.sensing import measure, noise
+from egovcp_train.lowlevel.skills import HOLD, SETTLED, Skill
+from egovcp_train.lowlevel.task import DisturbanceConfig
+
+Array = NDArray[np.float64]
+_FALLEN_TILT: Final = 1.0  # rad
+_FALLEN_HEIGHT: Final = 0.35  # m
+_PUSH_TICK: Final = CONTROLLER_HZ
+_STRIDE: Final = 40  # ticks over which velocities are averaged: the pelvis swings with each step
+_WARM_UP: Final = 2 * CONTROLLER_HZ  # ticks of ramp and transition that do not count in walking
+_LAGS: Final = 25  # ticks, the longest lag looked for
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """Per robot (N,); not-a-number where nothing could be judged."""
+
+    survived: NDArray[np.bool_]
+    hand_error: Array  # m, mean distance to the nearest reachable target
+    hand_lag: Array  # s, by which the hands follow best
+    height_error: Array  # m, mean
+    velocity_error: Array  # m/s, mean over strides
+    head_top: Array  # m, highest in walking
+
+
+class _Record:
+    """Series (T, N, ...) of one trial."""
+
+    def __init__(self) -> None:
+        self.hands: list[Array] = []
+        self.targets: list[Array] = []
+        self.height: list[Array] = []
+        self.velocity: list[Array] = []
+        self.head: list[Array] = []
+
+    def add(self, x: Snapshot, command: Array) -> None:
+        turn = rotation(x.quaternion)
+        forward = heading(turn)
+        to_heading = _heading_from_world(forward)
+        palms = (to_heading[:, None] @ (x.palms - x.position[:, None])[..., None])[..., 0]
+        pelvis = to_heading @ turn
+        waist = joint_rotations(x.joints[:, WAIST], WAIST)
+        torso = pelvis @ waist[:, 0] @ waist[:, 1] @ waist[:, 2]
+        self.hands.append(palms)
+        self.targets.append(nearest_reachable(command[:, 3:9].reshape(-1, 2, 3), pelvis, torso))
+        self.height.append(x.position[:, 2].copy())
+        self.velocity.append(in_heading(x.velocity, forward))
+        self.head.append(x.head_top.copy())
+
+
+def play(
+    controller: LowLevelController,
+    skill: Skill,
+    robots: int,
+    seed: int,
+    disturbances: DisturbanceConfig,
+    sensors: SensorConfig,
+    feet: FootModel = "stock",
+    threads: int = 1,
+) -> Outcome:
+    """Run ``skill`` once with each of ``robots`` robots of different physical parameters."""
+    rng = np.random.default_rng([seed, 1])
+    physics = Physics(robots, feet, disturbances, threads, seed)
+    commands = skill.script(skill.ticks, robots, rng)
+    _place(physics, robots)
+    low, high = (round(d / PHYSICS_DT) for d in disturbances.delay)
+    delay = rng.integers(low, high + 1, robots)
+    std, record = noise(sensors), _Record()
+    alive = np.ones((skill.ticks, robots), dtype=bool)
+    x = physics.snapshot()
+    controller.reset(measure(x, commands[0], std, rng))
+    for tick, command in enumerate(commands):
+        if skill.push and tick == _PUSH_TICK:
+            _push(physics, skill.push, rng)
+        state = measure(x, command, std, rng)
+        physics.step(controller.step(state), delay)
+        x = physics.snapshot()
+        alive[tick:] &= ~_fallen(x)
+        record.add(x, command)
+    physics.close()
+    return _judge(skill, commands, record, alive)
+
+
+def _place(physics: Physics, robots: int) -> None:
+    pose = standing_pose(ACTION_BOX.neutral[-1])
+    qpos = np.tile(np.concatenate([pose.position, pose.quaternion, pose.joints]), (robots, 1))
+    physics.place(np.arange(robots), qpos, qpos[:, 7:])
+
+
+def _push(physics: Physics, speed: float, rng: np.random.Generator) -> None:
+    angle = rng.uniform(-np.pi, np.pi, len(physics.qvel))
+    physics.qvel[:, 0] += speed * np.cos(angle)
+    physics.qvel[:, 1] += speed * np.sin(angle)
+
+
+def _fallen(x: Snapshot) -> NDArray[np.bool_]:
+    upright = rotation(x.quaternion)[:, 2, 2]
+    out: NDArray[np.bool_] = (upright < np.cos(_FALLEN_TILT)) | x.broken
+    return out | (x.position[:, 2] < _FALLEN_HEIGHT)
+
+
+def _heading_from_world(forward: Array) -> Array:
+    c, s = forward.T
+    o, i = np.zeros_like(c), np.ones_like(c)
+    rows = [[c, s, o], [-s, c, o], [o, o, i]]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _judge(skill: Skill, commands: Array, record: _Record, alive: NDArray[np.bool_]) -> Outcome:
+    hands, targets = np.array(record.hands), np.array(record.targets)  # (T, N, 2, 3)
+    height, velocity = np.array(record.height), np.array(record.velocity)
+    moves = commands[..., :2].any()
+    counted = alive.copy()
+    if skill.settled_only:
+        counted &= (np.arange(len(commands)) % HOLD >= SETTLED)[:, None]
+    elif moves:
+        counted[:_WARM_UP] = False
+    apart = np.linalg.norm(hands - targets, axis=-1).mean(axis=-1)
+    off = np.abs(height - commands[..., -1])
+    return Outcome(
+        survived=alive[-1],
+        hand_error=_mean(apart, counted),
+        hand_lag=_lag(hands, targets, counted)
+        if np.ptp(commands[..., 3:9], axis=0).any() and not skill.settled_only
+        else _nothing(alive),
+        height_error=_mean(off, counted),
+        velocity_error=_velocity_error(velocity, commands[..., :2], counted)
+        if moves
+        else _nothing(alive),
+        head_top=_highest(np.array(record.head), counted) if moves else _nothing(alive),
+    )
+
+
+def _nothing(alive: NDArray[np.bool_]) -> Array:
+    return np.full(alive.shape[1], np.nan)
+
+
+def _mean(series: Array, counted: NDArray[np.bool_]) -> Array:
+    """(T, N) -> (N,) over the counted ticks."""
+    number = counted.sum(axis=0)
+    total = np.where(counted, np.nan_to_num(series), 0.0).sum(axis=0)
+    return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
+
+
+def _highest(series: Array, counted: NDArray[np.bool_]) -> Array:
+    top = np.where(counted, np.nan_to_num(series), -np.inf).max(axis=0)
+    return np.where(np.isfinite(top), top, np.nan)
+
+
+def _velocity_error(velocity: Array, wanted: Array, counted: NDArray[np.bool_]) -> Array:
+    """Distance of the mean velocity of each stride to the mean of what was commanded."""
+    if len(velocity) <= _STRIDE:
+        return _nothing(counted)
+    kernel = np.cumsum(np.concatenate([np.zeros_like(velocity[:1]), velocity - wanted]), axis=0)
+    mean = (kernel[_STRIDE:] - kernel[:-_STRIDE]) / _STRIDE
+    return _mean(np.linalg.norm(mean, axis=-1), counted[_STRIDE - 1 :])
+
+
+def _lag(hands: Array, targets: Array, counted: NDArray[np.bool_]) -> Array:
+    """The delay (s) of the targets at which the hands are nearest to them."""
+    errors = []
+    for lag in range(_LAGS):
+        shifted = np.linalg.norm(hands[lag:] - targets[: len(targets) - lag], axis=-1).mean(-1)
+        errors.append(_mean(shifted, counted[lag:]))
+    table = np.array(errors)
+    best = np.argmin(np.where(np.isnan(table), np.inf, table), axis=0) / CONTROLLER_HZ
+    return np.where(np.isnan(table).all(axis=0), np.nan, best)
