@@ -25,7 +25,7 @@ from egovcp.errors import ArtefactError, UsageError
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
 
 SCHEMA: Final = "egovcp-walk-1"
-_CLIP: Final = 10.0  # standard deviations: one wild measurement must not kick
+OBSERVATION_CLIP: Final = 10.0  # standard deviations: one wild measurement must not kick
 
 Array32 = NDArray[np.float32]
 
@@ -44,7 +44,7 @@ class WalkPolicy:
 
     def __call__(self, observation: Array32) -> Array32:
         """(B, 92) -> actions (B, 15); a row's bits do not depend on the batch."""
-        x = np.clip((observation - self.mean) / self.std, -_CLIP, _CLIP)
+        x = np.clip((observation - self.mean) / self.std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
         for i, (weight, bias) in enumerate(self.layers):
             x = (weight @ x[:, :, None])[:, :, 0] + bias
             if i + 1 < len(self.layers):

@@ -28,7 +28,12 @@ def test_every_skill_commands_what_its_line_says(skill: Skill):
     assert (np.abs(hands) <= 1 + 1e-9).all()
     walks = skill.name in ("walk", "crouch", "low")
     assert commands[..., :3].any() == walks
-    ranges = {"squat": (0.50, 0.74), "walk": (0.70, 0.74), "crouch": (0.58, 0.62), "low": (0.55, 0.55)}
+    ranges = {
+        "squat": (0.50, 0.74),
+        "walk": (0.70, 0.74),
+        "crouch": (0.58, 0.62),
+        "low": (0.55, 0.55),
+    }
     if skill.name in ranges:
         low, high = ranges[skill.name]
         assert low - 1e-9 <= commands[-1, :, -1].min() <= commands[-1, :, -1].max() <= high + 1e-9

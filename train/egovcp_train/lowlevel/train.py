@@ -16,6 +16,7 @@ from tqdm import tqdm
 
 from egovcp.cli import run_command, save_config
 from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.robot.walk_onnx import export_onnx
 from egovcp.robot.walking import WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp_train.checkpoint import (
@@ -37,6 +38,7 @@ from egovcp_train.records import Recorder
 
 PROG = "egovcp-train-lowlevel"
 POLICY_FILE = "walk.safetensors"
+ONNX_FILE = "walk.onnx"
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,8 @@ class LowLevelTrainConfig:
     """Train the low-level controller with PPO (rsl-rl) in MuJoCo on the CPU.
 
     The result, OUTPUT_DIR/checkpoints/last/pretrained_model/walk.safetensors, is a controller
-    for egovcp-eval-lowlevel and for the simulator. Stop it at any time (Ctrl-C) and go on with
+    for egovcp-eval-lowlevel and for the simulator; walk.onnx beside it is the same for a robot
+    computer. Stop it at any time (Ctrl-C) and go on with
     --resume.
     """
 
@@ -194,7 +197,9 @@ class _Run:
             "difficulty": self._difficulty,
             "train_config": draccus.encode(self.config),
         }
-        self.learner.policy(self.config.walk, provenance).save(folder / POLICY_FILE)
+        policy = self.learner.policy(self.config.walk, provenance)
+        policy.save(folder / POLICY_FILE)
+        export_onnx(policy, folder / ONNX_FILE)
         finish_checkpoint(partial, self.learner.state_dict())
 
 

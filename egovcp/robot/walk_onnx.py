@@ -1,0 +1,175 @@
+"""The walking policy as ONNX: written with ``onnx``, run with ``onnxruntime`` on a robot.
+
+The graph maps the raw observation (B, 92) to the action (B, 15); normalisation is inside. What a
+robot computer must know besides is in the file's metadata: joint names, gains, the neutral
+pose, the action's scale, the observation's layout, and the configuration of `walking.Walk`.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Final
+
+import draccus
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp.robot.g1 import DAMPING, STIFFNESS
+from egovcp.robot.stance_table import standing_pose
+from egovcp.robot.walk_policy import OBSERVATION_CLIP, WalkPolicy
+from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
+from egovcp.spec import ACTION_BOX, JOINT_NAMES, STATE_NAMES
+
+SCHEMA: Final = "egovcp-walk-onnx-1"
+_OPSET: Final = 17
+_INPUT, _OUTPUT = "observation", "action"
+
+#: What each number of the observation is.
+OBSERVATION_NAMES: Final = (
+    *STATE_NAMES,
+    "gait.sin_phase",
+    "gait.cos_phase",
+    "gait.amount",
+    *(f"last_action.{name}" for name in JOINT_NAMES[:ACTIONS]),
+)
+
+
+def export_onnx(policy: WalkPolicy, path: Path) -> None:
+    """Write ``policy`` to ``path``.
+
+    Raises:
+        EnvironmentFailure: the package onnx is missing.
+    """
+    try:
+        import onnx
+    except ImportError as error:
+        raise _missing("onnx") from error
+    model = onnx.helper.make_model(
+        _graph(policy), opset_imports=[onnx.helper.make_opsetid("", _OPSET)], ir_version=9
+    )
+    onnx.helper.set_model_props(model, {k: _text(v) for k, v in metadata(policy).items()})
+    onnx.checker.check_model(model, full_check=True)
+    onnx.save(model, str(path))
+
+
+def metadata(policy: WalkPolicy) -> dict[str, Any]:
+    """What a robot computer must know besides the graph."""
+    return {
+        "schema": SCHEMA,
+        "digest": policy.digest,
+        "joint_names": list(JOINT_NAMES),
+        "stiffness": STIFFNESS.tolist(),
+        "damping": DAMPING.tolist(),
+        "default_joint_position": standing_pose(ACTION_BOX.neutral[-1]).joints.tolist(),
+        "action_joint_names": list(JOINT_NAMES[:ACTIONS]),
+        "action_scale": policy.config.action_scale,
+        "observation_names": list(OBSERVATION_NAMES),
+        "config": draccus.encode(policy.config),
+        "provenance": dict(policy.provenance),
+    }
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _graph(policy: WalkPolicy) -> Any:
+    """Sub, Div, Clip, then Gemm and Elu per layer."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    constants = {
+        "mean": policy.mean,
+        "std": policy.std,
+        "low": np.float32(-OBSERVATION_CLIP),
+        "high": np.float32(OBSERVATION_CLIP),
+    }
+    nodes = [
+        helper.make_node("Sub", [_INPUT, "mean"], ["centred"]),
+        helper.make_node("Div", ["centred", "std"], ["scaled"]),
+        helper.make_node("Clip", ["scaled", "low", "high"], ["hidden0"]),
+    ]
+    last = len(policy.layers) - 1
+    for i, (weight, bias) in enumerate(policy.layers):
+        constants |= {f"weight{i}": weight, f"bias{i}": bias}
+        out = _OUTPUT if i == last else f"linear{i}"
+        inputs = [f"hidden{i}", f"weight{i}", f"bias{i}"]
+        nodes.append(helper.make_node("Gemm", inputs, [out], transB=1))
+        if i < last:
+            nodes.append(helper.make_node("Elu", [out], [f"hidden{i + 1}"]))
+    return helper.make_graph(
+        nodes,
+        "egovcp_walk",
+        [helper.make_tensor_value_info(_INPUT, TensorProto.FLOAT, ["batch", OBSERVATION_DIM])],
+        [helper.make_tensor_value_info(_OUTPUT, TensorProto.FLOAT, ["batch", ACTIONS])],
+        [numpy_helper.from_array(np.asarray(v), name) for name, v in constants.items()],
+    )
+
+
+class OnnxPolicy:
+    """A policy that onnxruntime runs; a `walking.Residual`."""
+
+    def __init__(self, path: Path) -> None:
+        """Load and check a file.
+
+        Raises:
+            ArtefactError: missing, damaged, or not of this observation and action.
+            EnvironmentFailure: the package onnxruntime is missing.
+        """
+        try:
+            import onnxruntime
+        except ImportError as error:
+            raise _missing("onnxruntime") from error
+        if not path.is_file():
+            raise ArtefactError(f"{path}: no such controller; expected an exported .onnx file")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1  # a policy step must not wait for other threads
+        try:
+            self._session = onnxruntime.InferenceSession(
+                str(path), options, providers=["CPUExecutionProvider"]
+            )
+            self._metadata = self._session.get_modelmeta().custom_metadata_map
+            self.config: WalkConfig = self._check()
+        except Exception as error:  # onnxruntime raises a class per kind of damage
+            reason = " ".join(str(error).split())[:200]
+            raise ArtefactError(
+                f"{path}: not a controller of schema {SCHEMA} ({reason})"
+            ) from error
+
+    def _check(self) -> WalkConfig:
+        if self._metadata.get("schema") != SCHEMA:
+            raise ValueError(f"its schema is {self._metadata.get('schema')!r}")
+        shapes = [v.shape[1:] for v in (*self._session.get_inputs(), *self._session.get_outputs())]
+        if shapes != [[OBSERVATION_DIM], [ACTIONS]]:
+            raise ValueError(f"its shapes are {shapes}")
+        expected = {"joint_names": list(JOINT_NAMES), "observation_names": list(OBSERVATION_NAMES)}
+        for name, value in expected.items():
+            if json.loads(self._metadata[name]) != value:
+                raise ValueError(f"its {name} are others")
+        config: WalkConfig = draccus.decode(WalkConfig, json.loads(self._metadata["config"]))
+        return config
+
+    @cached_property
+    def digest(self) -> str:
+        """That of the policy which was exported."""
+        return str(self._metadata["digest"])
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        """Where the policy comes from."""
+        out: Mapping[str, Any] = json.loads(self._metadata["provenance"])
+        return out
+
+    def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(B, 92) -> actions (B, 15)."""
+        out: NDArray[np.float32] = self._session.run([_OUTPUT], {_INPUT: observation})[0]
+        return out
+
+
+def _missing(package: str) -> EnvironmentFailure:
+    return EnvironmentFailure(
+        f"this needs the package {package}, which is not installed here: pip install 'egovcp[onnx]'"
+    )
