@@ -16,7 +16,7 @@ import draccus
 from egovcp.cli import run_command
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.data.source import local_root
-from egovcp.robot.stance import StanceController
+from egovcp.robot.controllers import make_controller
 from egovcp_collect.config import CollectConfig
 from egovcp_collect.progress import Progress
 from egovcp_collect.workers import Shared, SimulationFailed, make_shared, run_groups
@@ -107,7 +107,7 @@ def _provenance(config: CollectConfig, command: str) -> Provenance:
     settings = draccus.encode(config)
     del settings["dataset"]
     return Provenance(
-        controller_id=StanceController().id,
+        controller_id=make_controller(config.env.controller).id,
         seed=config.seed,
         command=command,
         versions={"python": platform.python_version(), **_versions()},

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from egovcp.artefact import Artefact, load_artefact
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
-from egovcp.robot.stance import StanceController
+from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import TASKS
@@ -151,7 +151,7 @@ def _load_policy(config: EvalConfig) -> Artefact | None:
     if "planner" not in config.players:
         return None
     artefact = load_artefact(config.policy.path, config.policy.revision)
-    artefact.require_controller(StanceController().id)
+    artefact.require_controller(make_controller(config.env.controller).id)
     config.planner.apply(artefact.planner)
     return artefact
 
@@ -235,7 +235,7 @@ def _record(
     return {
         "config": draccus.encode(config),
         "artefact": artefact.manifest if artefact else None,
-        "low_level_controller": StanceController().id,
+        "low_level_controller": make_controller(config.env.controller).id,
         "versions": versions(),
         "constants": {task: asdict(best) for task, best in constants.items()},
         "success_gain_of_planner": gains(scores),

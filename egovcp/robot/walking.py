@@ -37,7 +37,10 @@ class WalkConfig:
     """All that the policy was trained with."""
 
     balance: BalanceConfig = field(default_factory=BalanceConfig)
-    reach: ReachConfig = field(default_factory=ReachConfig)
+    reach: ReachConfig = field(
+        default_factory=lambda: ReachConfig(bandwidth=20.0, acceleration=150.0)
+    )
+    """Brisker arms than the stance law alone can balance for long."""
     gait: GaitConfig = field(default_factory=GaitConfig)
     action_scale: float = 0.3
     """rad per unit of the policy's action."""

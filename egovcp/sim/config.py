@@ -112,9 +112,10 @@ class WallConfig:
 class ArchConfig:
     """An arch that an upright robot would hit and a crouched one passes under."""
 
-    motion: Literal["rail"] = "rail"
+    motion: Literal["rail", "walk"] = "rail"
     """`rail`: the robot stands and the arch comes to it at the commanded speed, the same
-    relative motion as walking through it, until a walking controller exists."""
+    relative motion as walking through it. `walk`: the arch stands and the robot walks, which
+    needs a controller that can (--env.controller)."""
     clearance_range: Range = (1.16, 1.24)
     """Lower edge of the lintel above ground, m."""
     width_range: Range = (1.1, 1.5)
@@ -225,6 +226,8 @@ class EnvConfig:
     """Length and timing of wall episodes."""
     arch_episode: EpisodeConfig = EpisodeConfig(ticks=230, event_ticks=(5, 25))
     """Length and timing of arch episodes; the default covers the slowest passage."""
+    controller: str = "stance"
+    """Low-level controller: stance, or the walk.safetensors of egovcp-train-lowlevel."""
     feet: Literal["stock", "points"] = "points"
     """Foot collision model: four points each (about twice as fast), or the stock capsules."""
     camera: CameraConfig = CameraConfig()

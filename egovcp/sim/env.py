@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
 from egovcp.robot.controller import LowLevelController
+from egovcp.robot.controllers import make_controller
 from egovcp.robot.stance import StanceController
 from egovcp.sim.camera import DepthCamera
 from egovcp.sim.config import EnvConfig
@@ -84,7 +85,12 @@ class VectorEnv:
             )
         self.config = config
         self.num_envs = num_envs
-        self.controller: LowLevelController = controller or StanceController()
+        self.controller = controller or make_controller(config.controller)
+        if config.arch.motion == "walk" and isinstance(self.controller, StanceController):
+            raise UsageError(
+                "arch.motion=walk needs a controller that walks, and stance does not; name one "
+                "with --env.controller, or leave the arch on its rail"
+            )
         self.lanes: list[Lane] = []
         self._camera = DepthCamera(config.camera)
         self._standing = settle(build_scene("ball", config.feet), self.controller)

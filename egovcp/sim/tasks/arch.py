@@ -1,7 +1,9 @@
 """Traverse the arch: duck under a lintel that an upright robot would hit.
 
 On the rail the robot stands and the arch comes to it at the commanded speed: the same
-relative motion as walking through it. A kinematic arch cannot be pushed away.
+relative motion as walking through it. With ``motion="walk"`` the arch stands and the robot
+walks; whoever commands the velocity also keeps it on course, as an operator would. A kinematic
+arch cannot be pushed away.
 """
 
 from __future__ import annotations
@@ -17,11 +19,16 @@ from egovcp.sim.robot import SimulatedRobot, Touch
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import ARCH_GEOMS, HEAD, PARTS
 from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
-from egovcp.spec import PHYSICS_DT, PLANNER_DT
+from egovcp.spec import PHYSICS_DT
 
 _OTHERS: Final = [part for part in range(len(PARTS)) if part != HEAD]
 _POST_HALF_WIDTH: Final = 0.06  # m
 _BEHIND: Final = 0.25  # m, an arch this far behind the pelvis has been passed
+# How whoever commands the velocity keeps a walking robot on course.
+_SIDE_GAIN: Final = 0.5  # 1/s
+_MOST_SIDEWAYS: Final = 0.1  # m/s
+_TURN_GAIN: Final = 1.0  # 1/s
+_MOST_TURNING: Final = 0.3  # rad/s
 
 
 class ArchTask(Task):
@@ -42,6 +49,7 @@ class ArchTask(Task):
         self.speed = float(rng.uniform(*c.speed_range))
         self._touched = False
         self._passed = False
+        self._progress = 0.0  # m in this tick
         self._shape_arch()
 
     @property
@@ -74,7 +82,7 @@ class ArchTask(Task):
     def place(self) -> None:
         """Stand the arch across the robot's way."""
         pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
-        self._direction = heading[:, 0].copy()
+        self._direction, self._start = heading[:, 0].copy(), pelvis.copy()
         self._origin = pelvis + heading @ np.array([0.0, self._lateral, 0.0])
         self._origin[2] = 0.0
         turn = math.atan2(heading[1, 0], heading[0, 0])
@@ -86,19 +94,48 @@ class ArchTask(Task):
 
     @property
     def moving(self) -> bool:
-        """Whether the arch comes nearer."""
+        """Whether the robot is told to walk, or the arch comes nearer."""
         return self.since_event >= 0.0
 
     @property
     def velocity_command(self) -> Array:
         """(3,) forward at the arch's speed once it moves."""
-        return np.array([self.speed if self.moving else 0.0, 0.0, 0.0])
+        if not self.moving or (self._walks and self._passed):
+            return np.zeros(3)
+        if not self._walks:
+            return np.array([self.speed, 0.0, 0.0])
+        aside, turned = self._off_course()
+        sideways = np.clip(-_SIDE_GAIN * aside, -_MOST_SIDEWAYS, _MOST_SIDEWAYS)
+        turning = np.clip(-_TURN_GAIN * turned, -_MOST_TURNING, _MOST_TURNING)
+        return np.array([self.speed, sideways, turning])
+
+    @property
+    def _walks(self) -> bool:
+        return self.config.motion == "walk"
+
+    def _off_course(self) -> tuple[float, float]:
+        """How far the pelvis is left of the straight way (m), and turned off it (rad)."""
+        ahead, left = self._direction, np.array([-self._direction[1], self._direction[0], 0.0])
+        aside = float((self.robot.data.qpos[:3] - self._start) @ left)
+        forward = self.robot.heading[:, 0]
+        return aside, math.atan2(float(forward @ left), float(forward @ ahead))
+
+    def begin_tick(self) -> None:
+        """Forget what the last planner tick saw."""
+        super().begin_tick()
+        self._progress = 0.0
 
     def act(self) -> None:
-        """Move the arch along the rail."""
-        if self.moving:
+        """Move the arch along the rail, or see how far the robot has walked."""
+        before = self._ahead
+        if self._walks:
+            arch = self.robot.data.mocap_pos[0]
+            self._ahead = float((arch - self.robot.data.qpos[:3]) @ self._direction)
+        elif self.moving:
             self._ahead -= self.speed * PHYSICS_DT
             self._put()
+        if self.moving:
+            self._progress += before - self._ahead
 
     def observe(self, touches: Sequence[Touch]) -> None:
         """Remember any contact."""
@@ -113,7 +150,7 @@ class ArchTask(Task):
         needless = abs(self._ahead) > c.near or self._passed
         crouch = max(0.0, -float(action[6]))
         return {
-            "progress": c.progress_reward * self.speed * PLANNER_DT * under_way,
+            "progress": c.progress_reward * self._progress * under_way,
             "pass": c.pass_reward * (passes and not self._touched),
             "head": -c.head_cost * bool(self.forces[HEAD] > 0.0),
             "contact": -c.contact_cost * bool(self.forces[_OTHERS].any()),
@@ -133,7 +170,7 @@ class ArchTask(Task):
 
     def state(self) -> ObjectState:
         """Arch centre on the ground; active until it has been passed."""
-        velocity = -self.speed * self.moving * self._direction
+        velocity = -self.speed * (self.moving and not self._walks) * self._direction
         position = self.robot.data.mocap_pos[0].copy()
         return ObjectState(position, velocity, self.clearance, self.moving and not self._passed)
 

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from egovcp.robot.stance import StanceController
+from egovcp.robot.stance import StanceConfig, StanceController
 from egovcp.robot.stance_table import standing_pose
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, Walk, WalkConfig, WalkingController
 from egovcp.spec import ACTION_BOX, STATE_DIM, STATE_SLICES
@@ -26,7 +26,7 @@ def _states(batch: int, ticks: int, seed: int = 0) -> np.ndarray:
 
 
 def test_without_a_velocity_and_without_a_residual_it_is_the_stance_law():
-    walk, stance = Walk(), StanceController()
+    walk, stance = Walk(), StanceController(StanceConfig(reach=WalkConfig().reach))
     states = _states(2, 30)
     walk.reset(states[0])
     stance.reset(states[0])

@@ -5,11 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from egovcp.errors import UsageError
+from egovcp.robot.stance import StanceController
 from egovcp.sim.config import ArchConfig, BallConfig, EnvConfig, WallConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.robot import Touch
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import HEAD, PARTS, TORSO, build_scene
+from egovcp.sim.tasks.arch import ArchTask
 from egovcp.sim.tasks.ball import BallTask
 from egovcp.spec import ACTION_DIM, TASKS
 
@@ -165,3 +168,72 @@ def test_every_collision_geom_of_the_robot_has_a_part(task: str) -> None:
     assert named == set(PARTS)
     assert scene.index.part[scene.index.floor] == -1
     assert not np.any(scene.index.is_object & (scene.index.part >= 0))
+
+
+class _NotStance:
+    """A controller of another class that stands by the stance law."""
+
+    def __init__(self) -> None:
+        self._stance = StanceController()
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._stance, name)
+
+
+def walked(config: EnvConfig) -> tuple[VectorEnv, ArchTask]:
+    """An arch that stands, and a robot that is due to walk."""
+    standing = replace(config, arch=ArchConfig(motion="walk"))
+    env = VectorEnv(standing, 1, _NotStance())  # type: ignore[arg-type]
+    begin(env, "arch")
+    task = env.lanes[0].task
+    assert isinstance(task, ArchTask)
+    while not task.moving:
+        env.step(HOLD[:1])
+    return env, task
+
+
+def carry(task: ArchTask, forward: float, left: float = 0.0, turn: float = 0.0) -> None:
+    """Move the robot through the scene by hand, and let the task look."""
+    data, direction = task.robot.data, task._direction
+    aside = np.array([-direction[1], direction[0], 0.0])
+    data.qpos[:3] += forward * direction + left * aside
+    yaw = turn / 2
+    data.qpos[3:7] = [np.cos(yaw), 0.0, 0.0, np.sin(yaw)]
+    task.act()
+
+
+def test_a_standing_arch_is_approached_by_walking_only(config: EnvConfig) -> None:
+    env, task = walked(config)
+    before, place = task._ahead, task.robot.data.mocap_pos[0].copy()
+    env.step(HOLD[:1])
+    assert task._ahead == pytest.approx(before, abs=0.01)
+    task.begin_tick()
+    carry(task, 0.2)
+    assert task._ahead == pytest.approx(before - 0.2, abs=0.01)
+    earned = task.rewards(HOLD[0])["progress"]
+    assert earned == pytest.approx(0.2 * ArchConfig().progress_reward, rel=1e-2)
+    np.testing.assert_array_equal(task.robot.data.mocap_pos[0], place)
+    assert not task.state().velocity_w.any()
+
+
+def test_a_walking_robot_is_kept_on_course(config: EnvConfig) -> None:
+    _, task = walked(config)
+    assert task.velocity_command == pytest.approx([task.speed, 0.0, 0.0], abs=0.05)
+    carry(task, 0.0, left=0.15)
+    assert task.velocity_command[1] < -0.05
+    carry(task, 0.0, left=-0.15, turn=0.2)
+    assert task.velocity_command[2] < -0.1
+
+
+def test_having_walked_through_the_arch_it_stops(config: EnvConfig) -> None:
+    _, task = walked(config)
+    carry(task, task._ahead + 0.6)
+    terms = task.rewards(HOLD[0])
+    assert terms["pass"] == ArchConfig().pass_reward
+    assert task.achieved
+    assert not task.velocity_command.any()
+
+
+def test_a_controller_that_cannot_walk_is_not_sent_through_the_arch(config: EnvConfig) -> None:
+    with pytest.raises(UsageError, match=r"arch\.motion=walk.*--env\.controller"):
+        VectorEnv(replace(config, arch=ArchConfig(motion="walk")), 1)

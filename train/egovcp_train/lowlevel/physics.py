@@ -158,6 +158,7 @@ def _compile(feet: FootModel) -> mujoco.MjModel:
     spec.add_sensor(
         type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=_HEAD
     )
+    spec.visual.global_.bvactive = 0  # nobody looks at bounding volumes; 5 to 10 % of the time
     return spec.compile()
 
 
