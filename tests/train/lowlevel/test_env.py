@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from egovcp.errors import UsageError
 from egovcp.robot.stance_table import standing_pose
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
 from egovcp.sim.config import SensorConfig
@@ -114,6 +115,32 @@ def test_robots_differ_within_the_ranges():
     low, high = DisturbanceConfig().friction
     assert low <= friction.min() < friction.max() <= high
     assert len(np.unique(friction)) == 64
+
+
+def test_a_robot_whose_simulation_diverges_has_fallen_and_starts_again():
+    env = _env(2, commands=STANDING, disturbances=PLAIN)
+    env.physics.qvel[1, 7] = np.nan
+    obs, reward, done, _ = env.step(_zero(env))
+    assert done.tolist() == [0.0, 1.0]
+    assert torch.isfinite(reward).all()
+    assert torch.isfinite(obs["policy"]).all()
+    assert torch.isfinite(obs["privileged"]).all()
+    for _ in range(5):
+        obs, _, done, _ = env.step(_zero(env))
+    assert not done.any()
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda: CommandConfig(forward=((0.1, 0.3), (0.6, 0.1))),
+        lambda: DisturbanceConfig(friction=(1.0, 0.5)),
+        lambda: DisturbanceConfig(models=0),
+    ],
+)
+def test_ranges_the_wrong_way_round_are_refused(wrong):
+    with pytest.raises(UsageError, match="expected"):
+        wrong()
 
 
 # --- commands ----------------------------------------------------------------------

@@ -105,7 +105,7 @@ class Physics:
         self.state[:] = self._states[:, -1]
 
     def snapshot(self) -> Snapshot:
-        """Where everything is now."""
+        """Where everything is now; of a robot just placed, feet, palms and torques are old."""
         qpos, qvel = self.qpos, self.qvel
         readings = self._readings[:, -1, : 3 * 2 * len(_SENSORS)]
         place, speed, forward, palms = np.moveaxis(readings.reshape(-1, len(_SENSORS), 2, 3), 1, 0)
@@ -158,6 +158,8 @@ def _compile(feet: FootModel) -> mujoco.MjModel:
     spec.add_sensor(
         type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=_HEAD
     )
+    # A robot whose simulation diverges must not be put back on its feet unnoticed.
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     spec.visual.global_.bvactive = 0  # nobody looks at bounding volumes; 5 to 10 % of the time
     return spec.compile()
 

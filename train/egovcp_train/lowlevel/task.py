@@ -8,7 +8,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from egovcp.errors import UsageError
+
 Range = tuple[float, float]
+
+
+def _check_ranges(where: str, config: object) -> None:
+    """Refuse a (low, high) pair that is the wrong way round, nested ones too."""
+    for name, value in vars(config).items():
+        pairs = value if isinstance(value, tuple) and isinstance(value[0], tuple) else (value,)
+        for pair in pairs:
+            if isinstance(pair, tuple) and pair[0] > pair[1]:
+                raise UsageError(
+                    f"expected low <= high, found {pair[0]} > {pair[1]} in task.{where}.{name}"
+                )
 
 
 @dataclass(frozen=True)
@@ -36,6 +49,9 @@ class CommandConfig:
     still_hands: float = 0.3
     """Share of commands whose hands rest; the others follow the data's random walk."""
 
+    def __post_init__(self) -> None:
+        _check_ranges("commands", self)
+
 
 @dataclass(frozen=True)
 class DisturbanceConfig:
@@ -59,6 +75,11 @@ class DisturbanceConfig:
     """s from a measurement to the new targets' effect, in physics steps."""
     models: int = 64
     """Robots of different physical parameters."""
+
+    def __post_init__(self) -> None:
+        _check_ranges("disturbances", self)
+        if self.models < 1:
+            raise UsageError(f"task.disturbances.models is {self.models}; expected at least 1")
 
 
 @dataclass(frozen=True)
