@@ -119,3 +119,15 @@ def test_always_the_mean_foresees_nothing_and_one_throw_has_no_share() -> None:
     alone = evaluate(model, _throws((0.3,)))
     assert alone["passing/seen"] == pytest.approx(0.0)
     assert "passing/r2_y" not in alone
+
+
+def test_what_passes_is_judged_on_rows_that_count() -> None:
+    model = _Foreseeing()
+    model.answer = torch.tensor([0.0, 1.0, 1.2, 5.0])
+    (batch,) = _throws((-0.3, 0.3))
+    valid = batch.valid.clone()
+    valid[:, 8:] = False
+    label = batch.passing.clone()
+    label[:, 8:, 3] = 0.0  # the padding says that nothing comes, and is wrong
+    metrics = evaluate(model, [batch._replace(passing=label, valid=valid)])
+    assert metrics["passing/seen"] == pytest.approx(1.0)

@@ -16,7 +16,7 @@ from egovcp.data import (
 )
 from egovcp.model import Batch, Carry, WorldModel
 from egovcp.testing import CountingModel, toy_model
-from egovcp_train.batches import set_normalisation, to_tensors
+from egovcp_train.batches import set_normalisation, to_tensors, whole_episodes
 from egovcp_train.value_fit import Rows, ValueFitConfig, _fit_heads, collect_rows, fit_value
 
 COUNT, IMAGINED = CountingModel.COUNT, CountingModel.IMAGINED
@@ -144,3 +144,14 @@ def test_a_batch_of_the_stream_becomes_the_models_tensors(store: EpisodeStore) -
         tensor = getattr(batch, name)
         assert tensor.shape == arrays[name].shape
         torch.testing.assert_close(tensor.double(), torch.from_numpy(arrays[name].astype(float)))
+
+
+def test_whole_episodes_are_whole_and_in_their_order(store: EpisodeStore) -> None:
+    (batch,) = whole_episodes(store, torch.device("cpu"), limit=3)
+    assert batch.is_first[:, 0].all()
+    assert batch.is_first.sum() == 3
+    assert batch.valid.sum(1).tolist() == store.length[:3].tolist()
+    plain, mirrored = whole_episodes(store, torch.device("cpu"), mirror=True, limit=2)
+    torch.testing.assert_close(mirrored.depth, plain.depth.flip(-1))
+    everything = sum(int(b.valid.sum()) for b in whole_episodes(store, torch.device("cpu")))
+    assert everything == store.num_frames

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,13 @@ import torch
 from numpy.typing import NDArray
 
 from egovcp.data import EpisodeStore
+from egovcp.data.stream import gather, mirror_rows
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
 
 STD_FLOOR = 0.02  # a constant value (v of the standing tasks) must not be blown up
 WORST_RETURN_QUANTILE = 0.001
+EPISODES_AT_ONCE = 32
 
 
 def to_tensors(arrays: Mapping[str, NDArray[Any]], device: torch.device) -> Batch:
@@ -24,6 +26,26 @@ def to_tensors(arrays: Mapping[str, NDArray[Any]], device: torch.device) -> Batc
     return Batch(depth=depth, **rest)._replace(
         **{k: v.to(device, non_blocking=True) for k, v in {"depth": depth, **rest}.items()}
     )
+
+
+def whole_episodes(
+    store: EpisodeStore, device: torch.device, mirror: bool = False, limit: int | None = None
+) -> Iterator[Batch]:
+    """Whole episodes from their start, as a robot lives through them, padded to the longest.
+
+    Args:
+        mirror: and then their mirror images.
+        limit: at most this many episodes, the first ones; None: all.
+    """
+    count = len(store.length) if limit is None else min(limit, len(store.length))
+    span = int(store.length[:count].max())
+    for mirrored in (False, True) if mirror else (False,):
+        for first in range(0, count, EPISODES_AT_ONCE):
+            which = np.arange(first, min(first + EPISODES_AT_ONCE, count))
+            arrays = gather(store, store.start[which], which, span)
+            if mirrored:
+                mirror_rows(arrays, np.arange(len(which)))
+            yield to_tensors(arrays, device)
 
 
 def set_normalisation(model: WorldModel, store: EpisodeStore) -> None:

@@ -20,7 +20,7 @@ ACTIVE_NATS = 0.01  # a latent dimension with less KL than this carries nothing
 
 @torch.no_grad()
 def evaluate(model: WorldModel, batches: Iterable[Batch]) -> dict[str, float]:
-    """Held-out metrics, averaged over batches.
+    """Held-out metrics, averaged over batches of whole episodes.
 
     value/r2         variance of the Monte Carlo return that Q explains
     value/slope      regression of the return on Q: 1 is calibrated
@@ -36,14 +36,15 @@ def evaluate(model: WorldModel, batches: Iterable[Batch]) -> dict[str, float]:
     returns: list[Tensor] = []
     passing: list[tuple[Tensor, Tensor]] = []
     for batch in batches:
-        rollout = filter_sequence(model, batch, generator=_fixed(batch))
+        rollout = filter_sequence(model, batch, sample=False)  # as on the robot
         kl = kl_divergence(rollout.posterior, rollout.prior)[batch.valid].mean(0)
         totals.setdefault("latent/kl", []).append(float(kl.sum()))
         totals.setdefault("latent/active", []).append(float((kl > ACTIVE_NATS).sum()))
         usable = batch.valid & batch.mc_valid
         values.append(model.value(rollout.carry, batch.action)[usable])
         returns.append(batch.mc_return[usable])
-        passing.append((model.decode_passing(rollout.carry.h, rollout.carry.z), batch.passing))
+        label = batch.passing.masked_fill(~batch.valid[..., None], 0.0)
+        passing.append((model.decode_passing(rollout.carry.h, rollout.carry.z), label))
         for name, error in _open_loop(model, batch, rollout.carry, rollout.near).items():
             totals.setdefault(name, []).append(error)
     metrics = {name: sum(v) / len(v) for name, v in totals.items()}
@@ -69,10 +70,6 @@ def _passing(output: Tensor, label: Tensor) -> dict[str, float]:
     r2 = 1 - error.square().mean(0) / spread
     names = ("passing/r2_y", "passing/r2_z", "passing/r2_time")
     return {"passing/seen": float(right), **dict(zip(names, r2.tolist(), strict=True))}
-
-
-def _fixed(batch: Batch) -> torch.Generator:
-    return torch.Generator(device=batch.state.device).manual_seed(0)
 
 
 def _calibration(value: Tensor, target: Tensor) -> dict[str, float]:

@@ -18,7 +18,7 @@ from egovcp.cli import run_command, save_config
 from egovcp.data import DatasetReader, EpisodeStore, SequenceStream, StreamConfig
 from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
 from egovcp.model import PRESETS, WorldModel
-from egovcp_train.batches import set_normalisation, to_tensors
+from egovcp_train.batches import set_normalisation, to_tensors, whole_episodes
 from egovcp_train.checkpoint import (
     begin_checkpoint,
     checkpoint_dir,
@@ -34,7 +34,7 @@ from egovcp_train.records import Recorder
 from egovcp_train.value_fit import fit_value
 
 PROG = "egovcp-train"
-EVALUATION_BATCHES = 8
+EVALUATION_EPISODES = 64
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -63,7 +63,7 @@ def train(config: TrainConfig) -> None:
     torch.manual_seed(config.seed)
     model = WorldModel(config.policy)
     set_normalisation(model, learning)
-    sampling = _stream_config(config, config.seed)
+    sampling = _stream_config(config)
     sampling.check()
     if config.policy.loss.passing:
         learning, heldout = label(learning, config.passing), label(heldout, config.passing)
@@ -139,9 +139,8 @@ class Run:
 
     def evaluate(self, model: WorldModel) -> None:
         """Measure a model on held-out episodes."""
-        fresh = SequenceStream(self.heldout, _stream_config(self.config, seed=12345, mirror=False))
-        batches = (to_tensors(next(fresh), self.device) for _ in range(EVALUATION_BATCHES))
-        self.metrics = evaluate(model, batches)
+        episodes = whole_episodes(self.heldout, self.device, limit=EVALUATION_EPISODES)
+        self.metrics = evaluate(model, episodes)
         self.recorder.scalars(
             self.learner.step, {f"heldout/{k}": v for k, v in self.metrics.items()}
         )
@@ -224,15 +223,15 @@ def _load(reader: DatasetReader, config: TrainConfig) -> tuple[EpisodeStore, Epi
     return learning, heldout
 
 
-def _stream_config(config: TrainConfig, seed: int, mirror: bool | None = None) -> StreamConfig:
+def _stream_config(config: TrainConfig) -> StreamConfig:
     sampling = config.sampling
     return StreamConfig(
         batch_size=config.batch_size,
         length=sampling.length,
         burn_in=sampling.burn_in,
         event_fraction=sampling.event_fraction,
-        mirror=sampling.mirror if mirror is None else mirror,
-        seed=seed,
+        mirror=sampling.mirror,
+        seed=config.seed,
     )
 
 

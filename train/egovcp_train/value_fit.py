@@ -8,23 +8,19 @@ explains on held-out episodes doubled (0.04 to 0.08).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
-import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from egovcp.data import EpisodeStore
-from egovcp.data.stream import gather, mirror_rows
 from egovcp.model import Batch, Carry, WorldModel
 from egovcp.model.losses import filter_sequence
 from egovcp.model.nets import SplitMlp, ValueHead
-from egovcp_train.batches import to_tensors
-
-EPISODES_AT_ONCE = 32
+from egovcp_train.batches import whole_episodes
 
 
 @dataclass(frozen=True)
@@ -147,21 +143,9 @@ def collect_rows(
     """
     parts = [
         _rows_of(model, batch, imagined_steps, generator)
-        for batch in _episodes(store, mirror, model.state_mean.device)
+        for batch in whole_episodes(store, model.state_mean.device, mirror=mirror)
     ]
     return Rows(*(torch.cat(column) for column in zip(*parts, strict=True)))
-
-
-def _episodes(store: EpisodeStore, mirror: bool, device: torch.device) -> Iterator[Batch]:
-    """Whole episodes, padded, and then their mirror images."""
-    span = int(store.length.max())
-    for mirrored in (False, True) if mirror else (False,):
-        for first in range(0, len(store.length), EPISODES_AT_ONCE):
-            which = np.arange(first, min(first + EPISODES_AT_ONCE, len(store.length)))
-            arrays = gather(store, store.start[which], which, span)
-            if mirrored:
-                mirror_rows(arrays, np.arange(len(which)))
-            yield to_tensors(arrays, device)
 
 
 def _rows_of(
