@@ -213,9 +213,14 @@ def test_a_mirrored_robot_under_mirrored_commands_does_the_mirrored_thing():
     for _ in range(15):
         obs, *_ = env.step(0.1 * action)
     both, _ = mirrored(env, obs, None)
-    for group, tolerance in (("policy", 0.1), ("privileged", 0.01)):  # joints turn at 5 rad/s
+    # The model's inertias are not quite symmetric; wrists show it most, in rates of rad/s.
+    for group, tolerance in (("policy", 0.3), ("privileged", 0.01)):
         np.testing.assert_allclose(both[group][2], both[group][1], atol=tolerance)
         assert np.abs(obs[group][0] - obs[group][1]).max() > 5 * tolerance
+    for part in ("angular_velocity", "projected_gravity", "joint_position"):
+        columns = STATE_SLICES[part]
+        reflected, lived = (both["policy"][row, columns] for row in (2, 1))
+        np.testing.assert_allclose(reflected, lived, atol=0.01)
 
 
 # --- rewards -----------------------------------------------------------------------
