@@ -23,6 +23,8 @@ from numpy.typing import NDArray
 
 SPEC_VERSION: Final = 1
 
+type _Array = NDArray[np.float64]
+
 # --- clock -----------------------------------------------------------------------
 PLANNER_HZ: Final = 25
 CONTROLLER_HZ: Final = 50
@@ -114,6 +116,13 @@ ACTION_NAMES: Final = (
 ACTION_DIM: Final = 7
 ACTION_ETA: Final = 0.32  # random-walk step of the paper (section III-B), box units per tick
 ACTION_RATE_LIMIT: Final = 0.32  # box units per planner tick; same in collection and deployment
+
+
+def reflect(action: NDArray[np.floating], low: NDArray[np.floating] | float = -1.0) -> _Array:
+    """Fold normalised actions that left [low, 1] back inside, as a mirror at the wall would."""
+    width = 1.0 - low
+    out: _Array = 1.0 - np.abs((action - low) % (2.0 * width) - width)
+    return out
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,11 @@ class LowLevelController(Protocol):
         ...
 
     @property
+    def walks(self) -> bool:
+        """Whether it follows the velocity part of the command."""
+        ...
+
+    @property
     def stiffness(self) -> NDArray[np.float64]:
         """(J,) proportional gains that the joint servos must run, N m/rad."""
         ...

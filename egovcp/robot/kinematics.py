@@ -19,6 +19,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.robot.g1 import WAIST
 from egovcp.spec import STATE_SLICES
 
 Array = NDArray[np.float64]
@@ -67,6 +68,17 @@ def rotate(rotation: Array, vector: Array) -> Array:
     """(..., 3, 3) times (..., 3), broadcast; the same bits for a row whatever the batch."""
     out: Array = (rotation @ vector[..., None])[..., 0]
     return out
+
+
+def torso_rotation(heading: Array, waist: Array) -> Array:
+    """Rotation (B, 3, 3) from the torso to the pelvis heading frame.
+
+    Args:
+        heading: (B, 3, 3) from the pelvis to the heading frame (`heading_rotation`).
+        waist: (B, 3) yaw, roll and pitch of the waist, rad.
+    """
+    turn = joint_rotations(waist, WAIST)
+    return np.asarray(heading @ turn[:, 0] @ turn[:, 1] @ turn[:, 2])
 
 
 @cache

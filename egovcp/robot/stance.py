@@ -8,7 +8,7 @@ law cannot step: the velocity part of the command is ignored.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
@@ -16,17 +16,18 @@ from numpy.typing import NDArray
 
 from egovcp.robot import arms, balance, reach
 from egovcp.robot.balance import Balance, BalanceConfig
-from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS, WAIST
+from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS
 from egovcp.robot.kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
     LINK_NAMES,
     Array,
     heading_rotation,
-    joint_rotations,
     link_transforms,
     rotate,
+    torso_rotation,
 )
+from egovcp.robot.memory import replace_rows
 from egovcp.robot.reach import TORSO_ORIGIN, Reach, ReachConfig
 from egovcp.robot.stance_table import stance_table
 from egovcp.spec import STATE_DIM, STATE_SLICES
@@ -63,6 +64,11 @@ class StanceController:
         return f"g1-stance-lqr-{digest.hexdigest()[:8]}"
 
     @property
+    def walks(self) -> bool:
+        """No: both feet stay where they are."""
+        return False
+
+    @property
     def stiffness(self) -> Array:
         """(J,) N m/rad."""
         return STIFFNESS
@@ -79,8 +85,8 @@ class StanceController:
             self._balance, self._reach = self._start(s)
             return
         fresh = self._start(s[rows])
-        _replace_rows(self._balance, fresh[0], rows)
-        _replace_rows(self._reach, fresh[1], rows)
+        replace_rows(self._balance, fresh[0], rows)
+        replace_rows(self._reach, fresh[1], rows)
 
     def _start(self, state: Array) -> tuple[Balance, Reach]:
         q = state[:, STATE_SLICES["joint_position"]]
@@ -97,8 +103,7 @@ class StanceController:
         height = s[:, STATE_SLICES["command_height"]][:, 0]
         balance.follow_height(memory, self._table.clamp(height), self.config.balance)
         heading = heading_rotation(balance.gravity_estimate(memory))
-        waist = joint_rotations(memory.prediction[:, 6:9], WAIST)
-        torso = heading @ waist[:, 0] @ waist[:, 1] @ waist[:, 2]
+        torso = torso_rotation(heading, memory.prediction[:, 6:9])
         hands = s[:, STATE_SLICES["command_hands"]].reshape(-1, 2, 3)
         relative = hands - rotate(heading, TORSO_ORIGIN)[:, None]
         arm_target = reach.follow(self._reach, relative, torso, self.config.reach)
@@ -106,11 +111,6 @@ class StanceController:
         body_target = balance.balance(memory, s, row, self._reach, self.config.balance)
         target = np.concatenate([body_target, arm_target], axis=1)
         return np.asarray(np.minimum(np.maximum(target, TARGET_LOW), TARGET_HIGH))
-
-
-def _replace_rows[M: (Balance, Reach)](memory: M, fresh: M, rows: NDArray[np.intp]) -> None:
-    for entry in fields(memory):
-        getattr(memory, entry.name)[rows] = getattr(fresh, entry.name)
 
 
 def pelvis_height(joint_position: Array, gravity: Array) -> Array:

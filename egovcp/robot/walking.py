@@ -12,7 +12,7 @@ motion (`gait`), how much of the gait is in, g, and the action a of a policy tra
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Final, Protocol
 
 import numpy as np
@@ -22,7 +22,8 @@ from egovcp.robot import arms, balance, gait, reach
 from egovcp.robot.balance import Balance, BalanceConfig
 from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS, WAIST
 from egovcp.robot.gait import Gait, GaitConfig
-from egovcp.robot.kinematics import Array, heading_rotation, joint_rotations, rotate
+from egovcp.robot.kinematics import Array, heading_rotation, rotate, torso_rotation
+from egovcp.robot.memory import replace_rows
 from egovcp.robot.reach import TORSO_ORIGIN, Reach, ReachConfig
 from egovcp.robot.stance import TARGET_HIGH, TARGET_LOW, pelvis_height
 from egovcp.robot.stance_table import NU, stance_table
@@ -90,7 +91,7 @@ class Walk:
         if rows is None or len(self._memory.action) != len(s):
             self._memory = self._start(s)
         else:
-            _replace_rows(self._memory, self._start(s[rows]), rows)
+            replace_rows(self._memory, self._start(s[rows]), rows)
 
     def _start(self, state: Array) -> _Memory:
         q = state[:, STATE_SLICES["joint_position"]]
@@ -146,8 +147,7 @@ class Walk:
             balance.gravity_estimate(m.balance),
         )
         heading = heading_rotation(gravity)
-        turns = joint_rotations(waist, WAIST)
-        torso = heading @ turns[:, 0] @ turns[:, 1] @ turns[:, 2]
+        torso = torso_rotation(heading, waist)
         hands = state[:, STATE_SLICES["command_hands"]].reshape(-1, 2, 3)
         relative = hands - rotate(heading, TORSO_ORIGIN)[:, None]
         return reach.follow(m.reach, relative, torso, self.config.reach)
@@ -161,7 +161,7 @@ class Walk:
         hands = Reach(*(getattr(self._memory.reach, n)[rows] for n in ("goal", "joints", "rate")))
         fresh = balance.start(m.height[rows], hands, self._table)
         fresh.height_rate = m.height_rate[rows]
-        _replace_rows(m, fresh, rows)
+        replace_rows(m, fresh, rows)
 
 
 class Residual(Protocol):
@@ -193,6 +193,11 @@ class WalkingController:
         return f"g1-walk-ppo-{digest.hexdigest()[:8]}"
 
     @property
+    def walks(self) -> bool:
+        """Yes."""
+        return True
+
+    @property
     def stiffness(self) -> Array:
         """(J,) N m/rad."""
         return STIFFNESS
@@ -212,14 +217,3 @@ class WalkingController:
         if len(state) != self._rows:
             self.reset(state)
         return self._walk.targets(self._policy(self._walk.observe(state)))
-
-
-def _replace_rows[M: (Balance, Reach, Gait, _Memory)](
-    memory: M, fresh: M, rows: NDArray[np.intp]
-) -> None:
-    for entry in fields(memory):
-        old, new = getattr(memory, entry.name), getattr(fresh, entry.name)
-        if isinstance(old, np.ndarray):
-            old[rows] = new
-        else:
-            _replace_rows(old, new, rows)

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from egovcp.errors import UsageError
 from egovcp.robot.controller import LowLevelController
 from egovcp.robot.controllers import make_controller
-from egovcp.robot.stance import StanceController
 from egovcp.sim.camera import DepthCamera
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.lane import Lane
@@ -86,10 +85,10 @@ class VectorEnv:
         self.config = config
         self.num_envs = num_envs
         self.controller = controller or make_controller(config.controller)
-        if config.arch.motion == "walk" and isinstance(self.controller, StanceController):
+        if config.arch.motion == "walk" and not self.controller.walks:
             raise UsageError(
-                "arch.motion=walk needs a controller that walks, and stance does not; name one "
-                "with --env.controller, or leave the arch on its rail"
+                f"arch.motion=walk needs a controller that walks, and {self.controller.id} does "
+                "not; name one with --env.controller, or leave the arch on its rail"
             )
         self.lanes: list[Lane] = []
         self._camera = DepthCamera(config.camera)

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from egovcp.errors import UsageError
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import ACTION_DIM, ACTION_ETA
+from egovcp.spec import ACTION_DIM, ACTION_ETA, reflect
 
 Array = NDArray[np.float64]
 
@@ -94,12 +94,6 @@ class RandomWalk:
         fold = reflect if self._bounds == "reflect" else _clip
         self._action[:] = fold(self._action + self._eta * delta)
         return self._action.copy()
-
-
-def reflect(action: Array) -> Array:
-    """Fold actions that left [-1, 1] back inside, as a mirror at the wall would."""
-    out: Array = 1.0 - np.abs((action + 1.0) % 4.0 - 2.0)
-    return out
 
 
 def _clip(action: Array) -> Array:

@@ -20,17 +20,23 @@ def base_rotation(quaternion: Array) -> Array:
     return out.reshape(3, 3)
 
 
+def noise_std(config: SensorConfig) -> Array:
+    """(S,) standard deviation of each number of a measurement; 0 for the command."""
+    out = np.zeros(STATE_DIM)
+    out[STATE_SLICES["angular_velocity"]] = config.angular_velocity
+    out[STATE_SLICES["projected_gravity"]] = config.gravity
+    out[STATE_SLICES["joint_position"]] = config.joint_position
+    out[STATE_SLICES["joint_velocity"]] = config.joint_velocity
+    return out
+
+
 class Proprioception:
     """The sensors of one robot in one episode; the command part is left to the caller."""
 
     def __init__(self, config: SensorConfig, index: SceneIndex, rng: np.random.Generator) -> None:
         self._index = index
         self._rng = rng
-        self._std = np.zeros(STATE_DIM)
-        self._std[STATE_SLICES["angular_velocity"]] = config.angular_velocity
-        self._std[STATE_SLICES["projected_gravity"]] = config.gravity
-        self._std[STATE_SLICES["joint_position"]] = config.joint_position
-        self._std[STATE_SLICES["joint_velocity"]] = config.joint_velocity
+        self._std = noise_std(config)
 
     def measure(self, data: mujoco.MjData, out: Array) -> None:
         """Write a noisy measurement into ``out`` (S,), all but its command part."""

@@ -45,13 +45,22 @@ def prepare_output(output_dir: str, resume: bool) -> Path:
             f"output folder {output} exists and is not empty; choose another, or continue the run "
             "in it with --resume"
         )
-    parent = next(p for p in [output, *output.absolute().parents] if p.exists())
+    require_writable(output)
+    return output
+
+
+def require_writable(folder: Path) -> None:
+    """Refuse a folder, existing or to be made, that cannot be written to.
+
+    Raises:
+        EnvironmentFailure: no permission, no space, or a file in the way.
+    """
+    parent = next(p for p in [folder, *folder.absolute().parents] if p.exists())
     try:
         with tempfile.TemporaryFile(dir=parent):
             pass
     except OSError as error:
         raise EnvironmentFailure(f"cannot write to {parent}: {error.strerror}") from error
-    return output
 
 
 @contextlib.contextmanager

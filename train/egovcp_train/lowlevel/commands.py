@@ -11,9 +11,9 @@ from egovcp.spec import (
     ACTION_BOX,
     ACTION_DIM,
     ACTION_ETA,
-    COMMAND_DIM,
     CONTROLLER_HZ,
     CONTROLLER_TICKS_PER_PLAN,
+    reflect,
 )
 from egovcp_train.lowlevel.task import CommandConfig, Range
 
@@ -76,7 +76,7 @@ class Commands:
         moved = self._action + np.where(self._moves, step, 0.0)
         low = np.full(moved.shape, -1.0)
         low[:, _HEIGHT] = self._low
-        self._action[:] = np.clip(_reflected(moved, low), low, 1.0)
+        self._action[:] = reflect(moved, low)
 
     def _draw(self, rows: NDArray[np.intp]) -> None:
         config, rng, n = self._config, self._rng, len(rows)
@@ -114,15 +114,3 @@ class Commands:
         self._moves[rows, _HEIGHT] = squats
         self._low[rows] = np.where(squats, bound, -1.0)
         self._action[rows, _HEIGHT] = np.where(squats, self._action[rows, _HEIGHT], wanted)
-
-    def state_dict(self) -> dict[str, float]:
-        return {"difficulty": self.difficulty}
-
-
-def _reflected(x: Array, low: Array) -> Array:
-    """Values that left [low, 1] thrown back inside."""
-    x = np.where(x > 1.0, 2.0 - x, x)
-    return np.where(x < low, 2.0 * low - x, x)
-
-
-assert COMMAND_DIM == 3 + ACTION_DIM

@@ -20,6 +20,7 @@ from egovcp.robot.mjcf import FootModel
 from egovcp.robot.stance_table import NU, standing_pose
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, Walk, WalkConfig
 from egovcp.sim.config import SensorConfig
+from egovcp.sim.sensors import noise_std
 from egovcp.spec import (
     ACTION_BOX,
     CONTROLLER_HZ,
@@ -31,7 +32,7 @@ from egovcp_train.lowlevel import rewards
 from egovcp_train.lowlevel.commands import Commands, between
 from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
 from egovcp_train.lowlevel.physics import Physics, Snapshot
-from egovcp_train.lowlevel.sensing import measure, noise
+from egovcp_train.lowlevel.sensing import measure
 from egovcp_train.lowlevel.task import LowLevelTask
 
 Array = NDArray[np.float64]
@@ -64,7 +65,7 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self.commands = Commands(robots, task.commands, self.rng)
         self.walk = Walk(walk)
         self.episode_length_buf = torch.zeros(robots, dtype=torch.long)
-        self._noise = noise(sensors)
+        self._noise = noise_std(sensors)
         self._delay = np.zeros(robots, dtype=np.intp)
         self._next_push = np.zeros(robots, dtype=np.intp)
         self._action = np.zeros((robots, ACTIONS))
@@ -152,8 +153,8 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         pose = standing_pose(ACTION_BOX.neutral[-1])
         n = len(rows)
         qpos = np.tile(np.concatenate([pose.position, pose.quaternion, pose.joints]), (n, 1))
-        yaw = self.rng.uniform(-np.pi, np.pi, n) / 2
-        pitch = 2 * np.arctan2(pose.quaternion[2], pose.quaternion[0]) / 2
+        yaw = self.rng.uniform(-np.pi, np.pi, n) / 2  # half the angle, as in a quaternion
+        pitch = np.arctan2(pose.quaternion[2], pose.quaternion[0])  # half of it, too
         qpos[:, 3:7] = np.stack(
             [
                 np.cos(yaw) * np.cos(pitch),

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import sys
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,12 +15,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp.cli import run_command
-from egovcp.errors import EnvironmentFailure, UsageError, suggest
+from egovcp.errors import UsageError, suggest
 from egovcp.intervals import wilson
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
 from egovcp_train.lowlevel.skills import SKILLS, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
+from egovcp_train.output import require_writable
 
 PROG = "egovcp-eval-lowlevel"
 RESULT = "lowlevel.json"
@@ -75,13 +75,15 @@ def evaluate(config: LowLevelEvalConfig) -> None:
         raise UsageError(f"--episodes is {config.episodes}; expected at least 1")
     skills = _chosen(config.skills)
     controller = make_controller(config.controller)
-    output = _writable(Path(config.output_dir))
+    output = Path(config.output_dir)
+    require_writable(output)
     figures = {}
     with tqdm(total=len(skills) * config.episodes, unit="robot", desc="skills") as bar:
         for skill in skills:
             bar.set_postfix_str(skill.name)
             figures[skill.name] = _figures(skill, _play(config, skill, bar))
     print(table(figures))
+    output.mkdir(parents=True, exist_ok=True)
     run = {"controller": controller.id, "command": [PROG, *sys.argv[1:]], "seed": config.seed}
     (output / RESULT).write_text(json.dumps(figures | {"_run": run}, indent=2))
     print(f"figures: {output / RESULT}")
@@ -93,16 +95,6 @@ def _chosen(names: str) -> list[Skill]:
         if name not in by_name:
             raise UsageError(f"unknown skill {name!r} in --skills{suggest(name, by_name)}")
     return [by_name[name] for name in names.split(",")]
-
-
-def _writable(folder: Path) -> Path:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except OSError as error:
-        raise EnvironmentFailure(f"cannot write to {folder}: {error.strerror}") from error
-    return folder
 
 
 def _play(config: LowLevelEvalConfig, skill: Skill, bar: Any) -> dict[str, NDArray[Any]]:

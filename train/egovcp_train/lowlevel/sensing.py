@@ -1,26 +1,15 @@
-"""What many robots measure at once (`egovcp.sim.sensors` for one)."""
+"""What many robots measure at once (`egovcp.sim.sensors` is for one)."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.sim.config import SensorConfig
 from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES
 from egovcp_train.lowlevel.geometry import rotation
 from egovcp_train.lowlevel.physics import Snapshot
 
 Array = NDArray[np.float64]
-
-
-def noise(config: SensorConfig) -> Array:
-    """(74,) standard deviations."""
-    out = np.zeros(STATE_DIM)
-    out[STATE_SLICES["angular_velocity"]] = config.angular_velocity
-    out[STATE_SLICES["projected_gravity"]] = config.gravity
-    out[STATE_SLICES["joint_position"]] = config.joint_position
-    out[STATE_SLICES["joint_velocity"]] = config.joint_velocity
-    return out
 
 
 def measure(x: Snapshot, command: Array, std: Array, rng: np.random.Generator) -> Array:

@@ -15,6 +15,7 @@ from egovcp.spec import (
     ACTION_ETA,
     CONTROLLER_HZ,
     CONTROLLER_TICKS_PER_PLAN,
+    reflect,
 )
 
 Array = NDArray[np.float64]
@@ -53,9 +54,8 @@ def _commands(actions: Array, velocity: Array | None = None) -> Array:
 def random_walk(ticks: int, robots: int, rng: np.random.Generator) -> Array:
     """The data's own: a += eta delta each 40 ms, reflected at the box, from neutral."""
     steps = ACTION_ETA * rng.uniform(-1, 1, (ticks // CONTROLLER_TICKS_PER_PLAN, robots, 7))
-    free = np.cumsum(steps, axis=0)
-    folded = np.abs((free - 1.0) % 4.0 - 2.0) - 1.0  # the walk between mirrors at -1 and 1
-    return _commands(np.repeat(folded, CONTROLLER_TICKS_PER_PLAN, axis=0))
+    walk = reflect(np.cumsum(steps, axis=0))
+    return _commands(np.repeat(walk, CONTROLLER_TICKS_PER_PLAN, axis=0))
 
 
 def held_targets(ticks: int, robots: int, rng: np.random.Generator) -> Array:

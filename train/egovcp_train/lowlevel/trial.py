@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 
 from egovcp.robot.controller import LowLevelController
 from egovcp.robot.g1 import WAIST
-from egovcp.robot.kinematics import joint_rotations
+from egovcp.robot.kinematics import torso_rotation
 from egovcp.robot.mjcf import FootModel
 from egovcp.robot.reach import nearest_reachable
 from egovcp.robot.stance_table import standing_pose
 from egovcp.sim.config import SensorConfig
+from egovcp.sim.sensors import noise_std
 from egovcp.spec import ACTION_BOX, CONTROLLER_HZ, PHYSICS_DT
 from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
 from egovcp_train.lowlevel.physics import Physics, Snapshot
-from egovcp_train.lowlevel.sensing import measure, noise
+from egovcp_train.lowlevel.sensing import measure
 from egovcp_train.lowlevel.skills import HOLD, SETTLED, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
 
@@ -59,8 +60,7 @@ class _Record:
         to_heading = _heading_from_world(forward)
         palms = (to_heading[:, None] @ (x.palms - x.position[:, None])[..., None])[..., 0]
         pelvis = to_heading @ turn
-        waist = joint_rotations(x.joints[:, WAIST], WAIST)
-        torso = pelvis @ waist[:, 0] @ waist[:, 1] @ waist[:, 2]
+        torso = torso_rotation(pelvis, x.joints[:, WAIST])
         self.hands.append(palms)
         self.targets.append(nearest_reachable(command[:, 3:9].reshape(-1, 2, 3), pelvis, torso))
         self.height.append(x.position[:, 2].copy())
@@ -85,7 +85,7 @@ def play(
     _place(physics, robots)
     low, high = (round(d / PHYSICS_DT) for d in disturbances.delay)
     delay = rng.integers(low, high + 1, robots)
-    std, record = noise(sensors), _Record()
+    std, record = noise_std(sensors), _Record()
     alive = np.ones((skill.ticks, robots), dtype=bool)
     x = physics.snapshot()
     controller.reset(measure(x, commands[0], std, rng))
