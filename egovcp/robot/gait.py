@@ -1,8 +1,16 @@
-"""The clock of walking and the leg motion that goes with it, on which a policy improves.
+"""Walking by hand: a clock, footholds that catch the fall, and legs that carry and push.
 
 The phase phi runs from 0 to 2 pi in one stride: the left foot swings while sin phi > 0, the
 right one while sin phi < 0. ``amount`` says how much of the gait is blended into standing.
 The robot steps when a velocity is commanded, and when it is about to fall over.
+
+The foot that swings aims at where a linear inverted pendulum of the pelvis's height would be
+caught: at touchdown its extrapolated centre of mass xi = v / omega lies beside the foothold by
+a constant offset that keeps the commanded speed and the stance width (Hof, "The 'extrapolated
+center of mass' concept suggests a simple control of balance in walking", Human Movement
+Science 27, 2008). The leg that stands carries the weight (its share of the static torques is
+fed forward, because the servos are soft), keeps the angle it has, and turns the pelvis upright.
+A policy trained by PPO (`walking`) corrects what this leaves.
 """
 
 from __future__ import annotations
@@ -13,25 +21,66 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.robot.kinematics import Array
+from egovcp.robot.g1 import STIFFNESS
+from egovcp.robot.kinematics import Array, foot_positions, heading_rotation, rotate
 from egovcp.robot.reach import DT
+from egovcp.robot.stance_table import NU, StanceRow
 from egovcp.spec import STATE_SLICES
 
+_GRAVITY: Final = 9.81
 _THIGH: Final = 0.30  # m, and the shank; as long as the pose of a height needs them to be
-_HIP_PITCH, _HIP_ROLL, _KNEE, _ANKLE_PITCH, _ANKLE_ROLL = 0, 1, 3, 4, 5
-_LEG_JOINTS: Final = 6
+_ANKLE_HEIGHT: Final = 0.035  # m above the sole
+_HALF_WIDTH: Final = 0.1185  # m, of the feet in the standing pose
+_SIDE: Final = np.array([1.0, -1.0])  # left, right
+_HIP_PITCH, _HIP_ROLL, _HIP_YAW, _KNEE, _ANKLE_PITCH, _ANKLE_ROLL = range(6)
+_LEGS: Final = 12
+_OVERDRIVEN: Final = np.array([1.0, 1.0, 1.0, 0.5, 0.0, 0.0])
+_KP: Final = STIFFNESS[:NU]
 
 
 @dataclass(frozen=True)
 class GaitConfig:
-    """Shape and timing of the steps; part of the controller's identity."""
+    """Timing, footholds and gains of the steps; part of the controller's identity.
 
-    period: float = 0.8
-    """s per stride, that is two steps."""
-    lift: float = 0.07
+    The numbers were found by CMA-ES (``python -m egovcp_train.lowlevel.tune``).
+    """
+
+    step_time: float = 0.31
+    """s per step; a stride is two."""
+    lift: float = 0.0565
     """m by which the swinging leg is shortened."""
-    sway: float = 0.04
-    """rad of hip roll that takes the pelvis over the standing foot."""
+    width: float = 0.234
+    """m across between the feet that the footholds aim at."""
+    capture: tuple[float, float] = (0.826, 1.41)
+    """How much of the expected velocity a foothold catches: along, across."""
+    ahead: float = 0.0363
+    """m by which footholds lie ahead of that."""
+    reach: tuple[float, float, float] = (0.35, 0.06, 0.30)
+    """m, bounds of footholds from the pelvis: along either way; across, nearest and farthest."""
+    shift: float = 0.168
+    """s for which the leg that will swing first pushes the weight to the other one."""
+    soften: float = 0.285
+    """sin phi over which the weight passes from leg to leg."""
+    swing_gain: float = 1.19
+    """Extra stiffness of the swinging hip and knee, as a share of the servos' own."""
+    carry: float = 1.26
+    """Share of the other leg's static torque that a standing leg takes over."""
+    hip_moment: float = 15.0
+    """N m about the standing hip that hold up the other side of the pelvis."""
+    hip_pitch: tuple[float, float] = (1.73, 0.114)
+    """rad per rad and per rad/s of the pelvis's pitch, standing leg."""
+    hip_roll: tuple[float, float] = (1.5, 0.194)
+    """rad per rad and per rad/s of its roll."""
+    hip_yaw: tuple[float, float] = (0.403, 0.299)
+    """rad per rad and per rad/s off the commanded turn."""
+    ankle_pitch: tuple[float, float, float, float] = (2.09, 0.251, 3.25, 0.349)
+    """rad per rad and rad/s of pitch, per m ahead of the foot, per m/s off the command."""
+    ankle_roll: tuple[float, float, float] = (1.17, 0.141, -0.466)
+    """rad per rad and rad/s of roll, per m/s off the command."""
+    knee: float = 5.8
+    """rad of knee bend per m above the height."""
+    velocity_filter: float = 0.321
+    """Weight of each tick's leg odometry in the estimated velocity."""
     least_speed: float = 0.05
     """m/s (a third of it per rad/s of turning) of commanded velocity that makes it step."""
     tipping: float = 0.2
@@ -46,64 +95,239 @@ class GaitConfig:
 
 @dataclass
 class Gait:
-    """Memory of the clock; leading axis B."""
+    """Memory of the clock and of the legs' odometry; leading axis B."""
 
     phase: Array  # (B,) rad
     amount: Array  # (B,) 0 standing .. 1 walking
     left: Array  # (B,) s until it may stand
+    shifting: Array  # (B,) s until the first foot may leave the floor
+    feet: Array  # (B, 2, 3) m, from the pelvis in the heading frame, at the last tick
+    velocity: Array  # (B, 2) m/s, estimated, in the heading frame
+    turned: Array  # (B,) rad off the commanded turn since it began to step, bounded
 
 
-def start(batch: int) -> Gait:
-    """Standing."""
-    return Gait(np.zeros(batch), np.zeros(batch), np.zeros(batch))
+def start(joint_position: Array, gravity: Array) -> Gait:
+    """Standing robots as measured: joints (B, 29) rad, gravity (B, 3) in the pelvis frame."""
+    n = len(joint_position)
+    return Gait(
+        phase=np.zeros(n),
+        amount=np.zeros(n),
+        left=np.zeros(n),
+        shifting=np.zeros(n),
+        feet=_feet(joint_position, gravity),
+        velocity=np.zeros((n, 2)),
+        turned=np.zeros(n),
+    )
+
+
+def _feet(joint_position: Array, gravity: Array) -> Array:
+    return rotate(heading_rotation(gravity)[:, None], foot_positions(joint_position))
 
 
 def advance(m: Gait, state: Array, tilt: Array, config: GaitConfig) -> NDArray[np.bool_]:
-    """One tick of the clock, in place.
+    """One tick of the clock and of the odometry, in place.
 
     Args:
+        m: memory.
         state: (B, 74) observations.
         tilt: (B, 2) rad, roll and pitch off the reference.
+        config: timing.
 
     Returns:
         (B,) which robots have just come to stand again.
     """
-    velocity = state[:, STATE_SLICES["command_velocity"]]
-    rate = state[:, STATE_SLICES["angular_velocity"]][:, :2]
-    speed = np.sqrt(np.sum(velocity[:, :2] ** 2, axis=1)) + np.abs(velocity[:, 2]) / 3
-    leaning = np.sqrt(np.sum((tilt + 0.15 * rate) ** 2, axis=1))
-    wanted = (speed > config.least_speed) | (leaning > config.tipping)
+    command = state[:, STATE_SLICES["command_velocity"]]
+    rate = state[:, STATE_SLICES["angular_velocity"]]
+    _odometry(m, state, config)
+    speed = np.sqrt(np.sum(command[:, :2] ** 2, axis=1)) + np.abs(command[:, 2]) / 3
+    leaning = np.sqrt(np.sum((tilt + 0.15 * rate[:, :2]) ** 2, axis=1)) > config.tipping
+    wanted = (speed > config.least_speed) | leaning
     standing = m.amount <= 0
-    leftwards = velocity[:, 1] + 0.3 * velocity[:, 2] - 0.3 * rate[:, 0] >= 0
-    begins = np.where(leftwards, 0.0, np.pi)
-    m.phase = np.where(standing, begins, (m.phase + 2 * np.pi * DT / config.period) % (2 * np.pi))
+    before = m.phase
+    _tick(m, standing, leaning, command, rate, config)
     m.left = np.where(wanted, config.linger, np.maximum(m.left - DT, 0.0))
-    change = np.where(m.left > 0, DT / config.rise, -DT / config.fade)
-    m.amount = np.clip(m.amount + change, 0.0, 1.0)
+    landed = (before // np.pi) != (m.phase // np.pi)
+    stops = (m.left <= 0) & ((m.amount < 1.0) | landed)
+    m.amount = np.clip(m.amount + np.where(stops, -DT / config.fade, DT / config.rise), 0.0, 1.0)
+    m.amount = np.where(standing & ~wanted, 0.0, m.amount)
+    off = np.clip(m.turned + DT * (rate[:, 2] - command[:, 2]), -0.5, 0.5)
+    m.turned = np.where(m.amount > 0, off, 0.0)
     stands: NDArray[np.bool_] = ~standing & (m.amount <= 0)
     return stands
 
 
-def leg_motion(m: Gait, joints: Array, velocity: Array, config: GaitConfig) -> Array:
-    """(B, 15) rad to add to a standing pose, feet kept level.
+def _tick(
+    m: Gait,
+    standing: NDArray[np.bool_],
+    leaning: NDArray[np.bool_],
+    command: Array,
+    rate: Array,
+    config: GaitConfig,
+) -> None:
+    """Turn the clock on, or set it to where the first step begins.
+
+    A step that is wanted begins with the weight on the leg that will swing, which throws it
+    onto the other one; a robot that tips over swings at once, on the side it falls to.
+    """
+    leftwards = command[:, 1] + 0.3 * command[:, 2] - 0.3 * rate[:, 0] >= 0
+    first = np.where(leftwards, 0.0, np.pi)
+    turn = np.pi * DT / config.step_time
+    shift = np.where(leaning, 0.0, config.shift)
+    begins = (first - np.pi * shift / config.step_time) % (2 * np.pi)
+    m.phase = np.where(standing, begins, (m.phase + turn) % (2 * np.pi))
+    m.shifting = np.where(standing, shift, np.maximum(m.shifting - DT, 0.0))
+
+
+def _odometry(m: Gait, state: Array, config: GaitConfig) -> None:
+    """Velocity by the feet that carry, each as much as it does."""
+    feet = _feet(
+        state[:, STATE_SLICES["joint_position"]], state[:, STATE_SLICES["projected_gravity"]]
+    )
+    load = _load(m, config)
+    moved = (m.feet - feet)[..., :2] / DT
+    velocity = moved[:, 0] * load[:, :1] + moved[:, 1] * load[:, 1:]
+    m.velocity = m.velocity + config.velocity_filter * (velocity - m.velocity)
+    m.feet = feet
+
+
+def _load(m: Gait, config: GaitConfig) -> Array:
+    """(B, 2) share of the weight on the left and on the right foot."""
+    swing = np.clip(np.sin(m.phase) / config.soften, -1.0, 1.0) * (m.amount > 0)
+    return np.stack([0.5 - 0.5 * swing, 0.5 + 0.5 * swing], axis=1)
+
+
+def foothold(m: Gait, row: StanceRow, height: Array, command: Array, config: GaitConfig) -> Array:
+    """(B, 2) m, where the swinging foot should land, from the pelvis in the heading frame.
 
     Args:
-        m: the clock.
-        joints: (B, 15) standing pose of legs and waist.
-        velocity: (B, 3) commanded velocity.
+        m: the clock, the feet and the velocity.
+        row: the standing pose.
+        height: (B,) m of the pelvis above the floor.
+        command: (B, 3) velocity, m/s and rad/s.
+        config: gains.
     """
-    out = np.zeros_like(joints)
-    sway = config.sway * np.sin(m.phase)
-    for first, swing in ((0, np.sin(m.phase)), (_LEG_JOINTS, -np.sin(m.phase))):
-        forward = velocity[:, 0] * config.period / 4 * -np.cos(m.phase)
-        forward = forward if first == 0 else -forward
-        knee = joints[:, first + _KNEE]
-        length = 2 * _THIGH * np.cos(knee / 2)
-        shorter = length - config.lift * np.maximum(swing, 0.0)
-        bend = 2 * np.arccos(np.clip(shorter / (2 * _THIGH), 0.0, 1.0)) - knee
-        out[:, first + _HIP_PITCH] = -bend / 2 - forward / length
-        out[:, first + _KNEE] = bend
-        out[:, first + _ANKLE_PITCH] = -bend / 2 + forward / length
-        out[:, first + _HIP_ROLL] = sway
-        out[:, first + _ANKLE_ROLL] = -sway
-    return np.asarray(m.amount[:, None] * out)
+    side, stance = _swinging(m)
+    foot = m.feet[np.arange(len(side)), stance, :2]
+    offset = row.pelvis[:, 0]  # of the balanced pelvis from the ankles
+    omega = np.sqrt(_GRAVITY / np.maximum(height - _ANKLE_HEIGHT, 0.3))
+    time = config.step_time
+    rest = (1.0 - m.phase % np.pi / np.pi) * time
+    cosh, sinh = np.cosh(omega * rest), np.sinh(omega * rest)
+    grown = np.exp(omega * time)
+    velocity = m.velocity * cosh[:, None]
+    velocity[:, 0] += (-foot[:, 0] - offset) * omega * sinh
+    velocity[:, 1] += -foot[:, 1] * omega * sinh
+    caught = velocity / omega[:, None] * config.capture
+    behind = command[:, :2] * time / (grown - 1.0)[:, None]
+    x = caught[:, 0] - behind[:, 0] - offset + config.ahead
+    y = caught[:, 1] - behind[:, 1] + side * config.width / (1.0 + grown)
+    along, near, far = config.reach
+    out = np.empty((len(x), 2))
+    out[:, 0] = np.clip(x, -along, along)
+    out[:, 1] = side * np.clip(side * y, near, far)
+    return out
+
+
+def _swinging(m: Gait) -> tuple[Array, NDArray[np.intp]]:
+    """(B,) the side (1 left, -1 right) that swings, and (B,) the index of the foot that stands."""
+    left = np.sin(m.phase) >= 0
+    return np.where(left, 1.0, -1.0), np.where(left, 1, 0)
+
+
+def leg_motion(
+    m: Gait, row: StanceRow, height: Array, tilt: Array, state: Array, config: GaitConfig
+) -> Array:
+    """(B, 15) rad that full gait adds to the targets of standing at that height.
+
+    Args:
+        m: memory, advanced.
+        row: standing pose and torques of the height.
+        height: (B,) m of the pelvis, as it should be by now.
+        tilt: (B, 2) rad, roll and pitch off the reference.
+        state: (B, 74) observations.
+        config: gains.
+    """
+    n = len(height)
+    command = state[:, STATE_SLICES["command_velocity"]]
+    rate = state[:, STATE_SLICES["angular_velocity"]]
+    measured = state[:, STATE_SLICES["joint_position"]][:, :_LEGS].reshape(n, 2, 6)
+    pose, torque = (x[:, :_LEGS].reshape(n, 2, 6).copy() for x in (row.joints, row.torque))
+    side, _ = _swinging(m)
+    swings = (side[:, None] == _SIDE)[..., None]  # (B, 2, 1)
+    load = _load(m, config)
+    torque *= (1.0 + (2.0 * load - 1.0) * config.carry)[..., None]
+    torque[..., _HIP_ROLL] += _SIDE * config.hip_moment * np.maximum(2.0 * load - 1.0, 0.0)
+    swing = pose + _swing(m, pose, row, height, command, tilt, config)
+    swing += config.swing_gain * _OVERDRIVEN * (swing - measured)
+    stance = pose + _stance(m, pose, row, height, command, tilt, rate, load, config)
+    out = np.zeros((n, NU))
+    out[:, :_LEGS] = np.where(swings, swing, stance).reshape(n, _LEGS) - row.joints[:, :_LEGS]
+    out[:, :_LEGS] += (torque.reshape(n, _LEGS) - row.torque[:, :_LEGS]) / _KP[:_LEGS]
+    return out
+
+
+def _swing(
+    m: Gait,
+    pose: Array,
+    row: StanceRow,
+    height: Array,
+    command: Array,
+    tilt: Array,
+    config: GaitConfig,
+) -> Array:
+    """(B, 2, 6) what either leg adds to the pose if it swings: shorter, and to its foothold."""
+    length = 2 * _THIGH * np.cos(pose[..., _KNEE] / 2)
+    leaves = (m.shifting <= 0)[:, None]
+    progress = m.phase[:, None] % np.pi / np.pi
+    shorter = length - config.lift * np.sin(np.pi * progress) * leaves
+    bend = 2 * np.arccos(np.clip(shorter / (2 * _THIGH), 0.0, 1.0)) - pose[..., _KNEE]
+    goal = foothold(m, row, height, command, config)
+    done = progress**2 * (3.0 - 2.0 * progress) * leaves
+    along = done * (goal[:, :1] + row.pelvis[:, :1]) / length
+    across = done * (goal[:, 1:] - _SIDE * _HALF_WIDTH) / length
+    out = np.zeros_like(pose)
+    out[..., _HIP_PITCH] = -bend / 2 - along - tilt[:, 1:]
+    out[..., _KNEE] = bend
+    out[..., _ANKLE_PITCH] = -bend / 2 + along
+    out[..., _HIP_ROLL] = across - tilt[:, :1]
+    out[..., _ANKLE_ROLL] = -across
+    return out
+
+
+def _stance(
+    m: Gait,
+    pose: Array,
+    row: StanceRow,
+    height: Array,
+    command: Array,
+    tilt: Array,
+    rate: Array,
+    load: Array,
+    config: GaitConfig,
+) -> Array:
+    """(B, 2, 6) what either leg adds to the pose if it stands: balance about where it is."""
+    length = 2 * _THIGH * np.cos(pose[..., _KNEE] / 2)
+    ahead = 2 * DT * m.velocity  # targets act about two ticks after what was measured
+    along = (m.feet[..., 0] + row.pelvis[:, :1] - ahead[:, :1]) / length
+    across = (m.feet[..., 1] - _SIDE * _HALF_WIDTH - ahead[:, 1:]) / length
+    over = -m.feet[..., 0] - row.pelvis[:, :1]  # m, the pelvis ahead of either foot
+    fast = m.velocity - command[:, :2]
+    roll, pitch = tilt.T
+    bend = config.knee * (-m.feet[..., 2] - (height[:, None] - _ANKLE_HEIGHT))
+    hip, tip, ankle, edge = (
+        config.hip_pitch,
+        config.hip_roll,
+        config.ankle_pitch,
+        config.ankle_roll,
+    )
+    out = np.zeros_like(pose)
+    out[..., _HIP_PITCH] = -along - bend / 2 + (hip[0] * pitch + hip[1] * rate[:, 1])[:, None]
+    out[..., _KNEE] = bend
+    out[..., _ANKLE_PITCH] = along - bend / 2 + load * (ankle[2] * over + ankle[3] * fast[:, :1])
+    out[..., _ANKLE_PITCH] += (ankle[0] * pitch + ankle[1] * rate[:, 1])[:, None]
+    out[..., _HIP_ROLL] = across + (tip[0] * roll + tip[1] * rate[:, 0])[:, None]
+    out[..., _ANKLE_ROLL] = -across + load * edge[2] * fast[:, 1:]
+    out[..., _ANKLE_ROLL] += (edge[0] * roll + edge[1] * rate[:, 0])[:, None]
+    turning = rate[:, 2] - command[:, 2]
+    out[..., _HIP_YAW] = (config.hip_yaw[0] * m.turned + config.hip_yaw[1] * turning)[:, None]
+    return out

@@ -39,6 +39,7 @@ JOINT_UPPER: Final[Array] = np.array(_TABLE["upper"])  # (J,) rad
 PALM_OFFSET: Final[Array] = np.array(_TABLE["palm"])  # (2, 3) m, wrist yaw link frame, left, right
 LINK_OFFSET: Final[Array] = np.array(_TABLE["offset"])  # (J, 3) m, in the parent's frame
 
+_LEGS: Final = 12  # the first joints; each leg is a chain of six from the pelvis
 TORSO: Final = LINK_NAMES.index("torso_link")
 _WRISTS: Final = tuple(LINK_NAMES.index(f"{side}_wrist_yaw_link") for side in ("left", "right"))
 
@@ -106,6 +107,20 @@ def link_transforms(joint_position: Array) -> tuple[Array, Array]:
         position[:, links] = position[:, parents] + rotate(base, LINK_OFFSET[links - 1])
         rotation[:, links] = base @ local[:, links - 1]
     return position, rotation
+
+
+def foot_positions(joint_position: Array) -> Array:
+    """(B, 2, 3) m, left and right ankle-roll link in the pelvis frame, of (B, J) rad."""
+    n = len(joint_position)
+    local = joint_rotations(joint_position[:, :_LEGS], slice(0, _LEGS)).reshape(
+        n, 2, _LEGS // 2, 3, 3
+    )
+    offset = LINK_OFFSET[:_LEGS].reshape(2, -1, 3)
+    rotation, position = local[:, :, 0], np.tile(offset[:, 0], (n, 1, 1))
+    for k in range(1, local.shape[2]):
+        position = position + rotate(rotation, offset[:, k])
+        rotation = rotation @ local[:, :, k]
+    return np.asarray(position)
 
 
 def link_poses(joint_position: NDArray[np.floating]) -> tuple[Array, Array]:

@@ -1,6 +1,6 @@
 """The walking policy as ONNX: written with ``onnx``, run with ``onnxruntime`` on a robot.
 
-The graph maps the raw observation (B, 92) to the action (B, 15); normalisation is inside. What a
+The graph maps the raw observation (B, 95) to the action (B, 15); normalisation is inside. What a
 robot computer must know besides is in the file's metadata: joint names, gains, the neutral
 pose, the action's scale, the observation's layout, and the configuration of `walking.Walk`.
 """
@@ -34,6 +34,9 @@ OBSERVATION_NAMES: Final = (
     "gait.sin_phase",
     "gait.cos_phase",
     "gait.amount",
+    "odometry.velocity_x",
+    "odometry.velocity_y",
+    "odometry.turned",
     *(f"last_action.{name}" for name in JOINT_NAMES[:ACTIONS]),
 )
 
@@ -164,7 +167,7 @@ class OnnxPolicy:
         return out
 
     def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(B, 92) -> actions (B, 15)."""
+        """(B, 95) -> actions (B, 15)."""
         out: NDArray[np.float32] = self._session.run([_OUTPUT], {_INPUT: observation})[0]
         return out
 

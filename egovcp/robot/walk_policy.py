@@ -34,8 +34,8 @@ Array32 = NDArray[np.float32]
 class WalkPolicy:
     """An MLP with ELU between its layers, on standardised observations."""
 
-    mean: Array32  # (92,)
-    std: Array32  # (92,)
+    mean: Array32  # (95,)
+    std: Array32  # (95,)
     layers: tuple[tuple[Array32, Array32], ...]  # weight (out, in), bias (out,)
     config: WalkConfig
     """What surrounds the network (`walking.Walk`)."""
@@ -43,7 +43,7 @@ class WalkPolicy:
     """Command, seed and steps of its training."""
 
     def __call__(self, observation: Array32) -> Array32:
-        """(B, 92) -> actions (B, 15); a row's bits do not depend on the batch."""
+        """(B, 95) -> actions (B, 15); a row's bits do not depend on the batch."""
         x = np.clip((observation - self.mean) / self.std, -OBSERVATION_CLIP, OBSERVATION_CLIP)
         for i, (weight, bias) in enumerate(self.layers):
             x = (weight @ x[:, :, None])[:, :, 0] + bias

@@ -4,7 +4,7 @@ The targets of legs and waist are
 
     q* = q_ref(h) + (1 - g) u_lqr + g q_gait(phi, v) + s a
 
-with the reference pose of the height h, the stance law's correction u_lqr, the gait's leg
+with the standing targets of the height h, the stance law's correction u_lqr, the gait's leg
 motion (`gait`), how much of the gait is in, g, and the action a of a policy trained by PPO
 (``egovcp-train-lowlevel``) times a scale s. The arms follow inverse kinematics as in standing.
 """
@@ -30,7 +30,8 @@ from egovcp.robot.stance_table import NU, stance_table
 from egovcp.spec import NUM_JOINTS, STATE_DIM, STATE_SLICES
 
 ACTIONS: Final = NU  # legs and waist
-OBSERVATION_DIM: Final = STATE_DIM + 3 + ACTIONS  # state; g sin phi, g cos phi, g; last action
+OBSERVATION_DIM: Final = STATE_DIM + 3 + 3 + ACTIONS
+"""State; g sin phi, g cos phi, g; velocity by odometry x, y and heading off; last action."""
 
 
 @dataclass(frozen=True)
@@ -95,28 +96,30 @@ class Walk:
 
     def _start(self, state: Array) -> _Memory:
         q = state[:, STATE_SLICES["joint_position"]]
-        height = pelvis_height(q, state[:, STATE_SLICES["projected_gravity"]])
+        gravity = state[:, STATE_SLICES["projected_gravity"]]
+        height, walking = pelvis_height(q, gravity), gait.start(q, gravity)
         hands = reach.start(q[:, ARMS])
         standing = balance.start(self._table.clamp(height), hands, self._table)
-        return _Memory(standing, hands, gait.start(len(state)), np.zeros((len(state), ACTIONS)))
+        return _Memory(standing, hands, walking, np.zeros((len(state), ACTIONS)))
 
     def observe(self, state: NDArray[np.floating]) -> NDArray[np.float32]:
-        """(B, 74) measurements -> (B, 92) what the policy sees; the memory advances."""
+        """(B, 74) measurements -> (B, 95) what the policy sees; the memory advances."""
         s = np.asarray(state, dtype=np.float64)
         m = self._memory
         command = s[:, STATE_SLICES["command_height"]][:, 0]
         balance.follow_height(m.balance, self._table.clamp(command), self.config.balance)
-        self._restart_standing(gait.advance(m.gait, s, self._tilt(s), self.config.gait))
+        tilt = self._tilt(s)
+        self._restart_standing(gait.advance(m.gait, s, tilt, self.config.gait))
         amount = m.gait.amount[:, None]
         arm_targets = self._reach(s, amount[:, 0] > 0)
         row = self._table.at(m.balance.height)
         body = balance.balance(m.balance, s, row, m.reach, self.config.balance)
-        body -= amount * m.balance.correction
-        velocity = s[:, STATE_SLICES["command_velocity"]]
-        body += gait.leg_motion(m.gait, row.joints, velocity, self.config.gait)
+        motion = gait.leg_motion(m.gait, row, m.balance.height, tilt, s, self.config.gait)
+        body += amount * (motion - m.balance.correction)
         self._nominal = np.asarray(np.concatenate([body, arm_targets], axis=1))
         clock = np.stack([np.sin(m.gait.phase), np.cos(m.gait.phase), np.ones(len(s))], axis=1)
-        return np.concatenate([s, amount * clock, m.action], axis=1, dtype=np.float32)
+        odometry = np.concatenate([m.gait.velocity, m.gait.turned[:, None]], axis=1)
+        return np.concatenate([s, amount * clock, odometry, m.action], axis=1, dtype=np.float32)
 
     def targets(self, action: NDArray[np.floating]) -> Array:
         """The policy's answer (B, 15) -> joint position targets (B, 29), rad."""
@@ -165,7 +168,7 @@ class Walk:
 
 
 class Residual(Protocol):
-    """The trained part (`walk_policy.WalkPolicy`): observations (B, 92) -> actions (B, 15)."""
+    """The trained part (`walk_policy.WalkPolicy`): observations (B, 95) -> actions (B, 15)."""
 
     @property
     def config(self) -> WalkConfig: ...

@@ -28,7 +28,7 @@ def policy() -> WalkPolicy:
     layers = tuple(
         (array(after, before), array(after)) for before, after in itertools.pairwise(SIZES)
     )
-    config = WalkConfig(gait=GaitConfig(period=0.7))
+    config = WalkConfig(gait=GaitConfig(step_time=0.35))
     std = np.abs(array(OBSERVATION_DIM)) + 0.1
     return WalkPolicy(array(OBSERVATION_DIM), std, layers, config, {"seed": 3})
 
@@ -92,7 +92,7 @@ GOOD = {"schema": SCHEMA, "content": json.dumps({"config": {}, "provenance": {}}
         ({}, {"schema": SCHEMA}, "content"),
         ({}, GOOD | {"content": "{"}, "double quotes"),
         ({}, GOOD | {"content": '{"config": {"gaits": 1}, "provenance": {}}'}, "gaits"),
-        ({"mean": np.zeros(91, np.float32)}, GOOD, r"mean has shape \(91,\)"),
+        ({"mean": np.zeros(94, np.float32)}, GOOD, r"mean has shape \(94,\)"),
         ({"mean": np.full(OBSERVATION_DIM, np.nan, np.float32)}, GOOD, "finite"),
         ({"mean": np.zeros(OBSERVATION_DIM)}, GOOD, "float32"),
         ({"std": np.zeros(OBSERVATION_DIM, np.float32)}, GOOD, "not positive"),

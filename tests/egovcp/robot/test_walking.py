@@ -48,7 +48,7 @@ def test_the_residual_moves_legs_and_waist_only_and_within_its_limit():
     assert np.abs(far).max() <= WalkConfig().action_limit * WalkConfig().action_scale + 1e-9
 
 
-def test_the_observation_is_the_state_the_clock_and_the_last_action():
+def test_the_observation_is_the_state_the_clock_the_odometry_and_the_last_action():
     walk = Walk()
     state = _states(1, 1)[0]
     state[:, STATE_SLICES["command_velocity"]] = (0.3, 0.0, 0.0)
@@ -62,7 +62,9 @@ def test_the_observation_is_the_state_the_clock_and_the_last_action():
     clock = seen[0, STATE_DIM : STATE_DIM + 3]
     assert clock[2] == 1
     assert clock[0] ** 2 + clock[1] ** 2 == pytest.approx(1.0)
-    np.testing.assert_allclose(seen[0, STATE_DIM + 3 :], 0.5)
+    odometry = [*walk.gait.velocity[0], walk.gait.turned[0]]
+    np.testing.assert_allclose(seen[0, STATE_DIM + 3 : STATE_DIM + 6], odometry, atol=1e-6)
+    np.testing.assert_allclose(seen[0, STATE_DIM + 6 :], 0.5)
 
 
 def _controller(gain: float = 0.1) -> WalkingController:

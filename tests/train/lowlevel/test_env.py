@@ -13,7 +13,8 @@ from egovcp.sim.config import SensorConfig
 from egovcp.spec import ACTION_BOX, STATE_SLICES
 from egovcp_train.lowlevel import rewards
 from egovcp_train.lowlevel.commands import Commands, between
-from egovcp_train.lowlevel.env import PRIVILEGED_DIM, LowLevelEnv, mirrored
+from egovcp_train.lowlevel.env import LowLevelEnv, mirrored
+from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
 from egovcp_train.lowlevel.task import CommandConfig, DisturbanceConfig, LowLevelTask
 
 SILENT = SensorConfig(0.0, 0.0, 0.0, 0.0)
@@ -231,8 +232,12 @@ def _terms(env: LowLevelEnv, **change: np.ndarray) -> dict[str, np.ndarray]:
     n = env.num_envs
     action = np.zeros((n, ACTIONS))
     walk = env.walk
+    motion = rewards.Motion(n)
+    for _ in range(100):
+        motion.add(x)
     return rewards.terms(
         x,
+        motion.average,
         env.commands.vector,
         walk.height,
         walk.pitch,

@@ -15,7 +15,7 @@ class NetworkConfig:
     """Hidden layers of the critic, which also sees what only the simulator knows."""
     activation: str = "elu"
     """Activation of both."""
-    initial_std: float = 0.4
+    initial_std: float = 0.3
     """Standard deviation of the policy's actions at the start."""
 
 

@@ -33,9 +33,9 @@ class PpoLearner:
         self.iteration = 0
         with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints its networks
             self.ppo = PPO.construct_algorithm(
-                env.get_observations(), env, _rsl_rl_config(network, ppo), "cpu"
+                env.get_observations(), env, rsl_rl_config(network, ppo), "cpu"
             )
-        _start_at_zero(self.ppo.get_policy().mlp)
+        start_at_zero(self.ppo.get_policy().mlp)
         self.ppo.train_mode()
 
     @property
@@ -61,30 +61,19 @@ class PpoLearner:
         self.iteration += 1
         scalars = {name: float(np.mean(values)) for name, values in log.items()}
         scalars["falls_per_second"] = falls * CONTROLLER_HZ / (self._ticks * self.env.num_envs)
-        self._adapt(scalars)
+        self.env.difficulty = adapted(
+            self.env.difficulty,
+            scalars["falls_per_second"],
+            scalars["reward/velocity"],
+            self.curriculum,
+        )
         std = self.ppo.get_policy().output_std.mean().item()
         losses |= {"learning_rate": self.ppo.learning_rate, "action_std": std}
         return scalars | {f"ppo/{name}": float(value) for name, value in losses.items()}
 
-    def _adapt(self, scalars: dict[str, float]) -> None:
-        rule, falls = self.curriculum, scalars["falls_per_second"]
-        if falls < rule.few_falls and scalars["reward/velocity"] > rule.tracking:
-            self.env.difficulty += rule.step
-        elif falls > rule.many_falls:
-            self.env.difficulty -= rule.step
-
     def policy(self, walk: WalkConfig, provenance: dict[str, Any]) -> WalkPolicy:
-        """The policy as it is now, with its normalisation, ready to be saved."""
-        actor = self.ppo.get_policy()
-        linear = [m for m in actor.mlp if isinstance(m, torch.nn.Linear)]
-        normal = actor.obs_normalizer
-        return WalkPolicy(
-            normal.mean.numpy(),
-            (normal.std + normal.eps).numpy(),
-            tuple((m.weight.detach().numpy(), m.bias.detach().numpy()) for m in linear),
-            walk,
-            provenance,
-        )
+        """The policy as it is now, ready to be saved."""
+        return walk_policy(self.ppo.get_policy(), walk, provenance)
 
     def state_dict(self) -> dict[str, Any]:
         """Networks, optimiser and difficulty; the robots start anew after a resume."""
@@ -101,7 +90,36 @@ class PpoLearner:
         self.env.reseed(self.iteration)
 
 
-def _start_at_zero(mlp: torch.nn.Sequential) -> None:
+def adapted(difficulty: float, falls: float, tracked: float, rule: CurriculumConfig) -> float:
+    """The difficulty after an iteration.
+
+    Args:
+        difficulty: before, 0 to 1.
+        falls: per robot and second.
+        tracked: mean of the velocity reward, at most 1.
+        rule: thresholds and step.
+    """
+    if falls < rule.few_falls and tracked > rule.tracking:
+        difficulty += rule.step
+    elif falls > rule.many_falls:
+        difficulty -= rule.step
+    return min(max(difficulty, 0.0), 1.0)
+
+
+def walk_policy(actor: Any, walk: WalkConfig, provenance: dict[str, Any]) -> WalkPolicy:
+    """rsl-rl's actor as a controller's file holds it, with its normalisation."""
+    linear = [m for m in actor.mlp if isinstance(m, torch.nn.Linear)]
+    normal = actor.obs_normalizer
+    return WalkPolicy(
+        normal.mean.cpu().numpy(),
+        (normal.std + normal.eps).cpu().numpy(),
+        tuple((m.weight.detach().cpu().numpy(), m.bias.detach().cpu().numpy()) for m in linear),
+        walk,
+        provenance,
+    )
+
+
+def start_at_zero(mlp: torch.nn.Sequential) -> None:
     """Begin with hardly any residual, as symmetric as the robot.
 
     The mirrored copies of a sample count as if the policy had chosen them, too: with a policy
@@ -113,7 +131,8 @@ def _start_at_zero(mlp: torch.nn.Sequential) -> None:
         last.bias.zero_()
 
 
-def _rsl_rl_config(network: NetworkConfig, ppo: PpoConfig) -> dict[str, Any]:
+def rsl_rl_config(network: NetworkConfig, ppo: PpoConfig) -> dict[str, Any]:
+    """rsl-rl's configuration of actor, critic and PPO."""
     options = asdict(ppo)
     steps = options.pop("num_steps_per_env")
     shared = {"class_name": "MLPModel", "activation": network.activation, "obs_normalization": True}

@@ -17,7 +17,7 @@ from egovcp_train.lowlevel.task import DisturbanceConfig
 
 Array = NDArray[np.float64]
 SIDES: Final = ("left", "right")
-_HEAD: Final = "head_collision"  # a sphere
+HEAD: Final = "head_collision"  # a sphere
 _STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
 #: What the sensors read per body: foot place and velocity, its x and z axis, palm place.
 _SENSORS: Final = (
@@ -61,7 +61,7 @@ class Physics:
         self._rollout = Rollout(nthread=threads if threads > 1 else 0)
         self.state = np.zeros((robots, mujoco.mj_stateSize(base, _STATE)))
         self._nq, self._nv = base.nq, base.nv
-        self._head_radius = float(base.geom(_HEAD).size[0])
+        self._head_radius = float(base.geom(HEAD).size[0])
         steps = PHYSICS_STEPS_PER_CONTROLLER_TICK
         self._states = np.zeros((robots, steps, self.state.shape[1]))
         self._readings = np.zeros((robots, steps, base.nsensordata))
@@ -156,7 +156,7 @@ def _compile(feet: FootModel) -> mujoco.MjModel:
             objname=joint,
         )
     spec.add_sensor(
-        type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=_HEAD
+        type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=HEAD
     )
     # A robot whose simulation diverges must not be put back on its feet unnoticed.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET

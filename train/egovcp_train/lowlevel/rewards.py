@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.g1 import EFFORT_LIMIT
+from egovcp.robot.reach import DT
 from egovcp.robot.stance_table import NU
 from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
 from egovcp_train.lowlevel.physics import Snapshot
@@ -15,7 +16,27 @@ from egovcp_train.lowlevel.physics import Snapshot
 Array = NDArray[np.float64]
 SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the floor when the foot is flat
 _CONTACT: Final = 0.012  # m above that, below which a foot counts as standing
+_AVERAGED: Final = 0.3  # s
 _LEAST_WIDTH: Final = 0.16  # m between the feet, across
+_FALLEN_TILT: Final = 0.8  # rad off the natural pitch
+_FALLEN_HEIGHT: Final = 0.2  # m below the height's reference
+
+
+class Motion:
+    """Velocity and turning over the last moments: a pelvis swings with each step."""
+
+    def __init__(self, robots: int) -> None:
+        self.average = np.zeros((robots, 3))  # m/s ahead and across, rad/s
+
+    def reset(self, rows: NDArray[np.intp]) -> None:
+        """Robots that start from rest."""
+        self.average[rows] = 0.0
+
+    def add(self, x: Snapshot) -> None:
+        """One tick of 20 ms."""
+        forward = heading(rotation(x.quaternion))
+        now = np.concatenate([in_heading(x.velocity, forward), x.angular_velocity[:, 2:]], axis=1)
+        self.average += DT / _AVERAGED * (np.nan_to_num(now) - self.average)
 
 
 def standing_feet(x: Snapshot) -> NDArray[np.bool_]:
@@ -26,6 +47,7 @@ def standing_feet(x: Snapshot) -> NDArray[np.bool_]:
 
 def terms(
     x: Snapshot,
+    motion: Array,
     command: Array,
     height: Array,
     pitch: Array,
@@ -38,6 +60,7 @@ def terms(
 
     Args:
         x: the true state.
+        motion: (N, 3) m/s ahead and across, rad/s of turning, averaged (`Motion`).
         command: (N, 10) v, hands, height.
         height: (N,) m, where the pelvis should be by now.
         pitch: (N,) rad, the natural pitch at that height.
@@ -48,7 +71,6 @@ def terms(
     """
     turn = rotation(x.quaternion)
     forward = heading(turn)
-    velocity = in_heading(x.velocity, forward)
     up = turn[:, 2]  # the world's vertical in the pelvis frame
     off = np.stack([up[:, 0] + np.sin(pitch), up[:, 1], up[:, 2] - np.cos(pitch)], axis=1)
     on = standing_feet(x)
@@ -59,8 +81,8 @@ def terms(
     slipping = np.sum(x.feet_velocity[..., :2] ** 2, axis=-1) * on
     return {
         "alive": np.ones(len(height)),
-        "velocity": np.exp(-np.sum((velocity - command[:, :2]) ** 2, axis=1) / 0.05),
-        "turning": np.exp(-((x.angular_velocity[:, 2] - command[:, 2]) ** 2) / 0.25),
+        "velocity": np.exp(-np.sum((motion[:, :2] - command[:, :2]) ** 2, axis=1) / 0.03),
+        "turning": np.exp(-((motion[:, 2] - command[:, 2]) ** 2) / 0.1),
         "height": np.exp(-((x.position[:, 2] - height) ** 2) / 0.001),
         "upright": np.exp(-np.sum(off**2, axis=1) / 0.03),
         "contact": _in_step(on, phase, gait),
@@ -71,6 +93,15 @@ def terms(
         "action_rate": np.sum((action - last_action) ** 2, axis=1),
         "torque": np.mean(torque**2, axis=1),
     }
+
+
+def fallen(x: Snapshot, height: Array, pitch: Array) -> NDArray[np.bool_]:
+    """(N,) tilted or sunk far off the reference, or the simulation diverged."""
+    up = rotation(x.quaternion)[:, 2]
+    cosine = up[:, 2] * np.cos(pitch) - up[:, 0] * np.sin(pitch)
+    low = x.position[:, 2] < height - _FALLEN_HEIGHT
+    out: NDArray[np.bool_] = (cosine < np.cos(_FALLEN_TILT)) | low | x.broken
+    return out
 
 
 def _in_step(on: NDArray[np.bool_], phase: Array, gait: Array) -> Array:

@@ -30,7 +30,7 @@ class CommandConfig:
 
     interval: Range = (2.0, 6.0)
     """s between changes of velocity and of how hands and height move."""
-    standing: float = 0.35
+    standing: float = 0.25
     """Share of commands with zero velocity."""
     forward: tuple[Range, Range] = ((0.1, 0.3), (0.1, 0.6))
     """m/s, easy and hard."""
@@ -86,12 +86,12 @@ class DisturbanceConfig:
 class RewardConfig:
     """Weights of the reward terms, per second; see `rewards`."""
 
-    alive: float = 1.0
-    velocity: float = 2.0
+    alive: float = 0.5
+    velocity: float = 3.0
     turning: float = 1.0
     height: float = 1.0
     upright: float = 1.0
-    contact: float = 0.5
+    contact: float = 1.0
     slip: float = -0.5
     stance_width: float = -5.0
     foot_heading: float = -1.0
