@@ -14,10 +14,12 @@ from egovcp.sim.oracles import Oracle
 from egovcp.sim.policies import Hold, RandomWalk
 from egovcp.sim.policies import Policy as ReferencePolicy
 from egovcp.sim.scenario import Scenario
+from egovcp_deploy.options import PLANNER
+from egovcp_deploy.robots.sim import SimRobot
 
 Array = NDArray[np.float64]
 
-CONTROLLERS: Final = ("planner", "hold", "constant", "random", "oracle")
+CONTROLLERS: Final = (PLANNER, "hold", "constant", "random", "oracle")
 
 
 class Controller(Protocol):
@@ -114,3 +116,33 @@ def reference(name: str) -> Controller:
         "oracle": Oracle,
     }
     return Reference(policies[name]())
+
+
+class Scripted:
+    """A reference as the runner's policy for one simulated robot, whose truth it may see."""
+
+    def __init__(self, controller: Controller, robot: SimRobot) -> None:
+        self._controller = controller
+        self._robot = robot
+
+    def reset(self) -> None:
+        """The robot has just begun an episode."""
+        self._controller.reset(self._robot.env, [self._robot.scenario])
+
+    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+        """The reference's action, and no plan."""
+        none = np.zeros(0, np.float32)
+        action = self._controller.act(self._robot.env, Observation(depth, state))
+        return PolicyStep(np.asarray(action, np.float32), none, none, none, none, none, 0)
+
+    def advance(self, sent: NDArray[np.floating]) -> None:
+        """Hand on what was sent."""
+        self._controller.advance(np.asarray(sent, np.float64))
+
+    def reconstruct(self) -> NDArray[np.float32]:
+        """There is no world model."""
+        raise NotImplementedError
+
+    def imagine(self, plan: NDArray[np.floating], horizon: int) -> NDArray[np.float32]:
+        """There is no world model."""
+        raise NotImplementedError

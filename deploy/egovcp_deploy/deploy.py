@@ -1,4 +1,4 @@
-"""`egovcp-deploy`: close the loop with a policy artefact and record every rollout."""
+"""`egovcp-deploy`: close the loop with a policy and record every rollout."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import draccus
 import numpy as np
@@ -25,6 +25,8 @@ from egovcp.rate import FixedRate, LockstepClock
 from egovcp.sim.config import EnvConfig
 from egovcp.spec import PLANNER_HZ, TASKS
 from egovcp_deploy.options import (
+    PLANNER,
+    REFERENCES,
     PlannerOptions,
     PolicyOptions,
     check_choice,
@@ -35,11 +37,15 @@ from egovcp_deploy.options import (
     write_json,
 )
 from egovcp_deploy.robots import Robot
-from egovcp_deploy.runner import RolloutSummary, Runner
+from egovcp_deploy.runner import RolloutPolicy, RolloutSummary, Runner
 from egovcp_deploy.scenarios import eventful, held_out
+
+if TYPE_CHECKING:
+    from egovcp_deploy.robots.sim import SimRobot
 
 PROG: Final = "egovcp-deploy"
 ROBOTS: Final = ("sim",)
+DRIVERS: Final = (PLANNER, *REFERENCES)
 _EPILOG: Final = (
     "Rollout i plays held-out scenario i of --seed, the same that egovcp-eval plays. "
     "Writes rollout-<i>.mcap, rollout-<i>.rrd, a picture rollout-0.png, and deploy.json."
@@ -56,10 +62,16 @@ class RobotOptions:
 
 @dataclass(frozen=True)
 class DeployConfig:
-    """Drive a robot with a policy artefact at 25 Hz and record each rollout."""
+    """Drive a robot with a policy artefact at 25 Hz and record each rollout.
+
+    --controller=oracle shows how a task is solved, with no artefact at all.
+    """
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
-    """The policy artefact."""
+    """The policy artefact; not needed without the controller `planner`."""
+    controller: str = PLANNER
+    """Who drives: planner, or in simulation a reference that needs no artefact: hold (neutral
+    pose), random (the data's walk) or oracle (scripted, sees the truth)."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     """Changes to the artefact's planner."""
     robot: RobotOptions = field(default_factory=RobotOptions)
@@ -91,20 +103,35 @@ def deploy(config: DeployConfig) -> None:
         ArtefactError: the artefact is missing, damaged, or not made for this robot.
     """
     _check(config)
-    artefact = load_artefact(config.policy.path, config.policy.revision)
-    planner = config.planner.apply(artefact.planner)
+    artefact = _load_policy(config)
     robot = make_robot(config)
     try:
-        artefact.require_controller(robot.controller_id)
+        policy = _make_policy(config, artefact, robot)
         folder = make_output_dir(config.output_dir)
-        policy = artefact.make_policy(1, config.seed, planner)
         rate = FixedRate(PLANNER_HZ, LockstepClock())
-        runner = Runner(policy, robot, rate, config.imagine)
+        runner = Runner(policy, robot, rate, config.imagine if artefact else 0)
         summaries = _play(config, artefact, robot, runner, folder)
     finally:
         robot.close()
-    write_json(folder / "deploy.json", _report(config, artefact, summaries))
+    write_json(folder / "deploy.json", _report(config, artefact, robot, summaries))
     _print(summaries, folder)
+
+
+def _load_policy(config: DeployConfig) -> Artefact | None:
+    if config.controller != PLANNER:
+        return None
+    artefact = load_artefact(config.policy.path, config.policy.revision)
+    config.planner.apply(artefact.planner)
+    return artefact
+
+
+def _make_policy(config: DeployConfig, artefact: Artefact | None, robot: SimRobot) -> RolloutPolicy:
+    if artefact is None:
+        from egovcp_deploy.controllers import Scripted, reference
+
+        return Scripted(reference(config.controller), robot)
+    artefact.require_controller(robot.controller_id)
+    return artefact.make_policy(1, config.seed, config.planner.apply(artefact.planner))
 
 
 def _check(config: DeployConfig) -> None:
@@ -112,14 +139,18 @@ def _check(config: DeployConfig) -> None:
     check_choice("--robot.type", config.robot.type, ROBOTS)
     check_positive("--episodes", config.episodes)
     held_out(config.task, config.seed, 0)
-    if not config.policy.path:
-        raise UsageError("--policy.path is missing; name the artefact")
+    check_choice("--controller", config.controller, DRIVERS)
+    if config.controller == PLANNER and not config.policy.path:
+        raise UsageError(
+            "--policy.path is missing; name the artefact, or choose a reference that needs none, "
+            "such as --controller=oracle"
+        )
     if config.imagine < 0:
         raise UsageError(f"--imagine={config.imagine}: expected a number of ticks from 0")
     check_output_dir(config.output_dir)
 
 
-def make_robot(config: DeployConfig) -> Robot:
+def make_robot(config: DeployConfig) -> SimRobot:
     """The robot of ``--robot.type``.
 
     Raises:
@@ -136,7 +167,7 @@ def make_robot(config: DeployConfig) -> Robot:
 
 
 def _play(
-    config: DeployConfig, artefact: Artefact, robot: Robot, runner: Runner, folder: Path
+    config: DeployConfig, artefact: Artefact | None, robot: Robot, runner: Runner, folder: Path
 ) -> list[RolloutSummary]:
     summaries = []
     with tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar:
@@ -163,14 +194,17 @@ def _recording(folder: Path, episode: int, info: RunInfo) -> Iterator[Sink]:
         yield sink
 
 
-def _run_info(config: DeployConfig, artefact: Artefact, robot: Robot, episode: int) -> RunInfo:
+def _run_info(
+    config: DeployConfig, artefact: Artefact | None, robot: Robot, episode: int
+) -> RunInfo:
+    files = artefact.manifest["files"] if artefact else {}
     return RunInfo(
         task=config.task,
         seed=config.seed,
         episode=episode,
         camera=robot.camera,
         config=draccus.encode(config),
-        hashes={"low_level_controller": robot.controller_id, **artefact.manifest["files"]},
+        hashes={"low_level_controller": robot.controller_id, **files},
         versions=versions(),
     )
 
@@ -181,7 +215,10 @@ def _show(bar: Any, tick: Tick) -> None:
 
 
 def _report(
-    config: DeployConfig, artefact: Artefact, summaries: Sequence[RolloutSummary]
+    config: DeployConfig,
+    artefact: Artefact | None,
+    robot: Robot,
+    summaries: Sequence[RolloutSummary],
 ) -> dict[str, Any]:
     """Content of ``deploy.json``."""
     return {
@@ -190,8 +227,8 @@ def _report(
         "success_rate": float(np.mean([summary.success for summary in summaries])),
         "rollouts": [_row(i, summary) for i, summary in enumerate(summaries)],
         "config": draccus.encode(config),
-        "artefact": artefact.manifest["files"],
-        "low_level_controller": artefact.controller_id,
+        "artefact": artefact.manifest["files"] if artefact else None,
+        "low_level_controller": robot.controller_id,
         "versions": versions(),
     }
 

@@ -13,6 +13,8 @@ from typing import Any, Final
 from egovcp.errors import EnvironmentFailure, UsageError, suggest
 from egovcp.plan import PlannerConfig
 
+PLANNER: Final = "planner"
+REFERENCES: Final = ("hold", "random", "oracle")
 _PACKAGES: Final = ("egovcp", "egovcp-deploy", "torch", "numpy")
 
 

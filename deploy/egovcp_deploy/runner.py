@@ -28,7 +28,10 @@ REJECTED: Final = "plan rejected: not finite"
 
 
 class RolloutPolicy(Protocol):
-    """What the runner needs of `egovcp.plan.Policy`, for one robot."""
+    """What the runner needs of `egovcp.plan.Policy`, for one robot.
+
+    One that does not plan returns empty arrays, and nothing of them is logged.
+    """
 
     def reset(self) -> None:
         """Forget the past."""
@@ -195,10 +198,10 @@ class _Moment:
             action_sent=outcome.sent,
             depth_reconstructed=self.decoded.reconstructed,
             depth_imagined=self.decoded.imagined,
-            plan=step.plan[0],
-            candidates=_candidates(step),
-            value=float(step.value[0]),
-            termination=float(step.termination[0]),
+            plan=step.plan[0] if step.plan.size else None,
+            candidates=_candidates(step) if step.candidates.size else None,
+            value=float(step.value[0]) if step.value.size else None,
+            termination=float(step.termination[0]) if step.termination.size else None,
             reward=outcome.reward,
             reward_terms=outcome.reward_terms,
             terminated=outcome.terminated,

@@ -51,9 +51,15 @@ class SimRobot:
         pitch = self._env.lanes[0].camera_pitch if self._env.lanes else 0.0
         return CameraView("torso_link", self._mount, pitch, self._fov)
 
+    @property
+    def env(self) -> VectorEnv:
+        """The simulator, for scripted policies that see the truth."""
+        return self._env
+
     def start(self, episode: int) -> None:
         """Reset to scenario ``episode``."""
-        self._observation = self._env.reset([held_out(self._task, self._seed, episode)])
+        self.scenario = held_out(self._task, self._seed, episode)
+        self._observation = self._env.reset([self.scenario])
         self._reported = set()
 
     def observe(self) -> Sensed:
