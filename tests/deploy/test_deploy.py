@@ -126,3 +126,24 @@ def test_each_event_of_an_episode_is_told_once(tmp_path: Path, artefact_dir: Pat
         first = next((t for t in ticks if t.reward_terms[term] != 0), None)
         assert (text in events) == (first is not None)
         assert first is None or text in first.events
+
+
+def test_a_reference_needs_no_artefact_and_leaves_no_plan(
+    tmp_path: Path, short: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    flags = ["--controller=oracle", "--episodes=1", "--seed=3", f"--output_dir={out}"]
+    assert run(*flags, *short) == 0, capsys.readouterr().err
+    ticks = read_recording(out / "rollout-0.mcap").ticks
+    assert len(ticks) == 15
+    assert all(t.plan is None and t.candidates is None and t.value is None for t in ticks)
+    assert any(t.action_sent.any() for t in ticks), "the oracle moves its hands to the ball"
+    report = json.loads((out / "deploy.json").read_text())
+    assert report["artefact"] is None
+    assert report["low_level_controller"].startswith("g1-stance")
+
+
+def test_an_unknown_driver_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--controller=orcale", f"--output_dir={tmp_path / 'x'}") == 2
+    assert "oracle" in capsys.readouterr().err
+    assert not (tmp_path / "x").exists()

@@ -1,0 +1,207 @@
+"""Find the numbers of the hand-made gait by evolution (CMA-ES): ``egovcp-tune-gait``.
+
+Each candidate walks with robots of its own at several speeds and turns, under noise, delay and
+randomised physics, without any policy. What counts is how long it stays up, how well it follows
+the velocity and how still the pelvis is.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from egovcp.cli import run_command
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.robot.gait import GaitConfig
+from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
+from egovcp.sim.config import SensorConfig
+from egovcp.sim.sensors import noise_std
+from egovcp.spec import ACTION_BOX, CONTROLLER_HZ
+from egovcp_train.lowlevel import events, rewards
+from egovcp_train.lowlevel.physics import Physics
+from egovcp_train.lowlevel.sensing import measure
+from egovcp_train.lowlevel.task import DisturbanceConfig
+from egovcp_train.output import require_writable
+
+PROG: Final = "egovcp-tune-gait"
+RESULT: Final = "gait.json"
+_DT: Final = 1.0 / CONTROLLER_HZ
+_FIXED: Final = ("reach", "least_speed", "tipping", "rise", "fade", "linger")
+_SPREAD: Final = 0.3  # of a number, relative to its size
+_LEAST: Final = 0.1  # ... and at least this
+_SPEEDS: Final = ((0.0, 0.0), (0.1, 0.3), (0.2, -0.3), (0.3, 0.0), (0.4, 0.2), (0.5, -0.2))
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class TuneConfig:
+    """Improve the hand-made gait by CMA-ES, starting from the present numbers.
+
+    Writes OUTPUT_DIR/gait.json, the numbers of `GaitConfig`; give them to egovcp-train-lowlevel
+    as --walk.gait.NAME=....
+    """
+
+    output_dir: str
+    """Where gait.json goes."""
+    start: GaitConfig = field(default_factory=GaitConfig)
+    """Where to start from."""
+    minutes: float = 15.0
+    """Wall-clock limit."""
+    population: int = 28
+    """Candidates per generation."""
+    seconds: float = 6.0
+    """Length of a walk, s."""
+    height: float = 0.72
+    """Pelvis height, m."""
+    seed: int = 0
+    """Seed of candidates, physics and noise."""
+    threads: int = 0
+    """CPU threads; 0: all cores."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run_command(TuneConfig, tune, argv, prog=PROG)
+
+
+def tune(config: TuneConfig) -> None:
+    """Search until the time is over; the best mean so far is always on disk.
+
+    Raises:
+        UsageError: an option makes no sense.
+        EnvironmentFailure: the package cma is missing, or the folder cannot be written.
+    """
+    if config.population < 4 or config.seconds <= 0 or config.minutes <= 0:
+        raise UsageError("--population must be at least 4, --seconds and --minutes above 0")
+    try:
+        import cma
+    except ImportError as error:
+        raise EnvironmentFailure(
+            f"{PROG} needs the package cma, which is not installed here: "
+            "pip install 'egovcp-train[lowlevel]'"
+        ) from error
+    output = Path(config.output_dir)
+    require_writable(output)
+    output.mkdir(parents=True, exist_ok=True)
+    search = cma.CMAEvolutionStrategy(
+        np.zeros(len(flat(config.start))),
+        0.5,
+        {"popsize": config.population, "seed": config.seed + 1, "verbose": -9},
+    )
+    end, generation = time.monotonic() + 60 * config.minutes, 0
+    with tqdm(unit="generation", desc="gait") as bar:
+        while time.monotonic() < end and not search.stop():
+            candidates = search.ask()
+            gaits = [shifted(config.start, x) for x in candidates]
+            scores = walk(gaits, config, generation)
+            search.tell(candidates, (-scores).tolist())
+            generation += 1
+            _save(output / RESULT, shifted(config.start, search.mean), generation)
+            most = config.seconds * _MOST
+            bar.set_postfix_str(f"best {scores.max() / most:.0%}, mean {scores.mean() / most:.0%}")
+            bar.update(1)
+    print(f"gait: {output / RESULT}")
+
+
+def flat(gait: GaitConfig) -> Array:
+    """(D,) the numbers that are searched."""
+    values = (getattr(gait, f.name) for f in fields(gait) if f.name not in _FIXED)
+    return np.concatenate([np.atleast_1d(np.asarray(v, dtype=np.float64)) for v in values])
+
+
+def shifted(gait: GaitConfig, by: Sequence[float] | Array) -> GaitConfig:
+    """``gait`` with its numbers moved by ``by`` (D,), in units of what is a usual change."""
+    now = flat(gait)
+    moved = now + np.asarray(by) * _SPREAD * np.maximum(np.abs(now), _LEAST)
+    change: dict[str, Any] = {}
+    for f in fields(gait):
+        old = getattr(gait, f.name)
+        if f.name in _FIXED:
+            continue
+        size = len(old) if isinstance(old, tuple) else 1
+        part, moved = moved[:size].tolist(), moved[size:]
+        change[f.name] = tuple(part) if isinstance(old, tuple) else part[0]
+    change["step_time"] = float(np.clip(change["step_time"], 0.25, 0.6))
+    change["soften"] = float(np.clip(change["soften"], 0.05, 1.0))
+    change["shift"] = float(np.clip(change["shift"], 0.0, change["step_time"]))
+    change["velocity_filter"] = float(np.clip(change["velocity_filter"], 0.05, 1.0))
+    return replace(gait, **change)
+
+
+_MOST: Final = 3.0  # of the score below, per second
+
+
+def walk(gaits: Sequence[GaitConfig], config: TuneConfig, generation: int) -> Array:
+    """(len(gaits),) score of each, the mean over its robots, at most 3 per second."""
+    each = len(_SPEEDS)
+    robots = each * len(gaits)
+    rng = np.random.default_rng([config.seed, generation])
+    threads = config.threads or len(os.sched_getaffinity(0))
+    disturbances = DisturbanceConfig(
+        stiffness_scale=(0.9, 1.1), damping_scale=(0.9, 1.1), friction=(0.6, 1.0)
+    )
+    seed = int(rng.integers(1 << 31))
+    physics = Physics(robots, "points", disturbances, threads, seed)
+    qpos = events.standing(robots, rng)
+    physics.place(np.arange(robots), qpos, qpos[:, 7:])
+    delay = events.delays(robots, disturbances, rng)
+    walks = [Walk(WalkConfig(gait=gait)) for gait in gaits]
+    rows = [slice(i * each, (i + 1) * each) for i in range(len(gaits))]
+    command = np.zeros((robots, 10))
+    command[:, 3:] = ACTION_BOX.neutral
+    command[:, 9] = config.height
+    command[:, [0, 2]] = np.tile(_SPEEDS, (len(gaits), 1))
+    command[:, 0] = np.maximum(command[:, 0], 0.06)  # even the slowest has to step
+    std, motion = noise_std(SensorConfig()), rewards.Motion(robots)
+    score, up = np.zeros(robots), np.ones(robots, dtype=bool)
+    x = physics.snapshot()
+    for tick in range(round(config.seconds * CONTROLLER_HZ)):
+        state = measure(x, command, std, rng)
+        targets = []
+        for w, r in zip(walks, rows, strict=True):
+            if tick == 0:
+                w.reset(state[r])
+            w.observe(state[r])
+            targets.append(w.targets(np.zeros((each, ACTIONS))))
+        physics.step(np.concatenate(targets), delay)
+        x = physics.snapshot()
+        height = np.concatenate([w.height for w in walks])
+        pitch = np.concatenate([w.pitch for w in walks])
+        up &= ~rewards.fallen(x, height, pitch)
+        motion.add(x)
+        score += up * _DT * _quality(x.angular_velocity, motion.average, command)
+        if not up.any():
+            break
+    physics.close()
+    return np.asarray(score.reshape(len(gaits), each).mean(axis=1))
+
+
+def _quality(rate: Array, motion: Array, command: Array) -> Array:
+    """(N,) per second, at most 3: up 1, velocity 1, turning 0.5, a still pelvis 0.5."""
+    off = np.sum((motion[:, :2] - command[:, :2]) ** 2, axis=1)
+    turn = (motion[:, 2] - command[:, 2]) ** 2
+    still = np.nan_to_num(np.sum(rate[:, :2] ** 2, axis=1), nan=1e3)
+    out = 1.0 + np.exp(-off / 0.04) + 0.5 * np.exp(-turn / 0.1) + 0.5 * np.exp(-still / 2.0)
+    return np.asarray(out)
+
+
+def _save(path: Path, gait: GaitConfig, generation: int) -> None:
+    content = {"gait": asdict(gait), "generations": generation, "command": [PROG, *sys.argv[1:]]}
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(content, indent=2))
+    partial.replace(path)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
