@@ -46,6 +46,23 @@ def test_mjlab_finds_the_task_by_its_entry_point():
     assert task_module.TASK_ID in list_tasks()
 
 
+def test_mjlabs_command_line_reaches_every_number():
+    import tyro
+    from mjlab import TYRO_FLAGS
+    from mjlab.scripts.train import TrainConfig
+
+    flags = ["--env.scene.num-envs", "7", "--env.commands.loop.walk.action-scale", "0.2"]
+    config = tyro.cli(
+        TrainConfig,
+        args=[*flags, "--agent.algorithm.desired-kl", "0.03"],
+        default=TrainConfig.from_task(task_module.TASK_ID),
+        config=TYRO_FLAGS,
+    )
+    assert config.env.scene.num_envs == 7
+    assert config.env.commands["loop"].walk.action_scale == 0.2
+    assert config.agent.algorithm.desired_kl == 0.03
+
+
 def test_the_robot_has_the_gains_and_feet_of_the_cpu_environment(env):
     model = env.sim.mj_model
     names = [model.actuator(i).name.split("/")[-1] for i in range(model.nu)]

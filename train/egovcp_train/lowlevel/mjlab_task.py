@@ -493,8 +493,8 @@ def rl_cfg(network: NetworkConfig | None = None, ppo: PpoConfig | None = None) -
     algorithm = shared["algorithm"]
     algorithm["symmetry_cfg"]["data_augmentation_func"] = "egovcp_train.lowlevel.env:mirrored"
     return RslRlOnPolicyRunnerCfg(
-        actor=RslRlModelCfg(**shared["actor"]),
-        critic=RslRlModelCfg(**shared["critic"]),
+        actor=_model_cfg(shared["actor"]),
+        critic=_model_cfg(shared["critic"]),
         algorithm=SymmetricPpoCfg(**algorithm),
         obs_groups={name: tuple(groups) for name, groups in shared["obs_groups"].items()},
         num_steps_per_env=shared["num_steps_per_env"],
@@ -503,6 +503,10 @@ def rl_cfg(network: NetworkConfig | None = None, ppo: PpoConfig | None = None) -
         upload_model=False,
         max_iterations=2_000,
     )
+
+
+def _model_cfg(options: dict[str, Any]) -> RslRlModelCfg:
+    return RslRlModelCfg(**options | {"hidden_dims": tuple(options["hidden_dims"])})
 
 
 class LowLevelRunner(MjlabOnPolicyRunner):
