@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from importlib import resources
 from pathlib import Path
+from typing import Final
 
 from egovcp.errors import UsageError
 from egovcp.robot.controller import LowLevelController
@@ -11,22 +13,31 @@ from egovcp.robot.walk_onnx import OnnxPolicy
 from egovcp.robot.walk_policy import WalkPolicy
 from egovcp.robot.walking import WalkingController
 
+STANCE: Final = "stance"
+WALK: Final = "walk"
+_SHIPPED: Final = "g1_walk.safetensors"
+
 
 def make_controller(which: str) -> LowLevelController:
-    """``stance``, or the path of a ``walk.safetensors`` or of its export to ONNX.
+    """``stance``, ``walk``, or the path of a ``walk.safetensors`` or of its export to ONNX.
+
+    ``stance`` is the LQR, ``walk`` the trained controller that the package ships.
 
     Raises:
         UsageError: neither.
         ArtefactError: the file cannot be used.
         EnvironmentFailure: onnxruntime is not installed.
     """
-    if which == "stance":
+    if which == STANCE:
         return StanceController()
+    if which == WALK:
+        with resources.as_file(resources.files("egovcp.robot").joinpath(_SHIPPED)) as path:
+            return WalkingController(WalkPolicy.load(path))
     if which.endswith(".safetensors"):
         return WalkingController(WalkPolicy.load(Path(which)))
     if which.endswith(".onnx"):
         return WalkingController(OnnxPolicy(Path(which)))
     raise UsageError(
-        f"unknown controller {which!r}; expected stance, or a file PATH.safetensors or PATH.onnx "
-        "that egovcp-train-lowlevel wrote"
+        f"unknown controller {which!r}; expected stance, walk, or a file PATH.safetensors or "
+        "PATH.onnx that egovcp-train-lowlevel wrote"
     )

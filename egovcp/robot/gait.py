@@ -83,8 +83,12 @@ class GaitConfig:
     """Weight of each tick's leg odometry in the estimated velocity."""
     least_speed: float = 0.05
     """m/s (a third of it per rad/s of turning) of commanded velocity that makes it step."""
-    tipping: float = 0.2
-    """rad of tilt off the reference, plus 0.15 s times the tilting rate, that makes it step."""
+    tipping: tuple[float, float] = (0.35, 0.6)
+    """rad of tilt off the reference, plus 0.15 s times the tilting rate, that makes a standing
+    robot step, and a stepping one step on."""
+    support: tuple[float, float] = (0.105, 0.15)
+    """m along and across, half axes of an ellipse about the middle of the feet; a robot that
+    stands steps once its extrapolated centre of mass leaves it."""
     rise: float = 0.1
     """s in which the gait comes in."""
     fade: float = 0.2
@@ -124,13 +128,29 @@ def _feet(joint_position: Array, gravity: Array) -> Array:
     return rotate(heading_rotation(gravity)[:, None], foot_positions(joint_position))
 
 
-def advance(m: Gait, state: Array, tilt: Array, config: GaitConfig) -> NDArray[np.bool_]:
-    """One tick of the clock and of the odometry, in place.
+def sense(m: Gait, state: Array, config: GaitConfig) -> None:
+    """Odometry: velocity by the feet that carry, each as much as it does; in place."""
+    feet = _feet(
+        state[:, STATE_SLICES["joint_position"]], state[:, STATE_SLICES["projected_gravity"]]
+    )
+    load = _load(m, config)
+    moved = (m.feet - feet)[..., :2] / DT
+    velocity = moved[:, 0] * load[:, :1] + moved[:, 1] * load[:, 1:]
+    m.velocity = m.velocity + config.velocity_filter * (velocity - m.velocity)
+    m.feet = feet
+
+
+def advance(
+    m: Gait, row: StanceRow, height: Array, tilt: Array, state: Array, config: GaitConfig
+) -> NDArray[np.bool_]:
+    """One tick of the clock, in place, after `sense`.
 
     Args:
         m: memory.
-        state: (B, 74) observations.
+        row: standing pose of the height.
+        height: (B,) m of the pelvis.
         tilt: (B, 2) rad, roll and pitch off the reference.
+        state: (B, 74) observations.
         config: timing.
 
     Returns:
@@ -138,11 +158,12 @@ def advance(m: Gait, state: Array, tilt: Array, config: GaitConfig) -> NDArray[n
     """
     command = state[:, STATE_SLICES["command_velocity"]]
     rate = state[:, STATE_SLICES["angular_velocity"]]
-    _odometry(m, state, config)
     speed = np.sqrt(np.sum(command[:, :2] ** 2, axis=1)) + np.abs(command[:, 2]) / 3
-    leaning = np.sqrt(np.sum((tilt + 0.15 * rate[:, :2]) ** 2, axis=1)) > config.tipping
-    wanted = (speed > config.least_speed) | leaning
     standing = m.amount <= 0
+    tipping = np.where(standing, *config.tipping)
+    leaning = np.sqrt(np.sum((tilt + 0.15 * rate[:, :2]) ** 2, axis=1)) > tipping
+    leaning |= standing & _leaves_support(m, row, height, config)
+    wanted = (speed > config.least_speed) | leaning
     before = m.phase
     _tick(m, standing, leaning, command, rate, config)
     m.left = np.where(wanted, config.linger, np.maximum(m.left - DT, 0.0))
@@ -154,6 +175,21 @@ def advance(m: Gait, state: Array, tilt: Array, config: GaitConfig) -> NDArray[n
     m.turned = np.where(m.amount > 0, off, 0.0)
     stands: NDArray[np.bool_] = ~standing & (m.amount <= 0)
     return stands
+
+
+def _leaves_support(
+    m: Gait, row: StanceRow, height: Array, config: GaitConfig
+) -> NDArray[np.bool_]:
+    """(B,) whether x + v / omega is outside the ellipse about the feet that stand."""
+    place = -0.5 * (m.feet[:, 0, :2] + m.feet[:, 1, :2]) - row.pelvis[:, :2]
+    extrapolated = place + m.velocity / _omega(height)[:, None]
+    out: NDArray[np.bool_] = np.sum((extrapolated / config.support) ** 2, axis=1) > 1.0
+    return out
+
+
+def _omega(height: Array) -> Array:
+    """(B,) 1/s, of the inverted pendulum."""
+    return np.asarray(np.sqrt(_GRAVITY / np.maximum(height - _ANKLE_HEIGHT, 0.3)))
 
 
 def _tick(
@@ -178,18 +214,6 @@ def _tick(
     m.shifting = np.where(standing, shift, np.maximum(m.shifting - DT, 0.0))
 
 
-def _odometry(m: Gait, state: Array, config: GaitConfig) -> None:
-    """Velocity by the feet that carry, each as much as it does."""
-    feet = _feet(
-        state[:, STATE_SLICES["joint_position"]], state[:, STATE_SLICES["projected_gravity"]]
-    )
-    load = _load(m, config)
-    moved = (m.feet - feet)[..., :2] / DT
-    velocity = moved[:, 0] * load[:, :1] + moved[:, 1] * load[:, 1:]
-    m.velocity = m.velocity + config.velocity_filter * (velocity - m.velocity)
-    m.feet = feet
-
-
 def _load(m: Gait, config: GaitConfig) -> Array:
     """(B, 2) share of the weight on the left and on the right foot."""
     swing = np.clip(np.sin(m.phase) / config.soften, -1.0, 1.0) * (m.amount > 0)
@@ -209,7 +233,7 @@ def foothold(m: Gait, row: StanceRow, height: Array, command: Array, config: Gai
     side, stance = _swinging(m)
     foot = m.feet[np.arange(len(side)), stance, :2]
     offset = row.pelvis[:, 0]  # of the balanced pelvis from the ankles
-    omega = np.sqrt(_GRAVITY / np.maximum(height - _ANKLE_HEIGHT, 0.3))
+    omega = _omega(height)
     time = config.step_time
     rest = (1.0 - m.phase % np.pi / np.pi) * time
     cosh, sinh = np.cosh(omega * rest), np.sinh(omega * rest)

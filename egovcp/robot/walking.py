@@ -40,9 +40,10 @@ class WalkConfig:
 
     balance: BalanceConfig = field(default_factory=BalanceConfig)
     reach: ReachConfig = field(
-        default_factory=lambda: ReachConfig(bandwidth=20.0, acceleration=150.0)
+        default_factory=lambda: ReachConfig(speed=14.0, acceleration=1000.0, bandwidth=34.0)
     )
-    """Brisker arms than the stance law alone can balance for long."""
+    """Brisker arms than the stance law alone can balance for long; the motors' limits bound
+    their acceleration."""
     gait: GaitConfig = field(default_factory=GaitConfig)
     action_scale: float = 0.3
     """rad per unit of the policy's action."""
@@ -109,10 +110,12 @@ class Walk:
         command = s[:, STATE_SLICES["command_height"]][:, 0]
         balance.follow_height(m.balance, self._table.clamp(command), self.config.balance)
         tilt = self._tilt(s)
-        self._restart_standing(gait.advance(m.gait, s, tilt, self.config.gait))
+        gait.sense(m.gait, s, self.config.gait)
+        row = self._table.at(m.balance.height)
+        stands = gait.advance(m.gait, row, m.balance.height, tilt, s, self.config.gait)
+        self._restart_standing(stands)
         amount = m.gait.amount[:, None]
         arm_targets = self._reach(s, amount[:, 0] > 0)
-        row = self._table.at(m.balance.height)
         body = balance.balance(m.balance, s, row, m.reach, self.config.balance)
         motion = gait.leg_motion(m.gait, row, m.balance.height, tilt, s, self.config.gait)
         body += amount * (motion - m.balance.correction)

@@ -227,7 +227,8 @@ class EnvConfig:
     arch_episode: EpisodeConfig = EpisodeConfig(ticks=230, event_ticks=(5, 25))
     """Length and timing of arch episodes; the default covers the slowest passage."""
     controller: str = "stance"
-    """Low-level controller: stance, or the walk.safetensors of egovcp-train-lowlevel."""
+    """Low-level controller: stance (LQR, does not step), walk (trained, ships with the package), or
+    the walk.safetensors or walk.onnx of egovcp-train-lowlevel."""
     feet: Literal["stock", "points"] = "points"
     """Foot collision model: four points each (about twice as fast), or the stock capsules."""
     camera: CameraConfig = CameraConfig()

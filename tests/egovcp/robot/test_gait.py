@@ -34,7 +34,13 @@ def _start(state: np.ndarray) -> Gait:
 
 
 def _run(m: Gait, state: np.ndarray, ticks: int) -> list[np.ndarray]:
-    return [gait.advance(m, state, np.zeros((len(state), 2)), CONFIG) for _ in range(ticks)]
+    return [_advance(m, state, np.zeros((len(state), 2))) for _ in range(ticks)]
+
+
+def _advance(m: Gait, state: np.ndarray, tilt: np.ndarray) -> np.ndarray:
+    h = np.full(len(state), HEIGHT)
+    gait.sense(m, state, CONFIG)
+    return gait.advance(m, stance_table().at(h), h, tilt, state, CONFIG)
 
 
 def _motion(m: Gait, state: np.ndarray, height: float = HEIGHT) -> np.ndarray:
@@ -120,9 +126,19 @@ def _shortened(m: Gait, state: np.ndarray) -> list[float]:
 def test_a_robot_that_tips_over_steps_at_once():
     state = _state(2)
     m = _start(state)
-    gait.advance(m, state, np.array([[0.05, 0.0], [0.0, 0.3]]), CONFIG)
+    _advance(m, state, np.array([[0.05, 0.0], [0.0, 0.3]]))
     assert (m.amount > 0).tolist() == [False, True]
     assert m.shifting[1] == 0
+
+
+@pytest.mark.parametrize("velocity", [(0.5, 0.0), (-0.5, 0.0), (0.0, 0.6), (0.0, -0.6)])
+def test_a_robot_that_is_pushed_steps_before_it_tips(velocity):
+    state = _state(2)
+    m = _start(state)
+    m.velocity[1] = velocity
+    h = np.full(2, HEIGHT)
+    gait.advance(m, stance_table().at(h), h, np.zeros((2, 2)), state, CONFIG)
+    assert (m.amount > 0).tolist() == [False, True]
 
 
 @pytest.mark.parametrize(("vy", "left_first"), [(0.2, True), (-0.2, False)])

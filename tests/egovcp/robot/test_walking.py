@@ -18,7 +18,7 @@ def _states(batch: int, ticks: int, seed: int = 0) -> np.ndarray:
     out = np.zeros((ticks, batch, STATE_DIM))
     out[..., STATE_SLICES["projected_gravity"]] = (0.0, 0.0, -1.0)
     out[..., STATE_SLICES["joint_position"]] = pose.joints
-    out += 0.01 * rng.standard_normal(out.shape)
+    out += 0.002 * rng.standard_normal(out.shape)
     action = np.cumsum(0.1 * rng.uniform(-1, 1, (ticks, batch, 7)), axis=0).clip(-1, 1)
     out[..., 9:16] = ACTION_BOX.to_metric(action)
     out[..., STATE_SLICES["command_velocity"]] = 0.0

@@ -47,7 +47,7 @@ class LowLevelEvalConfig:
     output_dir: str
     """Folder for lowlevel.json; its other files are left alone."""
     controller: str = "stance"
-    """stance, or the walk.safetensors that egovcp-train-lowlevel wrote."""
+    """stance, walk (which the package ships), or the walk.safetensors of egovcp-train-lowlevel."""
     skills: str = ",".join(skill.name for skill in SKILLS)
     """Which skills, separated by commas."""
     episodes: int = 400

@@ -17,6 +17,7 @@ Array = NDArray[np.float64]
 SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the floor when the foot is flat
 _CONTACT: Final = 0.012  # m above that, below which a foot counts as standing
 _AVERAGED: Final = 0.3  # s
+_STANDS: Final = 0.05  # m/s and rad/s, a slower command asks to stand
 _LEAST_WIDTH: Final = 0.16  # m between the feet, across
 _FALLEN_TILT: Final = 0.8  # rad off the natural pitch
 _FALLEN_HEIGHT: Final = 0.2  # m below the height's reference
@@ -86,6 +87,7 @@ def terms(
         "height": np.exp(-((x.position[:, 2] - height) ** 2) / 0.001),
         "upright": np.exp(-np.sum(off**2, axis=1) / 0.03),
         "contact": _in_step(on, phase, gait),
+        "stepping": gait * (np.abs(command[:, :3]).max(axis=1) < _STANDS),
         "slip": np.sum(np.minimum(slipping, 4.0), axis=1),
         "stance_width": np.maximum(_LEAST_WIDTH - width, 0.0),
         "foot_heading": np.sum(ahead[..., 1] ** 2, axis=1),

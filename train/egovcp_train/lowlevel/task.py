@@ -30,7 +30,7 @@ class CommandConfig:
 
     interval: Range = (2.0, 6.0)
     """s between changes of velocity and of how hands and height move."""
-    standing: float = 0.25
+    standing: float = 0.4
     """Share of commands with zero velocity."""
     forward: tuple[Range, Range] = ((0.1, 0.3), (0.1, 0.6))
     """m/s, easy and hard."""
@@ -46,7 +46,7 @@ class CommandConfig:
     """m, easy and hard."""
     acceleration: float = 0.8
     """m/s^2 and rad/s^2 at which the commanded velocity changes."""
-    still_hands: float = 0.3
+    still_hands: float = 0.2
     """Share of commands whose hands rest; the others follow the data's random walk."""
 
     def __post_init__(self) -> None:
@@ -92,6 +92,7 @@ class RewardConfig:
     height: float = 1.0
     upright: float = 1.0
     contact: float = 1.0
+    stepping: float = -0.5
     slip: float = -0.5
     stance_width: float = -5.0
     foot_heading: float = -1.0

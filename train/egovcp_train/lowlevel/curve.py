@@ -1,0 +1,79 @@
+"""The training curve of a low-level controller, from its TensorBoard records, as table and picture.
+
+    python -m egovcp_train.lowlevel.curve RUN --out docs/lowlevel_training
+
+Writes OUT.csv and OUT.png.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+from pathlib import Path
+from typing import Any, Final
+
+COLUMNS: Final = {
+    "difficulty": "episode/difficulty",
+    "falls per robot and minute": "falls_per_second",
+    "velocity reward": "reward/velocity",
+    "reward per second": "reward/total",
+}
+_POINTS: Final = 200
+
+
+def read(run: Path) -> list[dict[str, float]]:
+    """About 200 rows of steps and `COLUMNS`, each the mean of its stretch of the run."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    records = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0})
+    records.Reload()
+    series = {name: records.Scalars(tag) for name, tag in COLUMNS.items()}
+    count = min(len(points) for points in series.values())
+    stretch = max(1, count // _POINTS)
+    rows = []
+    for begin in range(0, count - stretch + 1, stretch):
+        part = slice(begin, begin + stretch)
+        row = {"steps": float(series["difficulty"][begin + stretch - 1].step)}
+        row |= {name: _mean(points[part]) for name, points in series.items()}
+        row["falls per robot and minute"] *= 60
+        rows.append(row)
+    return rows
+
+
+def _mean(points: list[Any]) -> float:
+    return sum(point.value for point in points) / len(points)
+
+
+def write(rows: list[dict[str, float]], out: Path) -> None:
+    """OUT.csv and OUT.png."""
+    with out.with_suffix(".csv").open("w", newline="", encoding="utf-8") as file:
+        table = csv.writer(file, lineterminator="\n")
+        table.writerow(rows[0])
+        table.writerows([f"{value:.4g}" for value in row.values()] for row in rows)
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    figure, axes = plt.subplots(1, len(COLUMNS), figsize=(14, 3), layout="constrained")
+    for axis, name in zip(axes, COLUMNS, strict=True):
+        axis.plot([row["steps"] / 1e6 for row in rows], [row[name] for row in rows])
+        axis.set(title=name, xlabel="million steps of 20 ms")
+        axis.grid(alpha=0.3)
+    figure.savefig(out.with_suffix(".png"), dpi=80)
+    plt.close(figure)
+
+
+def main() -> None:
+    """Read a run, write its curve."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path, help="--output_dir of egovcp-train-lowlevel")
+    parser.add_argument("--out", type=Path, required=True, help="path without ending")
+    args = parser.parse_args()
+    write(read(args.run), args.out)
+
+
+if __name__ == "__main__":
+    main()
