@@ -1,0 +1,49 @@
+"""The controller that the package ships: small, told where it comes from, and it walks."""
+
+import json
+from importlib import resources
+
+import numpy as np
+import pytest
+from safetensors import safe_open
+
+from egovcp.robot.controllers import make_controller
+from egovcp.sim.config import SensorConfig
+from egovcp_train.lowlevel.skills import SKILLS, Skill
+from egovcp_train.lowlevel.task import DisturbanceConfig
+from egovcp_train.lowlevel.trial import Outcome, play
+
+FILE = resources.files("egovcp.robot").joinpath("g1_walk.safetensors")
+
+
+def test_it_is_small_and_says_where_it_comes_from():
+    with resources.as_file(FILE) as path:
+        assert path.stat().st_size <= 2_000_000
+        with safe_open(path, framework="numpy") as file:
+            content = json.loads(file.metadata()["content"])
+    origin = content["provenance"]
+    assert origin["steps"] > 5_000_000
+    assert "seed" in origin
+    assert all(round_["command"].startswith("egovcp-train-lowlevel ") for round_ in origin["rounds"])
+    assert set(content["config"]) >= {"balance", "reach", "gait"}
+
+
+def test_it_walks_and_the_stance_law_does_not():
+    assert make_controller("walk").walks
+    assert make_controller("walk").id.startswith("g1-walk-ppo-")
+    assert not make_controller("stance").walks
+
+
+def _short(name: str, seconds: float) -> Outcome:
+    (skill,) = [s for s in SKILLS if s.name == name]
+    short = Skill(**{**vars(skill), "seconds": seconds})
+    return play(make_controller("walk"), short, 8, 3, DisturbanceConfig(models=8), SensorConfig())
+
+
+@pytest.mark.parametrize("name", ["walk", "crouch", "push"])
+def test_on_stock_feet_and_randomised_physics_it_stays_up(name):
+    """Short and few; docs/lowlevel.md has the table of 400 robots each."""
+    outcome = _short(name, 4.0)
+    assert outcome.survived.all()
+    if name != "push":
+        assert np.nanmean(outcome.velocity_error) < 0.1
