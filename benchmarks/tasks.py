@@ -3,10 +3,10 @@
 Plays held-out scenarios of each task with `hold` and `oracle`, the wall at one push speed after
 another, the arch in both bands of clearance. A task is well set for a controller when hands at
 rest mostly fail and the oracle almost always succeeds; the last line says for which pushes that is
-so. Run it whenever the controller changes, and put the range into `WallConfig`:
+so. Run it whenever the controller changes, and put the range into `egovcp.sim.config`:
 
     python benchmarks/tasks.py --controller stance
-    python benchmarks/tasks.py --controller walk --arch walk
+    python benchmarks/tasks.py --controller walk
 """
 
 from __future__ import annotations
@@ -53,12 +53,11 @@ def show(name: str, found: dict[str, float], episodes: int) -> dict[str, float]:
 def main() -> None:
     """Measure and print."""
     options = parser(__doc__)
-    options.add_argument("--controller", default="stance", help="stance, or a controller's file")
-    options.add_argument("--arch", choices=("rail", "walk"), default="rail")
+    options.add_argument("--controller", default="walk", help="walk, stance, or a file")
     options.add_argument("--episodes", type=int, default=100)
     options.add_argument("--seed", type=int, default=0)
     options.add_argument(
-        "--pushes", type=float, nargs="*", default=[0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.2]
+        "--pushes", type=float, nargs="*", default=[0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2]
     )
     args = options.parse_args()
     base = replace(eventful(), controller=args.controller)
@@ -72,8 +71,8 @@ def main() -> None:
     print(f"controller {make_controller(args.controller).id}, {n} episodes each")
     measured("ball", base, "ball")
     for band, clearance in BANDS.items():
-        arch = replace(base.arch, motion=args.arch, clearance_range=clearance)
-        measured(f"arch {band} {args.arch}", replace(base, arch=arch), "arch")
+        arch = replace(base.arch, clearance_range=clearance)
+        measured(f"arch {band}", replace(base, arch=arch), "arch")
     measured("wall default", base, "wall")
     fair = []
     for speed in args.pushes:

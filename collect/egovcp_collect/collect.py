@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import replace
 from functools import partial
 
 import draccus
@@ -104,10 +105,12 @@ def _stop_on_signal(shared: Shared) -> Iterator[None]:
 
 
 def _provenance(config: CollectConfig, command: str) -> Provenance:
-    settings = draccus.encode(config)
+    controller = make_controller(config.env.controller)
+    decided = replace(config, env=config.env.for_controller(controller.walks))
+    settings = draccus.encode(decided)
     del settings["dataset"]
     return Provenance(
-        controller_id=make_controller(config.env.controller).id,
+        controller_id=controller.id,
         seed=config.seed,
         command=command,
         versions={"python": platform.python_version(), **_versions()},

@@ -6,12 +6,16 @@ Frozen data only. Ranges are (low, high) and drawn uniformly once per episode.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, is_dataclass
+from dataclasses import dataclass, is_dataclass, replace
 from typing import Literal
 
 from egovcp.errors import UsageError, suggest
 
 Range = tuple[float, float]
+#: m/s towards the wall, calibrated with ``benchmarks/tasks.py`` for controllers that do not step
+#: (``stance``) and that do (``walk``).
+STANDING_PUSHES: Range = (0.40, 0.60)
+STEPPING_PUSHES: Range = (0.80, 1.20)
 
 
 def _check_ranges(where: str, part: object) -> None:
@@ -79,8 +83,9 @@ class WallConfig:
     """Turn of the wall about the vertical, rad; 0 faces the robot squarely."""
     friction_range: Range = (0.6, 1.0)
     """Sliding friction of the wall."""
-    push_speed_range: Range = (0.40, 0.60)
-    """Change of base velocity by a push towards the wall, m/s."""
+    push_speed_range: Range | None = None
+    """Change of base velocity by a push towards the wall, m/s. None: what hands must brace and
+    can, for a controller that steps or one that does not (benchmarks/tasks.py)."""
     push_bearing_range: Range = (-0.20, 0.20)
     """Direction of a push towards the wall, rad from straight ahead."""
     away_probability: float = 0.1
@@ -112,10 +117,11 @@ class WallConfig:
 class ArchConfig:
     """An arch that an upright robot would hit and a crouched one passes under."""
 
-    motion: Literal["rail", "walk"] = "rail"
-    """`rail`: the robot stands and the arch comes to it at the commanded speed, the same
-    relative motion as walking through it. `walk`: the arch stands and the robot walks, which
-    needs a controller that can (--env.controller)."""
+    motion: Literal["auto", "walk", "rail"] = "auto"
+    """`walk`: the arch stands and the robot walks, which needs a controller that can
+    (--env.controller). `rail`: the robot stands and the arch comes to it at the commanded
+    speed, the same relative motion; for controllers that cannot walk. `auto`: whichever the
+    controller can."""
     clearance_range: Range = (1.16, 1.24)
     """Lower edge of the lintel above ground, m."""
     width_range: Range = (1.1, 1.5)
@@ -226,8 +232,8 @@ class EnvConfig:
     """Length and timing of wall episodes."""
     arch_episode: EpisodeConfig = EpisodeConfig(ticks=230, event_ticks=(5, 25))
     """Length and timing of arch episodes; the default covers the slowest passage."""
-    controller: str = "stance"
-    """Low-level controller: stance (LQR, does not step), walk (trained, ships with the package), or
+    controller: str = "walk"
+    """Low-level controller: walk (trained, ships with the package), stance (LQR, does not step), or
     the walk.safetensors or walk.onnx of egovcp-train-lowlevel."""
     feet: Literal["stock", "points"] = "points"
     """Foot collision model: four points each (about twice as fast), or the stock capsules."""
@@ -246,6 +252,27 @@ class EnvConfig:
         for name, part in vars(self).items():
             if is_dataclass(part):
                 _check_ranges(name, part)
+
+    def for_controller(self, walks: bool) -> EnvConfig:
+        """What is left to the controller, decided for one that walks or does not.
+
+        Raises:
+            UsageError: a motion of the arch that does not go with it.
+        """
+        motion: Literal["walk", "rail"] = "walk" if walks else "rail"
+        if self.arch.motion not in ("auto", motion):
+            cause = "walks, and would walk to an arch that comes" if walks else "does not walk"
+            raise UsageError(
+                f"env.arch.motion={self.arch.motion} does not go with the low-level controller "
+                f"{self.controller!r}, which {cause}; expected {motion} or auto, or another "
+                "--env.controller"
+            )
+        pushes = self.wall.push_speed_range or (STEPPING_PUSHES if walks else STANDING_PUSHES)
+        return replace(
+            self,
+            arch=replace(self.arch, motion=motion),
+            wall=replace(self.wall, push_speed_range=pushes),
+        )
 
     def episode(self, task: str) -> EpisodeConfig:
         """Length and timing of an episode of ``task``.

@@ -82,14 +82,9 @@ class VectorEnv:
             raise UsageError(
                 f"num_envs and threads count from 1, found {num_envs} and {config.threads}"
             )
-        self.config = config
         self.num_envs = num_envs
         self.controller = controller or make_controller(config.controller)
-        if config.arch.motion == "walk" and not self.controller.walks:
-            raise UsageError(
-                f"arch.motion=walk needs a controller that walks, and {self.controller.id} does "
-                "not; name one with --env.controller, or leave the arch on its rail"
-            )
+        self.config = config = config.for_controller(self.controller.walks)
         self.lanes: list[Lane] = []
         self._camera = DepthCamera(config.camera)
         self._standing = settle(build_scene("ball", config.feet), self.controller)

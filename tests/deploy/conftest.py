@@ -31,7 +31,11 @@ def foreign_artefact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def short() -> list[str]:
     """Flags that make ball episodes 15 ticks long with the throw at tick 3."""
-    return ["--env.ball_episode.ticks=15", "--env.ball_episode.event_ticks=[3,3]"]
+    return [
+        "--env.controller=stance",
+        "--env.ball_episode.ticks=15",
+        "--env.ball_episode.event_ticks=[3,3]",
+    ]
 
 
 _PLANNER = PlannerConfig(samples=16, horizon=3, iterations=2, elites=4)

@@ -146,7 +146,7 @@ def test_labels_of_simulated_throws_agree_with_the_truth() -> None:
     """Sway, crouches, noise, holes and delays included; the truth only judges."""
     count = 32
     throws = EpisodeConfig(ticks=34, event_ticks=(2, 4), empty_probability=0.0)
-    env = VectorEnv(EnvConfig(ball_episode=throws), count)
+    env = VectorEnv(EnvConfig(controller="stance", ball_episode=throws), count)
     scenarios = [Scenario("ball", 5, i) for i in range(count)]
     observation, walk = env.reset(scenarios), RandomWalk()
     walk.reset(env, scenarios)

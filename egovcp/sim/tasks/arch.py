@@ -1,9 +1,8 @@
 """Traverse the arch: duck under a lintel that an upright robot would hit.
 
-On the rail the robot stands and the arch comes to it at the commanded speed: the same
-relative motion as walking through it. With ``motion="walk"`` the arch stands and the robot
-walks; whoever commands the velocity also keeps it on course, as an operator would. A kinematic
-arch cannot be pushed away.
+With ``motion="walk"`` the arch stands and the robot walks; whoever commands the velocity also
+keeps it on course, as an operator would. On the ``rail`` the robot stands and the arch comes to
+it at the commanded speed: the same relative motion. A kinematic arch cannot be pushed away.
 """
 
 from __future__ import annotations

@@ -36,7 +36,9 @@ class WallTask(Task):
         push = scenario.rng("push")
         self.away = bool(push.random() < c.away_probability)
         self._bearing = float(push.uniform(*c.push_bearing_range)) + math.pi * self.away
-        speed = c.away_speed_range if self.away else c.push_speed_range
+        towards = c.push_speed_range
+        assert towards is not None, "decided by `EnvConfig.for_controller`"
+        speed = c.away_speed_range if self.away else towards
         self.push_speed = float(push.uniform(*speed))
         self._touched_otherwise = False
         robot.model.geom_friction[robot.index.is_object, 0] = self._friction

@@ -12,8 +12,9 @@ SOON = EpisodeConfig(ticks=45, event_ticks=(3, 6), empty_probability=0.0)
 
 @pytest.fixture(scope="session")
 def config() -> EnvConfig:
-    """Episodes in which the event comes soon."""
+    """Episodes in which the event comes soon, for the controller that is cheaper to run."""
     return EnvConfig(
+        controller="stance",
         arch=ArchConfig(distance_range=(0.9, 1.0)),
         ball_episode=SOON,
         wall_episode=SOON,

@@ -229,5 +229,5 @@ def test_having_walked_through_the_arch_it_stops(config: EnvConfig) -> None:
 
 
 def test_a_controller_that_cannot_walk_is_not_sent_through_the_arch(config: EnvConfig) -> None:
-    with pytest.raises(UsageError, match=r"arch\.motion=walk.*--env\.controller"):
+    with pytest.raises(UsageError, match=r"arch\.motion=walk.*does not walk.*--env\.controller"):
         VectorEnv(replace(config, arch=ArchConfig(motion="walk")), 1)

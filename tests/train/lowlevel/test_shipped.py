@@ -24,7 +24,9 @@ def test_it_is_small_and_says_where_it_comes_from():
     origin = content["provenance"]
     assert origin["steps"] > 5_000_000
     assert "seed" in origin
-    assert all(round_["command"].startswith("egovcp-train-lowlevel ") for round_ in origin["rounds"])
+    assert all(
+        round_["command"].startswith("egovcp-train-lowlevel ") for round_ in origin["rounds"]
+    )
     assert set(content["config"]) >= {"balance", "reach", "gait"}
 
 

@@ -12,6 +12,8 @@ import csv
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 COLUMNS: Final = {
     "difficulty": "episode/difficulty",
     "falls per robot and minute": "falls_per_second",
@@ -41,7 +43,7 @@ def read(run: Path) -> list[dict[str, float]]:
 
 
 def _mean(points: list[Any]) -> float:
-    return sum(point.value for point in points) / len(points)
+    return float(np.mean([point.value for point in points]))
 
 
 def write(rows: list[dict[str, float]], out: Path) -> None:
