@@ -24,9 +24,8 @@ def test_it_is_small_and_says_where_it_comes_from():
     origin = content["provenance"]
     assert origin["steps"] > 5_000_000
     assert "seed" in origin
-    assert all(
-        round_["command"].startswith("egovcp-train-lowlevel ") for round_ in origin["rounds"]
-    )
+    commands = [stage["command"] for stage in origin["stages"]]
+    assert all(command.startswith("egovcp-train-lowlevel ") for command in commands)
     assert set(content["config"]) >= {"balance", "reach", "gait"}
 
 

@@ -13,7 +13,7 @@ from egovcp.sim.config import SensorConfig
 from egovcp.spec import STATE_DIM
 from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig, PpoConfig
 from egovcp_train.lowlevel.env import LowLevelEnv
-from egovcp_train.lowlevel.learn import PpoLearner
+from egovcp_train.lowlevel.learn import PpoLearner, adapted
 from egovcp_train.lowlevel.task import LowLevelTask, RewardConfig
 from egovcp_train.lowlevel.train import main
 
@@ -92,13 +92,12 @@ def test_the_exported_policy_is_the_trained_one():
 
 
 def test_it_becomes_harder_with_success_and_easier_with_falls():
-    learner = _learner(step=0.1)
-    learner._adapt({"falls_per_second": 0.0, "reward/velocity": 0.9})
-    assert learner.env.difficulty == pytest.approx(0.1)
-    learner._adapt({"falls_per_second": 0.0, "reward/velocity": 0.1})
-    assert learner.env.difficulty == pytest.approx(0.1)
-    learner._adapt({"falls_per_second": 1.0, "reward/velocity": 0.9})
-    assert learner.env.difficulty == pytest.approx(0.0)
+    rule = CurriculumConfig(step=0.1)
+    assert adapted(0.0, falls=0.0, tracked=0.9, rule=rule) == pytest.approx(0.1)
+    assert adapted(0.1, falls=0.0, tracked=0.1, rule=rule) == pytest.approx(0.1)
+    assert adapted(0.1, falls=1.0, tracked=0.9, rule=rule) == pytest.approx(0.0)
+    assert adapted(0.95, falls=0.0, tracked=0.9, rule=rule) == 1.0
+    assert adapted(0.05, falls=1.0, tracked=0.9, rule=rule) == 0.0
 
 
 def test_ppo_learns_what_a_term_rewards():
