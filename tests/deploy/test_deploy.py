@@ -116,6 +116,7 @@ def test_an_artefact_of_another_controller_drives_nothing(
 def test_each_event_of_an_episode_is_told_once(tmp_path: Path, artefact_dir: Path) -> None:
     out = tmp_path / "out"
     flags = ["--env.ball_episode.ticks=40", "--env.ball_episode.event_ticks=[2,2]", "--imagine=0"]
+    flags.append("--env.controller=stance")
     run(f"--policy.path={artefact_dir}", "--episodes=1", f"--output_dir={out}", *flags)
     ticks = read_recording(out / "rollout-0.mcap").ticks
     events = [event for tick in ticks for event in tick.events]

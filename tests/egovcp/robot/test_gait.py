@@ -126,7 +126,7 @@ def _shortened(m: Gait, state: np.ndarray) -> list[float]:
 def test_a_robot_that_tips_over_steps_at_once():
     state = _state(2)
     m = _start(state)
-    _advance(m, state, np.array([[0.05, 0.0], [0.0, 0.3]]))
+    _advance(m, state, np.array([[0.05, 0.0], [0.0, 0.4]]))
     assert (m.amount > 0).tolist() == [False, True]
     assert m.shifting[1] == 0
 

@@ -130,7 +130,7 @@ class Recorder:
 
     def __init__(self, inner: VectorEnv) -> None:
         self._inner = inner.controller
-        self.id, self.stiffness, self.damping = "recorder", None, None
+        self.id, self.walks, self.stiffness, self.damping = "recorder", False, None, None
         self.heights: list[float] = []
 
     def reset(self, state: np.ndarray, rows: np.ndarray | None = None) -> None:
