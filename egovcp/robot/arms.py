@@ -70,7 +70,7 @@ _CROSS: Final = (np.array([1, 2, 0]), np.array([2, 0, 1]))
 def cross(a: Array, b: Array) -> Array:
     """a x b over the last axis."""
     i, j = _CROSS
-    out: Array = np.take(a, i, -1) * np.take(b, j, -1) - np.take(a, j, -1) * np.take(b, i, -1)
+    out: Array = a.take(i, -1) * b.take(j, -1) - a.take(j, -1) * b.take(i, -1)
     return out
 
 

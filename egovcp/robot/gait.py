@@ -158,10 +158,10 @@ def advance(
     """
     command = state[:, STATE_SLICES["command_velocity"]]
     rate = state[:, STATE_SLICES["angular_velocity"]]
-    speed = np.sqrt(np.sum(command[:, :2] ** 2, axis=1)) + np.abs(command[:, 2]) / 3
+    speed = np.sqrt((command[:, :2] ** 2).sum(axis=1)) + np.abs(command[:, 2]) / 3
     standing = m.amount <= 0
     tipping = np.where(standing, *config.tipping)
-    leaning = np.sqrt(np.sum((tilt + 0.15 * rate[:, :2]) ** 2, axis=1)) > tipping
+    leaning = np.sqrt(((tilt + 0.15 * rate[:, :2]) ** 2).sum(axis=1)) > tipping
     leaning |= standing & _leaves_support(m, row, height, config)
     wanted = (speed > config.least_speed) | leaning
     before = m.phase
@@ -169,9 +169,10 @@ def advance(
     m.left = np.where(wanted, config.linger, np.maximum(m.left - DT, 0.0))
     landed = (before // np.pi) != (m.phase // np.pi)
     stops = (m.left <= 0) & ((m.amount < 1.0) | landed)
-    m.amount = np.clip(m.amount + np.where(stops, -DT / config.fade, DT / config.rise), 0.0, 1.0)
+    change = np.where(stops, -DT / config.fade, DT / config.rise)
+    m.amount = _bounded(m.amount + change, 0.0, 1.0)
     m.amount = np.where(standing & ~wanted, 0.0, m.amount)
-    off = np.clip(m.turned + DT * (rate[:, 2] - command[:, 2]), -0.5, 0.5)
+    off = _bounded(m.turned + DT * (rate[:, 2] - command[:, 2]), -0.5, 0.5)
     m.turned = np.where(m.amount > 0, off, 0.0)
     stands: NDArray[np.bool_] = ~standing & (m.amount <= 0)
     return stands
@@ -183,7 +184,7 @@ def _leaves_support(
     """(B,) whether x + v / omega is outside the ellipse about the feet that stand."""
     place = -0.5 * (m.feet[:, 0, :2] + m.feet[:, 1, :2]) - row.pelvis[:, :2]
     extrapolated = place + m.velocity / _omega(height)[:, None]
-    out: NDArray[np.bool_] = np.sum((extrapolated / config.support) ** 2, axis=1) > 1.0
+    out: NDArray[np.bool_] = ((extrapolated / config.support) ** 2).sum(axis=1) > 1.0
     return out
 
 
@@ -216,8 +217,15 @@ def _tick(
 
 def _load(m: Gait, config: GaitConfig) -> Array:
     """(B, 2) share of the weight on the left and on the right foot."""
-    swing = np.clip(np.sin(m.phase) / config.soften, -1.0, 1.0) * (m.amount > 0)
-    return np.stack([0.5 - 0.5 * swing, 0.5 + 0.5 * swing], axis=1)
+    swing = _bounded(np.sin(m.phase) / config.soften, -1.0, 1.0) * (m.amount > 0)
+    out = np.empty((len(swing), 2))
+    out[:, 0], out[:, 1] = 0.5 - 0.5 * swing, 0.5 + 0.5 * swing
+    return out
+
+
+def _bounded(x: Array, low: float, high: float) -> Array:
+    """As np.clip, which takes four times as long for a few numbers."""
+    return np.asarray(np.minimum(np.maximum(x, low), high))
 
 
 def foothold(m: Gait, row: StanceRow, height: Array, command: Array, config: GaitConfig) -> Array:
@@ -247,8 +255,8 @@ def foothold(m: Gait, row: StanceRow, height: Array, command: Array, config: Gai
     y = caught[:, 1] - behind[:, 1] + side * config.width / (1.0 + grown)
     along, near, far = config.reach
     out = np.empty((len(x), 2))
-    out[:, 0] = np.clip(x, -along, along)
-    out[:, 1] = side * np.clip(side * y, near, far)
+    out[:, 0] = _bounded(x, -along, along)
+    out[:, 1] = side * _bounded(side * y, near, far)
     return out
 
 
@@ -304,7 +312,7 @@ def _swing(
     leaves = (m.shifting <= 0)[:, None]
     progress = m.phase[:, None] % np.pi / np.pi
     shorter = length - config.lift * np.sin(np.pi * progress) * leaves
-    bend = 2 * np.arccos(np.clip(shorter / (2 * _THIGH), 0.0, 1.0)) - pose[..., _KNEE]
+    bend = 2 * np.arccos(_bounded(shorter / (2 * _THIGH), 0.0, 1.0)) - pose[..., _KNEE]
     goal = foothold(m, row, height, command, config)
     done = progress**2 * (3.0 - 2.0 * progress) * leaves
     along = done * (goal[:, :1] + row.pelvis[:, :1]) / length

@@ -120,24 +120,28 @@ class Walk:
         motion = gait.leg_motion(m.gait, row, m.balance.height, tilt, s, self.config.gait)
         body += amount * (motion - m.balance.correction)
         self._nominal = np.asarray(np.concatenate([body, arm_targets], axis=1))
-        clock = np.stack([np.sin(m.gait.phase), np.cos(m.gait.phase), np.ones(len(s))], axis=1)
-        odometry = np.concatenate([m.gait.velocity, m.gait.turned[:, None]], axis=1)
-        return np.concatenate([s, amount * clock, odometry, m.action], axis=1, dtype=np.float32)
+        phase, turned = m.gait.phase[:, None], m.gait.turned[:, None]
+        clock = [amount * np.sin(phase), amount * np.cos(phase), amount]
+        seen = [s, *clock, m.gait.velocity, turned, m.action]
+        return np.concatenate(seen, axis=1, dtype=np.float32)
 
     def targets(self, action: NDArray[np.floating]) -> Array:
         """The policy's answer (B, 15) -> joint position targets (B, 29), rad."""
         limit = self.config.action_limit
-        self._memory.action = np.clip(np.asarray(action, dtype=np.float64), -limit, limit)
+        wanted = np.asarray(action, dtype=np.float64)
+        self._memory.action = np.minimum(np.maximum(wanted, -limit), limit)
         out = self._nominal.copy()
         out[:, :ACTIONS] += self.config.action_scale * self._memory.action
-        return np.asarray(np.clip(out, TARGET_LOW, TARGET_HIGH))
+        return np.asarray(np.minimum(np.maximum(out, TARGET_LOW), TARGET_HIGH))
 
     def _tilt(self, state: Array) -> Array:
         """(B, 2) roll and pitch of the pelvis off the reference, rad, to first order."""
         gravity = state[:, STATE_SLICES["projected_gravity"]]
         pitch = self._memory.balance.pitch
         forward = gravity[:, 0] * np.cos(pitch) + gravity[:, 2] * np.sin(pitch)
-        return np.stack([-gravity[:, 1], forward], axis=1)
+        out = np.empty((len(state), 2))
+        out[:, 0], out[:, 1] = -gravity[:, 1], forward
+        return out
 
     def _reach(self, state: Array, walking: NDArray[np.bool_]) -> Array:
         """(B, 14) arm targets; the torso's attitude as estimated, or as measured in walking."""
