@@ -15,7 +15,7 @@ from egovcp.sim.tasks.base import Solid
 from egovcp_deploy.robots.base import Outcome, Sensed
 from egovcp_deploy.scenarios import held_out
 
-_BEGINS: Final = {"ball": "ball thrown", "wall": "robot pushed", "arch": "arch starts to move"}
+_BEGINS: Final = {"ball": "ball thrown", "wall": "robot pushed", "arch": "passage begins"}
 #: Reward terms, and what it means when one is first paid in an episode.
 _MEANS: Final = {
     "block": "ball blocked by a hand",
