@@ -74,7 +74,7 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
 
     # --- VecEnv ----------------------------------------------------------------------
     def get_observations(self) -> TensorDict:
-        """Groups ``policy`` (N, 95) and ``privileged`` (N, 13)."""
+        """Groups ``policy`` (N, 95) and ``privileged`` (N, 16)."""
         return self._observations
 
     def step(
