@@ -18,6 +18,7 @@ from egovcp.cli import run_command
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.data.source import local_root
 from egovcp.robot.controllers import make_controller
+from egovcp.sim.env import decided
 from egovcp_collect.config import CollectConfig
 from egovcp_collect.progress import Progress
 from egovcp_collect.workers import Shared, SimulationFailed, make_shared, run_groups
@@ -49,6 +50,7 @@ def collect(config: CollectConfig, command: str = "") -> None:
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     config.check()
+    config = replace(config, env=decided(config.env))
     writer = DatasetWriter(local_root(config.dataset), _provenance(config, command))
     try:
         with Progress(config.episodes) as progress:
@@ -106,8 +108,7 @@ def _stop_on_signal(shared: Shared) -> Iterator[None]:
 
 def _provenance(config: CollectConfig, command: str) -> Provenance:
     controller = make_controller(config.env.controller)
-    decided = replace(config, env=config.env.for_controller(controller.walks))
-    settings = draccus.encode(decided)
+    settings = draccus.encode(config)
     del settings["dataset"]
     return Provenance(
         controller_id=controller.id,

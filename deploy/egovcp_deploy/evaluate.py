@@ -17,6 +17,7 @@ from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig
+from egovcp.sim.env import decided
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import TASKS
 from egovcp_deploy.constant_search import Action, BestConstant, load_constants, search_constant
@@ -129,6 +130,7 @@ def evaluate(config: EvalConfig) -> None:
         ArtefactError: the artefact is missing, damaged, or of another controller.
     """
     config.check()
+    config = replace(config, env=decided(config.env))
     constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
     artefact = _load_policy(config)
     folder = make_output_dir(config.output_dir)

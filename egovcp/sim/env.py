@@ -68,6 +68,12 @@ class StepResult:
     """(B, 7) after the rate limit and the box."""
 
 
+def decided(config: EnvConfig) -> EnvConfig:
+    """``config`` with what it leaves to its low-level controller (see
+    `EnvConfig.for_controller`); what a command checks, hands on and records."""
+    return config.for_controller(make_controller(config.controller).walks)
+
+
 class VectorEnv:
     """B robots, each in an episode of its own.
 
