@@ -24,7 +24,7 @@ from egovcp_collect.dataset.survey import BAD_TERMS, GOOD_TERMS, Survey, TaskSur
 _DPI: Final = 100
 _GOOD, _BAD, _PLAIN = "#1b7837", "#c0392b", "#8a8f98"
 _COLOURS: Final = {"ball": "#d95f02", "wall": "#7570b3", "arch": "#1b9e77"}
-_AROUND: Final = (-20, 100)  # ticks around the event that the returns are shown over
+_AROUND: Final = (-20, 160)  # ticks around the event that the returns are shown over
 _DENSITY_ROWS: Final = 200_000  # of the actions that densities are drawn from
 
 
@@ -52,7 +52,9 @@ def draw_figures(found: Survey, returns: ReturnConfig, folder: Path) -> list[Pat
         "depth.png": _depth(found),
     }
     for name, figure in figures.items():
-        figure.savefig(folder / name, dpi=_DPI, metadata={"Software": None})
+        figure.savefig(
+            folder / name, dpi=_DPI, metadata={"Software": None}, pil_kwargs={"optimize": True}
+        )
     return [folder / name for name in figures]
 
 
@@ -156,12 +158,12 @@ def _return_around_event(axes: Any, rows: TaskRows) -> None:
 
 def _since_event(rows: TaskRows) -> NDArray[np.int64]:
     """(N,) ticks since the episode's event; far out of sight where there is none."""
-    never = -(10**9)
     ticks = [facts.get("event_tick") for facts in rows.metadata]
     events = np.array([10**9 if tick is None else tick for tick in ticks], dtype=np.int64)
-    frame = np.arange(len(rows.reward)) - np.repeat(rows.start, rows.length)
-    since = frame - np.repeat(events, rows.length)
-    return np.maximum(since, never)
+    since: NDArray[np.int64] = np.arange(len(rows.reward)) - np.repeat(
+        rows.start + events, rows.length
+    )
+    return since
 
 
 def _actions(found: Survey) -> Any:
