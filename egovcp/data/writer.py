@@ -21,6 +21,7 @@ from egovcp import spec
 from egovcp.data import schema, stats
 from egovcp.data.episode import Episode
 from egovcp.data.files import sync, sync_tree, write_json
+from egovcp.data.hashes import write_hashes
 from egovcp.data.parquet import EpisodesTable, RollingParquet, data_table
 from egovcp.errors import UsageError
 
@@ -106,6 +107,7 @@ class DatasetWriter:
         }
         self._episodes.add(row, stats.episode_stats(episode.depth, columns))
         facts = {"task": episode.task, "length": len(episode), "time_limit": episode.time_limit}
+        facts["sha256"] = episode.digest()
         self._metadata.append({**facts, "metadata": dict(episode.metadata)})
         self.num_episodes += 1
         self.num_frames += len(episode)
@@ -125,6 +127,7 @@ class DatasetWriter:
         write_json(self._folder / schema.INFO_PATH, self._info())
         write_json(self._folder / schema.STATS_PATH, stats.to_json(totals, self.num_frames))
         write_json(self._folder / schema.COLLECTION_PATH, self._collection())
+        write_hashes(self._folder)
         sync_tree(self._folder)
         require_new(self.root)
         self._folder.rename(self.root)
