@@ -58,9 +58,8 @@ def dataset_problems(root: Path, progress: Progress | None = None) -> Iterator[D
     for index in range(len(reader)):
         episode, problems = reader.inspect(index)
         yield from problems
-        if episode is not None:
-            if not problems:
-                yield from _command_problems(episode, str(reader.data_path(index)), index)
+        if episode is not None and not problems:
+            yield from _command_problems(episode, str(reader.data_path(index)), index)
             totals.add(episode)
         if progress is not None:
             progress(index + 1, len(reader))

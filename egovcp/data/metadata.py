@@ -154,7 +154,7 @@ def _check_episodes(
 ) -> None:
     path, count = root / schema.INFO_PATH, len(column["episode_index"])
     if count == 0:
-        raise DataError.at(root / "meta" / "episodes", "lists no episode, expected at least one")
+        raise DataError.at(file_of(-1), "lists no episode, expected at least one")
     if count != info["total_episodes"]:
         raise DataError.at(
             path, f"total_episodes is {info['total_episodes']}, but meta/episodes lists {count}"
