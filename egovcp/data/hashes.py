@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from egovcp.data import metadata, schema
-from egovcp.data.files import write_json
+from egovcp.data import files, metadata, schema
 from egovcp.data.paths import files_below, require_file
 from egovcp.errors import DataError
 
@@ -36,7 +34,7 @@ def write_hashes(root: Path) -> None:
     """List every file of a dataset as it is now."""
     path = root / schema.HASHES_PATH
     path.unlink(missing_ok=True)
-    write_json(path, {name: _sha256(root / name) for name in covered(root)})
+    files.write_json(path, {name: files.sha256(root / name) for name in covered(root)})
 
 
 def covered(root: Path) -> list[str]:
@@ -78,12 +76,7 @@ def _difference(root: Path, name: str, expected: str) -> Iterator[DataError]:
     except DataError as error:
         yield error
         return
-    if _sha256(root / name) != expected:
+    if files.sha256(root / name) != expected:
         yield DataError.at(
             root / name, f"damaged: its SHA-256 is not the one in {schema.HASHES_PATH}"
         )
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
