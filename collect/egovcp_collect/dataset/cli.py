@@ -40,6 +40,9 @@ SUBCOMMANDS: Final[Mapping[str, Subcommand]] = MappingProxyType(
         "info": Subcommand(
             "egovcp_collect.dataset.info", "what is in it: tasks, episodes, hours, provenance"
         ),
+        "check": Subcommand(
+            "egovcp_collect.dataset.check", "read every file and frame; name whatever is wrong"
+        ),
         "coverage": Subcommand(
             "egovcp_collect.dataset.coverage", "is it worth training on? events, returns, actions"
         ),

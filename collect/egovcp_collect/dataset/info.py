@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from egovcp.data import DatasetConfig, DatasetReader, schema
+from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.data.files import write_json
 from egovcp.data.split import HELDOUT_FRACTION, in_split
 
@@ -62,7 +62,7 @@ def describe(reader: DatasetReader) -> dict[str, Any]:
         "versions": dict(known.get("versions", {})),
         "features": {
             key: {"dtype": f["dtype"], "shape": list(f["shape"])}
-            for key, f in schema.FEATURES.items()
+            for key, f in reader.info["features"].items()
         },
     }
 
