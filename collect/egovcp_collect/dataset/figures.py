@@ -119,7 +119,7 @@ def _returns(tasks: Sequence[TaskRows], config: ReturnConfig) -> Any:
 
 def _return_histogram(axes: Any, rows: TaskRows, config: ReturnConfig) -> None:
     good, bad = events_ahead(rows, config.steps)
-    kinds = {"a cost ahead": bad, "a reward ahead": good & ~bad, "neither": ~good & ~bad}
+    kinds = {"a cost ahead": bad, "a reward, no cost ahead": good & ~bad, "neither": ~good & ~bad}
     valid = rows.mc_valid
     edges = np.histogram_bin_edges(rows.mc_return[valid], 60)
     for (name, kind), colour in zip(kinds.items(), (_BAD, _GOOD, _PLAIN), strict=True):
