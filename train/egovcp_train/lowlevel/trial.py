@@ -13,10 +13,10 @@ from egovcp.robot.g1 import WAIST
 from egovcp.robot.kinematics import torso_rotation
 from egovcp.robot.mjcf import FootModel
 from egovcp.robot.reach import nearest_reachable
-from egovcp.robot.stance_table import standing_pose
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.sensors import noise_std
-from egovcp.spec import ACTION_BOX, CONTROLLER_HZ, PHYSICS_DT
+from egovcp.spec import CONTROLLER_HZ
+from egovcp_train.lowlevel import events
 from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
 from egovcp_train.lowlevel.physics import Physics, Snapshot
 from egovcp_train.lowlevel.sensing import measure
@@ -82,16 +82,16 @@ def play(
     rng = np.random.default_rng([seed, 1])
     physics = Physics(robots, feet, disturbances, threads, seed)
     commands = skill.script(skill.ticks, robots, rng)
-    _place(physics, robots)
-    low, high = (round(d / PHYSICS_DT) for d in disturbances.delay)
-    delay = rng.integers(low, high + 1, robots)
+    qpos = events.neutral(robots)
+    physics.place(np.arange(robots), qpos, qpos[:, 7:])
+    delay = events.delays(robots, disturbances, rng)
     std, record = noise_std(sensors), _Record()
     alive = np.ones((skill.ticks, robots), dtype=bool)
     x = physics.snapshot()
     controller.reset(measure(x, commands[0], std, rng))
     for tick, command in enumerate(commands):
         if skill.push and tick == _PUSH_TICK:
-            _push(physics, skill.push, rng)
+            physics.qvel[:, :2] += events.kick(skill.push, events.directions(robots, rng))
         state = measure(x, command, std, rng)
         physics.step(controller.step(state), delay)
         x = physics.snapshot()
@@ -99,18 +99,6 @@ def play(
         record.add(x, command)
     physics.close()
     return _judge(skill, commands, record, alive)
-
-
-def _place(physics: Physics, robots: int) -> None:
-    pose = standing_pose(ACTION_BOX.neutral[-1])
-    qpos = np.tile(np.concatenate([pose.position, pose.quaternion, pose.joints]), (robots, 1))
-    physics.place(np.arange(robots), qpos, qpos[:, 7:])
-
-
-def _push(physics: Physics, speed: float, rng: np.random.Generator) -> None:
-    angle = rng.uniform(-np.pi, np.pi, len(physics.qvel))
-    physics.qvel[:, 0] += speed * np.cos(angle)
-    physics.qvel[:, 1] += speed * np.sin(angle)
 
 
 def _fallen(x: Snapshot) -> NDArray[np.bool_]:
