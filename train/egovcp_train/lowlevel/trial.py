@@ -42,6 +42,7 @@ class Outcome:
     height_error: Array  # m, mean
     velocity_error: Array  # m/s, mean over strides
     head_top: Array  # m, highest in walking
+    stepping: Array  # share of the ticks in which the robot steps
 
 
 class _Record:
@@ -53,8 +54,9 @@ class _Record:
         self.height: list[Array] = []
         self.velocity: list[Array] = []
         self.head: list[Array] = []
+        self.stepping: list[NDArray[np.bool_]] = []
 
-    def add(self, x: Snapshot, command: Array) -> None:
+    def add(self, x: Snapshot, command: Array, stepping: NDArray[np.bool_]) -> None:
         turn = rotation(x.quaternion)
         forward = heading(turn)
         to_heading = _heading_from_world(forward)
@@ -66,6 +68,7 @@ class _Record:
         self.height.append(x.position[:, 2].copy())
         self.velocity.append(in_heading(x.velocity, forward))
         self.head.append(x.head_top.copy())
+        self.stepping.append(stepping)
 
 
 def play(
@@ -96,7 +99,7 @@ def play(
         physics.step(controller.step(state), delay)
         x = physics.snapshot()
         alive[tick:] &= ~_fallen(x)
-        record.add(x, command)
+        record.add(x, command, controller.stepping)
     physics.close()
     return _judge(skill, commands, record, alive)
 
@@ -136,6 +139,7 @@ def _judge(skill: Skill, commands: Array, record: _Record, alive: NDArray[np.boo
         if moves
         else _nothing(alive),
         head_top=_highest(np.array(record.head), counted) if moves else _nothing(alive),
+        stepping=_mean(np.array(record.stepping), alive),
     )
 
 
