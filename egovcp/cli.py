@@ -24,7 +24,7 @@ from typing import Any, Literal
 
 import draccus
 from draccus.argparsing import ArgumentParser
-from draccus.utils import DraccusException
+from draccus.utils import CONFIG_ARG, DraccusException
 
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError, suggest
 
@@ -46,6 +46,24 @@ type Kind = Literal["switch", "text", "value"]
 
 class _Parser(ArgumentParser[Any]):
     """draccus' parser that raises `UsageError` instead of ending the process."""
+
+    def tidy_groups(self) -> None:
+        """One flag for each nested dataclass. draccus registers it twice, lists both, and one of
+        a deeper dataclass (``--ball`` beside ``--env.ball``) under a name that it then refuses."""
+        known = self.parser._option_string_actions
+        groups = {flag.rpartition(".")[0] for flag in known}
+        listed = self.parser._optionals._group_actions
+        for action in [a for a in listed if a.dest not in ("help", CONFIG_ARG)]:
+            flag = action.option_strings[-1]
+            if known.get(flag) is action and flag in groups:
+                action.metavar = "{NAME: VALUE, ...}"
+                action.help = f"several of the options {flag}.NAME at once"
+                action.default = argparse.SUPPRESS  # there is none to show
+                continue
+            listed.remove(action)
+            if known.get(flag) is action:
+                self.parser._actions.remove(action)
+                del known[flag]
 
     def flag_kinds(self) -> dict[str, Kind]:
         """What each flag takes: "switch", "text" (used as it is written) or "value" (YAML)."""
@@ -87,6 +105,7 @@ def parse_config[C](
         epilog=epilog,
         exit_on_error=False,
     )
+    parser.tidy_groups()
     kinds = parser.flag_kinds()
     args = [_checked(arg, kinds, prog) for arg in _joined(argv)]
     try:
@@ -94,10 +113,20 @@ def parse_config[C](
             parser.config_path = path
             config: C = parser.parse_args([_verbatim(arg, kinds) for arg in args])
     except (DraccusException, argparse.ArgumentError, ValueError, TypeError) as error:
+        if own := _own_error(error):
+            raise own from None
         raise UsageError(f"{' '.join(str(error).split())}; see {prog} --help") from error
     except OSError as error:
         raise UsageError(f"cannot read {error.filename}: {error.strerror}") from error
     return config
+
+
+def _own_error(error: BaseException) -> EgovcpError | None:
+    """What a config said itself against its values, below what draccus wrapped around it."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, EgovcpError):
+        cause = cause.__cause__
+    return cause
 
 
 @contextlib.contextmanager
