@@ -7,7 +7,7 @@ painted from the farthest to the nearest, lit by one lamp.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 
 _LAMP: Final = np.array([0.35, 0.45, 0.82])  # direction to the light, world
 _AMBIENT: Final = 0.45
+_LEASH_M: Final = 0.3  # how far a robot walks before the eye follows it
 _BONE: Final = (120, 122, 130)
 
 
@@ -36,6 +37,16 @@ class Eye:
     """World point in the middle of the picture, m."""
     focal: float = 3.3
     """Half the picture's height is 1 / focal of the distance."""
+
+    def following(self, pelvis_w: NDArray[np.floating]) -> Eye:
+        """The eye moved over the ground with a robot whose pelvis (3,) m has left the origin.
+
+        Within `_LEASH_M` it stays, so that a stumble is seen; beyond, it is dragged along.
+        """
+        way = np.array([*pelvis_w[:2], 0.0])
+        drag = way * max(0.0, 1.0 - _LEASH_M / max(float(np.linalg.norm(way)), 1e-9))
+        position, target = (np.add(point, drag).tolist() for point in (self.position, self.target))
+        return replace(self, position=tuple(position), target=tuple(target))
 
     def project(self, points_w: NDArray[np.floating]) -> tuple[Array, Array]:
         """(..., 3) world points -> picture coordinates (..., 2) and distances (...)."""
@@ -147,11 +158,19 @@ def paint_skeleton(axes: Any, pose: RobotPose, eye: Eye) -> None:
             axes.plot(*bone.T, color=np.array(_BONE) / 255.0, linewidth=3, solid_capstyle="round")
 
 
-def paint_floor(axes: Any, eye: Eye, extent: float = 3.0, spacing: float = 0.5) -> None:
-    """A grid on the ground around the robot."""
+def paint_floor(
+    axes: Any,
+    eye: Eye,
+    pelvis_w: NDArray[np.floating],
+    extent: float = 3.0,
+    spacing: float = 0.5,
+) -> None:
+    """A grid on the ground around the robot; it reaches on by whole squares, so that a walk past
+    its lines is seen."""
+    middle = spacing * np.round(np.asarray(pelvis_w[:2]) / spacing)
     marks = np.arange(-extent, extent + spacing / 2, spacing)
     ends = np.array([-extent, extent])
     for mark in marks:
         for line in (np.stack([ends, np.full(2, mark)], 1), np.stack([np.full(2, mark), ends], 1)):
-            points, _ = eye.project(np.column_stack([line, np.zeros(2)]))
+            points, _ = eye.project(np.column_stack([line + middle, np.zeros(2)]))
             axes.plot(*points.T, color="0.85", linewidth=0.6, zorder=0)
