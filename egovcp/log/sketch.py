@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 _LAMP: Final = np.array([0.35, 0.45, 0.82])  # direction to the light, world
 _AMBIENT: Final = 0.45
 _LEASH_M: Final = 0.3  # how far a robot walks before the eye follows it
+_GLASS: Final = 0.45  # opacity of obstacles
 _BONE: Final = (120, 122, 130)
 
 
@@ -68,6 +69,8 @@ class Surface:
     """(F, 3, 3) m."""
     colours: Array
     """(F, 3) RGB, 0 to 255."""
+    opacity: float = 1.0
+    """From 0, not to be seen, to 1."""
 
     @property
     def normals(self) -> Array:
@@ -81,13 +84,13 @@ class Surface:
         """The triangles that turn their outside to the eye."""
         towards = np.subtract(eye.position, self.corners_w[:, 0])
         seen = np.sum(self.normals * towards, axis=1) > 0
-        return Surface(self.corners_w[seen], self.colours[seen])
+        return Surface(self.corners_w[seen], self.colours[seen], self.opacity)
 
     def shaded(self) -> Array:
-        """(F, 3) RGB in [0, 1] under the lamp."""
+        """(F, 4) RGB and opacity in [0, 1] under the lamp."""
         light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(self.normals @ _LAMP, 0.0, 1.0)
-        shaded: Array = np.clip(self.colours / 255.0 * light[:, None], 0.0, 1.0)
-        return shaded
+        colours = np.clip(self.colours / 255.0 * light[:, None], 0.0, 1.0)
+        return np.column_stack([colours, np.full(len(colours), self.opacity)])
 
 
 def robot_surface(pose: RobotPose, meshes: Mapping[str, LinkMesh]) -> list[Surface]:
@@ -103,13 +106,14 @@ def robot_surface(pose: RobotPose, meshes: Mapping[str, LinkMesh]) -> list[Surfa
 
 
 def scene_surface(scene: Iterable[SceneObject]) -> list[Surface]:
-    """What stands in the scene."""
+    """What stands in the scene; walls and posts let through what they would hide."""
     surfaces = []
     for thing in scene:
-        shape, colour = (_sphere(), BALL) if thing.shape == "sphere" else (_box(), OBSTACLE)
+        ball = thing.shape == "sphere"
+        shape, colour, opacity = (_sphere(), BALL, 1.0) if ball else (_box(), OBSTACLE, _GLASS)
         turned = (shape * thing.size) @ rotation_matrix(np.array(thing.quaternion_w)).T
         colours = np.tile(np.array(colour, np.float64), (len(shape), 1))
-        surfaces.append(Surface(turned + thing.position_w, colours))
+        surfaces.append(Surface(turned + thing.position_w, colours, opacity))
     return surfaces
 
 
@@ -145,7 +149,7 @@ def paint(axes: Any, surfaces: list[Surface], eye: Eye) -> None:
     colours = np.concatenate([surface.shaded() for surface in seen])
     order = np.argsort(-depth.mean(axis=1))
     faces = PolyCollection(list(points[order]), facecolors=colours[order], edgecolors="face")
-    faces.set_linewidth(0.2)
+    faces.set_linewidth(np.where(colours[order, 3] < 1.0, 0.0, 0.2).tolist())  # no seams in glass
     axes.add_collection(faces, autolim=False)
 
 

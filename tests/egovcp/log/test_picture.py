@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -155,3 +156,22 @@ def test_nearer_triangles_are_painted_over_farther_ones() -> None:
     colours = axes.collections[0].get_facecolor()
     assert colours[0][2] > colours[0][0], "the far, blue triangle comes first"
     assert colours[-1][0] > colours[-1][2]
+
+
+@pytest.mark.parametrize(("shape", "hides"), [("sphere", True), ("box", False)])
+def test_a_ball_hides_what_is_behind_it_and_a_wall_does_not(shape: Any, hides: bool) -> None:
+    thing = SceneObject("a", shape, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.3, 0.3, 0.3))
+    eye = Eye(position=(-3.0, 0.0, 0.0), target=(0.0, 0.0, 0.0))
+    middles = []
+    for behind in ((255.0, 0.0, 0.0), (0.0, 0.0, 255.0)):
+        corners = np.array([[[1.0, 0.9, -0.9], [1.0, -0.9, -0.9], [1.0, 0.0, 0.9]]])
+        figure = Figure(figsize=(1, 1))
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set(xlim=(-1, 1), ylim=(-1, 1))
+        paint(axes, [Surface(corners, np.array([behind])), *scene_surface([thing])], eye)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        picture = np.asarray(canvas.buffer_rgba())
+        middles.append(picture[picture.shape[0] // 2, picture.shape[1] // 2, :3].astype(int))
+    seen = np.abs(middles[0] - middles[1]).max()
+    assert (seen < 30) == hides, "the seams between triangles let a little through"
