@@ -20,11 +20,12 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin
 
 import draccus
 from draccus.argparsing import ArgumentParser
-from draccus.utils import CONFIG_ARG, DraccusException
+from draccus.utils import CONFIG_ARG, DecodingError, DraccusException
 
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError, suggest
 
@@ -79,6 +80,20 @@ class _Parser(ArgumentParser[Any]):
                 kinds[name] = "text" if text else "value"
         return kinds
 
+    def flag_types(self) -> dict[str, str]:
+        """Flag -> what its value must be, in `_spoken` words; text and groups are left out."""
+        actions = [a for a in self.parser._actions if a.type not in (None, str)]
+        return {a.option_strings[-1]: _spoken(a.type) for a in actions}
+
+
+def _spoken(kind: object) -> str:
+    """A type as it is written on a command line: ``[float, float]``, ``int or null``."""
+    parts = [_spoken(part) for part in get_args(kind)]
+    if get_origin(kind) is tuple:
+        return f"[{', '.join(parts)}]"
+    name = "null" if kind is NoneType else getattr(kind, "__name__", str(kind))
+    return " or ".join(parts) or str(name)
+
 
 class _TeachingHelp(argparse.ArgumentDefaultsHelpFormatter):
     def __init__(self, prog: str) -> None:
@@ -106,7 +121,7 @@ def parse_config[C](
         exit_on_error=False,
     )
     parser.tidy_groups()
-    kinds = parser.flag_kinds()
+    kinds, types = parser.flag_kinds(), parser.flag_types()
     args = [_checked(arg, kinds, prog) for arg in _joined(argv)]
     try:
         with _defaults_file(defaults(args) if defaults else {}) as path:
@@ -115,7 +130,8 @@ def parse_config[C](
     except (DraccusException, argparse.ArgumentError, ValueError, TypeError) as error:
         if own := _own_error(error):
             raise own from None
-        raise UsageError(f"{' '.join(str(error).split())}; see {prog} --help") from error
+        words = _wrong_value(error, args, types) or " ".join(str(error).split())
+        raise UsageError(f"{words}; see {prog} --help") from error
     except OSError as error:
         raise UsageError(f"cannot read {error.filename}: {error.strerror}") from error
     return config
@@ -127,6 +143,13 @@ def _own_error(error: BaseException) -> EgovcpError | None:
     while cause is not None and not isinstance(cause, EgovcpError):
         cause = cause.__cause__
     return cause
+
+
+def _wrong_value(error: Exception, args: Sequence[str], types: Mapping[str, str]) -> str:
+    """``--count=many: expected int``; empty where no single flag is at fault."""
+    flag = f"--{'.'.join(error.key_path)}" if isinstance(error, DecodingError) else ""
+    given = [arg for arg in args if arg.partition("=")[0] == flag]
+    return f"{given[-1]}: expected {types[flag]}" if given and flag in types else ""
 
 
 @contextlib.contextmanager

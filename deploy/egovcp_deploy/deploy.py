@@ -117,22 +117,9 @@ def deploy(config: DeployConfig) -> None:
         policy = _make_policy(config, artefact, robot)
         folder = make_output_dir(config.output_dir)
         runner = Runner(policy, robot, FixedRate(PLANNER_HZ, LockstepClock()), config.imagine)
-        _play_and_sum_up(config, artefact, robot, runner, folder)
+        _play(config, artefact, robot, runner, folder)
     finally:
         robot.close()
-
-
-def _play_and_sum_up(
-    config: DeployConfig, artefact: Artefact | None, robot: Robot, runner: Runner, folder: Path
-) -> None:
-    summaries: list[RolloutSummary] = []
-    try:
-        for summary in _play(config, artefact, robot, runner, folder):
-            summaries.append(summary)
-    finally:
-        if summaries:
-            write_json(folder / "deploy.json", _report(config, artefact, robot, summaries))
-            _print(summaries, folder)
 
 
 def _make_policy(config: DeployConfig, artefact: Artefact | None, robot: SimRobot) -> RolloutPolicy:
@@ -175,16 +162,21 @@ def make_robot(config: DeployConfig) -> SimRobot:
 
 def _play(
     config: DeployConfig, artefact: Artefact | None, robot: Robot, runner: Runner, folder: Path
-) -> Iterator[RolloutSummary]:
-    """Record one rollout after the other; what came of each when its recording is closed."""
-    with tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar:
-        for episode in range(config.episodes):
-            robot.start(episode)
-            info = _run_info(config, artefact, robot, episode)
-            with _recording(folder, episode, info) as sink:
-                summary = runner.run(sink, lambda tick: _show(bar, tick))
-            bar.update(1)
-            yield summary
+) -> None:
+    """Record one rollout after the other and, whatever ends them, sum up the complete ones."""
+    summaries: list[RolloutSummary] = []
+    try:
+        with tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar:
+            for episode in range(config.episodes):
+                robot.start(episode)
+                info = _run_info(config, artefact, robot, episode)
+                with _recording(folder, episode, info) as sink:
+                    summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))
+                bar.update(1)
+    finally:
+        if summaries:
+            write_json(folder / "deploy.json", _report(config, artefact, robot, summaries))
+            _print(summaries, folder)
 
 
 @contextmanager

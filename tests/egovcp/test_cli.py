@@ -54,6 +54,8 @@ class Lamp:
 
     stand: Stand = field(default_factory=Stand)
     """Its stand."""
+    watts: int | None = None
+    """Power, W."""
 
 
 @dataclass(frozen=True)
@@ -200,6 +202,21 @@ def test_a_stray_argument_is_refused(argv: list[str]) -> None:
 def test_a_value_of_the_wrong_type_is_refused_by_name(flag: str, message: str) -> None:
     with pytest.raises(UsageError, match=f"{message}.*see egovcp-test --help"):
         _parse(flag)
+
+
+@pytest.mark.parametrize(
+    ("flag", "expected"),
+    [
+        ("--count=many", "int"),
+        ("--sizes=1,2,3", "[int, int, int]"),
+        ("--lamp.stand.height_range=3", "[float, float]"),
+        ("--lamp.watts=x", "int or null"),
+    ],
+)
+def test_a_wrong_value_is_shown_with_what_was_expected(flag: str, expected: str) -> None:
+    words = re.escape(f"{flag}: expected {expected}; see")
+    with pytest.raises(UsageError, match=f"^{words}"):
+        _parse("--count=2", flag)
 
 
 def test_what_a_config_says_against_its_values_is_said_alone() -> None:
