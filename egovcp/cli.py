@@ -91,6 +91,8 @@ def _spoken(kind: object) -> str:
     parts = [_spoken(part) for part in get_args(kind)]
     if get_origin(kind) is tuple:
         return f"[{', '.join(parts)}]"
+    if kind is Ellipsis:
+        return "..."
     name = "null" if kind is NoneType else getattr(kind, "__name__", str(kind))
     return " or ".join(parts) or str(name)
 
