@@ -23,6 +23,7 @@ from egovcp_collect.config import CollectConfig
 from egovcp_collect.simulation import Simulation
 
 _REPORT_EVERY: Final = 0.25  # s
+_UNSEALED: Final = 32  # episodes that may wait for a slow disk before the simulation does
 
 
 class LocalWorker:
@@ -136,14 +137,15 @@ class _Sealer:
         return Brief.of(number, encoded)
 
     def finished(self, wait: bool) -> tuple[Brief, ...]:
-        """Those that have been sealed since the last call; all of them if ``wait``.
+        """Those that have been sealed since the last call; all of them if ``wait``, and with a
+        slow disk as many as it takes to bound the memory.
 
         Raises:
             DataError: an episode is not valid.
             OSError: the disk is full.
         """
         out = []
-        while self._pending and (wait or self._pending[0].done()):
+        while self._pending and (wait or len(self._pending) > _UNSEALED or self._pending[0].done()):
             out.append(self._pending.popleft().result())
         return tuple(out)
 

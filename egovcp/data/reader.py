@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
@@ -58,6 +58,10 @@ class DatasetReader:
 
     def __len__(self) -> int:
         return len(self._table.length)
+
+    def __iter__(self) -> Iterator[Episode]:
+        """The episodes in order, each read when its turn comes (see `read`)."""
+        return (self.read(index) for index in range(len(self)))
 
     @property
     def root(self) -> Path:
@@ -159,6 +163,15 @@ class DatasetReader:
                 raise DataError(f"no column {name!r}{suggest(name, schema.FEATURES)}")
         parts = [self._columns(i, tuple(names)) for i in range(len(self))]
         return {name: np.concatenate([part[name] for part in parts]) for name in names}
+
+    def read_episode_columns(self, index: int, names: Sequence[str]) -> Columns:
+        """Some columns of one episode, ``(T, ...)`` each, not validated.
+
+        Raises:
+            DataError: the file is damaged.
+            IndexError: there is no such episode.
+        """
+        return self._columns(index, names)
 
     def _columns(self, index: int, names: Sequence[str]) -> Columns:
         if not 0 <= index < len(self):
