@@ -48,7 +48,7 @@ def run(config: CheckConfig) -> None:
         found = list(islice(dataset_problems(root, progress), config.max_problems))
     episodes, frames = _size(root)
     if config.json:
-        problems = [_as_json(error, root) for error in found]
+        problems = [as_json(error, root) for error in found]
         content = {"ok": not found, "episodes": episodes, "frames": frames, "problems": problems}
         write_json(Path(config.json), content)
     for error in found:
@@ -88,7 +88,8 @@ def _size(root: Path) -> tuple[int, int]:
     return episodes, frames
 
 
-def _as_json(error: DataError, root: Path) -> dict[str, Any]:
+def as_json(error: DataError, root: Path) -> dict[str, Any]:
+    """A problem as the reports of `check` and `repair` have it."""
     file = Path(error.file)
     inside = bool(error.file) and file.is_relative_to(root)
     return {

@@ -1,0 +1,25 @@
+"""Where a subcommand writes a new dataset: never into one that it reads."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from egovcp.data.writer import require_new
+from egovcp.errors import UsageError
+
+
+def new_folder(output_dir: str, sources: Sequence[Path]) -> Path:
+    """The folder that ``--output_dir`` names.
+
+    Raises:
+        UsageError: none is given, it exists, or it lies inside one of ``sources``.
+    """
+    if not output_dir:
+        raise UsageError("where does the new dataset go? give --output_dir=FOLDER")
+    folder = Path(output_dir).expanduser().absolute()
+    for source in sources:
+        if folder.resolve().is_relative_to(source.resolve()):
+            raise UsageError(f"--output_dir={output_dir} lies inside {source}; choose another")
+    require_new(folder)
+    return folder
