@@ -12,10 +12,9 @@ from tqdm import tqdm
 
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter
 from egovcp.data.continued import read_provenance
-from egovcp.data.files import write_json
 from egovcp.errors import DataError, UsageError
 from egovcp_collect.dataset.origin import joint, moved, require_one_controller
-from egovcp_collect.dataset.output import new_folder
+from egovcp_collect.dataset.output import new_folder, write_report
 
 
 @dataclass(frozen=True)
@@ -57,9 +56,8 @@ def run(config: MergeConfig) -> None:
     chosen, dropped = _chosen(readers, config.duplicates)
     command = shlex.join(["egovcp-dataset", "merge", *(str(reader.root) for reader in readers)])
     frames = _write(readers, chosen, output, command)
-    if config.json:
-        facts = {"episodes": len(chosen), "frames": frames, "dropped": dropped}
-        write_json(Path(config.json), facts)
+    facts = {"episodes": len(chosen), "frames": frames, "dropped": dropped}
+    write_report(config.json, facts)
     print(f"{output}: {len(chosen)} episodes, {frames} frames; {dropped} duplicates dropped")
 
 

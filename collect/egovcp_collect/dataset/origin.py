@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.data import Provenance
+from egovcp.data import Provenance, schema
 from egovcp.errors import DataError
 
 #: Where a joint provenance keeps those it was made of, and an episode says which is its own.
@@ -45,14 +45,36 @@ def joint(origins: Sequence[Provenance], command: str) -> Provenance:
 
 
 def parts_of(origin: Provenance) -> list[Provenance]:
-    """The provenances that a joint one was made of, or itself."""
-    return [Provenance(**part) for part in origin.config.get(SOURCES, ())] or [origin]
+    """The provenances that a joint one was made of, or itself.
+
+    Raises:
+        DataError: they are damaged.
+    """
+    parts = origin.config.get(SOURCES, [])
+    try:
+        return [Provenance(**part) for part in parts] or [origin]
+    except TypeError as error:
+        raise DataError(f"{schema.COLLECTION_PATH}: config.{SOURCES} is damaged") from error
 
 
 def origin_of(origin: Provenance, facts: Mapping[str, Any]) -> Provenance:
     """The provenance of an episode with these ``metadata``."""
-    parts = parts_of(origin)
-    return parts[int(facts.get(SOURCE, 0))]
+    return parts_of(origin)[source_of(origin, facts)]
+
+
+def source_of(origin: Provenance, facts: Mapping[str, Any]) -> int:
+    """Which of `parts_of` an episode with these ``metadata`` comes from.
+
+    Raises:
+        DataError: none of them.
+    """
+    source, count = facts.get(SOURCE, 0), len(parts_of(origin))
+    if not isinstance(source, int) or not 0 <= source < count:
+        raise DataError(
+            f"{schema.COLLECTION_PATH}: an episode's {SOURCE} is {source!r}, expected 0 to "
+            f"{count - 1}"
+        )
+    return source
 
 
 def moved(facts: Mapping[str, Any], origins: Sequence[Provenance], index: int) -> dict[str, Any]:
@@ -60,7 +82,7 @@ def moved(facts: Mapping[str, Any], origins: Sequence[Provenance], index: int) -
     if all(_shape(origin) == _shape(origins[0]) for origin in origins):
         return dict(facts)
     before = sum(len(parts_of(origin)) for origin in origins[:index])
-    return {**facts, SOURCE: before + int(facts.get(SOURCE, 0))}
+    return {**facts, SOURCE: before + source_of(origins[index], facts)}
 
 
 def _shape(origin: Provenance) -> Provenance:

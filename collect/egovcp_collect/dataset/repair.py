@@ -12,12 +12,11 @@ from tqdm import tqdm
 
 from egovcp.checks.dataset import command_problems
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode
-from egovcp.data.files import write_json
 from egovcp.data.source import Source, local_root
 from egovcp.errors import DataError
 from egovcp_collect.dataset.book import Book, open_book
 from egovcp_collect.dataset.check import as_json
-from egovcp_collect.dataset.output import new_folder
+from egovcp_collect.dataset.output import new_folder, write_report
 from egovcp_collect.dataset.salvage import Found, salvage
 
 
@@ -62,10 +61,9 @@ def run(config: RepairConfig) -> None:
         kept, frames = _rebuild(root, book, output, dropped, bar)
     for error in dropped:
         print(f"dropped: {error}")
-    if config.json:
-        facts = {"episodes": kept, "frames": frames}
-        problems = [as_json(error, root) for error in dropped]
-        write_json(Path(config.json), {**facts, "dropped": problems})
+    facts = {"episodes": kept, "frames": frames}
+    problems = [as_json(error, root) for error in dropped]
+    write_report(config.json, {**facts, "dropped": problems})
     if not kept:
         raise DataError(f"nothing of {root} can be kept; {len(dropped)} problem(s), see above")
     print(f"{output}: {kept} episodes, {frames} frames; {len(dropped)} problem(s) left behind")
