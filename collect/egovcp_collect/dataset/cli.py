@@ -53,6 +53,15 @@ SUBCOMMANDS: Final[Mapping[str, Subcommand]] = MappingProxyType(
             "egovcp_collect.dataset.audit",
             "simulate episodes again: are they the same bit for bit?",
         ),
+        "coverage": Subcommand(
+            "egovcp_collect.dataset.coverage", "is it worth training on? events, returns, actions"
+        ),
+        "card": Subcommand(
+            "egovcp_collect.dataset.card", "write its dataset card, README.md, with pictures"
+        ),
+        "viz": Subcommand(
+            "egovcp_collect.dataset.viz", "an episode in Rerun: depth, robot, actions, rewards"
+        ),
     }
 )
 
