@@ -65,10 +65,15 @@ def locate(config: DatasetConfig) -> Source:
     return _download(config)
 
 
+def is_repo_id(text: str) -> bool:
+    """Whether ``text`` has the form of an id on the Hub, ``user/name``."""
+    return bool(_REPO_ID.fullmatch(text)) and ".." not in text
+
+
 def _require_repo_id(repo_id: str) -> None:
     if not repo_id:
         raise UsageError("which dataset? give --dataset.repo_id=user/name or --dataset.root=FOLDER")
-    if not _REPO_ID.fullmatch(repo_id) or ".." in repo_id:
+    if not is_repo_id(repo_id):
         raise UsageError(f"--dataset.repo_id={repo_id!r} is not of the form user/name")
 
 
