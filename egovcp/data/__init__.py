@@ -7,11 +7,12 @@ In one line, all frames of a dataset as arrays::
 
 from egovcp.cli import DatasetConfig
 from egovcp.data.episode import Episode
+from egovcp.data.provenance import Provenance
 from egovcp.data.reader import DatasetReader
 from egovcp.data.store import EpisodeStore, ReturnConfig
 from egovcp.data.stream import Batch, SequenceStream, StreamConfig
 from egovcp.data.targets import is_terminal, mc_return, mc_valid
-from egovcp.data.writer import DatasetWriter, Provenance
+from egovcp.data.writer import DatasetWriter
 
 __all__ = [
     "Batch",

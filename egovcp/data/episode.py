@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,9 @@ from egovcp import spec
 from egovcp.errors import DataError, suggest
 
 _ACTION_SLACK = 1e-6  # float32 rounding of an action on the wall of its box
+
+#: The arrays of an episode, in the order in which its digest takes them.
+ARRAYS: Final = ("depth", "state", "action", "reward", "done", "success", "truncated")
 
 
 @dataclass(frozen=True)
@@ -50,6 +54,15 @@ class Episode:
     def terminated(self) -> bool:
         """The episode ended in failure (a fall), not because its time was up."""
         return bool(self.done[-1] and not self.truncated[-1])
+
+    def digest(self) -> str:
+        """SHA-256 of the arrays' little-endian bytes, hexadecimal: the same wherever and by
+        whatever tool the episode is stored."""
+        out = hashlib.sha256()
+        for name in ARRAYS:
+            array = np.ascontiguousarray(getattr(self, name))
+            out.update(array.astype(array.dtype.newbyteorder("<"), copy=False).data)
+        return out.hexdigest()
 
     def validate(self, where: str = "episode") -> None:
         """Raise `DataError` saying what is wrong, and at which frame of ``where``."""

@@ -1,17 +1,40 @@
-"""Durable small files: JSON out, and everything flushed to disk before it is published."""
+"""Every change that a dataset makes to the disk, and its flushing.
+
+All writers go through this module: it is the one place where a disk can fail, and where the tests
+make it fail.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import errno
+import hashlib
 import json
 import os
+import shutil
+import sys
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Final
+
+_AT_FDCWD: Final = -100
+_RENAME_EXCHANGE: Final = 2  # linux/fs.h
+
+
+def create(path: Path) -> IO[bytes]:
+    """Open a new file for writing; its folder is made if need be."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path.open("xb")
+
+
+def write_bytes(path: Path, content: bytes | memoryview) -> None:
+    """Write a new file."""
+    with create(path) as file:
+        file.write(content)
 
 
 def write_json(path: Path, content: Any) -> None:
     """Write ``content`` as JSON, strictly: NaN and infinities raise `ValueError`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_bytes(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def sync_tree(folder: Path) -> None:
@@ -28,3 +51,43 @@ def sync(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def rename(source: Path, target: Path) -> None:
+    """Move a file or folder, atomically; a file replaces another."""
+    os.rename(source, target)
+
+
+def link(source: Path, target: Path) -> None:
+    """The same file under a second name; a copy where the file system has no hard links."""
+    target.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        os.link(source, target)
+    except OSError as error:
+        if error.errno not in (errno.EPERM, errno.ENOTSUP, errno.EMLINK, errno.ENOSYS):
+            raise
+        shutil.copyfile(source, target)
+        sync(target)
+
+
+def exchange(one: Path, other: Path) -> None:
+    """Swap two folders in one step: whoever looks sees both as they were, or both swapped.
+
+    Raises:
+        OSError: EINVAL or ENOSYS where the system or the file system cannot.
+    """
+    if not sys.platform.startswith("linux"):
+        raise OSError(errno.ENOSYS, "exchanging folders needs Linux", str(one))
+    libc = ctypes.CDLL(None, use_errno=True)
+    code = libc.renameat2(
+        _AT_FDCWD, os.fsencode(one), _AT_FDCWD, os.fsencode(other), _RENAME_EXCHANGE
+    )
+    if code != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number), str(one))
+
+
+def sha256(path: Path) -> str:
+    """SHA-256 of a file's content, hexadecimal."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -136,7 +136,17 @@ class DatasetReader:
             metadata=self.metadata(index),
         )
         episode.validate(where)
+        self._check_digest(index, episode)
         return episode
+
+    def _check_digest(self, index: int, episode: Episode) -> None:
+        """Compare with what was sealed; datasets of version 1 do not say."""
+        sealed = self._collection["episodes"][index].get("sha256")
+        if sealed is not None and sealed != episode.digest():
+            raise DataError(
+                f"{self._data_path(index)}, episode {index}: its SHA-256 is not the one of "
+                f"{schema.COLLECTION_PATH}; the file has changed since it was written"
+            )
 
     def read_columns(self, names: Sequence[str]) -> Columns:
         """Whole columns over all frames, ``(N, ...)`` each, in episode order.

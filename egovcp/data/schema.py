@@ -14,7 +14,7 @@ CODEBASE_VERSION: Final = "v3.0"
 ROBOT_TYPE: Final = "unitree_g1"
 DEPTH_UNIT: Final = "mm"
 CHUNK_FILES: Final = 1000  # files per chunk folder
-FILE_MB: Final = 100  # a data file rolls over beyond this size
+FILE_MB: Final = 100  # said to LeRobot's own writer, should it append
 
 DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
@@ -23,7 +23,13 @@ STATS_PATH: Final = "meta/stats.json"
 TASKS_PATH: Final = "meta/tasks.parquet"
 #: What LeRobot has no place for: provenance and the scenario of each episode.
 COLLECTION_PATH: Final = "meta/collection.json"
-COLLECTION_VERSION: Final = 1
+COLLECTION_VERSION: Final = 2
+#: SHA-256 of every other file.
+HASHES_PATH: Final = "meta/sha256.json"
+#: Which commit of the Hub a downloaded folder is.
+SOURCE_PATH: Final = "meta/source.json"
+#: Episodes per shard: one data file and one file of the episodes table (150 ticks: 95 MB).
+SHARD_EPISODES: Final = 100
 
 #: Columns that LeRobot adds to every dataset.
 INDEX_FEATURES: Final[dict[str, dict[str, object]]] = {
@@ -37,6 +43,8 @@ FEATURES: Final = {**spec.FEATURES, **INDEX_FEATURES}
 
 #: Numeric columns in the order of ``FEATURES``; every one but the depth image.
 NUMERIC_KEYS: Final = tuple(key for key in FEATURES if key != spec.DEPTH_KEY)
+#: Those that an episode itself holds; the others say where in a dataset a frame lies.
+DATA_KEYS: Final = tuple(key for key in spec.FEATURES if key != spec.DEPTH_KEY)
 
 
 def width(key: str) -> int:
@@ -64,6 +72,11 @@ def arrow_schema() -> pa.Schema:
     hub = {key: _hub_type(feature) for key, feature in FEATURES.items()}
     metadata = {"huggingface": json.dumps({"info": {"features": hub}})}
     return pa.schema(fields, metadata=metadata)
+
+
+def episode_schema() -> pa.Schema:
+    """Arrow schema of what an episode itself holds: depth and `DATA_KEYS`."""
+    return pa.schema([pa.field(key, _arrow_type(spec.FEATURES[key])) for key in spec.FEATURES])
 
 
 def _arrow_type(feature: Mapping[str, Any]) -> pa.DataType:

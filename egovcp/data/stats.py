@@ -33,20 +33,35 @@ def _layout() -> dict[str, slice]:
 
 
 LAYOUT: Final = _layout()
+_DIM: Final = 1 + sum(map(schema.width, schema.NUMERIC_KEYS))
+#: Columns of a matrix that `data_stats` fills; `index_stats` fills the rest.
+DATA_COLUMNS: Final = slice(0, LAYOUT[next(iter(schema.INDEX_FEATURES))].start)
 
 
-def episode_stats(depth: NDArray[np.uint16], columns: Mapping[str, NDArray[np.generic]]) -> Matrix:
-    """Statistics ``(R, D)`` of one episode.
+def data_stats(depth: NDArray[np.uint16], columns: Mapping[str, NDArray[np.generic]]) -> Matrix:
+    """Statistics ``(R, D1)`` of what an episode itself holds: depth and `schema.DATA_KEYS`.
 
     Args:
         depth: (T, H, W) mm.
-        columns: every key of ``schema.NUMERIC_KEYS``, (T,) or (T, n).
+        columns: every key of ``schema.DATA_KEYS``, (T,) or (T, n).
     """
-    blocks = [np.asarray(columns[key]).reshape(len(depth), -1) for key in schema.NUMERIC_KEYS]
+    return np.concatenate([_depth_stats(depth), _numeric_stats(columns, schema.DATA_KEYS)], axis=1)
+
+
+def index_stats(columns: Mapping[str, NDArray[np.generic]]) -> Matrix:
+    """Statistics ``(R, D2)`` of the columns that say where in a dataset a frame lies.
+
+    Args:
+        columns: every key of ``schema.INDEX_FEATURES``, (T,).
+    """
+    return _numeric_stats(columns, tuple(schema.INDEX_FEATURES))
+
+
+def _numeric_stats(columns: Mapping[str, NDArray[np.generic]], keys: Sequence[str]) -> Matrix:
+    blocks = [np.asarray(columns[key]).reshape(len(columns[key]), -1) for key in keys]
     values = np.concatenate(blocks, axis=1, dtype=np.float64, casting="unsafe")
     numeric = np.stack([values.min(0), values.max(0), values.mean(0), values.std(0)])
-    quantiles = np.quantile(values, QUANTILES, axis=0)
-    return np.concatenate([_depth_stats(depth), np.concatenate([numeric, quantiles])], axis=1)
+    return np.concatenate([numeric, np.quantile(values, QUANTILES, axis=0)])
 
 
 def _depth_stats(depth: NDArray[np.uint16]) -> Matrix:
@@ -102,6 +117,16 @@ def to_arrow(matrices: Sequence[Matrix], counts: Sequence[int]) -> dict[str, pa.
             columns[f"stats/{key}/{row}"] = column
         columns[f"stats/{key}/count"] = _lists(np.asarray(counts, dtype=np.int64)[:, None])
     return columns
+
+
+def from_arrow(table: pa.Table) -> list[Matrix]:
+    """The matrices ``(R, D)`` of the episodes in a table that `to_arrow` made."""
+    out: list[Matrix] = [np.empty((len(ROWS), _DIM)) for _ in range(table.num_rows)]
+    for key, part in LAYOUT.items():
+        for i, row in enumerate(ROWS):
+            for matrix, values in zip(out, table[f"stats/{key}/{row}"].to_pylist(), strict=True):
+                matrix[i, part] = np.ravel(values)
+    return out
 
 
 def _lists(values: NDArray[np.generic]) -> pa.ListArray:

@@ -11,8 +11,8 @@ from egovcp.errors import DataError, UsageError
 _ARRAYS = ("depth", "state", "action", "reward", "done", "success", "truncated")
 
 
-def _rewrite(reader: DatasetReader, root: Path, max_file_bytes: int = 10**8) -> Path:
-    with DatasetWriter(root, Provenance("stance-1", 0, "collect"), max_file_bytes) as writer:
+def _rewrite(reader: DatasetReader, root: Path, shard_episodes: int = 100) -> Path:
+    with DatasetWriter(root, Provenance("stance-1", 0, "collect"), shard_episodes) as writer:
         for index in range(len(reader)):
             writer.add(reader.read(index))
     return root
@@ -37,8 +37,10 @@ def test_reading_returns_what_was_written(reader: DatasetReader, episodes: list[
         assert found.metadata == expected.metadata
 
 
-def test_files_roll_over_and_read_alike(reader: DatasetReader, tmp_path: Path) -> None:
-    root = _rewrite(reader, tmp_path / "small-files", max_file_bytes=100_000)
+def test_shards_have_the_size_asked_for_and_read_alike(
+    reader: DatasetReader, tmp_path: Path
+) -> None:
+    root = _rewrite(reader, tmp_path / "small-files", shard_episodes=2)
     assert len(list(root.glob("data/*/*.parquet"))) > 2
     rolled = DatasetReader.open(DatasetConfig(root=str(root)))
     for index in range(len(reader)):
