@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from egovcp.testing.hub.messages import Answer, Request, say
-from egovcp.testing.hub.store import Store
+from egovcp.testing.hub.store import Refusal, Store
 
 _DATE = "2026-01-01T00:00:00.000Z"
 
@@ -16,14 +16,18 @@ def whoami(store: Store, request: Request) -> Answer:
 
 
 def create(store: Store, request: Request) -> Answer:
-    """Make a repository; 409 if it exists."""
+    """Make a repository; 409 if it exists, with the same address in the answer."""
     wish = request.json()
     repo = f"{wish.get('organization') or 'user'}/{wish['name']}"
     kind = f"{wish.get('type') or 'model'}s"
     private = bool(wish.get("private")) or wish.get("visibility") == "private"
-    store.create(f"{kind}/{repo}", private)
     prefix = "" if kind == "models" else f"{kind}/"
-    return say({"url": f"{request.endpoint}/{prefix}{repo}", "id": repo, "name": repo})
+    made = {"url": f"{request.endpoint}/{prefix}{repo}", "id": repo, "name": repo}
+    try:
+        store.create(f"{kind}/{repo}", private)
+    except Refusal as refusal:
+        return say({"error": refusal.message, **made}, refusal.status)
+    return say(made)
 
 
 def info(store: Store, request: Request) -> Answer:
@@ -81,24 +85,24 @@ def commits(store: Store, request: Request) -> Answer:
 
 def tag(store: Store, request: Request) -> Answer:
     """Name a commit; 409 if the tag exists."""
-    store.name(request.repo, "tags", request.json()["tag"], request.parts["revision"])
+    store.tag(request.repo, request.json()["tag"], request.parts["revision"])
     return say({})
 
 
 def untag(store: Store, request: Request) -> Answer:
     """Remove a tag."""
-    store.name(request.repo, "tags", request.parts["name"], None)
+    store.tag(request.repo, request.parts["name"], None)
     return say({})
 
 
 def branch(store: Store, request: Request) -> Answer:
     """Start a branch; 409 if it exists."""
     start = request.json().get("startingPoint") or "main"
-    store.name(request.repo, "branches", request.parts["name"], start)
+    store.branch(request.repo, request.parts["name"], start)
     return say({})
 
 
 def unbranch(store: Store, request: Request) -> Answer:
     """Remove a branch."""
-    store.name(request.repo, "branches", request.parts["name"], None)
+    store.branch(request.repo, request.parts["name"], None)
     return say({})

@@ -158,19 +158,29 @@ class Store:
             self._write_refs(repo, replace(refs, branches={**refs.branches, branch: commit.sha}))
             return commit
 
-    def name(self, repo: str, kind: str, name: str, revision: str | None) -> None:
-        """Set a new ``branches`` or ``tags`` entry; None removes it."""
+    def tag(self, repo: str, name: str, revision: str | None) -> None:
+        """Set a new tag; None removes one."""
         with self._lock:
             refs = self.refs(repo)
-            entries = dict(getattr(refs, kind))
-            if revision is None:
-                if entries.pop(name, None) is None:
-                    raise Refusal(404, f"No such reference: {name}", "RevisionNotFound")
-            elif name in entries:
-                raise Refusal(409, f"Reference {name} exists already")
-            else:
-                entries[name] = self.commit(repo, revision).sha
-            self._write_refs(repo, replace(refs, **{kind: entries}))
+            self._write_refs(repo, replace(refs, tags=self._named(repo, refs.tags, name, revision)))
+
+    def branch(self, repo: str, name: str, revision: str | None) -> None:
+        """Start a branch; None removes one."""
+        with self._lock:
+            refs = self.refs(repo)
+            branches = self._named(repo, refs.branches, name, revision)
+            self._write_refs(repo, replace(refs, branches=branches))
+
+    def _named(
+        self, repo: str, names: Mapping[str, str], name: str, revision: str | None
+    ) -> dict[str, str]:
+        if revision is None and name not in names:
+            raise Refusal(404, f"No such reference: {name}", "RevisionNotFound")
+        if revision is None:
+            return {key: sha for key, sha in names.items() if key != name}
+        if name in names:
+            raise Refusal(409, f"Reference {name} exists already")
+        return {**names, name: self.commit(repo, revision).sha}
 
     def _folder(self, repo: str) -> Path:
         return self.root / "repos" / repo
