@@ -40,6 +40,15 @@ SUBCOMMANDS: Final[Mapping[str, Subcommand]] = MappingProxyType(
         "info": Subcommand(
             "egovcp_collect.dataset.info", "what is in it: tasks, episodes, hours, provenance"
         ),
+        "coverage": Subcommand(
+            "egovcp_collect.dataset.coverage", "is it worth training on? events, returns, actions"
+        ),
+        "card": Subcommand(
+            "egovcp_collect.dataset.card", "write its dataset card, README.md, with pictures"
+        ),
+        "viz": Subcommand(
+            "egovcp_collect.dataset.viz", "an episode in Rerun: depth, robot, actions, rewards"
+        ),
     }
 )
 
