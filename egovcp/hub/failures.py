@@ -59,7 +59,6 @@ def _explain(error: Exception, repo_id: str, revision: str, writing: bool) -> Ex
         HFValidationError,
         LocalEntryNotFoundError,
         OfflineModeIsEnabled,
-        RepositoryNotFoundError,
         RevisionNotFoundError,
     )
 
@@ -71,11 +70,13 @@ def _explain(error: Exception, repo_id: str, revision: str, writing: bool) -> Ex
         if isinstance(link, RevisionNotFoundError):
             return DataError(f"the Hub has dataset {repo_id}, but not {name}; check the revision")
         if isinstance(link, GatedRepoError):
-            return EnvironmentFailure(f"dataset {repo_id} is gated; ask its owner for access")
-        if isinstance(link, RepositoryNotFoundError) and link.response.status_code == 404:
+            return EnvironmentFailure(
+                f"dataset {repo_id} is gated: ask for access on its page, then run `hf auth login`"
+            )
+        if isinstance(link, HfHubHTTPError) and link.response.status_code == 404:
             return DataError(
-                f"the Hub has no dataset {repo_id}, or it is private and yours to see only after "
-                "`hf auth login`; check the id"
+                f"the Hub has no dataset {repo_id} (404 at {link.response.url.path}), or it is "
+                "private and yours to see only after `hf auth login`; check the id"
             )
         if isinstance(link, HfHubHTTPError):
             return _refused(link, repo_id, writing)

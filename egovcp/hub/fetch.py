@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from egovcp.errors import EnvironmentFailure
+from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.hub.failures import explained, token
 from egovcp.hub.patience import Patience, patient
 
@@ -66,8 +66,11 @@ def _listing(api: HfApi, repo_id: str, commit: str) -> dict[str, RepoFile]:
     from huggingface_hub.hf_api import RepoFile
 
     tree = api.list_repo_tree(repo_id, repo_type="dataset", revision=commit, recursive=True)
-    files = (entry for entry in tree if isinstance(entry, RepoFile))
-    return {file.path: file for file in files if file.path not in _FOREIGN}
+    files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
+    for path in files:
+        if path.startswith("/") or ".." in path.split("/"):
+            raise DataError(f"{repo_id}@{commit} holds {path!r}, a place outside the dataset")
+    return {path: file for path, file in files.items() if path not in _FOREIGN}
 
 
 def _remove_others(folder: Path, listing: dict[str, RepoFile]) -> None:

@@ -198,10 +198,10 @@ def _asked_pause(headers: httpx.Headers) -> float:
 
 
 def _given_up(request: httpx.Request, found: str, attempts: int) -> HubUnreachable:
-    tries = "once" if attempts == 1 else f"{attempts} times"
+    tries = f", {attempts} times" if attempts > 1 else ""
     return HubUnreachable(
-        f"no use of the Hub: {found} to {_name(request)}, tried {tries}; check the network, or "
-        "try again later"
+        f"the Hub cannot be used: {found} to {_name(request)}{tries}; check the network and "
+        "HF_ENDPOINT, or try again later"
     )
 
 

@@ -7,6 +7,7 @@ Hub, `egovcp.testing.hub`, fails on demand.
 
 from egovcp.testing.batches import memory_batch, random_batch
 from egovcp.testing.environments import CountingEnv, ToyObservation, ToyStep
+from egovcp.testing.episodes import random_episode
 from egovcp.testing.models import CountingModel, toy_model
 from egovcp.testing.planning import Point, PointWorld, ScriptedWorld
 
@@ -20,5 +21,6 @@ __all__ = [
     "ToyStep",
     "memory_batch",
     "random_batch",
+    "random_episode",
     "toy_model",
 ]

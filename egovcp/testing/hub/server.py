@@ -132,9 +132,12 @@ class _Handler(BaseHTTPRequestHandler):
             answer = self._answer(route, request)
         for _ in request.body:  # what no route has read: the connection is used again
             pass
-        if trouble == "lose":
+        half = trouble in ("stall", "truncate")
+        if trouble == "stall" and answer.size == 0:
+            self.hub.closing.wait(_STALL_S)
+        if trouble == "lose" or (half and answer.size == 0):
             return self._break()
-        return self._send(answer, trouble in ("stall", "truncate"), trouble == "stall")
+        return self._send(answer, half, stall=trouble == "stall")
 
     do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = _handle  # noqa: N815
 
