@@ -245,9 +245,19 @@ _ENVIRONMENT_ERRNOS = {
 
 def _report(prog: str, error: EgovcpError, debug: bool) -> int:
     if debug:
-        traceback.print_exc()
+        print(_without_token(traceback.format_exc()), end="", file=sys.stderr)
     print(f"{prog}: error: {error}", file=sys.stderr)
     return error.exit_code
+
+
+def _without_token(text: str) -> str:
+    """The text without the user's token for the Hub, which a server may have repeated."""
+    if "huggingface_hub" not in sys.modules:
+        return text
+    from huggingface_hub import get_token
+
+    token = get_token()
+    return text.replace(token, "<token>") if token else text
 
 
 def save_config(config: Any, path: str) -> None:

@@ -62,6 +62,13 @@ SUBCOMMANDS: Final[Mapping[str, Subcommand]] = MappingProxyType(
         "viz": Subcommand(
             "egovcp_collect.dataset.viz", "an episode in Rerun: depth, robot, actions, rewards"
         ),
+        "push": Subcommand(
+            "egovcp_collect.dataset.push",
+            "publish it on the Hub: data, card and tags in one commit",
+        ),
+        "pull": Subcommand(
+            "egovcp_collect.dataset.pull", "download one commit of the Hub to a new folder, checked"
+        ),
     }
 )
 
