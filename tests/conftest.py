@@ -4,3 +4,21 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: tests are many and small
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
+os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from egovcp.testing.hub import FakeHub, in_this_process
+
+
+@pytest.fixture
+def hub(tmp_path: Path) -> Iterator[FakeHub]:
+    """A fake Hub, to which this process's libraries talk, with all caches in ``tmp_path``."""
+    with (
+        FakeHub(tmp_path / "hub") as hub,
+        in_this_process(hub.endpoint, tmp_path / "home"),
+    ):
+        yield hub

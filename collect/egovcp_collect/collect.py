@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
 import shlex
 import signal
 import sys
@@ -26,9 +24,9 @@ from egovcp_collect.config import SHAPING, CollectConfig
 from egovcp_collect.crew import Crew
 from egovcp_collect.progress import Progress
 from egovcp_collect.resume import require_same
+from egovcp_collect.versions import installed_versions
 
 PROG: Final = "egovcp-collect"
-_PACKAGES: Final = ("egovcp", "mujoco", "mjlab", "numpy", "lerobot")
 _EPILOG: Final = (
     "Every finished episode is safe on the disk at once. Whatever ends the command, the same "
     "command with --resume goes on from there; with more --episodes it extends a dataset."
@@ -146,13 +144,9 @@ def _provenance(config: CollectConfig, command: str) -> Provenance:
         controller_id=make_controller(config.env.controller).id,
         seed=config.seed,
         command=command,
-        versions={"python": platform.python_version(), **_versions()},
+        versions=installed_versions(),
         config={name: settings[name] for name in SHAPING},
     )
-
-
-def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in _PACKAGES}
 
 
 if __name__ == "__main__":

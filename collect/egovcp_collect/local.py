@@ -6,11 +6,14 @@ import multiprocessing
 import os
 import pickle
 import traceback
+from collections import deque
 from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Final
 
+from egovcp.data import Episode
 from egovcp.data.encoded import encode
 from egovcp.data.spool import SealedEpisode, Spool
 from egovcp.sim.scenario import Scenario
@@ -20,6 +23,7 @@ from egovcp_collect.config import CollectConfig
 from egovcp_collect.simulation import Simulation
 
 _REPORT_EVERY: Final = 0.25  # s
+_UNSEALED: Final = 32  # episodes that may wait for a slow disk before the simulation does
 
 
 class LocalWorker:
@@ -95,10 +99,13 @@ class LocalBackend:
 def _serve(pipe: Connection, config: CollectConfig, spool: Path, parent: int) -> None:
     """Runs in the process, until the pipe or the parent is gone."""
     try:
-        simulation = Simulation(config)
+        simulation, sealer = Simulation(config), _Sealer(Spool(spool))
         while os.getppid() == parent:
             _receive(pipe, simulation)
-            pipe.send(_advance(simulation, Spool(spool)))
+            progress = simulation.advance(_REPORT_EVERY)
+            for number, episode in progress.episodes:
+                sealer.seal(number, episode)
+            pipe.send(Report(progress.steps, sealer.finished(wait=simulation.idle)))
     except (EOFError, BrokenPipeError):
         return
     except Exception as error:  # noqa: BLE001 - whatever it is, the collection must hear of it
@@ -112,14 +119,35 @@ def _receive(pipe: Connection, simulation: Simulation) -> None:
         simulation.add(pipe.recv())
 
 
-def _advance(simulation: Simulation, spool: Spool) -> Report:
-    progress = simulation.advance(_REPORT_EVERY)
-    briefs = []
-    for number, episode in progress.episodes:
+class _Sealer:
+    """Seals episodes on a thread: the simulation goes on while the disk flushes."""
+
+    def __init__(self, spool: Spool) -> None:
+        self._spool = spool
+        self._pool = ThreadPoolExecutor(1)
+        self._pending: deque[Future[Brief]] = deque()
+
+    def seal(self, number: int, episode: Episode) -> None:
+        """Begin."""
+        self._pending.append(self._pool.submit(self._put, number, episode))
+
+    def _put(self, number: int, episode: Episode) -> Brief:
         encoded = encode(episode, f"episode {number}")
-        spool.put(SealedEpisode.of(number, encoded))
-        briefs.append(Brief.of(number, encoded))
-    return Report(progress.steps, tuple(briefs))
+        self._spool.put(SealedEpisode.of(number, encoded))
+        return Brief.of(number, encoded)
+
+    def finished(self, wait: bool) -> tuple[Brief, ...]:
+        """Those that have been sealed since the last call; all of them if ``wait``, and with a
+        slow disk as many as it takes to bound the memory.
+
+        Raises:
+            DataError: an episode is not valid.
+            OSError: the disk is full.
+        """
+        out = []
+        while self._pending and (wait or len(self._pending) > _UNSEALED or self._pending[0].done()):
+            out.append(self._pending.popleft().result())
+        return tuple(out)
 
 
 def portable(error: Exception) -> Exception:

@@ -59,7 +59,8 @@ def dataset_problems(root: Path, progress: Progress | None = None) -> Iterator[D
         episode, problems = reader.inspect(index)
         yield from problems
         if episode is not None and not problems:
-            yield from _command_problems(episode, str(reader.data_path(index)), index)
+            for frame, problem in command_problems(episode):
+                yield DataError.at(reader.data_path(index), problem, index, frame)
             totals.add(episode)
         if progress is not None:
             progress(index + 1, len(reader))
@@ -94,17 +95,15 @@ def _raised(problems: Iterator[DataError]) -> Iterator[DataError]:
         yield error
 
 
-def _command_problems(episode: Episode, path: str, index: int) -> Iterator[DataError]:
-    """The command in o_t is a_{t-1} as sent, and the neutral pose at t = 0."""
+def command_problems(episode: Episode) -> Iterator[tuple[int, str]]:
+    """Where the command in o_t is not a_{t-1} as sent, or the neutral pose at t = 0."""
     before = np.vstack([np.zeros((1, spec.ACTION_DIM)), episode.action[:-1]])
     off = np.abs(commanded(episode.state) - spec.ACTION_BOX.to_metric(before)).max(axis=1)
     wrong = np.flatnonzero(off > COMMAND_TOLERANCE)
     if len(wrong):
         t = int(wrong[0])
-        yield DataError.at(
-            path,
+        yield (
+            t,
             f"the command in the state is {off[t]:.3g} m from the action sent one tick before; the "
             "rows are shifted in time, or the action box differs",
-            index,
-            t,
         )

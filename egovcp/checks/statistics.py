@@ -3,25 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp import spec
 from egovcp.data import DatasetReader, Episode, schema
+from egovcp.data.columns import EPISODE_FEATURES
 from egovcp.errors import DataError
 
-#: Attribute of an episode -> the feature whose statistics it has.
-_FEATURES: Final = {
-    "depth": spec.DEPTH_KEY,
-    "state": spec.STATE_KEY,
-    "action": spec.ACTION_KEY,
-    "reward": spec.REWARD_KEY,
-    "done": spec.DONE_KEY,
-    "success": spec.SUCCESS_KEY,
-    "truncated": spec.TRUNCATED_KEY,
-}
 _RELATIVE = 1e-4  # of the column's range: statistics may have been gathered in float32
 _LEAST = 1e-6
 
@@ -33,7 +22,7 @@ class Totals:
 
     def __init__(self) -> None:
         self.frames = 0
-        self._parts: dict[str, list[tuple[int, Moments]]] = {name: [] for name in _FEATURES}
+        self._parts: dict[str, list[tuple[int, Moments]]] = {name: [] for name in EPISODE_FEATURES}
 
     def add(self, episode: Episode) -> None:
         """Take in an episode."""
@@ -53,7 +42,7 @@ class Totals:
                 yield DataError.at(path, f"has no statistics of {key}")
         if self.frames != reader.num_frames:
             return
-        for name, key in _FEATURES.items():
+        for name, key in EPISODE_FEATURES.items():
             if isinstance(found.get(key), dict):
                 true = _joined(self._parts[name])
                 for problem in _differences(found[key], true, self.frames):

@@ -214,6 +214,9 @@ def load_collection(root: Path, lengths: NDArray[np.int64]) -> dict[str, Any]:
         raise DataError.at(path, f"specification {found}, expected {spec.SPEC_VERSION}")
     if not collection.get("controller_id") or not isinstance(collection["controller_id"], str):
         raise DataError.at(path, "names no low-level controller")
+    for name in ("config", "versions"):
+        if not isinstance(collection.get(name, {}), dict):
+            raise DataError.at(path, f"its {name} is no object")
     for episode, problem in record_problems(collection.get("episodes"), lengths):
         raise DataError.at(path, problem, episode)
     return collection

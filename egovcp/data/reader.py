@@ -10,13 +10,12 @@ from typing import Any, Self
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from egovcp import spec
 from egovcp.cli import DatasetConfig
-from egovcp.data import metadata, schema, tiff
+from egovcp.data import metadata, schema
+from egovcp.data.columns import EPISODE_FEATURES, Columns, open_data_file, to_numpy
 from egovcp.data.episode import Episode
 from egovcp.data.paths import require_file
 from egovcp.data.source import Source, locate
@@ -24,8 +23,6 @@ from egovcp.errors import DataError, suggest
 
 _OPEN_FILES = 8
 _TIMESTAMP_SLACK = 1e-3  # s; float32 timestamps
-
-type Columns = dict[str, NDArray[Any]]
 
 
 class DatasetReader:
@@ -43,7 +40,7 @@ class DatasetReader:
         self._collection = metadata.load_collection(source.root, self.lengths)
         self._task_names = metadata.load_tasks(source.root)
         self._file_start = _file_starts(self._table)
-        self._open_file = lru_cache(maxsize=_OPEN_FILES)(partial(_open_parquet, source.root))
+        self._open_file = lru_cache(maxsize=_OPEN_FILES)(partial(open_data_file, source.root))
 
     @classmethod
     def open(cls, config: DatasetConfig) -> Self:
@@ -64,6 +61,10 @@ class DatasetReader:
 
     def __len__(self) -> int:
         return len(self._table.length)
+
+    def __iter__(self) -> Iterator[Episode]:
+        """The episodes in order, each read when its turn comes (see `read`)."""
+        return (self.read(index) for index in range(len(self)))
 
     @property
     def root(self) -> Path:
@@ -166,13 +167,7 @@ class DatasetReader:
         except DataError as error:
             return None, [error]
         episode = Episode(
-            depth=columns[spec.DEPTH_KEY],
-            state=columns[spec.STATE_KEY],
-            action=columns[spec.ACTION_KEY],
-            reward=columns[spec.REWARD_KEY],
-            done=columns[spec.DONE_KEY],
-            success=columns[spec.SUCCESS_KEY],
-            truncated=columns[spec.TRUNCATED_KEY],
+            **{name: columns[key] for name, key in EPISODE_FEATURES.items()},
             task=self.task(index),
             time_limit=self.time_limit(index),
             metadata=self.metadata(index),
@@ -194,6 +189,15 @@ class DatasetReader:
         parts = [self._columns(i, tuple(names)) for i in range(len(self))]
         return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
+    def read_episode_columns(self, index: int, names: Sequence[str]) -> Columns:
+        """Some columns of one episode, ``(T, ...)`` each, not validated.
+
+        Raises:
+            DataError: the file is damaged.
+            IndexError: there is no such episode.
+        """
+        return self._columns(index, names)
+
     def _columns(self, index: int, names: Sequence[str]) -> Columns:
         if not 0 <= index < len(self):
             raise IndexError(f"episode {index} of {len(self)}")
@@ -203,7 +207,7 @@ class DatasetReader:
                 table = self._rows(self._open_file(path), index, names)
                 if table.num_rows != self._table.length[index]:
                     raise DataError("ends before the end of the episode")
-                return {name: _to_numpy(table[name], name) for name in names}
+                return {name: to_numpy(table[name], name) for name in names}
         except DataError as error:
             raise DataError.at(path, error.problem or str(error), index, error.frame) from error
 
@@ -257,41 +261,3 @@ def _file_starts(table: metadata.EpisodeTable) -> NDArray[np.int64]:
     files = np.stack([table.chunk_index, table.file_index], axis=1)
     _, first_episode, file_of = np.unique(files, axis=0, return_index=True, return_inverse=True)
     return np.asarray(table.start[first_episode][file_of])
-
-
-def _open_parquet(root: Path, path: Path) -> pq.ParquetFile:
-    require_file(root, path)
-    file = pq.ParquetFile(path, memory_map=True)
-    for problem in schema.type_problems(file.schema_arrow):
-        raise DataError(problem)
-    return file
-
-
-def _to_numpy(column: pa.ChunkedArray, name: str) -> NDArray[Any]:
-    array = column.combine_chunks()
-    if isinstance(array, pa.ChunkedArray):
-        array = pa.concat_arrays(array.chunks)
-    if array.null_count:
-        raise _empty(array, name)
-    if name == spec.DEPTH_KEY:
-        return tiff.decode(array.field("bytes"), spec.DEPTH_ROWS, spec.DEPTH_COLS)
-    dtype, width = str(schema.FEATURES[name]["dtype"]), schema.width(name)
-    if width == 1:
-        return np.asarray(array.to_numpy(zero_copy_only=False), dtype=dtype)
-    sizes = pc.list_value_length(array).to_numpy()
-    if (sizes != width).any():
-        at = int(np.argmax(sizes != width))
-        raise _at(at, f"column {name} has {sizes[at]} values, expected {width}")
-    flat = array.flatten().to_numpy(zero_copy_only=False)
-    return np.asarray(flat.reshape(len(array), width), dtype=dtype)
-
-
-def _empty(array: pa.Array, name: str) -> DataError:
-    at = int(np.argmax(array.is_null().to_numpy(zero_copy_only=False)))
-    return _at(at, f"column {name} is empty")
-
-
-def _at(frame: int, problem: str) -> DataError:
-    error = DataError(problem)
-    error.frame = frame
-    return error

@@ -36,12 +36,13 @@ def _problems(record: object, length: int) -> Iterator[str]:
     if not isinstance(record, Mapping):
         yield f"its record is a {type(record).__name__}, expected an object"
         return
-    yield from _shape_problems(record)
+    yield from shape_problems(record)
     if record.get("length", length) != length:
         yield f"its record says {record['length']} frames, but meta/episodes says {length}"
 
 
-def _shape_problems(record: Mapping[Any, Any]) -> Iterator[str]:
+def shape_problems(record: Mapping[Any, Any]) -> Iterator[str]:
+    """What is wrong with one record, whatever episode it belongs to."""
     task, limit, digest = record.get("task"), record.get("time_limit"), record.get("sha256", "")
     if task not in spec.TASKS:
         yield f"its task is {task!r}, expected one of {', '.join(spec.TASKS)}"

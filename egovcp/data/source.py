@@ -2,15 +2,22 @@
 
 from __future__ import annotations
 
+import json
+import logging
 import os
 import re
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from egovcp.cli import DatasetConfig
 from egovcp.data import schema
-from egovcp.errors import DataError, EnvironmentFailure, UsageError
+from egovcp.data.files import write_json
+from egovcp.errors import DataError, UsageError
+from egovcp.hub import HubUnreachable, Patience, explained, patient, token
 
+_LOG = logging.getLogger(__name__)
+_PATIENCE = Patience()
 _REPO_ID = re.compile(r"\w[\w.-]*/\w[\w.-]*", re.ASCII)
 
 
@@ -42,13 +49,15 @@ def local_root(config: DatasetConfig) -> Path:
     return lerobot_home() / config.repo_id
 
 
-def locate(config: DatasetConfig) -> Source:
+def locate(config: DatasetConfig, patience: Patience = _PATIENCE) -> Source:
     """Find the dataset; download it only if no root is given and no local copy exists.
+
+    If the Hub cannot be reached, a complete earlier download serves.
 
     Raises:
         UsageError: bad or missing id, or a revision asked of a folder.
         DataError: no dataset there.
-        EnvironmentFailure: the Hub cannot be reached.
+        EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
     root = local_root(config)
     if config.root and config.revision:
@@ -57,12 +66,35 @@ def locate(config: DatasetConfig) -> Source:
             "drop it, or drop --dataset.root"
         )
     if (root / schema.INFO_PATH).is_file() and not config.revision:
-        return Source(root, config.repo_id)
+        return recorded(root, config.repo_id)
     if config.root:
         raise DataError(
             f"no dataset at {root}: {schema.INFO_PATH} is missing; check --dataset.root"
         )
-    return _download(config)
+    return _download(config, patience)
+
+
+def record(source: Source) -> None:
+    """Note in a downloaded folder which commit it is."""
+    content = {"repo_id": source.repo_id, "commit": source.commit}
+    write_json(source.root / schema.SOURCE_PATH, content)
+
+
+def recorded(root: Path, repo_id: str = "") -> Source:
+    """The source of a folder: the one noted in it, unless it is of another dataset.
+
+    Raises:
+        DataError: the note is damaged.
+    """
+    path = root / schema.SOURCE_PATH
+    if not path.is_file():
+        return Source(root, repo_id)
+    try:
+        note = json.loads(path.read_text(encoding="utf-8"))
+        found = Source(root, str(note["repo_id"]), str(note["commit"]))
+    except (ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{path} is damaged; remove it, or pull the dataset again") from error
+    return found if repo_id in ("", found.repo_id) else Source(root, repo_id)
 
 
 def is_repo_id(text: str) -> bool:
@@ -77,49 +109,29 @@ def _require_repo_id(repo_id: str) -> None:
         raise UsageError(f"--dataset.repo_id={repo_id!r} is not of the form user/name")
 
 
-def _download(config: DatasetConfig) -> Source:
-    import httpx
-    from huggingface_hub import snapshot_download
-    from huggingface_hub.errors import (
-        GatedRepoError,
-        HfHubHTTPError,
-        LocalEntryNotFoundError,
-        OfflineModeIsEnabled,
-        RepositoryNotFoundError,
-        RevisionNotFoundError,
-    )
-
-    name = f"{config.repo_id}@{config.revision or 'main'}"
+def _download(config: DatasetConfig, patience: Patience) -> Source:
+    fetch = partial(_snapshot, config.repo_id, config.revision or "main")
     try:
-        folder = snapshot_download(
-            config.repo_id,
-            repo_type="dataset",
-            revision=config.revision or None,
-            cache_dir=lerobot_home() / "hub",
-        )
-    except RevisionNotFoundError as error:
-        raise DataError(f"the Hub has dataset {config.repo_id}, but not {name}") from error
-    except GatedRepoError as error:
-        raise DataError(f"dataset {name} is gated; ask its owner for access") from error
-    except RepositoryNotFoundError as error:
-        raise DataError(
-            f"no dataset {name}, neither in {lerobot_home()} nor on the Hub (or it is private: "
-            "run `hf auth login`)"
-        ) from error
-    except (
-        LocalEntryNotFoundError,
-        OfflineModeIsEnabled,
-        HfHubHTTPError,
-        httpx.HTTPError,
-    ) as error:
-        raise EnvironmentFailure(
-            f"cannot fetch dataset {name} from the Hub: {_first_line(error)}; check the network, "
-            "or give --dataset.root"
-        ) from error
-    root = Path(folder)
-    return Source(root, config.repo_id, commit=root.name)
+        with explained(config.repo_id, config.revision), patient(patience):
+            token()
+            return fetch(local_files_only=False)
+    except HubUnreachable as error:
+        try:
+            found = fetch(local_files_only=True)
+        except OSError:  # nothing, or not all of it
+            raise error from None
+        _LOG.warning("%s; taking the earlier download of commit %s", error, found.commit)
+        return found
 
 
-def _first_line(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+def _snapshot(repo_id: str, revision: str, *, local_files_only: bool) -> Source:
+    from huggingface_hub import snapshot_download
+
+    folder = snapshot_download(
+        repo_id,
+        repo_type="dataset",
+        revision=revision,
+        cache_dir=lerobot_home() / "hub",
+        local_files_only=local_files_only,
+    )
+    return Source(Path(folder), repo_id, commit=Path(folder).name)

@@ -13,9 +13,9 @@ from tqdm import tqdm
 
 from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetConfig, metadata
-from egovcp.data.files import write_json
 from egovcp.data.source import local_root, locate
 from egovcp.errors import DataError, UsageError
+from egovcp_collect.dataset.output import write_report
 
 
 @dataclass(frozen=True)
@@ -47,10 +47,9 @@ def run(config: CheckConfig) -> None:
     with _progress() as progress:
         found = list(islice(dataset_problems(root, progress), config.max_problems))
     episodes, frames = _size(root)
-    if config.json:
-        problems = [_as_json(error, root) for error in found]
-        content = {"ok": not found, "episodes": episodes, "frames": frames, "problems": problems}
-        write_json(Path(config.json), content)
+    problems = [as_json(error, root) for error in found]
+    content = {"ok": not found, "episodes": episodes, "frames": frames, "problems": problems}
+    write_report(config.json, content)
     for error in found:
         print(error)
     if found:
@@ -88,7 +87,8 @@ def _size(root: Path) -> tuple[int, int]:
     return episodes, frames
 
 
-def _as_json(error: DataError, root: Path) -> dict[str, Any]:
+def as_json(error: DataError, root: Path) -> dict[str, Any]:
+    """A problem as the reports of `check` and `repair` have it."""
     file = Path(error.file)
     inside = bool(error.file) and file.is_relative_to(root)
     return {

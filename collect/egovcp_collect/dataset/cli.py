@@ -43,6 +43,16 @@ SUBCOMMANDS: Final[Mapping[str, Subcommand]] = MappingProxyType(
         "check": Subcommand(
             "egovcp_collect.dataset.check", "read every file and frame; name whatever is wrong"
         ),
+        "repair": Subcommand(
+            "egovcp_collect.dataset.repair", "write a sound copy of whatever can still be read"
+        ),
+        "merge": Subcommand(
+            "egovcp_collect.dataset.merge", "one dataset out of several of the same controller"
+        ),
+        "audit": Subcommand(
+            "egovcp_collect.dataset.audit",
+            "simulate episodes again: are they the same bit for bit?",
+        ),
         "coverage": Subcommand(
             "egovcp_collect.dataset.coverage", "is it worth training on? events, returns, actions"
         ),
@@ -51,6 +61,13 @@ SUBCOMMANDS: Final[Mapping[str, Subcommand]] = MappingProxyType(
         ),
         "viz": Subcommand(
             "egovcp_collect.dataset.viz", "an episode in Rerun: depth, robot, actions, rewards"
+        ),
+        "push": Subcommand(
+            "egovcp_collect.dataset.push",
+            "publish it on the Hub: data, card and tags in one commit",
+        ),
+        "pull": Subcommand(
+            "egovcp_collect.dataset.pull", "download one commit of the Hub to a new folder, checked"
         ),
     }
 )

@@ -18,6 +18,7 @@ type Damage = Callable[[Path], object]
 DATA = "data/chunk-000/file-000.parquet"
 MORE_DATA = "data/chunk-000/file-001.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
+MORE_EPISODES = "meta/episodes/chunk-000/file-001.parquet"
 INFO, STATS, TASKS = "meta/info.json", "meta/stats.json", "meta/tasks.parquet"
 COLLECTION, HASHES = "meta/collection.json", "meta/sha256.json"
 
@@ -161,6 +162,13 @@ def rewrite(path: Path, table: pa.Table) -> None:
     table = table.replace_schema_metadata(pq.read_schema(path).metadata)
     path.unlink()
     pq.write_table(table, path)
+
+
+def no_episodes(root: Path) -> None:
+    """A table of episodes without a row, and totals that agree."""
+    for name in (EPISODES, MORE_EPISODES):
+        rows(lambda table: table.slice(0, 0), name)(root)
+    info(total_episodes=0, total_frames=0)(root)
 
 
 def put(index: int, value: object) -> Callable[[list[Any]], None]:

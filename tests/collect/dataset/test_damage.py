@@ -109,7 +109,7 @@ CASES = [
         INFO,
     ),
     # the table of episodes
-    Case("no episodes", d.rows(lambda t: t.slice(0, 0), EPISODES), EPISODES),
+    Case("no episodes", d.no_episodes, EPISODES),
     Case("episode listed twice", d.column("episode_index", d.put(1, 0), EPISODES), EPISODES, 1),
     Case("wrong length", d.column("length", d.put(2, 11), EPISODES), EPISODES, 2),
     Case("wrong range", d.column("dataset_to_index", d.put(1, 20), EPISODES), EPISODES, 1),

@@ -1,0 +1,101 @@
+"""`egovcp-dataset pull`: one commit of a dataset on the Hub to a folder."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from egovcp.data import DatasetConfig, DatasetReader, schema
+from egovcp.data.files import rename, sync, sync_tree, write_json
+from egovcp.data.hashes import verify_hashes
+from egovcp.data.lock import only_writer
+from egovcp.data.source import Source, is_repo_id, record, recorded
+from egovcp.data.writer import require_new
+from egovcp.errors import UsageError
+from egovcp.hub import Patience, fetch, resolve
+
+
+@dataclass(frozen=True)
+class PullConfig:
+    """Download a dataset from the Hub, pinned to one commit, to a folder of its own.
+
+    The folder appears when everything has arrived and its hashes agree. A pull that failed can
+    be repeated: the files that have arrived are kept aside and used.
+    """
+
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """The dataset: its id on the Hub, and the revision; empty: the latest."""
+    output_dir: str = ""
+    """The new folder."""
+    network: Patience = field(default_factory=Patience)
+    """How long to try."""
+    json: str = ""
+    """File for {"repo_id", "commit", "root", "episodes", "frames"}; empty: none."""
+
+
+CONFIG = PullConfig
+
+
+def run(config: PullConfig) -> None:
+    """Download, check, and say what came.
+
+    Raises:
+        UsageError: no id, or the folder is taken.
+        DataError: the Hub has no such dataset, or what it has is damaged.
+        EnvironmentFailure: the Hub cannot be reached, or refuses.
+    """
+    repo_id = config.dataset.repo_id
+    if config.dataset.root or not is_repo_id(repo_id):
+        raise UsageError("pull takes the id of a dataset on the Hub, user/name")
+    if not config.output_dir:
+        raise UsageError("--output_dir is missing: the new folder for the dataset")
+    root = Path(config.output_dir).expanduser().absolute()
+    commit = resolve(repo_id, config.dataset.revision, config.network)
+    if _is_there(root, repo_id, commit):
+        print(f"{root} is {repo_id}@{commit} already")
+    else:
+        require_new(root)
+        _bring(Source(root, repo_id, commit), config.network)
+    _report(config, DatasetReader.open(DatasetConfig(root=str(root))))
+
+
+def _is_there(root: Path, repo_id: str, commit: str) -> bool:
+    if not (root / schema.SOURCE_PATH).is_file() or recorded(root) != Source(root, repo_id, commit):
+        return False
+    verify_hashes(root)
+    return True
+
+
+def _bring(source: Source, patience: Patience) -> None:
+    """Everything into a folder aside, then that folder to its place."""
+    aside = source.root.with_name(f".{source.root.name}.pull")
+    files = aside / "files"
+    files.mkdir(parents=True, exist_ok=True)
+    with only_writer(source.root, aside):
+        fetch(source.repo_id, source.commit, files, patience)
+        (files / schema.SOURCE_PATH).unlink(missing_ok=True)
+        verify_hashes(files)
+        DatasetReader.open(DatasetConfig(root=str(files)))
+        record(Source(files, source.repo_id, source.commit))
+        sync_tree(files)
+        require_new(source.root)
+        rename(files, source.root)
+        sync(source.root.parent)
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def _report(config: PullConfig, reader: DatasetReader) -> None:
+    source = reader.source
+    print(f"{source.root}: {source.repo_id}@{source.commit}")
+    print(f"{len(reader)} episodes, {reader.num_frames} steps")
+    print(f"egovcp-train --dataset.root={source.root}")
+    if config.json:
+        facts = {
+            "repo_id": source.repo_id,
+            "commit": source.commit,
+            "root": str(source.root),
+            "episodes": len(reader),
+            "frames": reader.num_frames,
+        }
+        write_json(Path(config.json), facts)

@@ -1,0 +1,100 @@
+"""A commit of the Hub to a folder: resumable, and compared with what the Hub says it holds."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from egovcp.errors import DataError, EnvironmentFailure
+from egovcp.hub.failures import explained, token
+from egovcp.hub.patience import Patience, patient
+
+if TYPE_CHECKING:
+    from huggingface_hub import HfApi
+    from huggingface_hub.hf_api import RepoFile
+
+#: What the Hub keeps beside a dataset, and is none of it.
+_FOREIGN = (".gitattributes", ".gitignore")
+_WORKERS = 4
+
+
+def resolve(repo_id: str, revision: str, patience: Patience) -> str:
+    """The commit SHA of a branch, a tag or a shortened SHA.
+
+    Raises:
+        DataError: there is no such dataset or revision.
+        EnvironmentFailure: the Hub cannot be reached, or refuses.
+    """
+    with explained(repo_id, revision), patient(patience):
+        from huggingface_hub import HfApi
+
+        commit = HfApi(token=token()).dataset_info(repo_id, revision=revision or None).sha
+        assert commit is not None
+        return commit
+
+
+def fetch(repo_id: str, commit: str, folder: Path, patience: Patience) -> None:
+    """Make ``folder`` hold exactly the files of a commit.
+
+    What an interrupted call has brought is used; files that do not belong are removed.
+
+    Raises:
+        EnvironmentFailure: the Hub cannot be reached, refuses, or sends something else than it
+            lists; the damaged file is removed, so that the next call fetches it anew.
+    """
+    with explained(repo_id, commit), patient(patience):
+        from huggingface_hub import HfApi, snapshot_download
+
+        listing = _listing(HfApi(token=token()), repo_id, commit)
+        _remove_others(folder, listing)
+        snapshot_download(
+            repo_id,
+            repo_type="dataset",
+            revision=commit,
+            local_dir=folder,
+            ignore_patterns=list(_FOREIGN),
+            max_workers=_WORKERS,
+        )
+    for path, file in listing.items():
+        _require_same(folder / path, file)
+    shutil.rmtree(folder / ".cache", ignore_errors=True)  # LeRobot would download again
+
+
+def _listing(api: HfApi, repo_id: str, commit: str) -> dict[str, RepoFile]:
+    from huggingface_hub.hf_api import RepoFile
+
+    tree = api.list_repo_tree(repo_id, repo_type="dataset", revision=commit, recursive=True)
+    files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
+    for path in files:
+        if path.startswith("/") or ".." in path.split("/"):
+            raise DataError(f"{repo_id}@{commit} holds {path!r}, a place outside the dataset")
+    return {path: file for path, file in files.items() if path not in _FOREIGN}
+
+
+def _remove_others(folder: Path, listing: dict[str, RepoFile]) -> None:
+    for path in folder.rglob("*"):
+        name = path.relative_to(folder)
+        if path.is_file() and name.parts[0] != ".cache" and name.as_posix() not in listing:
+            path.unlink()
+
+
+def _require_same(path: Path, file: RepoFile) -> None:
+    if _digest(path, file) != (file.lfs.sha256 if file.lfs is not None else file.blob_id):
+        path.unlink(missing_ok=True)
+        raise EnvironmentFailure(
+            f"{file.path} is not what the Hub says it is: its hash differs; the file was removed "
+            "and is fetched anew by the next try"
+        )
+
+
+def _digest(path: Path, file: RepoFile) -> str:
+    if not path.is_file():
+        return ""
+    if file.lfs is None:
+        content = path.read_bytes()
+        header = b"blob %d\0" % len(content)
+        return hashlib.sha1(header + content, usedforsecurity=False).hexdigest()
+    with path.open("rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()

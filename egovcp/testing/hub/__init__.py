@@ -1,0 +1,14 @@
+"""A fake Hugging Face Hub for tests and trials without a network.
+
+A local server behind ``HF_ENDPOINT``, with enough of the Hub's interface to create a
+repository, upload, commit, tag, list, download and stream a dataset. It keeps contents on
+disk, counts requests and fails on demand (`FakeHub.fail`). On the command line::
+
+    python -m egovcp.testing.hub --root DIR --port 8080
+"""
+
+from egovcp.testing.hub.environment import environment, in_this_process
+from egovcp.testing.hub.faults import Fault
+from egovcp.testing.hub.server import FakeHub
+
+__all__ = ["FakeHub", "Fault", "environment", "in_this_process"]

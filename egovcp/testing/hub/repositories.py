@@ -1,0 +1,108 @@
+"""Repositories and the names of their revisions."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from egovcp.testing.hub.messages import Answer, Request, say
+from egovcp.testing.hub.store import Refusal, Store
+
+_DATE = "2026-01-01T00:00:00.000Z"
+
+
+def whoami(store: Store, request: Request) -> Answer:
+    """Everybody is the same user."""
+    return say({"type": "user", "id": "0", "name": "user", "fullname": "User", "orgs": []})
+
+
+def create(store: Store, request: Request) -> Answer:
+    """Make a repository; 409 if it exists, with the same address in the answer."""
+    wish = request.json()
+    repo = f"{wish.get('organization') or 'user'}/{wish['name']}"
+    kind = f"{wish.get('type') or 'model'}s"
+    private = bool(wish.get("private")) or wish.get("visibility") == "private"
+    prefix = "" if kind == "models" else f"{kind}/"
+    made = {"url": f"{request.endpoint}/{prefix}{repo}", "id": repo, "name": repo}
+    try:
+        store.create(f"{kind}/{repo}", private)
+    except Refusal as refusal:
+        return say({"error": refusal.message, **made}, refusal.status)
+    return say(made)
+
+
+def info(store: Store, request: Request) -> Answer:
+    """Describe a repository at a revision."""
+    commit = store.commit(request.repo, request.parts.get("revision", "main"))
+    return say(
+        {
+            "_id": commit.sha[:24],
+            "id": request.parts["repo"],
+            "author": request.parts["repo"].split("/")[0],
+            "sha": commit.sha,
+            "private": store.refs(request.repo).private,
+            "gated": False,
+            "disabled": False,
+            "lastModified": _DATE,
+            "createdAt": _DATE,
+            "downloads": 0,
+            "likes": 0,
+            "tags": [],
+            "siblings": [{"rfilename": path} for path in sorted(commit.files)],
+        }
+    )
+
+
+def refs(store: Store, request: Request) -> Answer:
+    """List branches and tags."""
+    found = store.refs(request.repo)
+
+    def entries(names: Any, folder: str) -> list[dict[str, str]]:
+        return [
+            {"name": name, "ref": f"refs/{folder}/{name}", "targetCommit": sha}
+            for name, sha in names.items()
+        ]
+
+    return say(
+        {
+            "branches": entries(found.branches, "heads"),
+            "tags": entries(found.tags, "tags"),
+            "converts": [],
+            "pullRequests": [],
+        }
+    )
+
+
+def commits(store: Store, request: Request) -> Answer:
+    """List commits, the newest first."""
+    history = store.history(request.repo, request.parts["revision"])
+    return say(
+        [
+            {"id": c.sha, "title": c.title, "message": "", "authors": [], "date": _DATE}
+            for c in history
+        ]
+    )
+
+
+def tag(store: Store, request: Request) -> Answer:
+    """Name a commit; 409 if the tag exists."""
+    store.tag(request.repo, request.json()["tag"], request.parts["revision"])
+    return say({})
+
+
+def untag(store: Store, request: Request) -> Answer:
+    """Remove a tag."""
+    store.tag(request.repo, request.parts["name"], None)
+    return say({})
+
+
+def branch(store: Store, request: Request) -> Answer:
+    """Start a branch; 409 if it exists."""
+    start = request.json().get("startingPoint") or "main"
+    store.branch(request.repo, request.parts["name"], start)
+    return say({})
+
+
+def unbranch(store: Store, request: Request) -> Answer:
+    """Remove a branch."""
+    store.branch(request.repo, request.parts["name"], None)
+    return say({})

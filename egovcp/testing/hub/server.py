@@ -1,0 +1,202 @@
+"""The server: sockets, credentials and faults around the routes."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import threading
+from functools import partial
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+from egovcp.testing.hub.faults import EVER, Fault, Faults, Trouble
+from egovcp.testing.hub.messages import Answer, Request, arriving, say
+from egovcp.testing.hub.routes import ROUTES, Route
+from egovcp.testing.hub.store import Refusal, Store
+
+_STALL_S = 3600.0
+_READING = {"GET", "HEAD"}
+
+
+class FakeHub:
+    """A Hub on the loopback whose repositories lie in a folder.
+
+    As a context manager it serves on a free port until the block ends::
+
+        with FakeHub(tmp_path / "hub") as hub:
+            hub.fail("commit", 503, times=2)
+            ...
+            assert hub.requests["commit"] == 3
+    """
+
+    def __init__(self, root: str | Path, port: int = 0, token: str = "") -> None:
+        """Open the folder and the port; ``token``: needed to write and to read private data."""
+        self.store = Store(Path(root))
+        self.token = token
+        self.faults = Faults()
+        self.closing = threading.Event()
+        self._server = _Server(("127.0.0.1", port), partial(_Handler, hub=self))
+
+    @property
+    def endpoint(self) -> str:
+        """The address for ``HF_ENDPOINT``."""
+        return f"http://127.0.0.1:{self._server.server_port}"
+
+    @property
+    def requests(self) -> dict[str, int]:
+        """How many requests each route has had; 0 for one without."""
+        return self.faults.requests
+
+    def fail(
+        self,
+        route: str,
+        trouble: Trouble,
+        times: int = EVER,
+        after: int = 0,
+        retry_after: int | None = None,
+        message: str = "",
+    ) -> None:
+        """Order a fault; see `Fault`."""
+        self.faults.add(Fault(route, trouble, times, after, retry_after, message))
+
+    def heal(self) -> None:
+        """Forget all faults and counts."""
+        self.faults.clear()
+
+    def serve(self) -> None:
+        """Answer requests until `close`."""
+        self._server.serve_forever(poll_interval=0.05)
+
+    def close(self) -> None:
+        """Stop answering; end what stalls."""
+        self.closing.set()
+        self._server.shutdown()
+        self._server.server_close()
+
+    def __enter__(self) -> Self:
+        self._thread = threading.Thread(target=self.serve, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+        self._thread.join()
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    block_on_close = False
+    request_queue_size = 128
+
+    def handle_error(self, request: object, client_address: object) -> None:
+        """A client that goes away is no event."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    disable_nagle_algorithm = True
+
+    def __init__(self, *args: object, hub: FakeHub) -> None:
+        self.hub = hub
+        super().__init__(*args)  # type: ignore[arg-type]
+
+    def log_message(self, *args: object) -> None:
+        """Say nothing."""
+
+    def _handle(self) -> None:
+        url = urlsplit(self.path)
+        route, parts = _find(self.command, url.path)
+        request = Request(
+            endpoint=self.hub.endpoint,
+            parts=parts,
+            query=dict(parse_qsl(url.query)),
+            headers=dict(self.headers.items()),
+            body=arriving(self.rfile, self.headers),  # type: ignore[arg-type]
+        )
+        fault = self.hub.faults.take(route.name if route else "unknown")
+        trouble = fault.trouble if fault else None
+        if trouble == "reset":
+            return self._break()
+        if fault is not None and isinstance(trouble, int):
+            answer = _refuse(Refusal(trouble, fault.message or "as ordered"), fault.retry_after)
+        else:
+            answer = self._answer(route, request)
+        for _ in request.body:  # what no route has read: the connection is used again
+            pass
+        half = trouble in ("stall", "truncate")
+        if trouble == "stall" and answer.size == 0:
+            self.hub.closing.wait(_STALL_S)
+        if trouble == "lose" or (half and answer.size == 0):
+            return self._break()
+        return self._send(answer, half, stall=trouble == "stall")
+
+    do_GET = do_HEAD = do_POST = do_PUT = do_DELETE = _handle  # noqa: N815
+
+    def _answer(self, route: Route | None, request: Request) -> Answer:
+        try:
+            if route is None:
+                raise Refusal(404, f"no route for {self.command} {self.path}")
+            self._authorize(route, request)
+            return route.answer(self.hub.store, request)
+        except Refusal as refusal:
+            return _refuse(refusal, None)
+
+    def _authorize(self, route: Route, request: Request) -> None:
+        token = request.headers.get("Authorization", "").removeprefix("Bearer ")
+        if not self.hub.token or token == self.hub.token or route.name.startswith("lfs_"):
+            return
+        public = route.method in _READING or route.name == "paths"
+        if "repo" in request.parts and public and not self.hub.store.refs(request.repo).private:
+            return
+        if token or route.name != "create":
+            raise Refusal(401, "Invalid username or password.")
+        raise Refusal(401, "Unauthorized")
+
+    def _send(self, answer: Answer, half: bool, stall: bool) -> None:
+        self.send_response(answer.status)
+        for name, value in answer.headers.items():
+            self.send_header(name, value)
+        self.send_header("Content-Length", str(answer.size))
+        self.end_headers()
+        limit = answer.size // 2 if half else answer.size
+        if self.command != "HEAD":
+            for chunk in answer.chunks(limit):
+                self.wfile.write(chunk)
+        if stall:
+            self.hub.closing.wait(_STALL_S)
+        self.close_connection = self.close_connection or half
+
+    def _break(self) -> None:
+        """End the connection as a crash does: without a farewell."""
+        self.close_connection = True
+        with contextlib.suppress(OSError):
+            self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            self.connection.close()
+
+
+def _find(method: str, path: str) -> tuple[Route | None, dict[str, str]]:
+    """The route of a path, and the parts that its pattern names, unquoted."""
+    for route in ROUTES:
+        found = route.pattern.fullmatch(path) if route.method == method else None
+        if found is not None:
+            parts = {k: unquote(v) for k, v in found.groupdict().items() if v is not None}
+            return route, parts
+    return None, {}
+
+
+def _refuse(refusal: Refusal, retry_after: int | None) -> Answer:
+    headers = {"Content-Type": "application/json", "X-Error-Message": refusal.message}
+    if refusal.code:
+        headers["X-Error-Code"] = refusal.code
+    if retry_after is not None:
+        headers["Retry-After"] = str(retry_after)
+    return say({"error": refusal.message}, refusal.status, headers)

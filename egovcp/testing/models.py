@@ -1,0 +1,65 @@
+"""World models that answer at once: an untrained one, and one that counts."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from egovcp import spec
+from egovcp.model import PRESETS, Carry, WorldModel
+from egovcp.model.nets import ValueHead
+
+
+def toy_model(preset: str = "debug", seed: int = 0) -> WorldModel:
+    """An untrained world model whose heads answer differently to different questions.
+
+    A new `WorldModel` predicts constants for value and termination, which hides mistakes.
+    """
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = WorldModel(PRESETS[preset])
+        for head in (model.value_head, model.passing_value_head, model.termination_head):
+            if head is None:
+                continue
+            last = (head.mlp if isinstance(head, ValueHead) else head).rest[-1]
+            assert isinstance(last, nn.Linear)
+            nn.init.normal_(last.weight, std=0.3)
+    return model.eval()
+
+
+class CountingModel(WorldModel):
+    """Counts instead of thinking: h[:, 0] is the number of observations since the reset,
+    z[:, :7] the action that led to the state, h[:, 1] the imagined ticks.
+
+    Q is highest for an action that repeats the last one, shifted by ``drift``.
+    """
+
+    COUNT, IMAGINED = 0, 1
+
+    def __init__(self, drift: float = 0.0) -> None:
+        super().__init__(PRESETS["debug"])
+        self.drift = drift
+
+    def observe(
+        self, carry: Carry, action: Tensor, depth: Tensor, state: Tensor, is_first: Tensor
+    ) -> Carry:
+        first = is_first[:, None]
+        h, z = carry.h.masked_fill(first, 0.0), torch.zeros_like(carry.z)
+        h[:, self.COUNT] += 1.0
+        z[:, : spec.ACTION_DIM] = action.masked_fill(first, 0.0)
+        return Carry(h, z)
+
+    def imagine(self, carry: Carry, action: Tensor) -> Carry:
+        shape = action.shape[:-1]
+        h = carry.h.expand(*shape, -1).clone()
+        z = carry.z.expand(*shape, -1).clone()
+        h[..., self.IMAGINED] += 1.0
+        z[..., : spec.ACTION_DIM] = action
+        return Carry(h, z)
+
+    def value(self, carry: Carry, action: Tensor) -> Tensor:
+        last = carry.z[..., : spec.ACTION_DIM]
+        return -(action - last - self.drift).square().sum(-1)
+
+    def termination(self, carry: Carry) -> Tensor:
+        return torch.zeros_like(carry.h[..., 0])

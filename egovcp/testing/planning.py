@@ -1,0 +1,75 @@
+"""Worlds whose best plan, values and terminations are known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+
+class Point(NamedTuple):
+    """State of `PointWorld`."""
+
+    position: Tensor  # (..., 7)
+    goal: Tensor  # (..., 7)
+
+
+class PointWorld:
+    """A point that jumps to each action; Q is minus the squared distance of action and goal.
+
+    Its best plan is known: walk straight to the goal. Beyond ``cliff`` in the first
+    coordinate the point has fallen.
+    """
+
+    def __init__(self, cliff: float = np.inf, floor: float = -100.0) -> None:
+        self.cliff = cliff
+        self.return_floor = torch.tensor(floor)
+
+    @staticmethod
+    def start(executed: Tensor, goal: Tensor) -> Point:
+        """Robots at their last executed actions (E, 7), each with a goal (E, 7)."""
+        return Point(executed, goal.expand_as(executed))
+
+    def spread(self, carry: Point) -> Point:
+        return Point(carry.position[:, None], carry.goal[:, None])
+
+    def imagine(self, carry: Point, action: Tensor) -> Point:
+        return Point(action, carry.goal)
+
+    def value(self, carry: Point, action: Tensor) -> Tensor:
+        return -(action - carry.goal).square().sum(-1)
+
+    def termination(self, carry: Point) -> Tensor:
+        return (carry.position[..., 0] > self.cliff).to(carry.position.dtype)
+
+
+class ScriptedWorld:
+    """Q and D read from a script, whatever the actions: tick k has ``values[k]``, ``deaths[k]``.
+
+    The carry is the tick, so a value or a termination asked for at the wrong time shows.
+    """
+
+    def __init__(
+        self, values: Sequence[float], deaths: Sequence[float], floor: float = 0.0
+    ) -> None:
+        self.values, self.deaths = torch.tensor(values), torch.tensor(deaths)
+        self.return_floor = torch.tensor(floor)
+
+    def start(self, robots: int = 1) -> Tensor:
+        """Tick 0 for every robot, (E,)."""
+        return torch.zeros(robots, dtype=torch.long)
+
+    def spread(self, carry: Tensor) -> Tensor:
+        return carry[:, None]
+
+    def imagine(self, carry: Tensor, action: Tensor) -> Tensor:
+        return (carry + 1).expand(action.shape[:-1])
+
+    def value(self, carry: Tensor, action: Tensor) -> Tensor:
+        return self.values[carry].expand(action.shape[:-1])
+
+    def termination(self, carry: Tensor) -> Tensor:
+        return self.deaths[carry]
