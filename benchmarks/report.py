@@ -11,11 +11,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import torch
-
 
 def hardware() -> dict[str, object]:
     """The machine in words that mean something to somebody else."""
+    import torch  # here, so that a process that only simulates does not hold it
+
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():

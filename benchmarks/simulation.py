@@ -12,13 +12,19 @@ import io
 import multiprocessing
 import os
 import re
+import resource
 import statistics
 import tempfile
 import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from unittest import mock
 
+import mujoco
 from report import parser, publish
 
-from egovcp.sim.camera import DepthCamera
+from egovcp.robot import arms
+from egovcp.sim.camera import DepthCamera, DepthNoise
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import RandomWalk
@@ -28,10 +34,10 @@ from egovcp_collect.collect import main as collect
 ENVS = 16
 
 
-def bare_rate(args: tuple[str, int, int]) -> float:
+def bare_rate(args: tuple[str, str, int, int]) -> float:
     """Planner ticks per second of one process over ``groups`` groups of episodes."""
-    task, worker, groups = args
-    env, policy = VectorEnv(EnvConfig(), ENVS), RandomWalk()
+    task, controller, worker, groups = args
+    env, policy = VectorEnv(replace(EnvConfig(), controller=controller), ENVS), RandomWalk()
     env.reset([Scenario(task, 0, i) for i in range(ENVS)])  # builds the models
     ticks, start = 0, time.perf_counter()
     for group in range(groups):
@@ -65,66 +71,100 @@ def collection_rate(task: str, cores: int, episodes: int) -> float:
     return float(found[1])
 
 
-def milliseconds_per_tick(task: str, ticks: int) -> dict[str, float]:
-    """What the controller and the camera cost per planner tick and robot, one process."""
-    env, policy = VectorEnv(EnvConfig(), ENVS), RandomWalk()
-    scenarios = [Scenario(task, 0, i) for i in range(ENVS)]
-    env.reset(scenarios)
-    policy.reset(env, scenarios)
-    spent = {"controller": 0.0, "depth": 0.0}
+def milliseconds_per_tick(task: str, controller: str, groups: int = 1) -> dict[str, float]:
+    """CPU time per planner tick and robot of one process over whole episodes: all of it, and
+    what the controller (and inside it the arms' inverse kinematics), physics, depth pictures
+    (rays and noise) and the rest cost."""
+    env, policy = VectorEnv(replace(EnvConfig(), controller=controller), ENVS), RandomWalk()
+    env.reset([Scenario(task, 0, i) for i in range(ENVS)])  # builds the models
+    with timed_parts(env) as spent:
+        ticks, start = 0, time.thread_time()
+        for group in range(groups):
+            scenarios = [Scenario(task, 2, group * ENVS + i) for i in range(ENVS)]
+            env.reset(scenarios)
+            policy.reset(env, scenarios)
+            while not env.done.all():
+                ticks += int((~env.done).sum())
+                env.step(policy.act(env))
+        total = time.thread_time() - start
+    named = {f"tick_{name}_ms": 1e3 * seconds / ticks for name, seconds in spent.items()}
+    named["tick_total_ms"] = 1e3 * total / ticks
+    parts = ("controller", "physics", "depth", "depth_noise")
+    rest = named["tick_total_ms"] - sum(named[f"tick_{part}_ms"] for part in parts)
+    return {
+        **named,
+        "tick_rest_ms": rest,
+        "tick_physics_and_rest_ms": named["tick_physics_ms"] + rest,
+    }
 
-    def timed(name: str, function):  # type: ignore[no-untyped-def]
-        def wrapper(*args, **kwargs):  # type: ignore[no-untyped-def]
-            start = time.perf_counter()
-            try:
-                return function(*args, **kwargs)
-            finally:
-                spent[name] += time.perf_counter() - start
 
-        return wrapper
+@contextlib.contextmanager
+def timed_parts(env: VectorEnv) -> Iterator[dict[str, float]]:
+    """Seconds of CPU spent in each part of ``env`` while the context lasts."""
+    places = {
+        "controller": (env.controller, "step"),
+        "ik": (arms, "improve"),
+        "physics": (mujoco, "mj_step"),
+        "depth": (DepthCamera, "render"),
+        "depth_noise": (DepthNoise, "apply"),
+    }
+    spent = dict.fromkeys(places, 0.0)
+    with contextlib.ExitStack() as stack:
+        for name, (owner, method) in places.items():
+            timed = _timed(getattr(owner, method), spent, name)
+            stack.enter_context(mock.patch.object(owner, method, timed))
+        yield spent
 
-    env.controller.step = timed("controller", env.controller.step)  # type: ignore[method-assign]
-    original = DepthCamera.render
-    DepthCamera.render = timed("depth", original)  # type: ignore[method-assign]
-    try:
-        start = time.perf_counter()
-        for _ in range(ticks):
-            env.step(policy.act(env))
-        total = time.perf_counter() - start
-    finally:
-        DepthCamera.render = original  # type: ignore[method-assign]
-    parts = {f"tick_{name}_ms": 1e3 * s / (ticks * ENVS) for name, s in spent.items()}
-    rest = 1e3 * (total - sum(spent.values())) / (ticks * ENVS)
-    return {**parts, "tick_physics_and_rest_ms": rest}
+
+def _timed(
+    function: Callable[..., object], spent: dict[str, float], name: str
+) -> Callable[..., object]:
+    def wrapper(*args: object, **kwargs: object) -> object:
+        start = time.thread_time()
+        try:
+            return function(*args, **kwargs)
+        finally:
+            spent[name] += time.thread_time() - start
+
+    return wrapper
+
+
+def resident_megabytes() -> float:
+    """The most that this process has held in memory."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # kB on Linux
 
 
 def main() -> None:
     p = parser(__doc__)
     p.set_defaults(rounds=3)
     p.add_argument("--task", default="ball", help="ball, wall or arch")
+    p.add_argument("--controller", default=EnvConfig().controller, help="walk or stance")
     p.add_argument("--groups", type=int, default=8, help="groups of 16 episodes per process")
     args = p.parse_args()
     cores = len(os.sched_getaffinity(0))
     os.environ.setdefault("OMP_NUM_THREADS", "1")
+    collects = args.controller == EnvConfig().controller  # only the default one is compared
     bare: list[float] = []
     collected: list[float] = []
-    jobs = [(args.task, worker, args.groups) for worker in range(cores)]
+    jobs = [(args.task, args.controller, worker, args.groups) for worker in range(cores)]
     with multiprocessing.get_context("spawn").Pool(cores) as pool:
         for _ in range(args.rounds):
             bare.append(sum(pool.map(bare_rate, jobs, chunksize=1)) / cores)
-            episodes = cores * args.groups * ENVS
-            collected.append(collection_rate(args.task, cores, episodes) / cores)
-    ratios = [c / b for c, b in zip(collected, bare, strict=True)]
-    publish(
-        {
-            "task": args.task,
-            "simulation_ticks_per_s_core": statistics.median(bare),
-            "collection_ticks_per_s_core": statistics.median(collected),
-            "collection_ratio": statistics.median(ratios),
-            **milliseconds_per_tick(args.task, 40),
-        },
-        args.json,
-    )
+            if collects:
+                episodes = cores * args.groups * ENVS
+                collected.append(collection_rate(args.task, cores, episodes) / cores)
+        resident = pool.apply(resident_megabytes)
+    figures: dict[str, object] = {
+        "task": args.task,
+        "controller": args.controller,
+        "simulation_ticks_per_s_core": statistics.median(bare),
+        "simulation_resident_mb": resident,
+    }
+    if collects:
+        ratios = [c / b for c, b in zip(collected, bare, strict=True)]
+        figures["collection_ticks_per_s_core"] = statistics.median(collected)
+        figures["collection_ratio"] = statistics.median(ratios)
+    publish({**figures, **milliseconds_per_tick(args.task, args.controller)}, args.json)
 
 
 if __name__ == "__main__":

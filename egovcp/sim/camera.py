@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.sim.config import CameraConfig
-from egovcp.sim.rays import Pinhole, cast
+from egovcp.sim.rays import Pinhole, View
 from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_MIN_M, DEPTH_ROWS
 
 Array = NDArray[np.float64]
@@ -41,18 +41,19 @@ class DepthCamera:
         tilt = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
         return data.xpos[torso_body] + torso @ self.position, torso @ tilt
 
-    def render(
-        self, model: mujoco.MjModel, data: mujoco.MjData, torso_body: int, pitch: float
-    ) -> NDArray[np.float32]:
+    def render(self, view: View, data: mujoco.MjData, pitch: float) -> NDArray[np.float32]:
         """True planar depth (H, W), m; 0 where nothing is within the camera's range.
 
-        ``data`` must hold current body poses (``mj_kinematics``).
+        Args:
+            view: of the body that carries the camera.
+            data: with current body poses (``mj_kinematics``).
+            pitch: rad below the body's horizontal.
         """
-        origin, rotation = self.pose(data, torso_body, pitch)
-        rays = self._directions @ rotation.T
-        ranges = cast(model, data, self._pinhole, origin, rotation, rays, torso_body, self._cutoff)
-        depth = (ranges * self._axial).astype(np.float32)
-        return within_range(depth).reshape(DEPTH_ROWS, DEPTH_COLS)
+        origin, rotation = self.pose(data, view.body, pitch)
+        rays = self._directions @ np.ascontiguousarray(rotation.T)
+        ranges = view.ranges(data, self._pinhole, origin, rotation, rays, self._cutoff)
+        ranges *= self._axial
+        return within_range(ranges.astype(np.float32)).reshape(DEPTH_ROWS, DEPTH_COLS)
 
 
 def pixel_rays(focal: float) -> Array:

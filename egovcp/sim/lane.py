@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from egovcp.sim.camera import DepthCamera, DepthNoise
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.randomise import apply_physics, draw_physics, initial_offset
+from egovcp.sim.rays import View
 from egovcp.sim.robot import SimulatedRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import build_scene
@@ -52,6 +53,7 @@ class Lane:
         apply_physics(self.physics, self.robot.scene, self.robot.model)
         self.task = make_task(self._config, scenario, self.robot)
         self._drawn = self.task.parameters
+        self._view = View(self.robot.model, self.robot.index.torso_body)
         offset = initial_offset(self._config.randomise, scenario)
         self.robot.reset(self._standing.joints + offset, self._standing.pelvis)
         self.task.place()
@@ -132,10 +134,7 @@ class Lane:
             self._pictures.append(self._take_picture())
 
     def _take_picture(self) -> NDArray[np.uint16]:
-        robot = self.robot
-        depth = self._camera.render(
-            robot.model, robot.data, robot.index.torso_body, self.camera_pitch
-        )
+        depth = self._camera.render(self._view, self.robot.data, self.camera_pitch)
         return self._noise.apply(depth)
 
     def end_tick(self, action: Array) -> dict[str, float]:

@@ -100,6 +100,8 @@ def build_scene(task: Literal["ball", "wall", "arch"] | str, feet: FootModel) ->
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0
     )
     {BALL: _add_ball, WALL: _add_wall, ARCH: _add_arch}[task](spec)
+    # proprioception reads the state itself; the model's own sensors would cost accelerations
+    spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
     model = spec.compile()
     return Scene(model, _index(model, task))
 

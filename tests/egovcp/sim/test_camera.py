@@ -6,6 +6,7 @@ import pytest
 
 from egovcp.sim.camera import DepthCamera, DepthNoise, discontinuity, pixel_rays
 from egovcp.sim.config import CameraConfig
+from egovcp.sim.rays import View
 from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_MIN_M, DEPTH_ROWS
 
 NOISELESS = CameraConfig(
@@ -24,7 +25,7 @@ def picture(xml: str, pitch: float = 0.0) -> np.ndarray:
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    return DepthCamera(NOISELESS).render(model, data, model.body("eye").id, pitch)
+    return DepthCamera(NOISELESS).render(View(model, model.body("eye").id), data, pitch)
 
 
 def plate(x: float) -> str:
