@@ -49,7 +49,13 @@ def endless(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
     """A long collection into ``cut``, in a process group of its own, that has sealed something."""
     command = [sys.executable, "-m", "egovcp_collect.collect", *_SHORT, *_SMALL]
     process = subprocess.Popen(
-        [*command, f"--dataset.root={tmp_path / 'cut'}", "--episodes=100000", "--num_workers=1"],
+        [
+            *command,
+            f"--dataset.root={tmp_path / 'cut'}",
+            "--episodes=100000",
+            "--num_workers=1",
+            "--worker_timeout=6",
+        ],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -137,11 +143,34 @@ def test_a_killed_worker_is_replaced(
     _require_resumable(tmp_path / "cut", ten)
 
 
+def test_a_hung_worker_is_replaced(
+    endless: subprocess.Popen[str], tmp_path: Path, ten: Path
+) -> None:
+    hung = _worker_of(endless.pid)
+    os.kill(hung, signal.SIGSTOP)
+    _wait_for(lambda: _worker_of(endless.pid) != hung)
+    before = max(_numbers(tmp_path / "cut"), default=0)
+    _wait_for(lambda: max(_numbers(tmp_path / "cut"), default=0) > before)
+    os.killpg(endless.pid, signal.SIGINT)
+    endless.communicate(timeout=10)
+    _require_resumable(tmp_path / "cut", ten)
+
+
+def test_a_second_collector_is_refused(
+    endless: subprocess.Popen[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tmp_path / "cut"
+    began = time.monotonic()
+    assert main([*_SHORT, *_SMALL, f"--dataset.root={root}", "--episodes=5", "--resume"]) == 5
+    assert time.monotonic() - began < 1.0  # part of the promise, and far from the truth
+    assert f"being written by process {endless.pid}" in capsys.readouterr().err
+    assert endless.poll() is None
+
+
 def _worker_of(parent: int) -> int:
     children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
-    return next(
-        int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()
-    )
+    mine = (c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes())
+    return int(next(mine, 0))
 
 
 def _numbers(root: Path) -> list[int]:
