@@ -74,7 +74,7 @@ def _table(facts: dict[str, Any]) -> str:
         ("frames", f"{facts['frames']} at {facts['fps']} Hz, {facts['hours']:.2f} h"),
         ("size", f"{facts['bytes'] / 1e6:.1f} MB"),
         ("controller", facts["controller_id"]),
-        ("seed", facts["seed"]),
+        ("seed", "several" if facts["seed"] is None else facts["seed"]),
         ("command", facts["command"] or "not recorded"),
         ("versions", ", ".join(f"{k} {v}" for k, v in facts["versions"].items()) or "not recorded"),
         ("features", ""),
