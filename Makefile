@@ -8,13 +8,14 @@ export PATH
 # Threads that spin at barriers for long slow each other down tenfold beside any other program.
 export GOMP_SPINCOUNT := 20000
 
-.PHONY: help install quickstart test check bench build clean
+.PHONY: help install quickstart test check bench build cards clean
 
 help:
 	@echo "make quickstart   install, then collect, train, evaluate and record the ball task (~15 min)"
 	@echo "make test         the test suite"
 	@echo "make check        linter, formatter, type checker, lock file"
 	@echo "make bench        benchmarks, ratios measured side by side"
+	@echo "make cards        dataset_cards/ from a dataset of 1000 episodes of each task (collected if need be)"
 	@echo "make build        wheels and source distributions of every package into dist/"
 
 install: .venv/installed
@@ -59,11 +60,23 @@ check: install
 
 bench: install
 	@mkdir -p outputs/benchmarks
-	for b in simulation planner; do python benchmarks/$$b.py --json outputs/benchmarks/$$b.json || exit 1; done
+	for b in simulation planner controller; do python benchmarks/$$b.py --json outputs/benchmarks/$$b.json || exit 1; done
 
 build: install
 	rm -rf dist
 	uv build --all-packages --quiet
+
+# A dataset that is there already is used as it is.
+CARDS ?= outputs/cards
+CARD_EPISODES ?= 1000
+
+cards: install
+	for task in ball wall arch; do \
+	  test -d $(CARDS)/$$task || egovcp-collect --task=$$task --episodes=$(CARD_EPISODES) --seed=0 \
+	    --dataset.root=$(CARDS)/$$task || exit 1; \
+	  egovcp-dataset card $(CARDS)/$$task --repo_id=egovcp/$$task \
+	    --output=dataset_cards/$$task.md --assets=assets/$$task || exit 1; \
+	done
 
 clean:
 	rm -rf dist outputs

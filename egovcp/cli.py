@@ -20,11 +20,12 @@ import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from types import NoneType
+from typing import Any, Literal, get_args, get_origin
 
 import draccus
 from draccus.argparsing import ArgumentParser
-from draccus.utils import DraccusException
+from draccus.utils import CONFIG_ARG, DecodingError, DraccusException
 
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError, suggest
 
@@ -47,6 +48,24 @@ type Kind = Literal["switch", "text", "value"]
 class _Parser(ArgumentParser[Any]):
     """draccus' parser that raises `UsageError` instead of ending the process."""
 
+    def tidy_groups(self) -> None:
+        """One flag for each nested dataclass. draccus registers it twice, lists both, and one of
+        a deeper dataclass (``--ball`` beside ``--env.ball``) under a name that it then refuses."""
+        known = self.parser._option_string_actions
+        groups = {flag.rpartition(".")[0] for flag in known}
+        listed = self.parser._optionals._group_actions
+        for action in [a for a in listed if a.dest not in ("help", CONFIG_ARG)]:
+            flag = action.option_strings[-1]
+            if known.get(flag) is action and flag in groups:
+                action.metavar = "{NAME: VALUE, ...}"
+                action.help = f"several of the options {flag}.NAME at once"
+                action.default = argparse.SUPPRESS  # there is none to show
+                continue
+            listed.remove(action)
+            if known.get(flag) is action:
+                self.parser._actions.remove(action)
+                del known[flag]
+
     def flag_kinds(self) -> dict[str, Kind]:
         """What each flag takes: "switch", "text" (used as it is written) or "value" (YAML)."""
         actions = [a for a in self.parser._actions if a.option_strings[-1].startswith("--")]
@@ -60,6 +79,22 @@ class _Parser(ArgumentParser[Any]):
                 text = action.type is str and not action.choices and not group
                 kinds[name] = "text" if text else "value"
         return kinds
+
+    def flag_types(self) -> dict[str, str]:
+        """Flag -> what its value must be, in `_spoken` words; text and groups are left out."""
+        actions = [a for a in self.parser._actions if a.type not in (None, str)]
+        return {a.option_strings[-1]: _spoken(a.type) for a in actions}
+
+
+def _spoken(kind: object) -> str:
+    """A type as it is written on a command line: ``[float, float]``, ``int or null``."""
+    parts = [_spoken(part) for part in get_args(kind)]
+    if get_origin(kind) is tuple:
+        return f"[{', '.join(parts)}]"
+    if kind is Ellipsis:
+        return "..."
+    name = "null" if kind is NoneType else getattr(kind, "__name__", str(kind))
+    return " or ".join(parts) or str(name)
 
 
 class _TeachingHelp(argparse.ArgumentDefaultsHelpFormatter):
@@ -87,17 +122,36 @@ def parse_config[C](
         epilog=epilog,
         exit_on_error=False,
     )
-    kinds = parser.flag_kinds()
+    parser.tidy_groups()
+    kinds, types = parser.flag_kinds(), parser.flag_types()
     args = [_checked(arg, kinds, prog) for arg in _joined(argv)]
     try:
         with _defaults_file(defaults(args) if defaults else {}) as path:
             parser.config_path = path
             config: C = parser.parse_args([_verbatim(arg, kinds) for arg in args])
     except (DraccusException, argparse.ArgumentError, ValueError, TypeError) as error:
-        raise UsageError(f"{' '.join(str(error).split())}; see {prog} --help") from error
+        if own := _own_error(error):
+            raise own from None
+        words = _wrong_value(error, args, types) or " ".join(str(error).split())
+        raise UsageError(f"{words}; see {prog} --help") from error
     except OSError as error:
         raise UsageError(f"cannot read {error.filename}: {error.strerror}") from error
     return config
+
+
+def _own_error(error: BaseException) -> EgovcpError | None:
+    """What a config said itself against its values, below what draccus wrapped around it."""
+    cause: BaseException | None = error
+    while cause is not None and not isinstance(cause, EgovcpError):
+        cause = cause.__cause__
+    return cause
+
+
+def _wrong_value(error: Exception, args: Sequence[str], types: Mapping[str, str]) -> str:
+    """``--count=many: expected int``; empty where no single flag is at fault."""
+    flag = f"--{'.'.join(error.key_path)}" if isinstance(error, DecodingError) else ""
+    given = [arg for arg in args if arg.partition("=")[0] == flag]
+    return f"{given[-1]}: expected {types[flag]}" if given and flag in types else ""
 
 
 @contextlib.contextmanager

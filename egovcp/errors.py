@@ -6,7 +6,9 @@ A message says what was found, what was expected, where, and what to do.
 from __future__ import annotations
 
 import difflib
+import os
 from collections.abc import Iterable
+from typing import Self
 
 
 class EgovcpError(Exception):
@@ -25,6 +27,29 @@ class DataError(EgovcpError):
     """A dataset is missing, damaged, of another schema, or cannot be mixed."""
 
     exit_code = 3
+    problem: str = ""
+    """What is wrong, without the place; empty: the message says it all."""
+    file: str = ""
+    """The file at fault, if that is known."""
+    episode: int | None = None
+    """The episode at fault, if it is one."""
+    frame: int | None = None
+    """The frame of that episode, if it is one."""
+
+    @classmethod
+    def at(
+        cls,
+        file: str | os.PathLike[str],
+        problem: str,
+        episode: int | None = None,
+        frame: int | None = None,
+    ) -> Self:
+        """``"FILE, episode 3, frame 7: problem"``, with the place kept for reports."""
+        numbers = {"episode": episode, "frame": frame}
+        place = [f"{name} {number}" for name, number in numbers.items() if number is not None]
+        error = cls(f"{', '.join([str(file), *place])}: {problem}")
+        error.problem, error.file, error.episode, error.frame = problem, str(file), episode, frame
+        return error
 
 
 class ArtefactError(EgovcpError):

@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
-import importlib.metadata
-import platform
 import shlex
 import signal
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from typing import Final
 
 import draccus
 
 from egovcp.cli import run_command
-from egovcp.data import DatasetWriter, Provenance
+from egovcp.data import Provenance
+from egovcp.data.committer import Committer, committing
 from egovcp.data.source import local_root
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.env import decided
-from egovcp_collect.config import CollectConfig
+from egovcp_collect.backend import Backend
+from egovcp_collect.config import SHAPING, CollectConfig
+from egovcp_collect.crew import Crew
 from egovcp_collect.progress import Progress
-from egovcp_collect.workers import Shared, SimulationFailed, make_shared, run_groups
+from egovcp_collect.resume import require_same
+from egovcp_collect.versions import installed_versions
 
-PROG = "egovcp-collect"
-_PACKAGES = ("egovcp", "mujoco", "mjlab", "numpy", "lerobot")
+PROG: Final = "egovcp-collect"
+_EPILOG: Final = (
+    "Every finished episode is safe on the disk at once. Whatever ends the command, the same "
+    "command with --resume goes on from there; with more --episodes it extends a dataset."
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,95 +38,115 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = sys.argv[1:] if argv is None else list(argv)
     command = shlex.join([PROG, *args])
     return run_command(
-        CollectConfig,
-        partial(collect, command=command),
-        args,
-        prog=PROG,
-        epilog="Ctrl-C keeps the episodes that are finished.",
+        CollectConfig, partial(collect, command=command), args, prog=PROG, epilog=_EPILOG
     )
 
 
 def collect(config: CollectConfig, command: str = "") -> None:
-    """Simulate, write the dataset and print a summary.
+    """Simulate what is missing, commit it shard by shard, and print a summary.
 
-    An interrupt, or an error of a worker, keeps the finished episodes and is then raised.
+    Whatever ends it early, every finished episode is sealed, and those that follow each other from
+    the first are in the dataset.
 
     Raises:
-        UsageError: an option makes no sense, or the folder exists.
+        UsageError: an option makes no sense, or something is there already.
+        DataError: what is there is damaged, or simulation went wrong.
+        EnvironmentFailure: another process writes the dataset; workers cannot be kept alive.
+        OSError: the disk is full.
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     config.check()
     config = replace(config, env=decided(config.env))
-    writer = DatasetWriter(local_root(config.dataset), _provenance(config, command))
-    try:
-        with Progress(config.episodes) as progress:
-            failure = _write_all(config, writer, progress)
-    except BaseException:
-        writer.discard()
-        raise
-    if writer.num_episodes:
-        writer.finalize()
-        print(progress.summary())
-    else:
-        writer.discard()
-    if failure is not None:
-        raise failure
-
-
-def _write_all(
-    config: CollectConfig, writer: DatasetWriter, progress: Progress
-) -> BaseException | None:
-    """Write episodes until all are there; what ended the simulation early, if anything did."""
-    shared = make_shared()
-
-    def refresh() -> None:
-        progress.show(shared.steps.value)
-
-    with _stop_on_signal(shared), closing(run_groups(config, shared, refresh)) as groups:
-        while True:
+    provenance = _provenance(config, command)
+    agree = partial(require_same, provenance) if config.resume else None
+    root = local_root(config.dataset)
+    with committing(root, provenance, config.shard_episodes, agree) as committer:
+        already = committer.committed + committer.sealed
+        with Progress(config.episodes, already, lambda: _disk_bytes(committer)) as progress:
             try:
-                group = next(groups, None)
-            except SimulationFailed as failed:
-                return failed.__cause__
-            if group is None:
-                break
-            for episode in group:
-                writer.add(episode)
-                progress.add(episode)
-            refresh()
-        return None if writer.num_episodes == config.episodes else KeyboardInterrupt()
+                _collect(config, committer, progress)
+            finally:
+                committer.commit()
+        print(_summary(committer, progress))
+        if committer.committed < config.episodes:
+            raise KeyboardInterrupt
+
+
+def _collect(config: CollectConfig, committer: Committer, progress: Progress) -> None:
+    """Until every episode is sealed, or a signal asks to stop."""
+    missing = set(committer.missing(config.episodes))
+    scenarios = [s for s in config.scenarios() if s.episode in missing]
+    if not scenarios:
+        return
+    backend = _backend(config, committer)
+    workers = config.num_workers or backend.cores
+    with (
+        _stop_on_signal() as stopped,
+        Crew(backend, workers, scenarios, config.num_envs, config.worker_timeout) as crew,
+    ):
+        while not crew.over and not stopped:
+            for report in crew.poll():
+                for sealed in report.sealed:
+                    committer.spool.put(sealed)
+                for brief in report.done:
+                    committer.note(brief.number)
+                progress.add(report)
+            progress.show()
+            if committer.shard_is_ready:
+                committer.commit()
+
+
+def _backend(config: CollectConfig, committer: Committer) -> Backend:
+    if config.backend == "ray":
+        from egovcp_collect.cluster import RayBackend
+
+        return RayBackend(config)
+    from egovcp_collect.local import LocalBackend
+
+    return LocalBackend(config, committer.spool.folder)
 
 
 @contextmanager
-def _stop_on_signal(shared: Shared) -> Iterator[None]:
-    """SIGINT and SIGTERM ask the workers to stop at their next tick."""
+def _stop_on_signal() -> Iterator[list[int]]:
+    """The first SIGINT or SIGTERM fills the list; the second interrupts at once."""
+    received: list[int] = []
 
     def request(number: int, frame: object) -> None:
-        shared.stop.value = 1
+        if received:
+            raise KeyboardInterrupt
+        received.append(number)
 
     previous = {s: signal.signal(s, request) for s in (signal.SIGINT, signal.SIGTERM)}
     try:
-        yield
+        yield received
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
 
 
-def _provenance(config: CollectConfig, command: str) -> Provenance:
-    controller = make_controller(config.env.controller)
-    settings = draccus.encode(config)
-    del settings["dataset"]
-    return Provenance(
-        controller_id=controller.id,
-        seed=config.seed,
-        command=command,
-        versions={"python": platform.python_version(), **_versions()},
-        config=settings,
+def _disk_bytes(committer: Committer) -> int:
+    files = committer.root.glob("data/*/*.parquet")
+    return committer.spool.size() + sum(file.stat().st_size for file in files)
+
+
+def _summary(committer: Committer, progress: Progress) -> str:
+    """The last line of the command."""
+    waiting = f", {committer.sealed} more sealed for --resume" if committer.sealed else ""
+    return (
+        f"{committer.committed} episodes, {committer.frames} steps, {progress.rate:.0f} steps/s"
+        f"{waiting}"
     )
 
 
-def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in _PACKAGES}
+def _provenance(config: CollectConfig, command: str) -> Provenance:
+    settings = draccus.encode(config)
+    return Provenance(
+        controller_id=make_controller(config.env.controller).id,
+        seed=config.seed,
+        command=command,
+        versions=installed_versions(),
+        config={name: settings[name] for name in SHAPING},
+    )
 
 
 if __name__ == "__main__":

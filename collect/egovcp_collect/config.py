@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-import os
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 from egovcp.data import DatasetConfig
+from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT, TASKS
 
-ALL_TASKS = "all"
+ALL_TASKS: Final = "all"
+#: Options that an episode depends on; the others only say how the work is done.
+SHAPING: Final = ("task", "mix", "seed", "eta", "boundary", "env")
+
+
+_LEAST: Final = {
+    "episodes": 1,
+    "seed": 0,
+    "num_workers": 0,
+    "num_envs": 1,
+    "shard_episodes": 1,
+    "worker_timeout": 1,
+}
 
 
 @dataclass(frozen=True)
@@ -38,11 +50,20 @@ class CollectConfig:
     mix: MixConfig = field(default_factory=MixConfig)
     """Shares of the tasks under --task=all."""
     episodes: int = 200
-    """Number of episodes."""
+    """Number of episodes, those that --resume finds included."""
+    resume: bool = False
+    """Go on with the collection that is there, if any; with more episodes, extend the dataset."""
+    shard_episodes: int = SHARD_EPISODES
+    """Episodes per data file; the dataset grows by one such shard at a time."""
     seed: int = 0
     """Episode i is a function of (seed, i) alone, whatever the number of workers."""
+    backend: Literal["local", "ray"] = "local"
+    """Where the workers run: as processes of this machine, or on a Ray cluster (RAY_ADDRESS; needs
+    egovcp-collect[ray])."""
     num_workers: int = 0
-    """Processes that simulate; 0: one per processor core."""
+    """Processes that simulate; 0: one per processor core, of the cluster under --backend=ray."""
+    worker_timeout: float = 120.0
+    """A worker that reports nothing for so long is replaced, s."""
     num_envs: int = 16
     """Robots that each process simulates side by side."""
     eta: float = ACTION_ETA
@@ -57,7 +78,7 @@ class CollectConfig:
         choices = (*TASKS, ALL_TASKS)
         if self.task not in choices:
             raise UsageError(f"unknown task --task={self.task}{suggest(self.task, choices)}")
-        for name, least in (("episodes", 1), ("seed", 0), ("num_workers", 0), ("num_envs", 1)):
+        for name, least in _LEAST.items():
             value = getattr(self, name)
             if value < least:
                 raise UsageError(f"--{name}={value}: expected at least {least}")
@@ -70,12 +91,6 @@ class CollectConfig:
             raise UsageError(f"{self.mix}: expected weights of at least 0, and one above it")
         if self.dataset.revision:
             raise UsageError("--dataset.revision has no meaning for a new dataset; drop it")
-
-    @property
-    def workers(self) -> int:
-        """Number of processes; no more than there are groups of episodes."""
-        wanted = self.num_workers or len(os.sched_getaffinity(0))
-        return min(wanted, len(self.groups()))
 
     def scenarios(self) -> tuple[Scenario, ...]:
         """The episodes in order. Tasks interleave so that every prefix holds their shares."""
@@ -90,11 +105,6 @@ class CollectConfig:
             counts[k] += 1
             chosen.append(Scenario(TASKS[k], self.seed, i))
         return tuple(chosen)
-
-    def groups(self) -> list[tuple[Scenario, ...]]:
-        """The episodes in groups that are simulated side by side."""
-        scenarios, size = self.scenarios(), self.num_envs
-        return [scenarios[i : i + size] for i in range(0, len(scenarios), size)]
 
     def _weights(self) -> tuple[float, ...]:
         return tuple(getattr(self.mix, task) for task in TASKS)

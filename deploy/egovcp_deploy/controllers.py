@@ -8,13 +8,14 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.plan import Policy, PolicyStep
+from egovcp.plan import PolicyStep
 from egovcp.sim.env import Observation, VectorEnv
 from egovcp.sim.oracles import Oracle
 from egovcp.sim.policies import Hold, RandomWalk
 from egovcp.sim.policies import Policy as ReferencePolicy
 from egovcp.sim.scenario import Scenario
 from egovcp_deploy.options import PLANNER
+from egovcp_deploy.policy import RolloutPolicy
 from egovcp_deploy.robots.sim import SimRobot
 
 Array = NDArray[np.float64]
@@ -38,26 +39,10 @@ class Controller(Protocol):
         ...
 
 
-class PlanningPolicy(Protocol):
-    """What is needed of `egovcp.plan.Policy` here."""
-
-    def reset(self) -> None:
-        """Forget the past."""
-        ...
-
-    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
-        """Observations of E robots -> plans."""
-        ...
-
-    def advance(self, sent: NDArray[np.floating]) -> None:
-        """The actions that were really sent."""
-        ...
-
-
 class Planned:
     """The world model's policy; it sees the observation and nothing else."""
 
-    def __init__(self, policy: PlanningPolicy | Policy) -> None:
+    def __init__(self, policy: RolloutPolicy) -> None:
         self._policy = policy
 
     def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
@@ -138,11 +123,3 @@ class Scripted:
     def advance(self, sent: NDArray[np.floating]) -> None:
         """Hand on what was sent."""
         self._controller.advance(np.asarray(sent, np.float64))
-
-    def reconstruct(self) -> NDArray[np.float32]:
-        """There is no world model."""
-        raise NotImplementedError
-
-    def imagine(self, plan: NDArray[np.floating], horizon: int) -> NDArray[np.float32]:
-        """There is no world model."""
-        raise NotImplementedError

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -13,7 +13,7 @@ import draccus
 import numpy as np
 from tqdm import tqdm
 
-from egovcp.artefact import Artefact, load_artefact
+from egovcp.artefact import Artefact
 from egovcp.cli import run_command
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.log.info import RunInfo
@@ -32,12 +32,14 @@ from egovcp_deploy.options import (
     check_choice,
     check_output_dir,
     check_positive,
+    load_policy,
     make_output_dir,
     versions,
     write_json,
 )
+from egovcp_deploy.policy import RolloutPolicy
 from egovcp_deploy.robots import Robot
-from egovcp_deploy.runner import RolloutPolicy, RolloutSummary, Runner
+from egovcp_deploy.runner import RolloutSummary, Runner
 from egovcp_deploy.scenarios import eventful, held_out
 
 if TYPE_CHECKING:
@@ -48,7 +50,8 @@ ROBOTS: Final = ("sim",)
 DRIVERS: Final = (PLANNER, *REFERENCES)
 _EPILOG: Final = (
     "Rollout i plays held-out scenario i of --seed, the same that egovcp-eval plays. "
-    "Writes rollout-<i>.mcap, rollout-<i>.rrd, a picture rollout-0.png, and deploy.json."
+    "Writes rollout-<i>.mcap, rollout-<i>.rrd, a picture rollout-0.png, and deploy.json, which "
+    "sums up the rollouts that came to their end, also when the others were interrupted."
 )
 
 
@@ -85,7 +88,8 @@ class DeployConfig:
     output_dir: str = ""
     """New folder for recordings and summary."""
     imagine: int = 16
-    """How far ahead to imagine depth for the recordings, ticks of 40 ms; 0: not at all."""
+    """How far ahead the world model imagines depth for the recordings, ticks of 40 ms; 0: not at
+    all."""
     env: EnvConfig = field(default_factory=eventful)
     """Scenes, sensors, delays and randomisation of the simulated robot."""
 
@@ -98,31 +102,24 @@ def main(argv: Sequence[str] | None = None) -> int:
 def deploy(config: DeployConfig) -> None:
     """Check everything, then play and record the rollouts.
 
+    Whatever ends it, an interrupt too, the rollouts that came to their end are summed up.
+
     Raises:
         UsageError: an option makes no sense, or the folder holds results.
         ArtefactError: the artefact is missing, damaged, or not made for this robot.
     """
     _check(config)
-    artefact = _load_policy(config)
+    planned = config.controller == PLANNER
+    artefact = load_policy(config.policy, config.planner) if planned else None
     robot = make_robot(config)
     try:
+        config = replace(config, env=robot.env.config)  # as decided for its controller
         policy = _make_policy(config, artefact, robot)
         folder = make_output_dir(config.output_dir)
-        rate = FixedRate(PLANNER_HZ, LockstepClock())
-        runner = Runner(policy, robot, rate, config.imagine if artefact else 0)
-        summaries = _play(config, artefact, robot, runner, folder)
+        runner = Runner(policy, robot, FixedRate(PLANNER_HZ, LockstepClock()), config.imagine)
+        _play(config, artefact, robot, runner, folder)
     finally:
         robot.close()
-    write_json(folder / "deploy.json", _report(config, artefact, robot, summaries))
-    _print(summaries, folder)
-
-
-def _load_policy(config: DeployConfig) -> Artefact | None:
-    if config.controller != PLANNER:
-        return None
-    artefact = load_artefact(config.policy.path, config.policy.revision)
-    config.planner.apply(artefact.planner)
-    return artefact
 
 
 def _make_policy(config: DeployConfig, artefact: Artefact | None, robot: SimRobot) -> RolloutPolicy:
@@ -131,7 +128,7 @@ def _make_policy(config: DeployConfig, artefact: Artefact | None, robot: SimRobo
 
         return Scripted(reference(config.controller), robot)
     artefact.require_controller(robot.controller_id)
-    return artefact.make_policy(1, config.seed, config.planner.apply(artefact.planner))
+    return artefact.make_policy(1, config.seed)
 
 
 def _check(config: DeployConfig) -> None:
@@ -140,11 +137,8 @@ def _check(config: DeployConfig) -> None:
     check_positive("--episodes", config.episodes)
     held_out(config.task, config.seed, 0)
     check_choice("--controller", config.controller, DRIVERS)
-    if config.controller == PLANNER and not config.policy.path:
-        raise UsageError(
-            "--policy.path is missing; name the artefact, or choose a reference that needs none, "
-            "such as --controller=oracle"
-        )
+    if config.controller == PLANNER:
+        config.policy.require("choose a reference that needs none, such as --controller=oracle")
     if config.imagine < 0:
         raise UsageError(f"--imagine={config.imagine}: expected a number of ticks from 0")
     check_output_dir(config.output_dir)
@@ -168,16 +162,21 @@ def make_robot(config: DeployConfig) -> SimRobot:
 
 def _play(
     config: DeployConfig, artefact: Artefact | None, robot: Robot, runner: Runner, folder: Path
-) -> list[RolloutSummary]:
-    summaries = []
-    with tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar:
-        for episode in range(config.episodes):
-            robot.start(episode)
-            info = _run_info(config, artefact, robot, episode)
-            with _recording(folder, episode, info) as sink:
-                summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))
-            bar.update(1)
-    return summaries
+) -> None:
+    """Record one rollout after the other and, whatever ends them, sum up the complete ones."""
+    summaries: list[RolloutSummary] = []
+    try:
+        with tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar:
+            for episode in range(config.episodes):
+                robot.start(episode)
+                info = _run_info(config, artefact, robot, episode)
+                with _recording(folder, episode, info) as sink:
+                    summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))
+                bar.update(1)
+    finally:
+        if summaries:
+            write_json(folder / "deploy.json", _report(config, artefact, robot, summaries))
+            _print(summaries, folder)
 
 
 @contextmanager

@@ -15,14 +15,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from egovcp.artefact import Artefact, load_artefact
+from egovcp.artefact import Artefact
 from egovcp.errors import EnvironmentFailure
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.controllers import Constants, Controller, Planned, reference
-from egovcp_deploy.options import PlannerOptions
+from egovcp_deploy.options import PlannerOptions, PolicyOptions, load_policy
 from egovcp_deploy.safety import SafetyFilter
 from egovcp_deploy.scores import EpisodeScore
 
@@ -32,9 +32,8 @@ class Setup:
     """What every group needs; sent to each worker once."""
 
     env: EnvConfig
-    policy_path: str = ""
-    """Empty when no planner plays."""
-    revision: str = ""
+    policy: PolicyOptions = field(default_factory=PolicyOptions)
+    """Names nothing when no planner plays."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     seed: int = 0
 
@@ -75,9 +74,8 @@ class Player:
             return reference(group.controller)
         setup = self._setup
         if self._artefact is None:
-            self._artefact = load_artefact(setup.policy_path, setup.revision)
-        planner = setup.planner.apply(self._artefact.planner)
-        return Planned(self._artefact.make_policy(len(group.scenarios), setup.seed, planner))
+            self._artefact = load_policy(setup.policy, setup.planner)
+        return Planned(self._artefact.make_policy(len(group.scenarios), setup.seed))
 
 
 def play(
@@ -138,7 +136,7 @@ class Stage:
     Args:
         setup: what all groups share.
         num_workers: processes; 1 plays in this process, 0 takes one per processor core.
-        artefact: spares this process loading it again.
+        artefact: what `load_policy` makes of the setup; spares this process loading it again.
     """
 
     def __init__(

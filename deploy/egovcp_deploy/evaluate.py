@@ -12,7 +12,7 @@ from typing import Any, Final
 import draccus
 from tqdm import tqdm
 
-from egovcp.artefact import Artefact, load_artefact
+from egovcp.artefact import Artefact
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.robot.controllers import make_controller
@@ -29,6 +29,7 @@ from egovcp_deploy.options import (
     check_choice,
     check_output_dir,
     check_positive,
+    load_policy,
     make_output_dir,
     versions,
     write_json,
@@ -109,10 +110,8 @@ class EvalConfig:
         if self.num_workers < 0:
             raise UsageError(f"--num_workers={self.num_workers}: expected 0 or more")
         held_out(self.tasks[0], self.seed, 0)
-        if "planner" in self.players and not self.policy.path:
-            raise UsageError(
-                "--policy.path is missing; name the artefact, or leave planner out of --controllers"
-            )
+        if "planner" in self.players:
+            self.policy.require("leave planner out of --controllers")
         check_output_dir(self.output_dir)
 
 
@@ -134,9 +133,7 @@ def evaluate(config: EvalConfig) -> None:
     constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
     artefact = _load_policy(config)
     folder = make_output_dir(config.output_dir)
-    setup = Setup(
-        config.env, config.policy.path, config.policy.revision, config.planner, config.seed
-    )
+    setup = Setup(config.env, config.policy, config.planner, config.seed)
     with closing(Stage(setup, config.num_workers, artefact)) as stage:
         if "constant" in config.players:
             constants = _find_constants(config, stage, constants)
@@ -152,9 +149,8 @@ def evaluate(config: EvalConfig) -> None:
 def _load_policy(config: EvalConfig) -> Artefact | None:
     if "planner" not in config.players:
         return None
-    artefact = load_artefact(config.policy.path, config.policy.revision)
+    artefact = load_policy(config.policy, config.planner)
     artefact.require_controller(make_controller(config.env.controller).id)
-    config.planner.apply(artefact.planner)
     return artefact
 
 

@@ -10,6 +10,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
+from egovcp.artefact import Artefact, load_artefact
 from egovcp.errors import EnvironmentFailure, UsageError, suggest
 from egovcp.plan import PlannerConfig
 
@@ -26,6 +27,11 @@ class PolicyOptions:
     """Folder of the artefact, or its Hub id `user/name`."""
     revision: str = ""
     """Branch, tag or commit SHA on the Hub; empty: the latest."""
+
+    def require(self, otherwise: str) -> None:
+        """Raise `UsageError`, which offers to do ``otherwise``, unless an artefact is named."""
+        if not self.path:
+            raise UsageError(f"--policy.path is missing; name the artefact, or {otherwise}")
 
 
 @dataclass(frozen=True)
@@ -48,6 +54,18 @@ class PlannerOptions:
             UsageError: the numbers do not go together.
         """
         return replace(planner, **{k: v for k, v in asdict(self).items() if v is not None})
+
+
+def load_policy(policy: PolicyOptions, planner: PlannerOptions) -> Artefact:
+    """The artefact, whose planner is changed as the options say.
+
+    Raises:
+        ArtefactError: missing, tampered with, or made for another feature spec.
+        EnvironmentFailure: the Hub cannot be reached.
+        UsageError: the planner's numbers do not go together.
+    """
+    artefact = load_artefact(policy.path, policy.revision)
+    return replace(artefact, planner=planner.apply(artefact.planner))
 
 
 def check_choice(flag: str, value: str, valid: Iterable[str]) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,38 +20,12 @@ from egovcp.log.tick import Candidates, Tick
 from egovcp.plan import PolicyStep
 from egovcp.rate import FixedRate
 from egovcp.spec import ACTION_BOX
+from egovcp_deploy.policy import ImaginingPolicy, RolloutPolicy
 from egovcp_deploy.robots.base import Outcome, Robot, Sensed
 from egovcp_deploy.safety import SafetyFilter
 
 LOGGED_CANDIDATES: Final = 32  # best first; more would hide the picture
 REJECTED: Final = "plan rejected: not finite"
-
-
-class RolloutPolicy(Protocol):
-    """What the runner needs of `egovcp.plan.Policy`, for one robot.
-
-    One that does not plan returns empty arrays, and nothing of them is logged.
-    """
-
-    def reset(self) -> None:
-        """Forget the past."""
-        ...
-
-    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
-        """Depth (1, 48, 64) mm and state (1, 74) -> plan."""
-        ...
-
-    def advance(self, sent: NDArray[np.floating]) -> None:
-        """The action (1, 7) that was really sent."""
-        ...
-
-    def reconstruct(self) -> NDArray[np.float32]:
-        """(1, 48, 64) m."""
-        ...
-
-    def imagine(self, plan: NDArray[np.floating], horizon: int) -> NDArray[np.float32]:
-        """(1, horizon, 48, 64) m."""
-        ...
 
 
 @dataclass
@@ -90,10 +64,11 @@ class Runner:
     """Drives one robot with one policy.
 
     Args:
-        policy: the world model's policy for one robot.
+        policy: decides for one robot.
         robot: lock-step simulation or hardware.
         rate: paces the loop; its clock gives each tick's time.
-        imagine: how many ticks ahead to decode for the log; 0 decodes nothing.
+        imagine: how many ticks ahead to decode for the log, of a policy that can imagine; 0
+            decodes nothing.
         max_ticks: end of a rollout on a robot that knows no time limit.
     """
 
@@ -109,6 +84,7 @@ class Runner:
         self._robot = robot
         self._rate = rate
         self._imagine = imagine
+        self._imagining = policy if imagine and isinstance(policy, ImaginingPolicy) else None
         self._max_ticks = max_ticks
         self._safety = SafetyFilter()
 
@@ -147,10 +123,10 @@ class Runner:
 
     def _decode(self, step: PolicyStep) -> _Decoded:
         """Pictures for the log. They come before the carry advances, for they show o_t."""
-        if self._imagine == 0:
+        if self._imagining is None:
             return _Decoded(None, None)
-        film = self._policy.imagine(step.plan, self._imagine)
-        return _Decoded(self._policy.reconstruct()[0], film[0])
+        film = self._imagining.imagine(step.plan, self._imagine)
+        return _Decoded(self._imagining.reconstruct()[0], film[0])
 
 
 class Stopwatch:

@@ -8,11 +8,18 @@
 Each returns quietly, or raises an `EgovcpError` that says what is wrong and where.
 """
 
-from egovcp.checks.artefact import check_artefact
-from egovcp.checks.dataset import check_dataset
-from egovcp.checks.environment import check_env
-from egovcp.checks.world_model import check_world_model
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING
+
 from egovcp.errors import ConformanceError
+
+if TYPE_CHECKING:
+    from egovcp.checks.artefact import check_artefact
+    from egovcp.checks.dataset import check_dataset
+    from egovcp.checks.environment import check_env
+    from egovcp.checks.world_model import check_world_model
 
 __all__ = [
     "ConformanceError",
@@ -21,3 +28,17 @@ __all__ = [
     "check_env",
     "check_world_model",
 ]
+
+#: Each check is imported when it is asked for: whoever checks a dataset need not wait for torch.
+_MODULES = {
+    "check_artefact": "artefact",
+    "check_dataset": "dataset",
+    "check_env": "environment",
+    "check_world_model": "world_model",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -1,11 +1,12 @@
 """Datasets: episodes as arrays, the LeRobot writer and reader, training batches.
 
-In one line, all frames of a dataset as arrays::
+In one line, a dataset as padded arrays [Batch, Time, Data]::
 
-    EpisodeStore.load([DatasetReader.open(DatasetConfig(root="..."))])
+    load_arrays("data/ball")["action"]  # (B, T, 7)
 """
 
 from egovcp.cli import DatasetConfig
+from egovcp.data.arrays import load_arrays, open_dataset
 from egovcp.data.episode import Episode
 from egovcp.data.provenance import Provenance
 from egovcp.data.reader import DatasetReader
@@ -26,6 +27,8 @@ __all__ = [
     "SequenceStream",
     "StreamConfig",
     "is_terminal",
+    "load_arrays",
     "mc_return",
     "mc_valid",
+    "open_dataset",
 ]

@@ -35,7 +35,7 @@ def read_version(root: Path) -> tuple[Contents, list[EncodedEpisode], Provenance
     info = metadata.load_info(root)
     table = metadata.load_episode_table(root, info)
     episodes = len(table.length)
-    collection = metadata.load_collection(root, episodes)
+    collection = metadata.load_collection(root, table.length)
     size = collection.get("shard_episodes")
     if not isinstance(size, int) or size < 1 or not load_hashes(root):
         raise DataError(

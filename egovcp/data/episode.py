@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -66,18 +66,25 @@ class Episode:
 
     def validate(self, where: str = "episode") -> None:
         """Raise `DataError` saying what is wrong, and at which frame of ``where``."""
-        _check_layout(self, where)
-        _check_values(self, where)
-        _check_ending(self, where)
+        for frame, problem in self.problems():
+            place = where if frame is None else f"{where}, frame {frame}"
+            raise DataError(f"{place}: {problem}")
+
+    def problems(self) -> Iterator[tuple[int | None, str]]:
+        """Everything that is wrong: (first frame at fault, or None; what is wrong)."""
+        layout = list(_layout_problems(self))
+        yield from layout
+        if not layout:
+            yield from _value_problems(self)
+            yield from _ending_problems(self)
 
 
-def _check_layout(episode: Episode, where: str) -> None:
+def _layout_problems(episode: Episode) -> Iterator[tuple[int | None, str]]:
     if episode.task not in spec.TASKS:
-        hint = suggest(episode.task, spec.TASKS)
-        raise DataError(f"{where}: unknown task {episode.task!r}{hint}")
+        yield None, f"unknown task {episode.task!r}{suggest(episode.task, spec.TASKS)}"
     length = len(episode.reward)
     if length == 0:
-        raise DataError(f"{where}: no frames, expected at least one")
+        yield None, "no frames, expected at least one"
     layout: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
         "depth": ((length, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16),
         "state": ((length, spec.STATE_DIM), np.float32),
@@ -90,39 +97,36 @@ def _check_layout(episode: Episode, where: str) -> None:
     for name, (shape, dtype) in layout.items():
         array = getattr(episode, name)
         if array.shape != shape or array.dtype != dtype:
-            raise DataError(
-                f"{where}: {name} is {array.dtype} {array.shape}, "
-                f"expected {np.dtype(dtype)} {shape}"
-            )
+            found, expected = f"{array.dtype} {array.shape}", f"{np.dtype(dtype)} {shape}"
+            yield None, f"{name} is {found}, expected {expected}"
 
 
-def _check_values(episode: Episode, where: str) -> None:
+def _value_problems(episode: Episode) -> Iterator[tuple[int, str]]:
     for name in ("state", "action", "reward"):
         finite = np.isfinite(getattr(episode, name)).reshape(len(episode), -1).all(axis=1)
-        _require(finite, where, f"{name} is not finite")
-    largest = np.abs(episode.action).max(axis=1)
-    _require(largest <= 1 + _ACTION_SLACK, where, "action lies outside [-1, 1]")
+        yield from _where_not(finite, f"{name} is not finite")
+    inside = ~(np.abs(episode.action).max(axis=1) > 1 + _ACTION_SLACK)  # NaN is told above
+    yield from _where_not(inside, "action lies outside [-1, 1]")
     farthest = round(spec.DEPTH_MAX_M * 1000)
     deepest = episode.depth.reshape(len(episode), -1).max(axis=1)
-    _require(
-        np.less_equal(deepest, farthest),
-        where,
-        f"depth exceeds the camera's range of {farthest} mm",
-    )
+    near = np.less_equal(deepest, farthest)
+    yield from _where_not(near, f"depth exceeds the camera's range of {farthest} mm")
 
 
-def _check_ending(episode: Episode, where: str) -> None:
+def _ending_problems(episode: Episode) -> Iterator[tuple[int | None, str]]:
     last = np.arange(len(episode)) == len(episode) - 1
-    _require(episode.done == last, where, "done must be set at the last frame, and only there")
-    _require(~episode.truncated | last, where, "truncated before the last frame")
+    once = "done must be set at the last frame, and only there"
+    yield from _where_not(episode.done == last, once)
+    yield from _where_not(~episode.truncated | last, "truncated before the last frame")
     length, limit = len(episode), episode.time_limit
     if length > limit or (episode.truncated[-1] and length != limit):
-        raise DataError(
-            f"{where}: {length} frames, truncated={bool(episode.truncated[-1])}, "
-            f"do not fit its time limit of {limit} ticks"
+        yield (
+            None,
+            f"{length} frames, truncated={bool(episode.truncated[-1])}, do not fit its time limit "
+            f"of {limit} ticks",
         )
 
 
-def _require(ok: NDArray[np.bool_], where: str, problem: str) -> None:
+def _where_not(ok: NDArray[np.bool_], problem: str) -> Iterator[tuple[int, str]]:
     if not ok.all():
-        raise DataError(f"{where}, frame {int(np.argmin(ok))}: {problem}")
+        yield int(np.argmin(ok)), problem

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from egovcp.data import files, metadata, schema
+from egovcp.data.paths import files_below, require_file
 from egovcp.errors import DataError
 
 #: Below these folders every file must be listed.
@@ -22,9 +23,10 @@ def load_hashes(root: Path) -> Mapping[str, str]:
     path = root / schema.HASHES_PATH
     if not path.exists():
         return {}
+    require_file(root, path)
     hashes = metadata.load_object(path)
-    if not all(isinstance(value, str) for value in hashes.values()):
-        raise DataError(f"{path}: expected the SHA-256 of each file")
+    if not hashes or not all(isinstance(value, str) for value in hashes.values()):
+        raise DataError.at(path, "expected the SHA-256 of each file")
     return hashes
 
 
@@ -40,8 +42,7 @@ def covered(root: Path) -> list[str]:
     found = (
         path.relative_to(root).as_posix()
         for folder in _COVERED
-        for path in (root / folder).rglob("*")
-        if not path.is_dir()
+        for path in files_below(root / folder)
     )
     return sorted(set(found) - set(_UNLISTED))
 
@@ -52,16 +53,30 @@ def verify_hashes(root: Path) -> None:
     Raises:
         DataError: naming the first file that is missing, not listed, or different.
     """
+    for error in hash_problems(root):
+        raise error
+
+
+def hash_problems(root: Path) -> Iterator[DataError]:
+    """Every file that is missing, not listed, or different; nothing if there is no list."""
     hashes = load_hashes(root)
-    if not hashes:
-        return
-    present = covered(root)
+    present = set(covered(root)) if hashes else set()
     for name in sorted({*hashes, *present}):
         if name not in hashes:
-            raise DataError(f"{root / name} is not listed in {schema.HASHES_PATH}; remove it")
-        if name not in present:
-            raise DataError(f"{root / name} is missing; the dataset is incomplete")
-        if files.sha256(root / name) != hashes[name]:
-            raise DataError(
-                f"{root / name} is damaged: its SHA-256 is not the one in {schema.HASHES_PATH}"
-            )
+            yield DataError.at(root / name, f"not listed in {schema.HASHES_PATH}; remove it")
+        elif name not in present:
+            yield DataError.at(root / name, "missing; the dataset is incomplete")
+        else:
+            yield from _difference(root, name, hashes[name])
+
+
+def _difference(root: Path, name: str, expected: str) -> Iterator[DataError]:
+    try:
+        require_file(root, root / name)
+    except DataError as error:
+        yield error
+        return
+    if files.sha256(root / name) != expected:
+        yield DataError.at(
+            root / name, f"damaged: its SHA-256 is not the one in {schema.HASHES_PATH}"
+        )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.data import schema
+from egovcp.data.paths import check_template, require_file
+from egovcp.data.records import record_problems
 from egovcp.errors import DataError
 
 _EPISODE_COLUMNS = (
@@ -45,14 +47,18 @@ def damaged(path: Path) -> Iterator[None]:
     try:
         yield
     except FileNotFoundError as error:
-        raise DataError(f"{path} is missing; the dataset is incomplete") from error
-    except (pa.ArrowException, json.JSONDecodeError, UnicodeDecodeError, KeyError) as error:
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise DataError(f"{path} is damaged: {reason}") from error
+        raise DataError.at(path, "missing; the dataset is incomplete") from error
     except OSError as error:
         if error.errno is not None:
             raise
-        raise DataError(f"{path} is damaged: {str(error).splitlines()[0]}") from error
+        raise _damage(path, error) from error
+    except (pa.ArrowException, ValueError, TypeError, LookupError, RecursionError) as error:
+        raise _damage(path, error) from error
+
+
+def _damage(path: Path, error: Exception) -> DataError:
+    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+    return DataError.at(path, f"damaged: {reason}")
 
 
 def load_info(root: Path) -> dict[str, Any]:
@@ -62,57 +68,53 @@ def load_info(root: Path) -> dict[str, Any]:
         DataError: missing, damaged, or of another format, rate or feature set.
     """
     path = root / schema.INFO_PATH
-    info = load_object(path)
+    info = load_object(path, root)
     missing = {"codebase_version", "fps", "features", "total_episodes", "data_path"} - info.keys()
     if missing:
-        raise DataError(f"{path} lacks {', '.join(sorted(missing))}")
+        raise DataError.at(path, f"lacks {', '.join(sorted(missing))}")
     if info["codebase_version"] != schema.CODEBASE_VERSION:
-        raise DataError(
-            f"{path}: LeRobot format {info['codebase_version']}, expected "
-            f"{schema.CODEBASE_VERSION}; convert it with LeRobot's own tools"
+        raise DataError.at(
+            path,
+            f"LeRobot format {info['codebase_version']}, expected {schema.CODEBASE_VERSION}; "
+            "convert it with LeRobot's own tools",
         )
     if info["fps"] != spec.PLANNER_HZ:
-        raise DataError(f"{path}: {info['fps']} fps, expected {spec.PLANNER_HZ}")
-    _check_features(info["features"], path)
-    _check_template(info["data_path"], path)
+        raise DataError.at(path, f"{info['fps']} fps, expected {spec.PLANNER_HZ}")
+    with damaged(path):
+        _check_features(dict(info["features"]), path)
+    check_template(info["data_path"], path)
     return info
 
 
-def load_object(path: Path) -> dict[str, Any]:
-    """A JSON file that holds an object."""
+def load_object(path: Path, root: Path | None = None) -> dict[str, Any]:
+    """A JSON file that holds an object; with ``root``, one that lies inside this folder."""
+    if root is not None:
+        require_file(root, path)
     with damaged(path):
         content = json.loads(path.read_text(encoding="utf-8"))
     if not isinstance(content, dict):
-        raise DataError(f"{path} holds a {type(content).__name__}, expected an object")
+        raise DataError.at(path, f"holds a {type(content).__name__}, expected an object")
     return content
 
 
 def _check_features(features: Mapping[str, Any], path: Path) -> None:
     for key, expected in schema.FEATURES.items():
-        found = features.get(key)
-        if found is None:
-            raise DataError(f"{path}: feature {key} is missing; found: {', '.join(features)}")
+        if key not in features:
+            raise DataError.at(path, f"feature {key} is missing; found: {', '.join(features)}")
+        found = dict(features[key])
         for field in ("dtype", "shape", "names"):
             have, want = _plain(found.get(field)), _plain(expected[field])
             if have != want:
-                raise DataError(f"{path}: {key} has {field} {have}, expected {want}")
-    info = features[spec.DEPTH_KEY].get("info") or {}
+                raise DataError.at(path, f"{key} has {field} {have}, expected {want}")
+    info = dict(features[spec.DEPTH_KEY].get("info") or {})
     unit = info.get("depth_unit", schema.DEPTH_UNIT)
     if not info.get("is_depth_map") or unit != schema.DEPTH_UNIT:
-        raise DataError(f"{path}: {spec.DEPTH_KEY} is no depth map in {schema.DEPTH_UNIT}: {info}")
+        problem = f"{spec.DEPTH_KEY} is no depth map in {schema.DEPTH_UNIT}: {info}"
+        raise DataError.at(path, problem)
 
 
 def _plain(value: object) -> object:
     return list(value) if isinstance(value, list | tuple) else value
-
-
-def _check_template(template: str, path: Path) -> None:
-    if Path(template).is_absolute() or ".." in Path(template).parts:
-        raise DataError(f"{path}: data_path {template!r} leads outside of the dataset")
-    try:
-        template.format(chunk_index=0, file_index=0)
-    except (KeyError, IndexError, ValueError, AttributeError) as error:
-        raise DataError(f"{path}: data_path {template!r} is no file template") from error
 
 
 def load_episode_table(root: Path, info: Mapping[str, Any]) -> EpisodeTable:
@@ -120,15 +122,11 @@ def load_episode_table(root: Path, info: Mapping[str, Any]) -> EpisodeTable:
     folder = root / "meta" / "episodes"
     paths = sorted(folder.glob("*/*.parquet"))
     if not paths:
-        raise DataError(f"{folder} holds no parquet file; the dataset is incomplete")
-    tables = []
-    for path in paths:
-        with damaged(path):
-            tables.append(pq.ParquetFile(path).read(columns=list(_EPISODE_COLUMNS)))
-    with damaged(folder):
-        table = pa.concat_tables(tables)
-        column = {name: table[name].to_numpy() for name in _EPISODE_COLUMNS}
-    _check_episodes(column, info, folder)
+        raise DataError.at(folder, "holds no parquet file; the dataset is incomplete")
+    parts = [_episode_columns(root, path) for path in paths]
+    column = {name: np.concatenate([part[name] for part in parts]) for name in _EPISODE_COLUMNS}
+    rows = np.cumsum([len(part["length"]) for part in parts])
+    _check_episodes(column, info, root, lambda row: paths[int(np.searchsorted(rows, row, "right"))])
     return EpisodeTable(
         length=column["length"],
         chunk_index=column["data/chunk_index"],
@@ -137,12 +135,30 @@ def load_episode_table(root: Path, info: Mapping[str, Any]) -> EpisodeTable:
     )
 
 
+def _episode_columns(root: Path, path: Path) -> dict[str, NDArray[np.int64]]:
+    require_file(root, path)
+    with damaged(path):
+        table = pq.ParquetFile(path).read(columns=list(_EPISODE_COLUMNS))
+        for name in _EPISODE_COLUMNS:
+            column = table[name]
+            if column.null_count or not pa.types.is_integer(column.type):
+                raise DataError.at(path, f"column {name} is {column.type}, expected whole numbers")
+        return {name: table[name].to_numpy().astype(np.int64) for name in _EPISODE_COLUMNS}
+
+
 def _check_episodes(
-    column: Mapping[str, NDArray[np.int64]], info: Mapping[str, Any], folder: Path
+    column: Mapping[str, NDArray[np.int64]],
+    info: Mapping[str, Any],
+    root: Path,
+    file_of: Callable[[int], Path],
 ) -> None:
-    count = len(column["episode_index"])
-    if count == 0 or count != info["total_episodes"]:
-        raise DataError(f"{folder}: {count} episodes, info.json says {info['total_episodes']}")
+    path, count = root / schema.INFO_PATH, len(column["episode_index"])
+    if count == 0:
+        raise DataError.at(file_of(-1), "lists no episode, expected at least one")
+    if count != info["total_episodes"]:
+        raise DataError.at(
+            path, f"total_episodes is {info['total_episodes']}, but meta/episodes lists {count}"
+        )
     ends = column["length"].cumsum()
     consistent = (
         (column["episode_index"] == np.arange(count))
@@ -152,36 +168,55 @@ def _check_episodes(
     )
     if not consistent.all():
         bad = int(np.argmin(consistent))
-        raise DataError(f"{folder}: the index, length or frame range of episode {bad} is wrong")
+        problem = "its index, length or frame range does not follow from the episodes before it"
+        raise DataError.at(file_of(bad), problem, bad)
     if ends[-1] != info.get("total_frames"):
-        raise DataError(f"{folder}: {ends[-1]} frames, info.json says {info.get('total_frames')}")
+        raise DataError.at(
+            path,
+            f"total_frames is {info.get('total_frames')}, but meta/episodes adds to {ends[-1]}",
+        )
 
 
 def load_tasks(root: Path) -> dict[int, str]:
     """``meta/tasks.parquet``: task index -> task name."""
     path = root / schema.TASKS_PATH
+    require_file(root, path)
     with damaged(path):
         table = pq.ParquetFile(path).read(columns=["task_index", "task"])
-        return dict(zip(table["task_index"].to_pylist(), table["task"].to_pylist(), strict=True))
+        numbers, names = table["task_index"].to_pylist(), table["task"].to_pylist()
+    if len(set(numbers)) != len(numbers) or len(set(names)) != len(names):
+        raise DataError.at(path, f"lists a task twice: {names}, {numbers}")
+    return dict(zip(numbers, names, strict=True))
 
 
-def load_collection(root: Path, episodes: int) -> dict[str, Any]:
-    """``meta/collection.json``: provenance, and the scenario of each episode."""
+def load_stats(root: Path) -> dict[str, Any]:
+    """``meta/stats.json``: feature -> statistic -> values."""
+    return load_object(root / schema.STATS_PATH, root)
+
+
+def load_collection(root: Path, lengths: NDArray[np.int64]) -> dict[str, Any]:
+    """``meta/collection.json``: provenance, and the record of each episode.
+
+    Args:
+        lengths: (E,) frames of each episode, as the table of episodes has them.
+    """
     path = root / schema.COLLECTION_PATH
-    if not path.is_file():
-        raise DataError(
-            f"{path} is missing: the low-level controller and the planned episode lengths are "
-            "unknown; was this dataset collected by egovcp-collect?"
+    if not path.exists() and not path.is_symlink():
+        raise DataError.at(
+            path,
+            "missing: the low-level controller and the planned episode lengths are unknown. "
+            "If LeRobot's tools made this dataset out of others, take the facts from those: "
+            f"egovcp-dataset repair {root} --records=ORIGINAL --output_dir=NEW",
         )
-    collection = load_object(path)
+    collection = load_object(path, root)
     if collection.get("spec_version") != spec.SPEC_VERSION:
-        raise DataError(
-            f"{path}: specification {collection.get('spec_version')}, expected {spec.SPEC_VERSION}"
-        )
-    if len(collection.get("episodes", ())) != episodes:
-        raise DataError(
-            f"{path}: {len(collection.get('episodes', ()))} episodes, info.json says {episodes}"
-        )
-    if not collection.get("controller_id"):
-        raise DataError(f"{path} names no low-level controller")
+        found = collection.get("spec_version")
+        raise DataError.at(path, f"specification {found}, expected {spec.SPEC_VERSION}")
+    if not collection.get("controller_id") or not isinstance(collection["controller_id"], str):
+        raise DataError.at(path, "names no low-level controller")
+    for name in ("config", "versions"):
+        if not isinstance(collection.get(name, {}), dict):
+            raise DataError.at(path, f"its {name} is no object")
+    for episode, problem in record_problems(collection.get("episodes"), lengths):
+        raise DataError.at(path, problem, episode)
     return collection

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import lru_cache
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, Self
 
@@ -12,24 +13,23 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from egovcp import spec
 from egovcp.cli import DatasetConfig
-from egovcp.data import metadata, schema, tiff
+from egovcp.data import metadata, schema
+from egovcp.data.columns import EPISODE_FEATURES, Columns, open_data_file, to_numpy
 from egovcp.data.episode import Episode
+from egovcp.data.paths import require_file
 from egovcp.data.source import Source, locate
 from egovcp.errors import DataError, suggest
 
 _OPEN_FILES = 8
 _TIMESTAMP_SLACK = 1e-3  # s; float32 timestamps
 
-type Columns = dict[str, NDArray[Any]]
-
 
 class DatasetReader:
     """A validated dataset; the arrays themselves are read, and checked, on demand."""
 
     def __init__(self, source: Source) -> None:
-        """Check the `meta` folder of a dataset that lies on disk.
+        """Check the `meta` folder of a dataset that lies on disk; `open` looks for its files, too.
 
         Raises:
             DataError: it is damaged, incomplete, or of another specification.
@@ -37,10 +37,10 @@ class DatasetReader:
         self.source = source
         self._info = metadata.load_info(source.root)
         self._table = metadata.load_episode_table(source.root, self._info)
-        self._collection = metadata.load_collection(source.root, len(self))
+        self._collection = metadata.load_collection(source.root, self.lengths)
         self._task_names = metadata.load_tasks(source.root)
         self._file_start = _file_starts(self._table)
-        self._open_file = lru_cache(maxsize=_OPEN_FILES)(_open_parquet)
+        self._open_file = lru_cache(maxsize=_OPEN_FILES)(partial(open_data_file, source.root))
 
     @classmethod
     def open(cls, config: DatasetConfig) -> Self:
@@ -54,10 +54,17 @@ class DatasetReader:
             DataError: there is none, or not one of this specification.
             EnvironmentFailure: the Hub cannot be reached.
         """
-        return cls(locate(config))
+        reader = cls(locate(config))
+        for path in reader.frames_per_file:
+            require_file(reader.root, path)
+        return reader
 
     def __len__(self) -> int:
         return len(self._table.length)
+
+    def __iter__(self) -> Iterator[Episode]:
+        """The episodes in order, each read when its turn comes (see `read`)."""
+        return (self.read(index) for index in range(len(self)))
 
     @property
     def root(self) -> Path:
@@ -75,9 +82,27 @@ class DatasetReader:
         return int(self._table.length.sum())
 
     @property
+    def frames_per_file(self) -> dict[Path, int]:
+        """The data files, in order, and how many frames each holds."""
+        frames: Counter[Path] = Counter()
+        for index, length in enumerate(self.lengths.tolist()):
+            frames[self.data_path(index)] += length
+        return dict(frames)
+
+    @property
     def fps(self) -> int:
         """Rows per second."""
         return int(self._info["fps"])
+
+    @property
+    def info(self) -> Mapping[str, Any]:
+        """``meta/info.json``."""
+        return self._info
+
+    @property
+    def task_names(self) -> Mapping[int, str]:
+        """``meta/tasks.parquet``: task index -> task."""
+        return self._task_names
 
     @property
     def controller_id(self) -> str:
@@ -92,7 +117,7 @@ class DatasetReader:
     @property
     def stats(self) -> dict[str, Any]:
         """Statistics of every feature, as in ``meta/stats.json``."""
-        return metadata.load_object(self.root / schema.STATS_PATH)
+        return metadata.load_stats(self.root)
 
     def task(self, index: int) -> str:
         """Task of an episode."""
@@ -107,6 +132,10 @@ class DatasetReader:
         """Planned length of an episode, ticks."""
         return int(self._collection["episodes"][index]["time_limit"])
 
+    def digest(self, index: int) -> str:
+        """`Episode.digest` as it was when the episode was written; empty if not recorded."""
+        return str(self._collection["episodes"][index].get("sha256", ""))
+
     def identity(self, index: int) -> str:
         """What the episode is, whatever dataset holds it: task, seed and episode number."""
         facts = self.metadata(index)
@@ -114,39 +143,39 @@ class DatasetReader:
         return f"{self.task(index)}/{seed}/{number}"
 
     def read(self, index: int) -> Episode:
-        """Read one episode and validate it.
+        """Read one episode, validate it and compare it with its recorded digest.
 
         Raises:
             DataError: the file is damaged or its content violates the specification.
             IndexError: there is no such episode.
         """
-        where = f"{self.root}, episode {index}"
-        columns = self._columns(index, tuple(schema.FEATURES))
-        self._check_index(index, columns, where)
+        episode, problems = self.inspect(index)
+        for error in problems:
+            raise error
+        assert episode is not None
+        return episode
+
+    def inspect(self, index: int) -> tuple[Episode | None, list[DataError]]:
+        """Read one episode, and everything that is wrong with it; None if it cannot be read.
+
+        Raises:
+            IndexError: there is no such episode.
+        """
+        path = self.data_path(index)
+        try:
+            columns = self._columns(index, tuple(schema.FEATURES))
+        except DataError as error:
+            return None, [error]
         episode = Episode(
-            depth=columns[spec.DEPTH_KEY],
-            state=columns[spec.STATE_KEY],
-            action=columns[spec.ACTION_KEY],
-            reward=columns[spec.REWARD_KEY],
-            done=columns[spec.DONE_KEY],
-            success=columns[spec.SUCCESS_KEY],
-            truncated=columns[spec.TRUNCATED_KEY],
+            **{name: columns[key] for name, key in EPISODE_FEATURES.items()},
             task=self.task(index),
             time_limit=self.time_limit(index),
             metadata=self.metadata(index),
         )
-        episode.validate(where)
-        self._check_digest(index, episode)
-        return episode
-
-    def _check_digest(self, index: int, episode: Episode) -> None:
-        """Compare with what was sealed; datasets of version 1 do not say."""
-        sealed = self._collection["episodes"][index].get("sha256")
-        if sealed is not None and sealed != episode.digest():
-            raise DataError(
-                f"{self._data_path(index)}, episode {index}: its SHA-256 is not the one of "
-                f"{schema.COLLECTION_PATH}; the file has changed since it was written"
-            )
+        found = [*self._index_problems(index, columns), *episode.problems()]
+        if not found and self.digest(index) not in ("", episode.digest()):
+            found = [(None, "differs from what was collected: its sha256 is not the recorded one")]
+        return episode, [DataError.at(path, problem, index, frame) for frame, problem in found]
 
     def read_columns(self, names: Sequence[str]) -> Columns:
         """Whole columns over all frames, ``(N, ...)`` each, in episode order.
@@ -160,17 +189,30 @@ class DatasetReader:
         parts = [self._columns(i, tuple(names)) for i in range(len(self))]
         return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
+    def read_episode_columns(self, index: int, names: Sequence[str]) -> Columns:
+        """Some columns of one episode, ``(T, ...)`` each, not validated.
+
+        Raises:
+            DataError: the file is damaged.
+            IndexError: there is no such episode.
+        """
+        return self._columns(index, names)
+
     def _columns(self, index: int, names: Sequence[str]) -> Columns:
         if not 0 <= index < len(self):
             raise IndexError(f"episode {index} of {len(self)}")
-        path = self._data_path(index)
-        with metadata.damaged(path):
-            table = self._rows(self._open_file(path), index, names)
-            if table.num_rows != self._table.length[index]:
-                raise DataError(f"{path} ends before the end of episode {index}")
-            return {name: _to_numpy(table[name], name) for name in names}
+        path = self.data_path(index)
+        try:
+            with metadata.damaged(path):
+                table = self._rows(self._open_file(path), index, names)
+                if table.num_rows != self._table.length[index]:
+                    raise DataError("ends before the end of the episode")
+                return {name: to_numpy(table[name], name) for name in names}
+        except DataError as error:
+            raise DataError.at(path, error.problem or str(error), index, error.frame) from error
 
-    def _data_path(self, index: int) -> Path:
+    def data_path(self, index: int) -> Path:
+        """The file that holds an episode."""
         name = str(self._info["data_path"]).format(
             chunk_index=int(self._table.chunk_index[index]),
             file_index=int(self._table.file_index[index]),
@@ -188,21 +230,30 @@ class DatasetReader:
         offset = first - int(edges[touched[0]]) if len(touched) else 0
         return table.slice(offset, last - first)
 
-    def _check_index(self, index: int, columns: Columns, where: str) -> None:
+    def _index_problems(self, index: int, columns: Columns) -> Iterator[tuple[int, str]]:
         frames = np.arange(len(columns["index"]))
-        expected = {
+        counts = {
             "index": frames + self._table.start[index],
             "frame_index": frames,
             "episode_index": np.full(len(frames), index),
         }
-        for name, values in expected.items():
-            if not np.array_equal(columns[name], values):
-                raise DataError(f"{where}: column {name} does not count {values[0]}, ...")
-        if np.abs(columns["timestamp"] - frames / self.fps).max() > _TIMESTAMP_SLACK:
-            raise DataError(f"{where}: timestamps are not those of {self.fps} frames per second")
-        names = {self._task_names.get(int(i), "unknown") for i in np.unique(columns["task_index"])}
-        if names != {self.task(index)}:
-            raise DataError(f"{where}: tasks {sorted(names)}, collection says {self.task(index)}")
+        for name, expected in counts.items():
+            wrong = np.flatnonzero(columns[name] != expected)
+            if len(wrong):
+                at = int(wrong[0])
+                found = columns[name][at]
+                yield at, f"column {name} does not count: {found}, expected {expected[at]}"
+        late = ~(np.abs(columns["timestamp"] - frames / self.fps) <= _TIMESTAMP_SLACK)
+        if late.any():
+            at = int(np.argmax(late))
+            found = columns["timestamp"][at]
+            yield at, f"timestamp {found:g} s, expected {at / self.fps:g} at {self.fps} fps"
+        own = [number for number, name in self._task_names.items() if name == self.task(index)]
+        other = ~np.isin(columns["task_index"], own)
+        if other.any():
+            at = int(np.argmax(other))
+            found = self._task_names.get(int(columns["task_index"][at]), "unknown")
+            yield at, f"its task is {found}, but {schema.COLLECTION_PATH} says {self.task(index)}"
 
 
 def _file_starts(table: metadata.EpisodeTable) -> NDArray[np.int64]:
@@ -210,22 +261,3 @@ def _file_starts(table: metadata.EpisodeTable) -> NDArray[np.int64]:
     files = np.stack([table.chunk_index, table.file_index], axis=1)
     _, first_episode, file_of = np.unique(files, axis=0, return_index=True, return_inverse=True)
     return np.asarray(table.start[first_episode][file_of])
-
-
-def _open_parquet(path: Path) -> pq.ParquetFile:
-    return pq.ParquetFile(path, memory_map=True)
-
-
-def _to_numpy(column: pa.ChunkedArray, name: str) -> NDArray[Any]:
-    array = column.combine_chunks()
-    if isinstance(array, pa.ChunkedArray):
-        array = pa.concat_arrays(array.chunks)
-    if array.null_count:
-        raise DataError(f"column {name} has {array.null_count} empty rows")
-    if name == spec.DEPTH_KEY:
-        return tiff.decode(array.field("bytes"), spec.DEPTH_ROWS, spec.DEPTH_COLS)
-    feature = schema.FEATURES[name]
-    if schema.width(name) > 1:
-        flat = array.flatten().to_numpy(zero_copy_only=False)
-        return np.asarray(flat.reshape(len(array), -1), dtype=str(feature["dtype"]))
-    return np.asarray(array.to_numpy(zero_copy_only=False), dtype=str(feature["dtype"]))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 import pyarrow as pa
@@ -52,6 +52,24 @@ def width(key: str) -> int:
     shape = FEATURES[key]["shape"]
     assert isinstance(shape, tuple)
     return int(shape[0])
+
+
+def type_problems(found: pa.Schema) -> Iterator[str]:
+    """What is wrong with the columns of a data file; a list may be of fixed size or not."""
+    expected = arrow_schema()
+    for name in sorted(set(expected.names) - set(found.names)):
+        yield f"column {name} is missing"
+    for field in found:
+        if field.name in expected.names:
+            want = expected.field(field.name).type
+            if _elements(field.type) != _elements(want):
+                yield f"column {field.name} is {field.type}, expected {want}"
+
+
+def _elements(kind: pa.DataType) -> tuple[bool, pa.DataType]:
+    """Whether a type is a list, and of what."""
+    listed = pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)
+    return listed, kind.value_type if listed else kind
 
 
 def info_features(controller_id: str) -> dict[str, dict[str, object]]:

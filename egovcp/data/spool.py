@@ -75,7 +75,7 @@ class Spool:
             found = _read(path)
             if found is not None:
                 return found
-            path.unlink()
+            path.unlink(missing_ok=True)
         return None
 
     def drop_before(self, number: int) -> None:
@@ -87,10 +87,10 @@ class Spool:
     def sweep(self) -> None:
         """Remove what interrupted writers left, and what is not whole any more."""
         for path in self.folder.glob(".*"):
-            path.unlink()
+            path.unlink(missing_ok=True)  # a worker that outlived its service may be at it, too
         for _, _, path in self._files():
             if _read(path) is None:
-                path.unlink()
+                path.unlink(missing_ok=True)
 
     def size(self) -> int:
         """Bytes on disk."""

@@ -67,7 +67,8 @@ def decode(blobs: pa.BinaryArray, rows: int, cols: int) -> NDArray[np.uint16]:
         DataError: a blob is missing, is no TIFF, or has another size or pixel type.
     """
     if blobs.null_count:
-        raise DataError(f"{blobs.null_count} of {len(blobs)} depth frames are empty")
+        empty = int(np.argmax(blobs.is_null().to_numpy(zero_copy_only=False)))
+        raise _at(empty, "is empty")
     raw = _fixed_size_bytes(blobs, len(header(rows, cols)) + 2 * rows * cols)
     if raw is not None:
         head = np.frombuffer(header(rows, cols), dtype=np.uint8)
@@ -89,16 +90,36 @@ def _fixed_size_bytes(blobs: pa.BinaryArray, size: int) -> NDArray[np.uint8] | N
 
 
 def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uint16]:
-    from PIL import Image, UnidentifiedImageError  # only for layouts that are not ours
+    from PIL import Image  # only for layouts that are not ours
 
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(blob)) as image:
             mode, size = image.mode, image.size
-            pixels = np.asarray(image)
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError) as error:
-        raise DataError(f"depth frame {frame} is not a readable TIFF: {error}") from error
-    if not mode.startswith("I;16") or size != (cols, rows):
-        raise DataError(
-            f"depth frame {frame} is {mode} {size[1]}x{size[0]}, expected uint16 {rows}x{cols}"
-        )
-    return pixels.astype(np.uint16)
+            if mode.startswith("I;16") and size == (cols, rows):
+                return np.asarray(image).astype(np.uint16)
+    except (*_PILLOW_ERRORS, Image.DecompressionBombError) as error:
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise _at(frame, f"is not a readable TIFF: {reason}") from error
+    raise _at(frame, f"is {mode} {size[1]}x{size[0]}, expected uint16 {rows}x{cols}")
+
+
+#: What Pillow raises on a damaged TIFF: its parser trusts what it reads.
+_PILLOW_ERRORS = (
+    ArithmeticError,
+    AttributeError,
+    EOFError,
+    LookupError,
+    OSError,  # UnidentifiedImageError among them
+    RuntimeError,
+    SyntaxError,
+    TypeError,
+    ValueError,
+    struct.error,
+)
+
+
+def _at(frame: int, problem: str) -> DataError:
+    error = DataError(f"depth frame {frame} {problem}")
+    error.frame = frame
+    error.problem = f"its depth image {problem}"
+    return error

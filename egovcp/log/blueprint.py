@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import rerun.blueprint as rrb
 
 from egovcp.log.paths import (
+    ACTION,
     CAMERA,
     DEPTH,
     EVENTS,
     IMAGINED,
     INFO,
+    OUTCOME,
     PLAN,
     RECONSTRUCTED,
     REWARD,
+    STATE,
     TIMING,
     WORLD,
 )
@@ -30,10 +35,74 @@ def blueprint(imagined: tuple[int, ...] = ()) -> rrb.Blueprint:
             rrb.Vertical(*_pictures(imagined), *_curves(), row_shares=_shares(imagined)),
             column_shares=[3, 2],
         ),
-        rrb.TimePanel(
-            state="collapsed", timeline="time", fps=25.0, play_state="playing", loop_mode="all"
-        ),
+        _time_panel(),
         collapse_panels=True,
+    )
+
+
+def signals_blueprint() -> rrb.Blueprint:
+    """3D view and depth at the left; at the right the curves of reward, action and state."""
+    seen = rrb.Spatial2DView(name="depth seen", origin=CAMERA, contents=[DEPTH])
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(_scene(_SIDE), seen, row_shares=[3, 2]),
+            rrb.Vertical(*_outcome_curves(), *_action_curves(), _state_tabs()),
+            column_shares=[1, 1],
+        ),
+        _time_panel(),
+        collapse_panels=True,
+    )
+
+
+def _time_panel() -> rrb.TimePanel:
+    return rrb.TimePanel(
+        state="collapsed", timeline="time", fps=25.0, play_state="playing", loop_mode="all"
+    )
+
+
+def _outcome_curves() -> list[rrb.View | rrb.Container]:
+    return [
+        rrb.Horizontal(
+            rrb.TimeSeriesView(name="reward", origin=REWARD),
+            rrb.TimeSeriesView(name="done, success", origin=OUTCOME),
+        )
+    ]
+
+
+def _action_curves() -> list[rrb.View | rrb.Container]:
+    return [
+        rrb.Horizontal(
+            rrb.TimeSeriesView(name="left hand target (m)", origin=f"{ACTION}/left_hand"),
+            rrb.TimeSeriesView(name="right hand target (m)", origin=f"{ACTION}/right_hand"),
+        ),
+        rrb.Horizontal(
+            rrb.TimeSeriesView(name="height target (m)", origin=f"{ACTION}/height"),
+            rrb.TimeSeriesView(name="action in [-1, 1]", origin=f"{ACTION}/normalised"),
+        ),
+    ]
+
+
+def _state_tabs() -> rrb.Container:
+    return rrb.Tabs(
+        rrb.Horizontal(
+            rrb.TimeSeriesView(name="angular velocity (rad/s)", origin=f"{STATE}/angular_velocity"),
+            rrb.TimeSeriesView(name="projected gravity", origin=f"{STATE}/projected_gravity"),
+            name="IMU",
+        ),
+        _command_curves(),
+        rrb.TimeSeriesView(name="joint angles (rad)", origin=f"{STATE}/joint_position"),
+        rrb.TimeSeriesView(name="joint velocities (rad/s)", origin=f"{STATE}/joint_velocity"),
+        rrb.TextLogView(name="events", origin=EVENTS),
+        rrb.TextDocumentView(name="episode", origin=INFO),
+    )
+
+
+def _command_curves() -> rrb.Container:
+    return rrb.Horizontal(
+        rrb.TimeSeriesView(name="velocity (m/s, rad/s)", origin=f"{STATE}/command_velocity"),
+        rrb.TimeSeriesView(name="hands (m)", origin=f"{STATE}/command_hands"),
+        rrb.TimeSeriesView(name="height (m)", origin=f"{STATE}/command_height"),
+        name="command in o_t",
     )
 
 
@@ -41,15 +110,19 @@ def _shares(imagined: tuple[int, ...]) -> list[float]:
     return [3.0, *([2.0] if imagined else []), 2.0, 2.0, 1.5]
 
 
-def _scene() -> rrb.View:
-    """The scene from the front left, where both the hands and what approaches are seen."""
+_FRONT: Final = (1.9, 1.5, 1.2)  # both the hands and what approaches are seen
+_SIDE: Final = (0.3, 3.1, 1.6)  # a surface before the robot, seen edge on, does not hide it
+
+
+def _scene(eye: tuple[float, float, float] = _FRONT) -> rrb.View:
+    """The scene, seen from the world position ``eye``."""
     return rrb.Spatial3DView(
         name="robot",
         origin=WORLD,
         contents=[f"{WORLD}/**"],
         background=[24, 26, 32],
         eye_controls=rrb.EyeControls3D(
-            position=(1.9, 1.5, 1.2), look_target=(0.45, 0.0, 0.68), eye_up=(0.0, 0.0, 1.0)
+            position=eye, look_target=(0.45, 0.0, 0.68), eye_up=(0.0, 0.0, 1.0)
         ),
     )
 

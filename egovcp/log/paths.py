@@ -20,3 +20,6 @@ REWARD: Final = "/reward"
 TIMING: Final = "/timing"
 EVENTS: Final = "/events"
 INFO: Final = "/info"
+ACTION: Final = "/action"  # one entity per group of signals beneath
+STATE: Final = "/state"  # likewise
+OUTCOME: Final = "/outcome"  # done and success, 0 or 1

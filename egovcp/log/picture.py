@@ -1,7 +1,8 @@
 """A rollout as one picture: a film strip over the curves of value and reward.
 
 Rows: the robot, the depth it saw, what the world model reconstructed, and what it had
-imagined of this moment some ticks before. No graphics card and no display are needed.
+imagined of this moment some ticks before; what the run knows nothing of (no world model
+played) is left out. No graphics card and no display are needed.
 """
 
 from __future__ import annotations
@@ -27,6 +28,18 @@ AHEAD: Final = 8  # how many ticks before a moment the imagination shown for it 
 _BEFORE_TICKS: Final = 2  # the strip starts this long before the first event
 _AFTER_TICKS: Final = 6  # and ends this long after the last one
 _MESH_GRID_M: Final = 0.024
+_STYLES: Final = {
+    "value of the plan": "C0",
+    "termination probability": "C3",
+    "return so far": "C2",
+}
+_TOP_INCH: Final = 0.516  # title and times
+_ROW_INCH: Final = 1.419  # one row of the film strip
+_CURVES_INCH: Final = 2.408  # what lies below the strip
+
+
+type Films = dict[str, list[NDArray[np.floating] | None]]
+type Curves = dict[str, list[float | None]]
 
 
 class PictureSink:
@@ -67,12 +80,20 @@ def rollout_picture(ticks: Sequence[Tick], path: Path, title: str = "") -> None:
     from matplotlib.figure import Figure
 
     moments = key_moments(ticks)
-    figure = Figure(figsize=(2.1 * len(moments) + 0.5, 8.6), facecolor="white")
+    rows = films(ticks, moments)
+    height = _TOP_INCH + _ROW_INCH * (1 + len(rows)) + _CURVES_INCH
+    figure = Figure(figsize=(2.1 * len(moments) + 0.5, height), facecolor="white")
     FigureCanvasAgg(figure)
-    _film_strip(figure, ticks, moments)
+    _film_strip(figure, ticks, moments, rows)
     _curves(figure, ticks, moments)
-    figure.suptitle(title, fontsize=12, y=0.99)
+    figure.suptitle(title, fontsize=12, y=1.0 - 0.086 / height)
     figure.savefig(path, dpi=110)
+
+
+def _place(figure: Any, bottom_inch: float, top_inch: float) -> dict[str, float]:
+    """Where in the figure a grid of plots goes, as shares of its size."""
+    height = figure.get_figheight()
+    return {"left": 0.05, "right": 0.995, "bottom": bottom_inch / height, "top": top_inch / height}
 
 
 def key_moments(ticks: Sequence[Tick], count: int = MOMENTS) -> list[int]:
@@ -85,21 +106,28 @@ def key_moments(ticks: Sequence[Tick], count: int = MOMENTS) -> list[int]:
     return sorted({int(i) for i in np.rint(np.linspace(begin, end, count))})
 
 
-def _film_strip(figure: Any, ticks: Sequence[Tick], moments: Sequence[int]) -> None:
-    place = {"left": 0.05, "right": 0.995, "bottom": 0.28, "top": 0.94}
-    grid = figure.add_gridspec(4, len(moments), hspace=0.04, wspace=0.03, **place)
-    rows = grid.subplots(squeeze=False)
+def films(ticks: Sequence[Tick], moments: Sequence[int]) -> Films:
+    """The rows of depth pictures; none for what is missing at every moment."""
+    rows: Films = {
+        "depth seen": [ticks[i].depth / 1000.0 for i in moments],
+        "reconstructed": [ticks[i].depth_reconstructed for i in moments],
+        f"imagined\n{AHEAD * PLANNER_DT:.2f} s before": [imagined_of(ticks, i) for i in moments],
+    }
+    return {name: row for name, row in rows.items() if any(depth is not None for depth in row)}
+
+
+def _film_strip(figure: Any, ticks: Sequence[Tick], moments: Sequence[int], rows: Films) -> None:
+    place = _place(figure, _CURVES_INCH, figure.get_figheight() - _TOP_INCH)
+    grid = figure.add_gridspec(1 + len(rows), len(moments), hspace=0.04, wspace=0.03, **place)
+    first, *others = grid.subplots(squeeze=False)
     meshes = link_meshes(_MESH_GRID_M)
-    for column, i in enumerate(moments):
-        tick = ticks[i]
-        _robot(rows[0, column], tick, meshes)
-        rows[0, column].set_title(f"{tick.index * PLANNER_DT:.2f} s", fontsize=9)
-        _depth(rows[1, column], tick.depth / 1000.0)
-        _depth(rows[2, column], tick.depth_reconstructed)
-        _depth(rows[3, column], imagined_of(ticks, i))
-    names = ("", "depth seen", "reconstructed", f"imagined\n{AHEAD * PLANNER_DT:.2f} s before")
-    for row, name in zip(rows[:, 0], names, strict=True):
-        row.set_ylabel(name, fontsize=9)
+    for axes, i in zip(first, moments, strict=True):
+        _robot(axes, ticks[i], meshes)
+        axes.set_title(f"{ticks[i].index * PLANNER_DT:.2f} s", fontsize=9)
+    for row, (name, film) in zip(others, rows.items(), strict=True):
+        row[0].set_ylabel(name, fontsize=9)
+        for axes, depth in zip(row, film, strict=True):
+            _depth(axes, depth)
 
 
 def imagined_of(ticks: Sequence[Tick], i: int) -> NDArray[np.floating] | None:
@@ -109,8 +137,10 @@ def imagined_of(ticks: Sequence[Tick], i: int) -> NDArray[np.floating] | None:
 
 
 def _robot(axes: Any, tick: Tick, meshes: dict[str, LinkMesh]) -> None:
-    pose, eye = robot_pose(tick), Eye()
-    paint_floor(axes, eye)
+    pose = robot_pose(tick)
+    pelvis_w = pose.positions_w[0]
+    eye = Eye().following(pelvis_w)
+    paint_floor(axes, eye, pelvis_w)
     surfaces = robot_surface(pose, meshes) + scene_surface(tick.scene)
     if not meshes:
         paint_skeleton(axes, pose, eye)
@@ -131,16 +161,22 @@ def _depth(axes: Any, depth_m: NDArray[np.floating] | None) -> None:
     axes.imshow(shown, cmap="viridis_r", vmin=0.3, vmax=DEPTH_MAX_M)
 
 
-def _curves(figure: Any, ticks: Sequence[Tick], moments: Sequence[int]) -> None:
-    place = {"left": 0.05, "right": 0.995, "bottom": 0.06, "top": 0.235}
-    plots = figure.add_gridspec(1, 3, wspace=0.13, **place).subplots()
-    curves = {
+def curves(ticks: Sequence[Tick]) -> Curves:
+    """What changed over the run; without what no tick knows."""
+    known: Curves = {
         "value of the plan": [tick.value for tick in ticks],
         "termination probability": [tick.termination for tick in ticks],
         "return so far": np.cumsum([tick.reward for tick in ticks]).tolist(),
     }
-    for axes, (name, values), style in zip(plots, curves.items(), ("C0", "C3", "C2"), strict=True):
-        _curve(axes, ticks, values, style)
+    return {name: row for name, row in known.items() if any(value is not None for value in row)}
+
+
+def _curves(figure: Any, ticks: Sequence[Tick], moments: Sequence[int]) -> None:
+    shown = curves(ticks)
+    place = _place(figure, 0.516, 2.021)
+    plots = figure.add_gridspec(1, len(shown), wspace=0.13, **place).subplots(squeeze=False)[0]
+    for axes, (name, values) in zip(plots, shown.items(), strict=True):
+        _curve(axes, ticks, values, _STYLES[name])
         axes.set_title(name, fontsize=9, loc="left")
         for i in moments:
             axes.axvline(ticks[i].index * PLANNER_DT, color="0.9", linewidth=1, zorder=0)

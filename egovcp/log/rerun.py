@@ -17,12 +17,13 @@ import rerun as rr
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.log import paths
-from egovcp.log.blueprint import blueprint
+from egovcp.log.blueprint import blueprint, signals_blueprint
 from egovcp.log.colour import BALL, LEFT, OBSTACLE, RIGHT
 from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.meshes import link_meshes
 from egovcp.log.pose import robot_poses
 from egovcp.log.rerun_columns import Frame, all_columns, skeleton_columns
+from egovcp.log.signals import log_styles, signal_columns
 from egovcp.log.tick import SceneObject, Tick
 from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_ROWS
 
@@ -37,14 +38,21 @@ class RerunSink:
         path: the ``.rrd`` to create; raises `EnvironmentFailure` when it exists.
         imagined: horizons of the imagined depth to show, planner ticks ahead.
         meshes: draw the links' surfaces where the model is installed, else a skeleton.
+        signals: show action and proprioception as curves in the place of a planner's thoughts,
+            for what was recorded without one.
     """
 
     def __init__(
-        self, path: Path, imagined: tuple[int, ...] = (4, 8, 16), meshes: bool = True
+        self,
+        path: Path,
+        imagined: tuple[int, ...] = (4, 8, 16),
+        meshes: bool = True,
+        signals: bool = False,
     ) -> None:
         self._path = path
         self._imagined = imagined
         self._meshes = link_meshes() if meshes else {}
+        self._signals = signals
         self._batch: list[Tick] = []
         self._known: set[str] = set()
         self._stream: rr.RecordingStream | None = None
@@ -58,10 +66,13 @@ class RerunSink:
         self._view = info.camera
         name = f"{info.task} seed {info.seed} episode {info.episode}"
         stream = rr.RecordingStream("egovcp", recording_id=name)
-        stream.save(self._path, default_blueprint=blueprint(self._imagined))
+        look = signals_blueprint() if self._signals else blueprint(self._imagined)
+        stream.save(self._path, default_blueprint=look)
         stream.send_recording_name(name)
         self._stream = stream
         _log_static(stream, info, self._imagined)
+        if self._signals:
+            log_styles(stream)
         for link, mesh in self._meshes.items():
             surface = rr.Mesh3D(
                 vertex_positions=mesh.vertices,
@@ -95,6 +106,8 @@ class RerunSink:
         groups = [*all_columns(frames, self._view, self._imagined)]
         if not self._meshes:
             groups.append(skeleton_columns(frames))
+        if self._signals:
+            groups += signal_columns(self._batch)
         for path, ticks, columns in groups:
             if ticks:
                 self._stream.send_columns(path, _times(ticks), columns)

@@ -7,7 +7,7 @@ painted from the farthest to the nearest, lit by one lamp.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 _LAMP: Final = np.array([0.35, 0.45, 0.82])  # direction to the light, world
 _AMBIENT: Final = 0.45
+_LEASH_M: Final = 0.3  # how far a robot walks before the eye follows it
+_GLASS: Final = 0.45  # opacity of obstacles
 _BONE: Final = (120, 122, 130)
 
 
@@ -36,6 +38,16 @@ class Eye:
     """World point in the middle of the picture, m."""
     focal: float = 3.3
     """Half the picture's height is 1 / focal of the distance."""
+
+    def following(self, pelvis_w: NDArray[np.floating]) -> Eye:
+        """The eye moved over the ground with a robot whose pelvis (3,) m has left the origin.
+
+        Within `_LEASH_M` it stays, so that a stumble is seen; beyond, it is dragged along.
+        """
+        way = np.array([*pelvis_w[:2], 0.0])
+        drag = way * max(0.0, 1.0 - _LEASH_M / max(float(np.linalg.norm(way)), 1e-9))
+        position, target = (np.add(point, drag).tolist() for point in (self.position, self.target))
+        return replace(self, position=tuple(position), target=tuple(target))
 
     def project(self, points_w: NDArray[np.floating]) -> tuple[Array, Array]:
         """(..., 3) world points -> picture coordinates (..., 2) and distances (...)."""
@@ -57,6 +69,8 @@ class Surface:
     """(F, 3, 3) m."""
     colours: Array
     """(F, 3) RGB, 0 to 255."""
+    opacity: float = 1.0
+    """From 0, not to be seen, to 1."""
 
     @property
     def normals(self) -> Array:
@@ -70,13 +84,13 @@ class Surface:
         """The triangles that turn their outside to the eye."""
         towards = np.subtract(eye.position, self.corners_w[:, 0])
         seen = np.sum(self.normals * towards, axis=1) > 0
-        return Surface(self.corners_w[seen], self.colours[seen])
+        return Surface(self.corners_w[seen], self.colours[seen], self.opacity)
 
     def shaded(self) -> Array:
-        """(F, 3) RGB in [0, 1] under the lamp."""
+        """(F, 4) RGB and opacity in [0, 1] under the lamp."""
         light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(self.normals @ _LAMP, 0.0, 1.0)
-        shaded: Array = np.clip(self.colours / 255.0 * light[:, None], 0.0, 1.0)
-        return shaded
+        colours = np.clip(self.colours / 255.0 * light[:, None], 0.0, 1.0)
+        return np.column_stack([colours, np.full(len(colours), self.opacity)])
 
 
 def robot_surface(pose: RobotPose, meshes: Mapping[str, LinkMesh]) -> list[Surface]:
@@ -92,13 +106,14 @@ def robot_surface(pose: RobotPose, meshes: Mapping[str, LinkMesh]) -> list[Surfa
 
 
 def scene_surface(scene: Iterable[SceneObject]) -> list[Surface]:
-    """What stands in the scene."""
+    """What stands in the scene; walls and posts let through what they would hide."""
     surfaces = []
     for thing in scene:
-        shape, colour = (_sphere(), BALL) if thing.shape == "sphere" else (_box(), OBSTACLE)
+        ball = thing.shape == "sphere"
+        shape, colour, opacity = (_sphere(), BALL, 1.0) if ball else (_box(), OBSTACLE, _GLASS)
         turned = (shape * thing.size) @ rotation_matrix(np.array(thing.quaternion_w)).T
         colours = np.tile(np.array(colour, np.float64), (len(shape), 1))
-        surfaces.append(Surface(turned + thing.position_w, colours))
+        surfaces.append(Surface(turned + thing.position_w, colours, opacity))
     return surfaces
 
 
@@ -134,7 +149,7 @@ def paint(axes: Any, surfaces: list[Surface], eye: Eye) -> None:
     colours = np.concatenate([surface.shaded() for surface in seen])
     order = np.argsort(-depth.mean(axis=1))
     faces = PolyCollection(list(points[order]), facecolors=colours[order], edgecolors="face")
-    faces.set_linewidth(0.2)
+    faces.set_linewidth(np.where(colours[order, 3] < 1.0, 0.0, 0.2).tolist())  # no seams in glass
     axes.add_collection(faces, autolim=False)
 
 
@@ -147,11 +162,19 @@ def paint_skeleton(axes: Any, pose: RobotPose, eye: Eye) -> None:
             axes.plot(*bone.T, color=np.array(_BONE) / 255.0, linewidth=3, solid_capstyle="round")
 
 
-def paint_floor(axes: Any, eye: Eye, extent: float = 3.0, spacing: float = 0.5) -> None:
-    """A grid on the ground around the robot."""
+def paint_floor(
+    axes: Any,
+    eye: Eye,
+    pelvis_w: NDArray[np.floating],
+    extent: float = 3.0,
+    spacing: float = 0.5,
+) -> None:
+    """A grid on the ground around the robot; it reaches on by whole squares, so that a walk past
+    its lines is seen."""
+    middle = spacing * np.round(np.asarray(pelvis_w[:2]) / spacing)
     marks = np.arange(-extent, extent + spacing / 2, spacing)
     ends = np.array([-extent, extent])
     for mark in marks:
         for line in (np.stack([ends, np.full(2, mark)], 1), np.stack([np.full(2, mark), ends], 1)):
-            points, _ = eye.project(np.column_stack([line, np.zeros(2)]))
+            points, _ = eye.project(np.column_stack([line + middle, np.zeros(2)]))
             axes.plot(*points.T, color="0.85", linewidth=0.6, zorder=0)

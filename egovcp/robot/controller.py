@@ -26,6 +26,11 @@ class LowLevelController(Protocol):
         ...
 
     @property
+    def stepping(self) -> NDArray[np.bool_]:
+        """(B,) which robots were taking steps in the last `step`."""
+        ...
+
+    @property
     def stiffness(self) -> NDArray[np.float64]:
         """(J,) proportional gains that the joint servos must run, N m/rad."""
         ...

@@ -69,6 +69,11 @@ class StanceController:
         return False
 
     @property
+    def stepping(self) -> NDArray[np.bool_]:
+        """(B,) none."""
+        return np.zeros(len(self._balance.height), dtype=np.bool_)
+
+    @property
     def stiffness(self) -> Array:
         """(J,) N m/rad."""
         return STIFFNESS

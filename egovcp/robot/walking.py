@@ -208,6 +208,11 @@ class WalkingController:
         return True
 
     @property
+    def stepping(self) -> NDArray[np.bool_]:
+        """(B,) which robots have any of the gait blended in."""
+        return self._walk.gait.amount > 0
+
+    @property
     def stiffness(self) -> Array:
         """(J,) N m/rad."""
         return STIFFNESS

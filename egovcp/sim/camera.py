@@ -14,12 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.sim.config import CameraConfig
+from egovcp.sim.rays import Pinhole, cast
 from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_MIN_M, DEPTH_ROWS
 
 Array = NDArray[np.float64]
-
-_GROUPS = np.array([1, 0, 0, 1, 0, 0], dtype=np.uint8)
-_NUM_PIXELS = DEPTH_ROWS * DEPTH_COLS
 
 
 class DepthCamera:
@@ -32,8 +30,7 @@ class DepthCamera:
         self._axial = 1.0 / np.linalg.norm(rays, axis=1)  # cosine to the optical axis
         self._directions = rays * self._axial[:, None]
         self._cutoff = DEPTH_MAX_M / float(self._axial.min())
-        self._geom = np.empty(_NUM_PIXELS, dtype=np.int32)
-        self._range = np.empty(_NUM_PIXELS)
+        self._pinhole = Pinhole(DEPTH_ROWS, DEPTH_COLS, self.focal)
 
     def pose(
         self, data: mujoco.MjData, torso_body: int, pitch: float
@@ -53,11 +50,8 @@ class DepthCamera:
         """
         origin, rotation = self.pose(data, torso_body, pitch)
         rays = self._directions @ rotation.T
-        mujoco.mj_multiRay(
-            model, data, origin, rays.ravel(), _GROUPS, True, torso_body,
-            self._geom, self._range, None, _NUM_PIXELS, self._cutoff,
-        )  # fmt: skip
-        depth = (self._range * self._axial).astype(np.float32)
+        ranges = cast(model, data, self._pinhole, origin, rotation, rays, torso_body, self._cutoff)
+        depth = (ranges * self._axial).astype(np.float32)
         return within_range(depth).reshape(DEPTH_ROWS, DEPTH_COLS)
 
 
@@ -90,15 +84,17 @@ class DepthNoise:
         noise = self._rng.standard_normal(depth.shape, dtype=np.float32)
         chance = self._rng.random(depth.shape, dtype=np.float32)
         edge = discontinuity(depth, self._edge_ratio)
-        lost = chance < np.where(edge, self._edges, np.float32(0)) + self._holes
-        noisy = depth + noise * (self._per_z2 * depth * depth)
-        measured = within_range(np.where(lost, np.float32(0), noisy))
-        return quantise(measured)
+        lost = chance < np.where(edge, self._edges + self._holes, self._holes)
+        noise *= self._per_z2 * depth * depth
+        noise += depth
+        return quantise(np.where(lost, np.float32(0), noise))
 
 
 def quantise(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """Metres -> whole millimetres."""
-    return np.asarray(np.rint(depth * 1000.0), dtype=np.uint16)
+    """Metres -> whole millimetres, 0 for what the camera cannot measure."""
+    millimetres = within_range(depth)
+    millimetres *= 1000.0
+    return np.rint(millimetres, out=millimetres).astype(np.uint16)
 
 
 def discontinuity(depth: NDArray[np.float32], ratio: np.float32) -> NDArray[np.bool_]:
@@ -106,11 +102,22 @@ def discontinuity(depth: NDArray[np.float32], ratio: np.float32) -> NDArray[np.b
 
     The floor, seen at a slant, is no discontinuity; the border of nothing (0) is.
     """
-    edge = np.zeros(depth.shape, dtype=np.bool_)
-    across = np.abs(np.diff(depth, axis=1)) > ratio * np.maximum(depth[:, 1:], depth[:, :-1])
-    down = np.abs(np.diff(depth, axis=0)) > ratio * np.maximum(depth[1:], depth[:-1])
-    edge[:, 1:] |= across
-    edge[:, :-1] |= across
-    edge[1:] |= down
-    edge[:-1] |= down
-    return edge
+    width = depth.shape[1]
+    flat = np.ascontiguousarray(depth).reshape(-1)  # long rows are quicker than many
+    across = _jumps(flat[:-1], flat[1:], ratio)
+    across[width - 1 :: width] = False  # the next pixel is on the other side of the picture
+    down = _jumps(flat[:-width], flat[width:], ratio)
+    edge = np.zeros(flat.shape, dtype=np.bool_)
+    for jump, step in ((across, 1), (down, width)):
+        edge[:-step] |= jump
+        edge[step:] |= jump
+    return edge.reshape(depth.shape)
+
+
+def _jumps(a: NDArray[np.float32], b: NDArray[np.float32], ratio: np.float32) -> NDArray[np.bool_]:
+    """Where ``a`` and ``b`` differ by more than ``ratio`` of the greater."""
+    most = np.maximum(a, b)
+    most *= ratio
+    gap = b - a
+    found: NDArray[np.bool_] = np.abs(gap, out=gap) > most
+    return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,11 +15,14 @@ from egovcp.sim.sensors import base_rotation
 
 Array = NDArray[np.float64]
 
-_BAD_STATE = [
-    int(mujoco.mjtWarning.mjWARN_BADQPOS),
-    int(mujoco.mjtWarning.mjWARN_BADQVEL),
-    int(mujoco.mjtWarning.mjWARN_BADQACC),
-]
+_BAD_STATE = np.array(
+    [
+        mujoco.mjtWarning.mjWARN_BADQPOS,
+        mujoco.mjtWarning.mjWARN_BADQVEL,
+        mujoco.mjtWarning.mjWARN_BADQACC,
+    ],
+    dtype=np.intp,
+)
 
 _LYING_HEIGHT = 0.5  # m, pelvis; above it no part of the trunk reaches the floor
 
@@ -85,13 +89,13 @@ class SimulatedRobot:
         return self._touches()
 
     def _touches(self) -> list[Touch]:
-        contact = self.data.contact
-        first, second = contact.geom[:, 0], contact.geom[:, 1]
-        of_object = self.index.is_object
-        hits = np.flatnonzero(of_object[first] | of_object[second])
+        geoms = self.data.contact.geom
+        of_object = self.index.is_object.take(geoms)
+        if not of_object.any():
+            return []  # as in nearly every step
         found = []
-        for i in hits:
-            other = second[i] if of_object[first[i]] else first[i]
+        for i in np.flatnonzero(of_object.any(axis=1)):
+            other = geoms[i, 1] if of_object[i, 0] else geoms[i, 0]
             part = int(self.index.part[other])
             if part >= 0:
                 mujoco.mj_contactForce(self.model, self.data, int(i), self._wrench)
@@ -101,12 +105,12 @@ class SimulatedRobot:
     @property
     def broken(self) -> bool:
         """Whether the physics has diverged since the last reset."""
-        return bool(self.data.warning.number[_BAD_STATE].any()) or not self.finite
+        return bool(self.data.warning.number.take(_BAD_STATE).any()) or not self.finite
 
     @property
     def finite(self) -> bool:
         """Whether positions and velocities hold numbers only."""
-        return bool(np.isfinite(self.data.qpos.sum() + self.data.qvel.sum()))
+        return math.isfinite(self.data.qpos.sum() + self.data.qvel.sum())
 
     @property
     def pelvis_height(self) -> float:
@@ -121,7 +125,7 @@ class SimulatedRobot:
     @property
     def tilt(self) -> float:
         """Angle between the pelvis' z axis and the vertical, rad."""
-        return float(np.arccos(np.clip(self.rotation[2, 2], -1.0, 1.0)))
+        return float(np.arccos(min(max(self.rotation[2, 2], -1.0), 1.0)))
 
     @property
     def heading(self) -> Array:

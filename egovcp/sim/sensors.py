@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,11 @@ from egovcp.sim.scene import SceneIndex
 from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES
 
 Array = NDArray[np.float64]
+
+_ANGULAR_VELOCITY: Final = STATE_SLICES["angular_velocity"]
+_GRAVITY: Final = STATE_SLICES["projected_gravity"]
+_POSITION: Final = STATE_SLICES["joint_position"]
+_VELOCITY: Final = STATE_SLICES["joint_velocity"]
 
 
 def base_rotation(quaternion: Array) -> Array:
@@ -37,15 +44,20 @@ class Proprioception:
         self._index = index
         self._rng = rng
         self._std = noise_std(config)
+        self._fresh = np.empty(STATE_DIM)
+        self._rotation = np.empty(9)
 
     def measure(self, data: mujoco.MjData, out: Array) -> None:
         """Write a noisy measurement into ``out`` (S,), all but its command part."""
-        command = out[COMMAND_SLICE].copy()
-        out[STATE_SLICES["angular_velocity"]] = data.qvel[3:6]
-        out[STATE_SLICES["projected_gravity"]] = -base_rotation(data.qpos[3:7])[2]
-        out[STATE_SLICES["joint_position"]] = data.qpos[self._index.joint_qpos]
-        out[STATE_SLICES["joint_velocity"]] = data.qvel[self._index.joint_qvel]
-        out += self._std * self._rng.standard_normal(STATE_DIM)
-        gravity = out[STATE_SLICES["projected_gravity"]]
+        fresh, qpos, qvel = self._fresh, data.qpos, data.qvel
+        self._rng.standard_normal(out=fresh)
+        fresh *= self._std
+        fresh[_ANGULAR_VELOCITY] += qvel[3:6]
+        mujoco.mju_quat2Mat(self._rotation, qpos[3:7])
+        gravity = fresh[_GRAVITY]
+        gravity -= self._rotation[6:]
         gravity /= np.sqrt(gravity @ gravity)
-        out[COMMAND_SLICE] = command
+        fresh[_POSITION] += qpos[self._index.joint_qpos]
+        fresh[_VELOCITY] += qvel[self._index.joint_qvel]
+        out[: COMMAND_SLICE.start] = fresh[: COMMAND_SLICE.start]
+        out[COMMAND_SLICE.stop :] = fresh[COMMAND_SLICE.stop :]

@@ -1,10 +1,4 @@
 import json
-import os
-import signal
-import subprocess
-import sys
-import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -124,61 +118,6 @@ def test_no_destination_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> 
     assert "--dataset.repo_id" in capsys.readouterr().err
 
 
-@pytest.fixture
-def endless(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """A long collection into ``cut``, in a process group of its own, that has written data."""
-    command = [sys.executable, "-m", "egovcp_collect.collect", f"--dataset.root={tmp_path / 'cut'}",
-               *_SHORT, "--episodes=100000", "--num_envs=1", "--num_workers=1"]  # fmt: skip
-    process = subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
-    )
-    _wait_for_data(tmp_path)
-    yield process
-    process.kill()
-    process.wait()
-
-
-def _wait_for_data(folder: Path) -> None:
-    """Until some episodes have been written."""
-    deadline = time.monotonic() + 60
-    while time.monotonic() < deadline:
-        if any(p.stat().st_size > 100_000 for p in folder.rglob("data/**/*.parquet")):
-            return
-        time.sleep(0.05)
-    raise TimeoutError("no episode within a minute")
-
-
-def _require_prefix(folder: Path, last_line: str) -> None:
-    """The dataset holds the first episodes, as many as the last line says, and nothing lies
-    beside it."""
-    reader = DatasetReader.open(DatasetConfig(root=str(folder / "cut")))
-    assert last_line.startswith(f"{len(reader)} episodes, ")
-    assert [reader.read(i).metadata["episode"] for i in range(len(reader))] == [*range(len(reader))]
-    assert [p.name for p in folder.iterdir()] == ["cut"]
-
-
-def test_an_interrupt_keeps_the_finished_episodes(
-    endless: subprocess.Popen[str], tmp_path: Path
-) -> None:
-    os.killpg(endless.pid, signal.SIGINT)  # as a terminal does: the workers get it, too
-    out, err = endless.communicate(timeout=30)
-    assert endless.returncode == 130, err
-    assert "Traceback" not in err
-    _require_prefix(tmp_path, out.strip().splitlines()[-1])
-
-
-def test_a_killed_worker_ends_the_run_but_not_its_episodes(
-    endless: subprocess.Popen[str], tmp_path: Path
-) -> None:
-    children = Path(f"/proc/{endless.pid}/task/{endless.pid}/children").read_text().split()
-    worker = next(c for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes())
-    os.kill(int(worker), signal.SIGKILL)
-    out, err = endless.communicate(timeout=30)
-    assert endless.returncode == 5, err
-    assert "a worker process was killed" in err.strip().splitlines()[-1]
-    _require_prefix(tmp_path, out.strip().splitlines()[-1])
-
-
 @pytest.mark.parametrize("mix", [MixConfig(), MixConfig(3, 1, 0), MixConfig(0.2, 0.5, 0.3)])
 def test_every_prefix_holds_the_tasks_in_their_shares(mix: MixConfig) -> None:
     tasks = [s.task for s in CollectConfig(task="all", mix=mix, episodes=300).scenarios()]
@@ -186,10 +125,3 @@ def test_every_prefix_holds_the_tasks_in_their_shares(mix: MixConfig) -> None:
     for length in range(1, 301):
         counts = np.array([tasks[:length].count(task) for task in spec.TASKS])
         assert np.abs(counts - length * weights / weights.sum()).max() < 1.5
-
-
-def test_groups_cover_all_episodes_in_order() -> None:
-    config = CollectConfig(episodes=35, num_envs=16, num_workers=8)
-    groups = config.groups()
-    assert [s.episode for group in groups for s in group] == list(range(35))
-    assert config.workers == len(groups) == 3

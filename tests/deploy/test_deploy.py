@@ -3,14 +3,22 @@
 from __future__ import annotations
 
 import json
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from egovcp.log.mcap_reader import read_recording
+from egovcp.sim.config import STANDING_PUSHES
 from egovcp.spec import ACTION_RATE_LIMIT, COMMAND_SLICE
 from egovcp_deploy.deploy import main
+from egovcp_deploy.robots import Outcome
+from egovcp_deploy.robots.sim import SimRobot
 
 
 def run(*flags: str) -> int:
@@ -142,6 +150,91 @@ def test_a_reference_needs_no_artefact_and_leaves_no_plan(
     report = json.loads((out / "deploy.json").read_text())
     assert report["artefact"] is None
     assert report["low_level_controller"].startswith("g1-stance")
+
+
+def test_records_say_what_the_controller_has_decided(
+    tmp_path: Path, artefact_dir: Path, short: list[str]
+) -> None:
+    out = tmp_path / "out"
+    assert run(f"--policy.path={artefact_dir}", "--episodes=1", f"--output_dir={out}", *short) == 0
+    report = json.loads((out / "deploy.json").read_text())
+    env = report["config"]["env"]
+    assert env["arch"]["motion"] == "rail"
+    assert env["wall"]["push_speed_range"] == list(STANDING_PUSHES)
+    assert read_recording(out / "rollout-0.mcap").info.config == report["config"]
+
+
+def test_a_changed_planner_is_the_one_that_plans(
+    tmp_path: Path, artefact_dir: Path, short: list[str]
+) -> None:
+    out = tmp_path / "out"
+    flags = [f"--policy.path={artefact_dir}", "--episodes=1", f"--output_dir={out}"]
+    assert run(*flags, "--planner.horizon=5", "--planner.elites=2", *short) == 0
+    tick = read_recording(out / "rollout-0.mcap").ticks[0]
+    assert tick.plan is not None
+    assert tick.plan.shape == (5, 7)
+    assert tick.candidates is not None
+    assert len(tick.candidates.values) == 2
+
+
+@pytest.fixture
+def interrupted_in(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
+    """Makes Ctrl-C come in the middle of the rollout of that number."""
+
+    def arrange(episode: int) -> None:
+        act = SimRobot.act
+
+        def interrupted(robot: SimRobot, action: NDArray[np.float64]) -> Outcome:
+            if robot.scenario.episode == episode and robot.env.tick[0] == 4:
+                signal.raise_signal(signal.SIGINT)
+            return act(robot, action)
+
+        monkeypatch.setattr(SimRobot, "act", interrupted)
+
+    return arrange
+
+
+def test_an_interrupt_leaves_the_summary_of_what_was_complete(
+    tmp_path: Path,
+    short: list[str],
+    interrupted_in: Callable[[int], None],
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    interrupted_in(2)
+    out = tmp_path / "out"
+    assert run("--controller=hold", "--episodes=4", f"--output_dir={out}", *short) == 130
+    report = json.loads((out / "deploy.json").read_text())
+    assert [row["episode"] for row in report["rollouts"]] == [0, 1]
+    assert report["config"]["episodes"] == 4
+    for row in report["rollouts"]:
+        assert len(read_recording(out / row["mcap"]).ticks) == row["steps"] == 15
+    assert len(read_recording(out / "rollout-2.mcap").ticks) == 4
+    assert not (out / "rollout-3.mcap").exists()
+    captured = capsys.readouterr()
+    assert captured.out.count("rollout 0:") == 1
+    assert captured.err.endswith("egovcp-deploy: interrupted\n")
+
+
+def test_an_interrupt_in_the_first_rollout_leaves_no_summary(
+    tmp_path: Path, short: list[str], interrupted_in: Callable[[int], None]
+) -> None:
+    interrupted_in(0)
+    out = tmp_path / "out"
+    assert run("--controller=hold", f"--output_dir={out}", *short) == 130
+    assert not (out / "deploy.json").exists()
+
+
+def test_a_computer_without_the_simulator_is_told_what_to_install(tmp_path: Path) -> None:
+    """All that does not need the simulator is loaded without it."""
+    code = (
+        "import sys; sys.modules['mujoco'] = None\n"
+        "from egovcp_deploy.deploy import main\n"
+        f"sys.exit(main(['--controller=hold', '--output_dir={tmp_path / 'out'}']))"
+    )
+    ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert ended.returncode == 5
+    assert "mujoco is not installed" in ended.stderr
+    assert "Traceback" not in ended.stderr
 
 
 def test_an_unknown_driver_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ from egovcp_deploy.robots import Outcome, Sensed
 from egovcp_deploy.runner import LOGGED_CANDIDATES, REJECTED, Runner
 
 
-class FakePolicy:
+class PlainPolicy:
     """Plans what it is told to; remembers what it saw and what it heard was sent."""
 
     def __init__(self, actions: list[float]) -> None:
@@ -42,6 +42,10 @@ class FakePolicy:
 
     def advance(self, sent: NDArray[np.floating]) -> None:
         self.sent.append(sent.copy())
+
+
+class FakePolicy(PlainPolicy):
+    """The same with a world model: it imagines what it saw last."""
 
     def reconstruct(self) -> NDArray[np.float32]:
         return np.full((1, 48, 64), float(self.seen[-1]), np.float32)
@@ -97,7 +101,7 @@ class Memory:
         pass
 
 
-def runner(policy: FakePolicy, robot: FakeRobot, **options: int | None) -> Runner:
+def runner(policy: PlainPolicy, robot: FakeRobot, **options: int | None) -> Runner:
     return Runner(policy, robot, FixedRate(25, LockstepClock(time_ns=123)), **options)
 
 
@@ -157,6 +161,16 @@ def test_every_rollout_starts_afresh() -> None:
         assert memory.ticks[0].time_ns == 0
     assert actions[0] == actions[1]
     assert policy.resets == 2
+
+
+def test_of_a_policy_that_cannot_imagine_nothing_is_decoded() -> None:
+    memory = Memory()
+    runner(PlainPolicy([0.1] * 5), FakeRobot(), imagine=3).run(memory)
+    assert len(memory.ticks) == 5
+    for tick in memory.ticks:
+        assert tick.depth_reconstructed is None
+        assert tick.depth_imagined is None
+        assert tick.plan is not None
 
 
 def test_the_best_candidates_are_logged_as_hand_paths() -> None:

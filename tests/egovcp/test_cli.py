@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -36,6 +37,28 @@ class Ball:
 
 
 @dataclass(frozen=True)
+class Stand:
+    """What the lamp stands on."""
+
+    height_range: tuple[float, float] = (0.5, 1.5)
+    """Height, m."""
+
+    def __post_init__(self) -> None:
+        if self.height_range[0] > self.height_range[1]:
+            raise DataError(f"expected low <= high, found {self.height_range} in height_range")
+
+
+@dataclass(frozen=True)
+class Lamp:
+    """A lamp."""
+
+    stand: Stand = field(default_factory=Stand)
+    """Its stand."""
+    watts: int | None = None
+    """Power, W."""
+
+
+@dataclass(frozen=True)
 class Config:
     """A command for tests."""
 
@@ -55,6 +78,8 @@ class Config:
     """Preset."""
     ball: Ball = field(default_factory=Ball)
     """The ball."""
+    lamp: Lamp = field(default_factory=Lamp)
+    """The lamp."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset."""
 
@@ -179,6 +204,34 @@ def test_a_value_of_the_wrong_type_is_refused_by_name(flag: str, message: str) -
         _parse(flag)
 
 
+@pytest.mark.parametrize(
+    ("flag", "expected"),
+    [
+        ("--count=many", "int"),
+        ("--sizes=1,2,3", "[int, int, int]"),
+        ("--lamp.stand.height_range=3", "[float, float]"),
+        ("--lamp.watts=x", "int or null"),
+    ],
+)
+def test_a_wrong_value_is_shown_with_what_was_expected(flag: str, expected: str) -> None:
+    words = re.escape(f"{flag}: expected {expected}; see")
+    with pytest.raises(UsageError, match=f"^{words}"):
+        _parse("--count=2", flag)
+
+
+def test_what_a_config_says_against_its_values_is_said_alone() -> None:
+    """Neither the parser's own words around it, nor another exit code."""
+    with pytest.raises(DataError, match=r"^expected low <= high, found \(2\.0, 1\.0\) in \w+$"):
+        _parse("--lamp.stand.height_range=[2,1]")
+
+
+def test_a_nested_group_goes_by_its_full_name_only() -> None:
+    assert _parse("--lamp.stand={height_range: [1, 2]}").lamp.stand == Stand((1.0, 2.0))
+    assert _parse("--lamp={stand: {height_range: [1, 2]}}").lamp.stand == Stand((1.0, 2.0))
+    with pytest.raises(UsageError, match="unknown option --stand"):
+        _parse("--stand={height_range: [1, 2]}")
+
+
 def test_a_config_file_that_is_not_there_is_named() -> None:
     with pytest.raises(UsageError, match=r"cannot read absent\.yaml"):
         _parse("--config_path=absent.yaml")
@@ -261,3 +314,12 @@ def test_help_ends_well_and_shows_defaults_and_units(capsys: pytest.CaptureFixtu
     text = " ".join(capsys.readouterr().out.split())
     for part in ("--ball.radius", "Radius, m", "0.1", "A command for tests", "--debug"):
         assert part in text
+
+
+def test_help_lists_every_option_once(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        _run("--help")
+    listed = re.findall(r"^  (--[\w.]+)", capsys.readouterr().out, flags=re.MULTILINE)
+    assert {"--lamp", "--lamp.stand", "--lamp.stand.height_range", "--count"} <= set(listed)
+    assert len(set(listed)) == len(listed)
+    assert "--stand" not in listed

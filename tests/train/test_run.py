@@ -199,6 +199,7 @@ def test_a_place_that_cannot_be_written_is_a_matter_of_the_surroundings(
         ({"planner__elites": 99}, "elites"),
         ({"sampling__length": 0}, "length"),
         ({"stpes": 3}, "did you mean '--steps'"),
+        ({"config_path": "absent.yaml"}, "--preset=debug and --config_path=absent.yaml"),
     ],
 )
 def test_senseless_options_are_refused_before_anything_is_written(

@@ -44,10 +44,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
     """What stands where no flag says otherwise: the options of the run that is resumed, or those
-    that --preset stands for."""
+    that --preset stands for.
+
+    Raises:
+        UsageError: a config file, which says everything itself, would hide the preset.
+    """
     if options := resumed_options(argv):
         return options
     given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
+    if "preset" in given and "config_path" in given:
+        raise UsageError(
+            f"--preset={given['preset']} and --config_path={given['config_path']} both say what "
+            "the other options are; give one of them, and single options as flags of their own"
+        )
     name = given.get("preset", "")
     policy = {"policy": draccus.encode(PRESETS[name])} if name in PRESETS else {}
     return policy | TRAINING_PRESETS.get(name, {})

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -17,6 +15,7 @@ from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.errors import UsageError
 from egovcp_collect.dataset import card_tables
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
+from egovcp_collect.dataset.replace import replace_text
 from egovcp_collect.dataset.survey import Survey, survey
 from egovcp_collect.dataset.verdict import Thresholds, judge
 
@@ -88,9 +87,7 @@ def card_text(reader: DatasetReader, repo_id: str) -> str:
     return _render(reader, repo_id, survey(reader, ReturnConfig()), pictures)
 
 
-def _render(
-    reader: DatasetReader, repo_id: str, found: Survey, pictures: Mapping[str, str]
-) -> str:
+def _render(reader: DatasetReader, repo_id: str, found: Survey, pictures: Mapping[str, str]) -> str:
     name = repo_id or reader.source.repo_id or f"user/{reader.root.name}"
     tasks = [task.task for task in found.tasks]
     config = reader.provenance.get("config", {})
@@ -160,22 +157,3 @@ def _template() -> str:
 def _list(names: Sequence[str]) -> str:
     *first, last = names
     return f"{', '.join(first)} and {last}" if first else last
-
-
-def replace_text(path: Path, text: str) -> None:
-    """Write a whole file in the place of any other: a reader sees the old or the new one.
-
-    Never writes through a link, so that an older version of the dataset keeps its own.
-    """
-    path.parent.mkdir(parents=True, exist_ok=True)
-    number, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(number, "w", encoding="utf-8") as file:
-            os.fchmod(number, 0o644)
-            file.write(text)
-            file.flush()
-            os.fsync(number)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise

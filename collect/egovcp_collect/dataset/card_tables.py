@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
+from functools import cache
+from itertools import pairwise
 from typing import Any, Final
-
-from draccus.wrappers.docstring import get_attribute_docstring
 
 from egovcp import spec
 from egovcp.data import schema
@@ -124,13 +126,28 @@ def _plain(value: object) -> str:
 
 def _meaning(name: str) -> str:
     """The configuration's own words; empty for what this version does not know."""
-    owner: object = EnvConfig()
+    owner: Any = EnvConfig()
     *parts, last = name.split(".")
     for part in parts:
         owner = getattr(owner, part, None)
-    if not is_dataclass(owner) or not hasattr(owner, last):
+    if not is_dataclass(owner):
         return ""
-    return " ".join(get_attribute_docstring(type(owner), last).docstring_below.split())
+    kind: type = type(owner)
+    return field_docs(kind).get(last, "")
+
+
+@cache
+def field_docs(config_class: type) -> Mapping[str, str]:
+    """Field -> the docstring beneath it, on one line."""
+    body = ast.parse(inspect.getsource(config_class)).body[0]
+    assert isinstance(body, ast.ClassDef), "the source of a class is a class"
+    docs = {}
+    for statement, below in pairwise(body.body):
+        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
+            text = below.value if isinstance(below, ast.Expr) else None
+            if isinstance(text, ast.Constant) and isinstance(text.value, str):
+                docs[statement.target.id] = " ".join(text.value.split())
+    return docs
 
 
 def coverage_table(tasks: Sequence[TaskSurvey]) -> str:

@@ -40,6 +40,19 @@ SUBCOMMANDS: Final[Mapping[str, Subcommand]] = MappingProxyType(
         "info": Subcommand(
             "egovcp_collect.dataset.info", "what is in it: tasks, episodes, hours, provenance"
         ),
+        "check": Subcommand(
+            "egovcp_collect.dataset.check", "read every file and frame; name whatever is wrong"
+        ),
+        "repair": Subcommand(
+            "egovcp_collect.dataset.repair", "write a sound copy of whatever can still be read"
+        ),
+        "merge": Subcommand(
+            "egovcp_collect.dataset.merge", "one dataset out of several of the same controller"
+        ),
+        "audit": Subcommand(
+            "egovcp_collect.dataset.audit",
+            "simulate episodes again: are they the same bit for bit?",
+        ),
         "coverage": Subcommand(
             "egovcp_collect.dataset.coverage", "is it worth training on? events, returns, actions"
         ),

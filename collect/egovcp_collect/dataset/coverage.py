@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig
-from egovcp.data.files import write_json
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
+from egovcp_collect.dataset.replace import replace_json
 from egovcp_collect.dataset.spread import Spread
 from egovcp_collect.dataset.survey import EventRate, TaskSurvey, survey
 from egovcp_collect.dataset.verdict import Finding, Thresholds, judge, summary
@@ -62,7 +62,7 @@ def run(config: CoverageConfig) -> None:
             "summary": summary(findings),
             "findings": [asdict(finding) for finding in findings],
         }
-        write_json(Path(config.json), {"tasks": found.to_json(), "verdict": verdict})
+        replace_json(Path(config.json), {"tasks": found.to_json(), "verdict": verdict})
 
 
 def _verdict(findings: list[Finding]) -> Iterator[str]:

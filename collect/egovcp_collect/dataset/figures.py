@@ -24,7 +24,8 @@ from egovcp_collect.dataset.survey import BAD_TERMS, GOOD_TERMS, Survey, TaskSur
 _DPI: Final = 100
 _GOOD, _BAD, _PLAIN = "#1b7837", "#c0392b", "#8a8f98"
 _COLOURS: Final = {"ball": "#d95f02", "wall": "#7570b3", "arch": "#1b9e77"}
-_AROUND: Final = (-20, 100)  # ticks around the event that the returns are shown over
+_AROUND: Final = (-20, 160)  # ticks around the event that the returns are shown over
+_GAP: Final = 2  # pixels between the frames of a film strip
 _DENSITY_ROWS: Final = 200_000  # of the actions that densities are drawn from
 
 
@@ -52,7 +53,9 @@ def draw_figures(found: Survey, returns: ReturnConfig, folder: Path) -> list[Pat
         "depth.png": _depth(found),
     }
     for name, figure in figures.items():
-        figure.savefig(folder / name, dpi=_DPI, metadata={"Software": None})
+        figure.savefig(
+            folder / name, dpi=_DPI, metadata={"Software": None}, pil_kwargs={"optimize": True}
+        )
     return [folder / name for name in figures]
 
 
@@ -156,12 +159,12 @@ def _return_around_event(axes: Any, rows: TaskRows) -> None:
 
 def _since_event(rows: TaskRows) -> NDArray[np.int64]:
     """(N,) ticks since the episode's event; far out of sight where there is none."""
-    never = -(10**9)
     ticks = [facts.get("event_tick") for facts in rows.metadata]
     events = np.array([10**9 if tick is None else tick for tick in ticks], dtype=np.int64)
-    frame = np.arange(len(rows.reward)) - np.repeat(rows.start, rows.length)
-    since = frame - np.repeat(events, rows.length)
-    return np.maximum(since, never)
+    since: NDArray[np.int64] = np.arange(len(rows.reward)) - np.repeat(
+        rows.start + events, rows.length
+    )
+    return since
 
 
 def _actions(found: Survey) -> Any:
@@ -236,27 +239,40 @@ def _depth(found: Survey) -> Any:
         for rows, sample in zip(found.rows, found.samples, strict=True)
         for strip in sample.strips
     ]
-    figure = _figure(1.55 * FRAMES + 0.9, 1.4 * len(strips) + 0.3)
-    figure.get_layout_engine().set(h_pad=0.01, w_pad=0.01, hspace=0.0, wspace=0.0)
-    grid = figure.subplots(len(strips), FRAMES, squeeze=False)
-    for row, (task, strip) in zip(grid, strips, strict=True):
-        image = _film_strip(row, strip)
-        row[0].set_ylabel(f"{task}\nepisode {strip.episode}", fontsize=9)
-    bar = figure.colorbar(image, ax=grid, fraction=0.02, pad=0.01)
+    figure = _figure(1.5 * FRAMES + 1.0, 1.4 * len(strips) + 0.3)
+    colours = _depth_colours()
+    grid = figure.subplots(len(strips), 1, squeeze=False)[:, 0]
+    for axes, (task, strip) in zip(grid, strips, strict=True):
+        _film_strip(axes, strip, colours)
+        axes.set_ylabel(f"{task}\nepisode {strip.episode}", fontsize=9)
+    bar = figure.colorbar(colours, ax=grid, fraction=0.02, pad=0.01)
     bar.set_label("depth (m); grey: not measured", fontsize=9)
     bar.ax.tick_params(labelsize=8)
     return figure
 
 
-def _film_strip(row: Sequence[Any], strip: FilmStrip) -> Any:
-    image = None
-    for axes in row:
-        axes.set(xticks=[], yticks=[])
-        axes.set_frame_on(False)
-    for axes, tick, depth in zip(row, strip.tick, strip.depth, strict=False):
+def _film_strip(axes: Any, strip: FilmStrip, colours: Any) -> None:
+    """The frames side by side in one picture: far quicker to draw than one for each."""
+    rows, cols = strip.depth.shape[1:]
+    pitch = cols + _GAP
+    film = np.full((rows, FRAMES * pitch - _GAP, 4), 255, np.uint8)
+    for i, depth in enumerate(strip.depth):
         metres = np.where(depth > 0, depth / 1000.0, np.nan)
-        axes.set_frame_on(True)
-        axes.set_facecolor("0.8")
-        image = axes.imshow(metres, cmap="viridis_r", vmin=0.0, vmax=DEPTH_MAX_M)
-        axes.set_title(f"{tick * PLANNER_DT:.2f} s", fontsize=8, pad=2)
-    return image
+        film[:, i * pitch : i * pitch + cols] = colours.cmap(colours.norm(metres), bytes=True)
+    axes.imshow(film)
+    axes.xaxis.tick_top()
+    middles = [i * pitch + cols / 2 for i in range(len(strip.tick))]
+    axes.set_xticks(middles, [f"{tick * PLANNER_DT:.2f} s" for tick in strip.tick], fontsize=8)
+    axes.tick_params(length=0, pad=1)
+    axes.set_yticks([])
+    axes.spines[:].set_visible(False)
+
+
+def _depth_colours() -> Any:
+    """Metres -> colour: near yellow, far dark blue, grey where nothing was measured."""
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    colours = colormaps["viridis_r"].with_extremes(bad="0.8")
+    return ScalarMappable(Normalize(0.0, DEPTH_MAX_M), colours)

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
-from egovcp.data import DatasetConfig, DatasetReader, schema
-from egovcp.data.files import write_json
+from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.data.split import HELDOUT_FRACTION, in_split
+from egovcp_collect.dataset.output import write_report
 
 
 @dataclass(frozen=True)
@@ -33,8 +32,7 @@ def run(config: InfoConfig) -> None:
     """
     facts = describe(DatasetReader.open(config.dataset))
     print(_table(facts))
-    if config.json:
-        write_json(Path(config.json), facts)
+    write_report(config.json, facts)
 
 
 def describe(reader: DatasetReader) -> dict[str, Any]:
@@ -62,7 +60,7 @@ def describe(reader: DatasetReader) -> dict[str, Any]:
         "versions": dict(known.get("versions", {})),
         "features": {
             key: {"dtype": f["dtype"], "shape": list(f["shape"])}
-            for key, f in schema.FEATURES.items()
+            for key, f in reader.info["features"].items()
         },
     }
 

@@ -1,8 +1,8 @@
 """How much of the action box the actions of a dataset fill, and how evenly.
 
-Uniformity of a histogram is its entropy over that of the uniform one, H(p) / log(bins): 1 is
-even, 0 is a single bin. Random walks that are reflected at the walls of the box come near 1;
-walks that are clipped pile up on them, and a policy that always does the same is near 0.
+Uniformity of a histogram p over n bins is its overlap with the even one, sum of min(p_i, 1 / n): 1
+is even, 1 / n is a single bin. Random walks that are reflected at the walls of the box come near
+1; walks that are clipped pile up on them, and a policy that always does the same is near 0.
 """
 
 from __future__ import annotations
@@ -52,9 +52,8 @@ class Occupancy:
 
 
 def uniformity(counts: NDArray[np.integer]) -> float:
-    """Entropy of a histogram over that of the uniform one."""
-    share = counts[counts > 0] / counts.sum()
-    return float(-(share * np.log(share)).sum() / np.log(len(counts)))
+    """Overlap of a histogram with the even one."""
+    return float(np.minimum(counts / counts.sum(), 1.0 / len(counts)).sum())
 
 
 def occupied(points: NDArray[np.floating]) -> float:

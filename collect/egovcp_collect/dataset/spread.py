@@ -27,5 +27,5 @@ class Spread:
         flat = np.asarray(values, np.float64).reshape(-1)
         if not flat.size:
             return None
-        quantiles = np.quantile(flat, (0.0, 0.05, 0.5, 0.95, 1.0))
-        return cls(*map(float, quantiles), float(flat.mean()), float(flat.std()))
+        low, q05, median, q95, high = np.quantile(flat, (0.0, 0.05, 0.5, 0.95, 1.0)).tolist()
+        return cls(low, q05, median, q95, high, float(flat.mean()), float(flat.std()))

@@ -28,8 +28,8 @@ class Thresholds:
     """Smallest standard deviation of the return: less is a constant."""
     one_outcome: float = 0.98
     """Largest share of episodes with the same outcome."""
-    uniformity: float = 0.85
-    """Least even histogram of an action over its box, 0 to 1."""
+    uniformity: float = 0.7
+    """Least overlap of an action's histogram with an even one, 0 to 1."""
     occupied: float = 0.5
     """Smallest share of a hand's grid cells that hold an action."""
     valid_pixels: float = 0.05

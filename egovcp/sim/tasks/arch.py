@@ -104,8 +104,8 @@ class ArchTask(Task):
         if not self._walks:
             return np.array([self.speed, 0.0, 0.0])
         aside, turned = self._off_course()
-        sideways = np.clip(-_SIDE_GAIN * aside, -_MOST_SIDEWAYS, _MOST_SIDEWAYS)
-        turning = np.clip(-_TURN_GAIN * turned, -_MOST_TURNING, _MOST_TURNING)
+        sideways = min(max(-_SIDE_GAIN * aside, -_MOST_SIDEWAYS), _MOST_SIDEWAYS)
+        turning = min(max(-_TURN_GAIN * turned, -_MOST_TURNING), _MOST_TURNING)
         return np.array([self.speed, sideways, turning])
 
     @property

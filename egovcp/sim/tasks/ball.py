@@ -19,6 +19,7 @@ from egovcp.sim.scene import BALL, HANDS, HEAD, LEG, TORSO
 from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
 
 _PARKED: Final = np.array([-20.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # behind the robot, unseen
+_AT_REST: Final = np.zeros(6)
 _GRAVITY: Final = np.array([0.0, 0.0, -9.81])  # m/s^2
 
 
@@ -71,7 +72,7 @@ class BallTask(Task):
 
     def place(self) -> None:
         """Park the ball out of sight."""
-        self._set_ball(_PARKED, np.zeros(6))
+        self._set_ball(_PARKED, _AT_REST)
 
     def _set_ball(self, pose: Array, velocity: Array) -> None:
         self.robot.data.qpos[-7:] = pose

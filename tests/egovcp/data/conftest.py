@@ -1,13 +1,23 @@
-"""Synthetic episodes and a small dataset on disk."""
+"""Synthetic episodes, a small dataset on disk, and a disk that fails."""
 
+import errno
+import os
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from egovcp import spec
-from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, Provenance
+from egovcp.data import (
+    DatasetConfig,
+    DatasetReader,
+    DatasetWriter,
+    Episode,
+    Provenance,
+    files,
+)
 
 type MakeEpisode = Callable[..., Episode]
 
@@ -64,3 +74,71 @@ def dataset_root(tmp_path_factory: pytest.TempPathFactory, episodes: list[Episod
 @pytest.fixture(scope="session")
 def reader(dataset_root: Path) -> DatasetReader:
     return DatasetReader.open(DatasetConfig(root=str(dataset_root)))
+
+
+class Disk:
+    """Every write, flush, rename and link of `egovcp.data` goes through it.
+
+    Counts operations and bytes; fails at the ``fail_at``-th operation, or beyond ``room``.
+    """
+
+    def __init__(self, fail_at: int | None = None, room: int | None = None) -> None:
+        self.fail_at = fail_at
+        self.room = room
+        self.operations = 0
+        self.bytes = 0
+
+    def operate(self, name: object) -> None:
+        self.operations += 1
+        if self.operations == self.fail_at:
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(name))
+
+    def fill(self, size: int, name: object) -> None:
+        self.bytes += size
+        if self.room is not None and self.bytes > self.room:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(name))
+
+    def install(self, monkeypatch: pytest.MonkeyPatch) -> "Disk":
+        """Put the disk between `egovcp.data.files` and the real one."""
+        create = files.create
+        monkeypatch.setattr(files, "create", lambda path: _File(self, create(path)))
+        for name in ("sync", "rename", "link", "exchange"):
+            monkeypatch.setattr(files, name, self._counted(getattr(files, name)))
+        return self
+
+    def _counted(self, function: Any) -> Any:
+        def counted(*paths: Path) -> None:
+            self.operate(paths[0])
+            function(*paths)
+
+        return counted
+
+
+class _File:
+    """A file that writes what fits."""
+
+    def __init__(self, disk: Disk, file: Any) -> None:
+        self._disk, self._file = disk, file
+        disk.operate(file.name)
+
+    def write(self, content: Any) -> int:
+        self._disk.operate(self._file.name)
+        self._disk.fill(len(memoryview(content).cast("B")), self._file.name)
+        return int(self._file.write(content))
+
+    def __enter__(self) -> "_File":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._file, name)
+
+
+type MakeDisk = Callable[..., Disk]
+
+
+@pytest.fixture(scope="session")
+def make_disk() -> MakeDisk:
+    return Disk

@@ -8,12 +8,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.log.info import RunInfo
-from egovcp.log.picture import AHEAD, PictureSink, imagined_of, key_moments
+from egovcp.log.picture import (
+    AHEAD,
+    PictureSink,
+    curves,
+    films,
+    imagined_of,
+    key_moments,
+    rollout_picture,
+)
 from egovcp.log.sketch import Eye, Surface, paint, scene_surface
 from egovcp.log.tick import SceneObject
 
@@ -47,6 +56,30 @@ def test_imagination_is_shown_for_the_moment_it_was_about(make_tick: Any) -> Non
     assert imagined_of(ticks, AHEAD - 1) is None
 
 
+def test_what_a_run_knows_nothing_of_has_no_row_and_no_curve(make_tick: Any) -> None:
+    ticks = [make_tick(i, bare=True) for i in range(AHEAD + 2)]
+    last = len(ticks) - 1
+    assert list(films(ticks, [0, last])) == ["depth seen"]
+    assert list(curves(ticks)) == ["return so far"]
+    ticks[-1] = replace(ticks[-1], depth_reconstructed=np.ones((48, 64)), value=0.5)
+    assert list(films(ticks, [0, last])) == ["depth seen", "reconstructed"]
+    assert list(films(ticks, [0])) == ["depth seen"]
+    assert list(curves(ticks)) == ["value of the plan", "return so far"]
+    ticks[last - AHEAD] = replace(ticks[last - AHEAD], depth_imagined=np.ones((AHEAD, 48, 64)))
+    assert len(films(ticks, [0, last])) == 3
+
+
+def test_a_row_less_makes_a_lower_picture_of_the_same_width(tmp_path: Path, make_tick: Any) -> None:
+    sizes = []
+    for bare in (False, True):
+        path = tmp_path / f"{bare}.png"
+        rollout_picture([make_tick(i, bare=bare) for i in range(2)], path)
+        with Image.open(path) as image:
+            sizes.append(image.size)
+    assert sizes[0][0] == sizes[1][0]
+    assert sizes[0][1] > sizes[1][1] + 100
+
+
 @pytest.mark.parametrize("bare", [False, True])
 def test_the_sink_writes_a_picture_when_closed(tmp_path: Path, make_tick: Any, bare: bool) -> None:
     path = tmp_path / "a.png"
@@ -75,6 +108,22 @@ def test_the_eye_sees_its_target_in_the_middle_and_left_to_the_left() -> None:
     assert points[1, 0] < 0
     assert points[1, 1] == pytest.approx(0.0)
     assert points[2, 1] > 0
+
+
+@pytest.mark.parametrize("way", [(8.0, 0.0), (0.0, -5.0), (-3.0, 4.0)])
+def test_the_eye_follows_a_robot_that_walks_but_not_one_that_stumbles(
+    way: tuple[float, float],
+) -> None:
+    stumble = np.array(way) / np.hypot(*way) * 0.2
+    assert Eye().following(np.array([*stumble, 0.74])) == Eye()
+    for share in (0.2, 0.5, 1.0):
+        pelvis = np.array([way[0] * share, way[1] * share, 0.74])
+        eye = Eye().following(pelvis)
+        (points, _) = eye.project(pelvis[None])
+        assert np.all(np.abs(points) < [0.85, 0.5]), "it stays in the picture"
+        moved = np.subtract(eye.target, Eye().target)
+        np.testing.assert_allclose(np.subtract(eye.position, Eye().position), moved)
+        assert moved[2] == 0.0
 
 
 @pytest.mark.parametrize("shape", ["sphere", "box"])
@@ -107,3 +156,22 @@ def test_nearer_triangles_are_painted_over_farther_ones() -> None:
     colours = axes.collections[0].get_facecolor()
     assert colours[0][2] > colours[0][0], "the far, blue triangle comes first"
     assert colours[-1][0] > colours[-1][2]
+
+
+@pytest.mark.parametrize(("shape", "hides"), [("sphere", True), ("box", False)])
+def test_a_ball_hides_what_is_behind_it_and_a_wall_does_not(shape: Any, hides: bool) -> None:
+    thing = SceneObject("a", shape, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.3, 0.3, 0.3))
+    eye = Eye(position=(-3.0, 0.0, 0.0), target=(0.0, 0.0, 0.0))
+    middles = []
+    for behind in ((255.0, 0.0, 0.0), (0.0, 0.0, 255.0)):
+        corners = np.array([[[1.0, 0.9, -0.9], [1.0, -0.9, -0.9], [1.0, 0.0, 0.9]]])
+        figure = Figure(figsize=(1, 1))
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set(xlim=(-1, 1), ylim=(-1, 1))
+        paint(axes, [Surface(corners, np.array([behind])), *scene_surface([thing])], eye)
+        canvas = FigureCanvasAgg(figure)
+        canvas.draw()
+        picture = np.asarray(canvas.buffer_rgba())
+        middles.append(picture[picture.shape[0] // 2, picture.shape[1] // 2, :3].astype(int))
+    seen = np.abs(middles[0] - middles[1]).max()
+    assert (seen < 30) == hides, "the seams between triangles let a little through"

@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from egovcp.errors import UsageError
-from egovcp.robot.stance_table import standing_pose
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import ACTION_BOX, STATE_SLICES
-from egovcp_train.lowlevel import rewards
+from egovcp_train.lowlevel import events, rewards
 from egovcp_train.lowlevel.commands import Commands, between
 from egovcp_train.lowlevel.env import LowLevelEnv, mirrored
 from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
@@ -61,7 +60,7 @@ def test_told_to_walk_without_a_trained_residual_it_falls_and_starts_again():
         for row in torch.nonzero(done):
             assert float(reward[row]) < -1
             assert int(env.episode_length_buf[row]) == 0
-            assert env.walk.gait.amount[row] == 0
+            assert env.loop.walk.gait.amount[row] == 0
             assert not extras["time_outs"][row]
         fell += int(done.sum())
     assert fell >= 8
@@ -80,7 +79,7 @@ def test_the_same_seed_gives_the_same_run_whatever_the_threads():
         env = LowLevelEnv(
             4, LowLevelTask(), WalkConfig(), SensorConfig(), threads=threads, seed=seed
         )
-        env.difficulty = 1.0
+        env.loop.difficulty = 1.0
         for _ in range(40):
             obs, *_ = env.step(_zero(env))
         env.close()
@@ -202,14 +201,13 @@ def test_mirrored_twice_is_the_same():
 def test_a_mirrored_robot_under_mirrored_commands_does_the_mirrored_thing():
     """Robot 1 gets everything in the mirror, tick by tick; what is observed stays a mirror."""
     env = _env(2, commands=STANDING, disturbances=PLAIN)
-    pose = standing_pose(ACTION_BOX.neutral[-1])  # itself its mirror image
-    qpos = np.tile(np.concatenate([pose.position, pose.quaternion, pose.joints]), (2, 1))
+    qpos = events.neutral(2)  # itself its mirror image
     env.physics.place(np.arange(2), qpos, qpos[:, 7:])
-    env.commands.velocity[:] = env.commands._goal[:] = [[0.2, 0.1, 0.2], [0.2, -0.1, -0.2]]
-    env.commands._ticks_left[:] = 1000
-    for _ in range(2):  # the second time with the state of the first
-        env.walk.reset(env.state)
-        env._observe(env.physics.snapshot())
+    env.loop.restart(np.arange(2))
+    commands = env.loop.commands
+    commands.velocity[:] = commands._goal[:] = [[0.2, 0.1, 0.2], [0.2, -0.1, -0.2]]
+    commands._ticks_left[:] = 1000
+    env._observe(env.physics.snapshot())
     _, action = mirrored(env, None, torch.randn(1, ACTIONS, generator=torch.manual_seed(0)))
     for _ in range(15):
         obs, *_ = env.step(0.1 * action)
@@ -231,14 +229,14 @@ def _terms(env: LowLevelEnv, **change: np.ndarray) -> dict[str, np.ndarray]:
     x = replace(env.physics.snapshot(), **change)
     n = env.num_envs
     action = np.zeros((n, ACTIONS))
-    walk = env.walk
+    walk = env.loop.walk
     motion = rewards.Motion(n)
     for _ in range(100):
         motion.add(x)
     return rewards.terms(
         x,
         motion.average,
-        env.commands.vector,
+        env.loop.commands.vector,
         walk.height,
         walk.pitch,
         walk.gait.phase,
@@ -293,10 +291,11 @@ def test_what_is_not_wanted_is_counted(stood, change, term):
 
 
 def test_the_observed_state_is_what_a_robot_measures(stood):
-    state = stood.state[0]
+    state = stood.get_observations()["policy"][0].numpy()
     x = stood.physics.snapshot()
-    np.testing.assert_allclose(state[STATE_SLICES["joint_position"]], x.joints[0])
-    np.testing.assert_allclose(state[STATE_SLICES["angular_velocity"]], x.angular_velocity[0])
+    joints, rate = (state[STATE_SLICES[n]] for n in ("joint_position", "angular_velocity"))
+    np.testing.assert_allclose(joints, x.joints[0], rtol=1e-6)
+    np.testing.assert_allclose(rate, x.angular_velocity[0], rtol=1e-6)
     gravity = state[STATE_SLICES["projected_gravity"]]
     assert gravity @ gravity == pytest.approx(1.0)
     assert gravity[2] < -0.99

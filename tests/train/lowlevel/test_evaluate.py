@@ -82,6 +82,19 @@ def test_a_robot_that_is_thrown_down_has_fallen():
     assert not outcome.survived.any()
 
 
+def test_stepping_is_the_share_of_the_ticks_up_to_a_fall_in_which_it_steps():
+    walk = Skill("trial", "", 2.0, skills.walking((0.3, 0.3), (0.72, 0.72)))
+    stand = Skill("trial", "", 2.0, skills.neutral)
+    physics, sensors = DisturbanceConfig(models=4), SensorConfig()
+    for name, skill, low, high in (
+        ("walk", walk, 0.9, 1.0),  # not yet while the velocity rises
+        ("walk", stand, 0.0, 0.1),
+        ("stance", walk, 0.0, 0.0),
+    ):
+        share = play(make_controller(name), skill, 4, 0, physics, sensors).stepping
+        assert ((low <= share) & (share <= high)).all(), (name, share)
+
+
 def test_it_writes_a_line_per_skill(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
     flags = [f"--output_dir={tmp_path / 'out'}", "--skills=squat", "--episodes=2", "--threads=1"]
     assert main(flags) == 0
@@ -90,6 +103,7 @@ def test_it_writes_a_line_per_skill(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert figures["squat"]["survival"] == 1.0
     assert figures["squat"]["height_error_m"] < 0.02
     assert figures["squat"]["velocity_error_mps"] is None
+    assert figures["squat"]["stepping"] == 0.0
     assert figures["_run"]["controller"] == make_controller("stance").id
     assert "squat" in capsys.readouterr().out
 

@@ -10,11 +10,13 @@ import torch
 from egovcp.robot.g1 import STIFFNESS
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
 from egovcp.spec import JOINT_NAMES
+from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
 from egovcp_train.lowlevel.task import DisturbanceConfig, LowLevelTask, RewardConfig
 
 pytestmark = pytest.mark.timeout(900)  # Warp compiles its kernels once
 
 task_module = pytest.importorskip("egovcp_train.lowlevel.mjlab_task")
+terms_module = pytest.importorskip("egovcp_train.lowlevel.mjlab_terms")
 N = 3
 PLAIN = DisturbanceConfig(
     push_interval=(90.0, 99.0),
@@ -83,7 +85,7 @@ def test_robots_stand_for_a_while_without_a_policy(env):
     for _ in range(25):
         obs, reward, terminated, truncated, _ = env.step(torch.zeros(N, ACTIONS))
     assert obs["policy"].shape == (N, OBSERVATION_DIM)
-    assert obs["privileged"].shape == (N, task_module.sensing.PRIVILEGED_DIM)
+    assert obs["privileged"].shape == (N, PRIVILEGED_DIM)
     assert not terminated.any()
     assert not truncated.any()
     best = sum(w for w in asdict(RewardConfig()).values() if w > 0) * 0.02
@@ -125,10 +127,11 @@ def test_a_checkpoint_comes_with_the_controllers_file(env, tmp_path):
 
     first = runner()
     first.learn(1)
-    task_module.loop(env).difficulty = 0.5
+    loop = terms_module.loop_term(env).loop
+    loop.difficulty = 0.5
     first.save(str(tmp_path / "model_1.pt"))
-    task_module.loop(env).difficulty = 0.0
+    loop.difficulty = 0.0
     runner().load(str(tmp_path / "model_1.pt"))
-    assert task_module.loop(env).difficulty == 0.5
+    assert loop.difficulty == 0.5
     controller = make_controller(str(tmp_path / "model_1.safetensors"))
     assert controller.walks

@@ -1,18 +1,23 @@
 """The training curve of a low-level controller, from its TensorBoard records, as table and picture.
 
-    python -m egovcp_train.lowlevel.curve RUN --out docs/lowlevel_training
+    python -m egovcp_train.lowlevel.curve RUN [RUN ...] --out docs/lowlevel_training
 
-Writes OUT.csv and OUT.png.
+Writes OUT.csv and OUT.png. Several runs, in order, are a run and its continuations in other
+folders: what a continuation did again counts instead of what it had continued from.
 """
 
 from __future__ import annotations
 
 import argparse
 import csv
+import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+
+from egovcp.errors import ArtefactError, EgovcpError
 
 COLUMNS: Final = {
     "difficulty": "episode/difficulty",
@@ -23,13 +28,19 @@ COLUMNS: Final = {
 _POINTS: Final = 200
 
 
-def read(run: Path) -> list[dict[str, float]]:
-    """About 200 rows of steps and `COLUMNS`, each the mean of its stretch of the run."""
-    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+def read(runs: Sequence[Path]) -> list[dict[str, float]]:
+    """About 200 rows of steps and `COLUMNS`, each the mean of its stretch of the runs.
 
-    records = EventAccumulator(str(run / "tensorboard"), size_guidance={"scalars": 0})
-    records.Reload()
-    series = {name: records.Scalars(tag) for name, tag in COLUMNS.items()}
+    Args:
+        runs: output folders of a run and of its continuations, in order.
+
+    Raises:
+        ArtefactError: a folder holds no records of a training of the low-level controller.
+    """
+    series: dict[str, list[Any]] = {name: [] for name in COLUMNS}
+    for run in runs:
+        for name, points in _records(run).items():
+            series[name] = [p for p in series[name] if p.step < points[0].step] + points
     count = min(len(points) for points in series.values())
     stretch = max(1, count // _POINTS)
     rows = []
@@ -40,6 +51,23 @@ def read(run: Path) -> list[dict[str, float]]:
         row["falls per robot and minute"] *= 60
         rows.append(row)
     return rows
+
+
+def _records(run: Path) -> dict[str, list[Any]]:
+    """One run's scalars of `COLUMNS`; not empty."""
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    folder = run / "tensorboard"
+    records = EventAccumulator(str(folder), size_guidance={"scalars": 0})
+    if folder.is_dir():
+        records.Reload()
+    missing = sorted(set(COLUMNS.values()) - set(records.Tags()["scalars"]))
+    if missing:
+        raise ArtefactError(
+            f"{folder}: no records of {', '.join(missing)}; expected those of an output folder "
+            "of egovcp-train-lowlevel that has finished an iteration, with --tensorboard=true"
+        )
+    return {name: records.Scalars(tag) for name, tag in COLUMNS.items()}
 
 
 def _mean(points: list[Any]) -> float:
@@ -66,16 +94,23 @@ def write(rows: list[dict[str, float]], out: Path) -> None:
     plt.close(figure)
 
 
-def main() -> None:
-    """Read a run, write its curve."""
+def main(argv: Sequence[str] | None = None) -> int:
+    """Read runs, write their curve; returns the exit code."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("run", type=Path, help="--output_dir of egovcp-train-lowlevel")
+    parser.add_argument(
+        "runs", type=Path, nargs="+", metavar="RUN", help="--output_dir of egovcp-train-lowlevel"
+    )
     parser.add_argument("--out", type=Path, required=True, help="path without ending")
-    args = parser.parse_args()
-    write(read(args.run), args.out)
+    args = parser.parse_args(argv)
+    try:
+        write(read(args.runs), args.out)
+    except EgovcpError as error:
+        print(f"{parser.prog}: {error}", file=sys.stderr)
+        return error.exit_code
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

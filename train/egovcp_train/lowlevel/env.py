@@ -17,12 +17,11 @@ from tensordict import TensorDict
 
 from egovcp.data.mirror import STATE_SIGN, STATE_SOURCE
 from egovcp.robot.mjcf import FootModel
-from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, Walk, WalkConfig
+from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
 from egovcp.sim.config import SensorConfig
-from egovcp.sim.sensors import noise_std
 from egovcp.spec import CONTROLLER_HZ, STATE_DIM, STATE_SLICES
 from egovcp_train.lowlevel import events, rewards, sensing
-from egovcp_train.lowlevel.commands import Commands
+from egovcp_train.lowlevel.loop import Loop
 from egovcp_train.lowlevel.physics import Physics, Snapshot
 from egovcp_train.lowlevel.task import LowLevelTask
 
@@ -50,27 +49,12 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self.task = task
         self.physics = Physics(robots, feet, task.disturbances, threads, seed)
         self.seed, self.rng = seed, np.random.default_rng(seed)
-        self.commands = Commands(robots, task.commands, self.rng)
-        self.walk = Walk(walk)
+        self.loop = Loop(robots, task, walk, sensors, self.rng)
         self.episode_length_buf = torch.zeros(robots, dtype=torch.long)
-        self._noise = noise_std(sensors)
         self._delay = np.zeros(robots, dtype=np.intp)
         self._next_push = np.zeros(robots, dtype=np.intp)
-        self._action = np.zeros((robots, ACTIONS))
-        self._motion = rewards.Motion(robots)
-        self._sums: dict[str, Array] = {}
         self._start(np.arange(robots))
         self._observe(self.physics.snapshot())
-
-    # --- difficulty ------------------------------------------------------------------
-    @property
-    def difficulty(self) -> float:
-        """0 .. 1; raised by the trainer as the policy succeeds."""
-        return self.commands.difficulty
-
-    @difficulty.setter
-    def difficulty(self, value: float) -> None:
-        self.commands.difficulty = float(np.clip(value, 0.0, 1.0))
 
     # --- VecEnv ----------------------------------------------------------------------
     def get_observations(self) -> TensorDict:
@@ -81,32 +65,17 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """One tick of 20 ms."""
-        action = actions.detach().numpy().astype(np.float64)
-        self.physics.step(self.walk.targets(action), self._delay)
+        self.physics.step(self.loop.targets(actions.detach().numpy()), self._delay)
         self.episode_length_buf += 1
         self._push()
         x = self.physics.snapshot()
-        self._motion.add(x)
-        terms = rewards.terms(
-            x,
-            self._motion.average,
-            self.commands.vector,
-            self.walk.height,
-            self.walk.pitch,
-            self.walk.gait.phase,
-            self.walk.gait.amount,
-            action,
-            self._action,
-        )
-        fallen = rewards.fallen(x, self.walk.height, self.walk.pitch)
-        weights = asdict(self.task.rewards)
-        total = sum(weights[name] * _DT * np.nan_to_num(value) for name, value in terms.items())
-        reward = np.where(x.broken, 0.0, total) + weights["fall"] * _DT * fallen
-        self._action = action
+        terms = self.loop.judge(x)
+        fallen = self.loop.fallen
+        reward = self._weighted(rewards.earned(terms, fallen, x.broken))
         late = self.episode_length_buf.numpy() >= self.max_episode_length
         done = fallen | late
         log = self._record(terms, done, fallen)
-        self.commands.advance()
+        self.loop.commands.advance()
         if done.any():
             self._start(np.flatnonzero(done))
             x = self.physics.snapshot()
@@ -135,14 +104,10 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         n = len(rows)
         qpos = events.standing(n, self.rng)
         self.physics.place(rows, qpos, qpos[:, 7:])
-        self.commands.reset(rows)
+        self.loop.restart(rows)
         self.episode_length_buf[torch.from_numpy(rows)] = 0
         self._delay[rows] = events.delays(n, self.task.disturbances, self.rng)
         self._schedule_push(rows)
-        self._action[rows] = 0.0
-        self._motion.reset(rows)
-        state = self._measure(self.physics.snapshot())
-        self.walk.reset(state, None if n == self.num_envs else rows)
 
     def _schedule_push(self, rows: NDArray[np.intp]) -> None:
         seconds = self.rng.uniform(*self.task.disturbances.push_interval, len(rows))
@@ -155,19 +120,18 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         if len(rows) == 0:
             return
         self.physics.qvel[rows, :2] += events.pushes(
-            len(rows), self.task.disturbances, self.difficulty, self.rng
+            len(rows), self.task.disturbances, self.loop.difficulty, self.rng
         )
         self._schedule_push(rows)
 
-    def _measure(self, x: Snapshot) -> Array:
-        return sensing.measure(x, self.commands.vector, self._noise, self.rng)
+    def _weighted(self, earned: dict[str, Array]) -> Array:
+        """(N,) reward of the tick."""
+        weights = asdict(self.task.rewards)
+        parts = [weights[name] * _DT * value for name, value in earned.items()]
+        return np.asarray(sum(parts))
 
     def _observe(self, x: Snapshot) -> None:
-        self.state = self._measure(x)
-        policy = self.walk.observe(self.state)
-        privileged = sensing.privileged(
-            x, self._motion.average, self.walk.height, self.physics.floor_friction
-        )
+        policy, privileged = self.loop.observe(x, self.physics.floor_friction)
         self._observations = TensorDict(
             {"policy": torch.from_numpy(policy), "privileged": torch.from_numpy(privileged)},
             batch_size=[self.num_envs],
@@ -180,7 +144,7 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         log = {f"/reward/{name}": float(np.nanmean(value)) for name, value in terms.items()}
         if done.any():
             log["/episode/fell"] = float(fallen[done].mean())
-        log["/episode/difficulty"] = self.difficulty
+        log["/episode/difficulty"] = self.loop.difficulty
         return log
 
 

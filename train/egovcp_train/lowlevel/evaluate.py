@@ -32,6 +32,7 @@ _FIGURES: Final = {
     "height_error_m": "height_error",
     "velocity_error_mps": "velocity_error",
     "head_top_m": "head_top",
+    "stepping": "stepping",
 }
 
 
@@ -41,7 +42,7 @@ class LowLevelEvalConfig:
 
     Every skill is played by --episodes robots of different mass, friction and gains, with
     delay and sensor noise. A fall is a tilt of more than 1 rad or a pelvis below 0.35 m.
-    Errors are means over the time before a fall.
+    Errors, and the share of the time in which it steps, are means over the time before a fall.
     """
 
     output_dir: str
@@ -139,7 +140,7 @@ def _figures(skill: Skill, outcome: dict[str, NDArray[Any]]) -> dict[str, Any]:
 def table(figures: dict[str, dict[str, Any]]) -> str:
     """One line per skill."""
     head = f"{'skill':<8}{'survival':>9}  {'95 %':<18}{'hand':>8}{'lag':>8}{'height':>9}"
-    lines = [head + f"{'velocity':>11}{'head top':>10}"]
+    lines = [head + f"{'velocity':>11}{'head top':>10}{'stepping':>10}"]
     for name, f in figures.items():
         low, high = f["survival_ci95"]
         lines.append(
@@ -147,7 +148,7 @@ def table(figures: dict[str, dict[str, Any]]) -> str:
             f"{_cell(f['hand_error_m'], 100, 'cm'):>8}{_cell(f['hand_lag_s'], 1000, 'ms', 0):>8}"
             f"{_cell(f['height_error_m'], 100, 'cm'):>9}"
             f"{_cell(f['velocity_error_mps'], 1, 'm/s', 2):>11}"
-            f"{_cell(f['head_top_m'], 1, 'm', 2):>10}"
+            f"{_cell(f['head_top_m'], 1, 'm', 2):>10}{_cell(f['stepping'], 100, '%', 0):>10}"
         )
     return "\n".join(lines)
 

@@ -61,8 +61,8 @@ class PpoLearner:
         self.iteration += 1
         scalars = {name: float(np.mean(values)) for name, values in log.items()}
         scalars["falls_per_second"] = falls * CONTROLLER_HZ / (self._ticks * self.env.num_envs)
-        self.env.difficulty = adapted(
-            self.env.difficulty,
+        self.env.loop.difficulty = adapted(
+            self.env.loop.difficulty,
             scalars["falls_per_second"],
             scalars["reward/velocity"],
             self.curriculum,
@@ -80,13 +80,13 @@ class PpoLearner:
         return {
             "ppo": self.ppo.save(),
             "iteration": self.iteration,
-            "difficulty": self.env.difficulty,
+            "difficulty": self.env.loop.difficulty,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         self.ppo.load(state["ppo"], None, strict=True)
         self.iteration = int(state["iteration"])
-        self.env.difficulty = float(state["difficulty"])
+        self.env.loop.difficulty = float(state["difficulty"])
         self.env.reseed(self.iteration)
 
 

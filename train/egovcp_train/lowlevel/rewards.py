@@ -106,6 +106,14 @@ def fallen(x: Snapshot, height: Array, pitch: Array) -> NDArray[np.bool_]:
     return out
 
 
+def earned(
+    terms: dict[str, Array], fell: NDArray[np.bool_], broken: NDArray[np.bool_]
+) -> dict[str, Array]:
+    """`terms` and the ``fall``, finite: a robot whose simulation diverged earns nothing else."""
+    finite = {name: np.where(broken, 0.0, np.nan_to_num(v)) for name, v in terms.items()}
+    return finite | {"fall": fell.astype(np.float64)}
+
+
 def _in_step(on: NDArray[np.bool_], phase: Array, gait: Array) -> Array:
     """Share of the feet that stand or swing as the clock says; standing, all feet stand."""
     swing = np.stack([np.sin(phase), -np.sin(phase)], axis=1) * gait[:, None]

@@ -183,7 +183,7 @@ class _Run:
 
     @property
     def _difficulty(self) -> float:
-        return float(self.learner.env.difficulty)
+        return float(self.learner.env.loop.difficulty)
 
     def save(self) -> None:
         """Write a checkpoint: the controller's file, and the training state."""

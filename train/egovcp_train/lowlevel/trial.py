@@ -13,10 +13,10 @@ from egovcp.robot.g1 import WAIST
 from egovcp.robot.kinematics import torso_rotation
 from egovcp.robot.mjcf import FootModel
 from egovcp.robot.reach import nearest_reachable
-from egovcp.robot.stance_table import standing_pose
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.sensors import noise_std
-from egovcp.spec import ACTION_BOX, CONTROLLER_HZ, PHYSICS_DT
+from egovcp.spec import CONTROLLER_HZ
+from egovcp_train.lowlevel import events
 from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
 from egovcp_train.lowlevel.physics import Physics, Snapshot
 from egovcp_train.lowlevel.sensing import measure
@@ -42,6 +42,7 @@ class Outcome:
     height_error: Array  # m, mean
     velocity_error: Array  # m/s, mean over strides
     head_top: Array  # m, highest in walking
+    stepping: Array  # share of the ticks in which the robot steps
 
 
 class _Record:
@@ -53,8 +54,9 @@ class _Record:
         self.height: list[Array] = []
         self.velocity: list[Array] = []
         self.head: list[Array] = []
+        self.stepping: list[NDArray[np.bool_]] = []
 
-    def add(self, x: Snapshot, command: Array) -> None:
+    def add(self, x: Snapshot, command: Array, stepping: NDArray[np.bool_]) -> None:
         turn = rotation(x.quaternion)
         forward = heading(turn)
         to_heading = _heading_from_world(forward)
@@ -66,6 +68,7 @@ class _Record:
         self.height.append(x.position[:, 2].copy())
         self.velocity.append(in_heading(x.velocity, forward))
         self.head.append(x.head_top.copy())
+        self.stepping.append(stepping)
 
 
 def play(
@@ -82,35 +85,23 @@ def play(
     rng = np.random.default_rng([seed, 1])
     physics = Physics(robots, feet, disturbances, threads, seed)
     commands = skill.script(skill.ticks, robots, rng)
-    _place(physics, robots)
-    low, high = (round(d / PHYSICS_DT) for d in disturbances.delay)
-    delay = rng.integers(low, high + 1, robots)
+    qpos = events.neutral(robots)
+    physics.place(np.arange(robots), qpos, qpos[:, 7:])
+    delay = events.delays(robots, disturbances, rng)
     std, record = noise_std(sensors), _Record()
     alive = np.ones((skill.ticks, robots), dtype=bool)
     x = physics.snapshot()
     controller.reset(measure(x, commands[0], std, rng))
     for tick, command in enumerate(commands):
         if skill.push and tick == _PUSH_TICK:
-            _push(physics, skill.push, rng)
+            physics.qvel[:, :2] += events.kick(skill.push, events.directions(robots, rng))
         state = measure(x, command, std, rng)
         physics.step(controller.step(state), delay)
         x = physics.snapshot()
         alive[tick:] &= ~_fallen(x)
-        record.add(x, command)
+        record.add(x, command, controller.stepping)
     physics.close()
     return _judge(skill, commands, record, alive)
-
-
-def _place(physics: Physics, robots: int) -> None:
-    pose = standing_pose(ACTION_BOX.neutral[-1])
-    qpos = np.tile(np.concatenate([pose.position, pose.quaternion, pose.joints]), (robots, 1))
-    physics.place(np.arange(robots), qpos, qpos[:, 7:])
-
-
-def _push(physics: Physics, speed: float, rng: np.random.Generator) -> None:
-    angle = rng.uniform(-np.pi, np.pi, len(physics.qvel))
-    physics.qvel[:, 0] += speed * np.cos(angle)
-    physics.qvel[:, 1] += speed * np.sin(angle)
 
 
 def _fallen(x: Snapshot) -> NDArray[np.bool_]:
@@ -148,6 +139,7 @@ def _judge(skill: Skill, commands: Array, record: _Record, alive: NDArray[np.boo
         if moves
         else _nothing(alive),
         head_top=_highest(np.array(record.head), counted) if moves else _nothing(alive),
+        stepping=_mean(np.array(record.stepping), alive),
     )
 
 

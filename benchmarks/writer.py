@@ -1,0 +1,122 @@
+"""Writing episodes: LeRobot's own writer against `DatasetWriter` and against the service's path.
+
+The same frames, from arrays in memory to a complete dataset on the disk:
+
+* ``lerobot``: `LeRobotDataset.add_frame` per frame, `save_episode`, `finalize`;
+* ``writer``: `egovcp.data.DatasetWriter`;
+* ``service``: every episode encoded, sealed (flushed to the disk) and committed in shards, as
+  `egovcp-collect` does.
+
+    python benchmarks/writer.py
+"""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+from report import parser, publish
+
+from egovcp import spec
+from egovcp.data import DatasetWriter, Episode, Provenance
+from egovcp.data.committer import committing
+from egovcp.data.encoded import encode
+from egovcp.data.spool import SealedEpisode
+
+PROVENANCE = Provenance("benchmark")
+
+
+def make_episode(number: int, ticks: int) -> Episode:
+    """Depth as a camera sees it, a ramp with noise and holes, since it is compressed."""
+    rng = np.random.default_rng(number)
+    pixels = (ticks, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+    ramp = np.linspace(4500, 900, spec.DEPTH_ROWS)[:, None]
+    depth = (ramp + rng.normal(0, 20, pixels)).clip(280, 5000).astype(np.uint16)
+    depth[rng.random(pixels) < 0.3] = 0
+    last = np.arange(ticks) == ticks - 1
+    return Episode(
+        depth=depth,
+        state=rng.normal(size=(ticks, spec.STATE_DIM)).astype(np.float32),
+        action=rng.uniform(-1, 1, (ticks, spec.ACTION_DIM)).astype(np.float32),
+        reward=rng.normal(size=ticks).astype(np.float32),
+        done=last,
+        success=np.zeros(ticks, dtype=np.bool_),
+        truncated=last,
+        task="ball",
+        time_limit=ticks,
+        metadata={"seed": 0, "episode": number},
+    )
+
+
+def lerobot(root: Path, episodes: Sequence[Episode]) -> None:
+    """Frame by frame, as its documentation says."""
+    dataset = LeRobotDataset.create(
+        "me/bench", spec.PLANNER_HZ, spec.FEATURES, root=root, use_videos=False
+    )
+    for e in episodes:
+        for t in range(len(e)):
+            dataset.add_frame(
+                {
+                    spec.DEPTH_KEY: e.depth[t, :, :, None],
+                    spec.STATE_KEY: e.state[t],
+                    spec.ACTION_KEY: e.action[t],
+                    spec.REWARD_KEY: e.reward[t : t + 1],
+                    spec.DONE_KEY: e.done[t : t + 1],
+                    spec.SUCCESS_KEY: e.success[t : t + 1],
+                    spec.TRUNCATED_KEY: e.truncated[t : t + 1],
+                    "task": e.task,
+                }
+            )
+        dataset.save_episode()
+    dataset.finalize()
+
+
+def writer(root: Path, episodes: Sequence[Episode]) -> None:
+    """Whole episodes."""
+    with DatasetWriter(root, PROVENANCE) as out:
+        for episode in episodes:
+            out.add(episode)
+
+
+def service(root: Path, episodes: Sequence[Episode]) -> None:
+    """Sealed one by one, committed together."""
+    with committing(root, PROVENANCE) as committer:
+        for number, episode in enumerate(episodes):
+            committer.spool.put(SealedEpisode.of(number, encode(episode)))
+            committer.note(number)
+        committer.commit()
+
+
+def rate(write: Callable[[Path, Sequence[Episode]], None], episodes: Sequence[Episode]) -> float:
+    """Frames per second."""
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.perf_counter()
+        write(Path(folder) / "dataset", episodes)
+        return sum(map(len, episodes)) / (time.perf_counter() - start)
+
+
+def main() -> None:
+    """Measure and print."""
+    options = parser(__doc__)
+    options.add_argument("--episodes", type=int, default=12)
+    options.add_argument("--ticks", type=int, default=150)
+    args = options.parse_args()
+    episodes = [make_episode(i, args.ticks) for i in range(args.episodes)]
+    for write in (writer, service):
+        rate(write, episodes[:1])  # imports, first allocations
+    found = [[rate(w, episodes) for w in (lerobot, writer, service)] for _ in range(args.rounds)]
+    figures = {}
+    for i, name in enumerate(("lerobot", "writer", "service")):
+        figures[f"{name}_frames_per_s"] = statistics.median(row[i] for row in found)
+        if i:
+            figures[f"{name}_ratio"] = statistics.median(row[i] / row[0] for row in found)
+    publish(figures, args.json)
+
+
+if __name__ == "__main__":
+    main()

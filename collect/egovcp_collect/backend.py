@@ -1,0 +1,94 @@
+"""What a collection asks of those who simulate for it, wherever they run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from egovcp.data.encoded import EncodedEpisode
+from egovcp.data.spool import SealedEpisode
+from egovcp.sim.scenario import Scenario
+
+
+@dataclass(frozen=True)
+class Brief:
+    """What the progress display needs to know of an episode."""
+
+    number: int
+    """Its number in the run."""
+    steps: int
+    """Planner ticks."""
+    success: bool
+    terms: dict[str, int]
+    """Reward term -> ticks in which it was not zero."""
+    hand_contacts: int
+    """Ticks in which a hand touched the task's object."""
+
+    @classmethod
+    def of(cls, number: int, encoded: EncodedEpisode) -> Brief:
+        """Summarise an episode."""
+        metadata = encoded.facts["metadata"]
+        return cls(
+            number,
+            len(encoded),
+            bool(encoded.table["next.success"][-1].as_py()),
+            {name: term["ticks"] for name, term in metadata["reward_terms"].items()},
+            metadata["contact_ticks"]["hands"],
+        )
+
+
+@dataclass(frozen=True)
+class Report:
+    """A sign of life of a worker."""
+
+    steps: int
+    """Planner ticks since its last report."""
+    done: tuple[Brief, ...] = ()
+    """Episodes that it has finished since."""
+    sealed: tuple[SealedEpisode, ...] = ()
+    """Those of them that it could not put into the spool itself."""
+    failure: Exception | None = None
+    """Why it has ended; nothing follows."""
+
+
+class Worker(Protocol):
+    """One process that simulates."""
+
+    def give(self, scenarios: Sequence[Scenario]) -> None:
+        """More episodes to play, after those it has."""
+        ...
+
+    def reports(self) -> list[Report]:
+        """What has come in since the last call; does not wait."""
+        ...
+
+    @property
+    def alive(self) -> bool:
+        """Whether more reports can come."""
+        ...
+
+    def kill(self) -> None:
+        """End it now, whatever it does; returns when it is gone."""
+        ...
+
+
+class Backend(Protocol):
+    """Starts workers."""
+
+    def start(self) -> Worker:
+        """A new worker, which may still be getting ready."""
+        ...
+
+    @property
+    def cores(self) -> int:
+        """Processor cores that workers can have."""
+        ...
+
+    def wait(self, seconds: float) -> None:
+        """Return when a worker has reported or died, or the time is over."""
+        ...
+
+    def close(self) -> None:
+        """Free what the backend itself holds."""
+        ...

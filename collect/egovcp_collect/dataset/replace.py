@@ -1,0 +1,33 @@
+"""Result files: written whole, in the place of an older one."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from pathlib import Path
+from typing import Any
+
+
+def replace_json(path: Path, content: Any) -> None:
+    """Write ``content`` as JSON, strictly: NaN and infinities raise `ValueError`."""
+    replace_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Write a whole file in the place of any other: a reader sees the old or the new one.
+
+    Never writes through a link, so that an older version of the dataset keeps its own.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    number, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    try:
+        with os.fdopen(number, "w", encoding="utf-8") as file:
+            os.fchmod(number, 0o644)
+            file.write(text)
+            file.flush()
+            os.fsync(number)
+        os.replace(name, path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise

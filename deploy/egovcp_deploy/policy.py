@@ -1,0 +1,42 @@
+"""What is asked of a policy that drives robots, and of one that can also show what it thinks."""
+
+from __future__ import annotations
+
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.plan import PolicyStep
+
+
+class RolloutPolicy(Protocol):
+    """Decides for E robots in step, from their observations alone.
+
+    One that does not plan returns empty arrays, and nothing of them is logged.
+    """
+
+    def reset(self) -> None:
+        """Forget the past: every robot has just begun an episode."""
+        ...
+
+    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+        """Depth (E, 48, 64) mm and state (E, 74) -> plans."""
+        ...
+
+    def advance(self, sent: NDArray[np.floating]) -> None:
+        """The actions (E, 7) that were really sent."""
+        ...
+
+
+@runtime_checkable
+class ImaginingPolicy(RolloutPolicy, Protocol):
+    """A policy with a world model that can be looked into, between `act` and `advance`."""
+
+    def reconstruct(self) -> NDArray[np.float32]:
+        """(E, 48, 64) m: the present as the model holds it."""
+        ...
+
+    def imagine(self, plan: NDArray[np.floating], horizon: int) -> NDArray[np.float32]:
+        """(E, horizon, 48, 64) m: what the plans (E, N, 7) lead to."""
+        ...

@@ -1,0 +1,63 @@
+"""Which files a dataset may name: regular ones, inside its own folder."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+
+from egovcp.errors import DataError
+
+_FIELD = re.compile(r"\{(?:chunk_index|file_index)(?::0?[1-9]?d)?\}")
+
+
+def check_template(template: object, path: Path) -> None:
+    """Raise `DataError` unless ``template``, found in ``path``, names files inside the dataset.
+
+    Only plain fields may stand in it: Python's format language can do far more than count.
+    """
+    if not isinstance(template, str):
+        raise DataError.at(path, f"data_path {template!r} is no file template")
+    parts = PurePosixPath(template)
+    if parts.is_absolute() or ".." in parts.parts:
+        raise DataError.at(path, f"data_path {template!r} leads outside of the dataset")
+    plain = _FIELD.sub("", template)
+    if not template.startswith("data/") or re.search(r"[^\w./-]", plain, re.ASCII):
+        raise DataError.at(
+            path,
+            f"data_path {template!r} is no file template; expected one below data/ with the "
+            "fields chunk_index and file_index",
+        )
+
+
+def require_file(root: Path, path: Path) -> None:
+    """Raise `DataError` unless ``path`` is a regular file inside ``root``.
+
+    Links may lead into the folder of blobs beside a snapshot in the Hub's cache, which is how
+    huggingface_hub stores a download, and nowhere else.
+    """
+    try:
+        target = path.resolve(strict=True)
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise DataError.at(path, "missing; the dataset is incomplete") from error
+    except (OSError, RuntimeError) as error:
+        raise DataError.at(path, "a link that leads nowhere") from error
+    if not any(target.is_relative_to(home) for home in _homes(root)):
+        raise DataError.at(path, f"a link that leads outside of the dataset, to {target}")
+    if not target.is_file():
+        kind = "a folder" if target.is_dir() else "no regular file"
+        raise DataError.at(path, f"{kind}, expected a file")
+
+
+def _homes(root: Path) -> list[Path]:
+    homes = [root.resolve()]
+    if root.parent.name == "snapshots":
+        homes.append(root.resolve().parents[1] / "blobs")
+    return homes
+
+
+def files_below(folder: Path) -> Iterator[Path]:
+    """Everything in ``folder``, at any depth, that is no folder; links are not followed."""
+    for parent, folders, files in folder.walk():
+        linked = [name for name in folders if (parent / name).is_symlink()]
+        yield from (parent / name for name in sorted([*files, *linked]))

@@ -1,0 +1,155 @@
+"""Dataset cards: readable by the Hub, complete, and out of the way of the data."""
+
+import os
+import re
+from pathlib import Path
+
+import datasets
+import pytest
+from huggingface_hub import DatasetCard
+from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+import egovcp_collect.dataset
+from egovcp import spec
+from egovcp.data import DatasetConfig, DatasetReader, schema
+from egovcp.data.hashes import verify_hashes
+from egovcp.data.source import Source
+from egovcp.errors import UsageError
+from egovcp_collect.dataset import card
+from egovcp_collect.dataset.card import CardConfig, card_text
+from egovcp_collect.dataset.card_tables import field_docs, settings_tables
+from egovcp_collect.dataset.cli import main
+from egovcp_collect.dataset.replace import replace_text
+
+from .scenes import SETTINGS, three_balls, write_scenes
+
+HOUSE = Path(__file__).resolve().parents[3]
+PICTURE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
+
+
+@pytest.fixture(scope="module")
+def carded(tmp_path_factory: pytest.TempPathFactory) -> DatasetReader:
+    """Three balls with a card of their own."""
+    reader = write_scenes(tmp_path_factory.mktemp("data") / "three", three_balls())
+    assert main(["card", str(reader.root), "--repo_id=me/three"]) == 0
+    return reader
+
+
+@pytest.fixture(scope="module")
+def text(carded: DatasetReader) -> str:
+    return (carded.root / "README.md").read_text()
+
+
+def test_the_hub_finds_what_it_looks_for(carded: DatasetReader) -> None:
+    data = DatasetCard.load(carded.root / "README.md").data
+    assert data.license == "apache-2.0"
+    assert data.task_categories == ["robotics"]
+    assert {"LeRobot", "egovcp", "unitree_g1", "depth"} <= set(data.tags)
+    assert data.configs == [{"config_name": "default", "data_files": "data/*/*.parquet"}]
+
+
+def test_the_schema_is_complete(text: str) -> None:
+    for key in schema.FEATURES:
+        assert f"| `{key}` |" in text
+    for part in spec.STATE_SLICES.values():
+        assert f"| {part.start}:{part.stop} |" in text
+    for name in spec.ACTION_NAMES:
+        assert f"| `{name}` |" in text
+
+
+def test_how_it_was_collected_is_told(text: str) -> None:
+    assert SETTINGS.command in text
+    assert "mujoco 3.11.0" in text
+    assert "stance-1" in text
+    assert "0.32 d with d uniform" in text
+    assert "| `env.ball.radius_range` | 0.09 | 0.12 | Radius of the ball, m. |" in text
+    assert "`env.ball.block_reward` | 1 | Once" in text
+    assert "env.wall." not in text  # no such task in it
+
+
+def test_every_setting_of_a_task_is_in_one_of_the_tables_with_its_meaning() -> None:
+    env = SETTINGS.config["env"]
+    for task in spec.TASKS:
+        both = "\n".join(settings_tables(SETTINGS.config, [task]))
+        for name in (*env[task], *env["camera"], *env["randomise"], *env[f"{task}_episode"]):
+            (line,) = {s for s in both.splitlines() if re.search(rf"`env\.\w+\.{name}`", s)} or {""}
+            assert line, name
+            assert not line.endswith("|  |"), f"no meaning: {line}"
+
+
+def test_a_setting_of_another_version_is_kept_without_a_meaning() -> None:
+    config = {"env": {"ball": {"spin_range": [0.0, 1.0]}, "moon": True}}
+    drawn, constant = settings_tables(config, ["ball"])
+    assert "| `env.ball.spin_range` | 0 | 1 |  |" in drawn
+    assert "| `env.moon` | True |  |" in constant
+
+
+def test_field_docs_read_fields_of_any_type() -> None:
+    docs = field_docs(CardConfig)
+    assert set(docs) == set(CardConfig.__dataclass_fields__)
+
+
+def test_pictures_are_where_the_card_says(carded: DatasetReader, text: str) -> None:
+    found = PICTURE.findall(text)
+    assert len(found) == 4
+    assert all((carded.root / path).is_file() for path in found)
+
+
+def test_what_is_pushed_is_what_the_command_wrote(carded: DatasetReader, text: str) -> None:
+    assert card_text(carded, "me/three") == text
+
+
+def test_a_card_without_pictures_shows_none(sound: Path) -> None:
+    text = card_text(DatasetReader.open(DatasetConfig(root=str(sound))), "")
+    assert PICTURE.findall(text) == []
+    assert 'LeRobotDataset("user/six")' in text
+
+
+def test_card_and_pictures_stay_out_of_the_data(carded: DatasetReader) -> None:
+    verify_hashes(carded.root)
+    DatasetReader.open(DatasetConfig(root=str(carded.root)))
+    assert len(LeRobotDataset("me/three", root=carded.root)) == carded.num_frames
+    loaded = datasets.load_dataset(str(carded.root), split="train", streaming=True)
+    assert set(loaded.features) == set(schema.FEATURES)
+
+
+def test_a_card_can_lie_elsewhere(carded: DatasetReader, tmp_path: Path) -> None:
+    before = {p: p.stat().st_mtime_ns for p in carded.root.rglob("*")}
+    output = tmp_path / "cards" / "three.md"
+    assert main(["card", str(carded.root), f"--output={output}", "--assets=assets/three"]) == 0
+    found = PICTURE.findall(output.read_text())
+    assert len(found) == 4
+    assert all((output.parent / path).is_file() for path in found)
+    assert {p: p.stat().st_mtime_ns for p in carded.root.rglob("*")} == before
+
+
+def test_the_cache_of_the_hub_is_not_written_to(
+    carded: DatasetReader, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader = DatasetReader(Source(carded.root, "me/three", commit="0" * 40))
+    monkeypatch.setattr(card.DatasetReader, "open", lambda config: reader)
+    with pytest.raises(UsageError, match="--output"):
+        card.run(CardConfig())
+
+
+def test_a_file_that_is_replaced_is_not_written_through_its_other_name(tmp_path: Path) -> None:
+    old, other = tmp_path / "README.md", tmp_path / "older"
+    old.write_text("first")
+    os.link(old, other)
+    replace_text(old, "second")
+    assert (old.read_text(), other.read_text()) == ("second", "first")
+    assert old.stat().st_mode & 0o777 == 0o644
+
+
+def test_the_template_of_the_repository_is_the_one_that_ships() -> None:
+    shipped = Path(egovcp_collect.dataset.__path__[0]) / "card_template.md"
+    assert (HOUSE / "dataset_cards" / "template.md").read_text() == shipped.read_text()
+
+
+@pytest.mark.parametrize("task", spec.TASKS)
+def test_the_finished_cards_are_sound(task: str) -> None:
+    path = HOUSE / "dataset_cards" / f"{task}.md"
+    assert DatasetCard.load(path).data.license == "apache-2.0"
+    found = PICTURE.findall(path.read_text())
+    assert len(found) == 4
+    assert all((path.parent / picture).is_file() for picture in found)

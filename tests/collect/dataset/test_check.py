@@ -1,0 +1,72 @@
+"""The report of the check: all problems up to a limit, each with its place."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from egovcp_collect.dataset.cli import main
+
+from . import damage as d
+
+pytestmark = pytest.mark.usefixtures("no_network")
+
+
+def test_a_sound_dataset_passes(
+    sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = tmp_path / "report.json"
+    assert main(["check", str(sound), f"--json={report}"]) == 0
+    assert "6 episodes, 57 frames, nothing wrong" in capsys.readouterr().out
+    assert json.loads(report.read_text()) == {
+        "ok": True,
+        "episodes": 6,
+        "frames": 57,
+        "problems": [],
+    }
+
+
+def test_every_problem_is_told_up_to_the_limit(copy: Path, tmp_path: Path) -> None:
+    (copy / d.HASHES).unlink()
+    d.column("next.reward", d.put(14, float("nan")))(copy)
+    d.column("timestamp", d.put(15, 9.0))(copy)
+    d.column("next.reward", d.put(1, float("inf")), d.MORE_DATA)(copy)
+    d.info(total_tasks=5)(copy)
+    report = tmp_path / "report.json"
+    assert main(["check", str(copy), f"--json={report}"]) == 3
+    problems = json.loads(report.read_text())["problems"]
+    assert [(p["file"], p["episode"], p["frame"]) for p in problems] == [
+        (d.INFO, None, None),
+        (d.DATA, 1, 3),
+        (d.DATA, 1, 2),
+        (d.MORE_DATA, 3, 1),
+    ]
+    assert main(["check", str(copy), f"--json={report}", "--max_problems=2"]) == 3
+    assert json.loads(report.read_text())["problems"] == problems[:2]
+
+
+def test_every_broken_part_of_meta_is_told(copy: Path, tmp_path: Path) -> None:
+    (copy / d.HASHES).unlink()
+    for name in (d.INFO, d.TASKS, d.STATS):
+        d.cut(name, 0.5)(copy)
+    report = tmp_path / "report.json"
+    assert main(["check", str(copy), f"--json={report}"]) == 3
+    problems = json.loads(report.read_text())["problems"]
+    assert {p["file"] for p in problems} == {d.INFO, d.TASKS, d.STATS}
+
+
+def test_a_snapshot_of_the_hubs_cache_may_link_to_its_blobs(copy: Path, tmp_path: Path) -> None:
+    blobs, snapshot = tmp_path / "repo/blobs", tmp_path / "repo/snapshots/abc"
+    blobs.mkdir(parents=True)
+    for number, path in enumerate(sorted(p for p in copy.rglob("*") if p.is_file())):
+        link = snapshot / path.relative_to(copy)
+        link.parent.mkdir(parents=True, exist_ok=True)
+        link.symlink_to(path.rename(blobs / str(number)))
+    assert main(["check", str(snapshot)]) == 0
+
+
+def test_a_missing_folder_is_told_without_asking_the_hub(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", str(tmp_path / "none")]) == 3
+    assert "meta/info.json" in capsys.readouterr().err

@@ -1,0 +1,140 @@
+"""`egovcp-dataset viz`: an episode as a Rerun recording."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rerun.experimental import RrdReader
+
+from egovcp import spec
+from egovcp.data import DatasetReader
+from egovcp.log import paths
+from egovcp.robot.kinematics import LINK_NAMES
+from egovcp_collect.dataset import viz
+from egovcp_collect.dataset.cli import main
+from egovcp_collect.dataset.viz import camera_view, ticks_of, write_recording
+
+from .scenes import SETTINGS, scene, three_balls, write_scenes
+
+
+@pytest.fixture(scope="module")
+def reader(tmp_path_factory: pytest.TempPathFactory) -> DatasetReader:
+    return write_scenes(tmp_path_factory.mktemp("data") / "three", three_balls())
+
+
+@pytest.fixture(scope="module")
+def store(reader: DatasetReader, tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Episode 1, the one that ends in a fall."""
+    path = tmp_path_factory.mktemp("rrd") / "new" / "one.rrd"
+    write_recording(reader, 1, path, meshes=False)
+    return RrdReader(path).store()
+
+
+def column(store: Any, path: str, component: str) -> list[Any]:
+    """Values of one component over time, in the order of the ticks."""
+    rows: list[tuple[int, Any]] = []
+    for chunk in store.stream().to_chunks():
+        if chunk.entity_path == path and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            if component in batch.schema.names:
+                ticks = batch.column("tick").to_pylist()
+                rows += zip(ticks, batch.column(component).to_pylist(), strict=True)
+    return [value for _, value in sorted(rows)]
+
+
+def test_everything_that_a_row_holds_has_its_entity(store: Any) -> None:
+    found = set(store.schema().entity_paths())
+    expected = {paths.DEPTH, paths.CAMERA, paths.HAND_TARGETS, paths.SKELETON, paths.INFO}
+    expected |= {f"{paths.ROBOT}/{link}" for link in LINK_NAMES}
+    expected |= {f"{paths.REWARD}/total", paths.OUTCOME, paths.EVENTS}
+    expected |= {f"{paths.ACTION}/{part}" for part in ("left_hand", "right_hand", "height")}
+    expected |= {f"{paths.STATE}/projected_gravity", f"{paths.STATE}/joint_position/left_arm"}
+    assert expected <= found
+
+
+def test_rows_are_recorded_as_they_are(store: Any, reader: DatasetReader) -> None:
+    episode = reader.read(1)
+    images = column(store, paths.DEPTH, "DepthImage:buffer")
+    assert len(images) == len(episode)
+    depth = np.array([np.asarray(i[0], np.uint8).view(np.uint16) for i in images])
+    np.testing.assert_array_equal(depth.reshape(episode.depth.shape), episode.depth)
+    scalars = "Scalars:scalars"
+    np.testing.assert_allclose(
+        column(store, f"{paths.ACTION}/normalised", scalars), episode.action, atol=1e-6
+    )
+    metric = spec.ACTION_BOX.to_metric(episode.action)
+    right = column(store, f"{paths.ACTION}/right_hand", scalars)
+    np.testing.assert_allclose(right, metric[:, 3:6], atol=1e-6)
+    reward = np.ravel(column(store, f"{paths.REWARD}/total", scalars))
+    np.testing.assert_allclose(reward, episode.reward)
+    outcome = np.array(column(store, paths.OUTCOME, scalars))
+    np.testing.assert_array_equal(outcome[:, 0], episode.done)
+    np.testing.assert_array_equal(outcome[:, 1], episode.success)
+
+
+def test_the_pelvis_stands_at_its_commanded_height(store: Any) -> None:
+    (translation,) = column(store, f"{paths.ROBOT}/{LINK_NAMES[0]}", "Transform3D:translation")[3]
+    np.testing.assert_allclose(translation, [0.0, 0.0, 0.7], atol=1e-6)
+
+
+def test_what_happened_is_told(reader: DatasetReader) -> None:
+    ticks = [*ticks_of(reader.read(1))]
+    assert ticks[20].events == ("the ball is thrown",)
+    assert ticks[40].events == ("reward -1.000", "a fall ends the episode")
+    assert ticks[40].terminated
+    assert not ticks[40].truncated
+    assert [*ticks_of(reader.read(2))][-1].events == ("the time is up",)
+    assert ticks[2].time_ns == 2 * 40_000_000
+
+
+def test_the_camera_looks_as_it_did_in_the_episode() -> None:
+    view = camera_view(SETTINGS.config, {"camera_pitch": 0.05})
+    assert view.pitch == 0.05
+    assert view.position == (0.058, 0.0, 0.42)
+    assert camera_view({}, {}).vertical_fov > 0
+
+
+def test_the_command_names_the_file_after_dataset_and_episode(
+    reader: DatasetReader,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["viz", str(reader.root), "--episode=2"]) == 0
+    out = capsys.readouterr().out
+    assert "three-episode-2.rrd" in out
+    assert "pelvis pose is not recorded" in out
+    assert [p.name for p in tmp_path.iterdir()] == ["three-episode-2.rrd"]
+    assert main(["viz", str(reader.root), "--episode=2"]) == 5
+    assert "exists already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("episode", [-1, 3])
+def test_an_episode_that_is_not_there(
+    reader: DatasetReader, episode: int, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["viz", str(reader.root), f"--episode={episode}"]) == 2
+    assert "has episodes 0 to 2" in capsys.readouterr().err
+
+
+def test_spawn_opens_a_viewer_that_only_this_machine_can_reach(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reader = write_scenes(tmp_path / "one", [scene(0, length=3, time_limit=3)])
+    started: list[list[str]] = []
+    monkeypatch.setattr(viz.subprocess, "Popen", lambda args, **options: started.append(args))
+    output = tmp_path / "a.rrd"
+    assert main(["viz", str(reader.root), f"--output={output}", "--spawn"]) == 0
+    (command,) = started
+    assert command[-3:] == ["--bind", "127.0.0.1", str(output)]
+    assert output.is_file()
+
+
+def test_a_missing_rerun_is_an_environment_failure(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(viz, "find_spec", lambda name: None)
+    assert main(["viz", "--dataset.root=anything"]) == 5
+    assert "egovcp-collect[viz]" in capsys.readouterr().err

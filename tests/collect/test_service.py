@@ -1,0 +1,209 @@
+"""The service as a process: stopped, killed, resumed, extended."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from egovcp.data import DatasetConfig, DatasetReader
+from egovcp.data.committer import work_folder
+from egovcp.data.hashes import verify_hashes
+from egovcp_collect.collect import main
+
+_SHORT = (
+    "--task=ball",
+    "--seed=3",
+    "--env.controller=stance",
+    "--env.ball_episode.ticks=6",
+    "--env.ball_episode.event_ticks=[0,1]",
+)
+_SMALL = ("--num_envs=2", "--shard_episodes=4")
+
+type Tree = dict[str, bytes]
+
+
+def _tree(root: Path) -> Tree:
+    """The files that depend on the episodes alone."""
+    return {
+        str(p.relative_to(root)): p.read_bytes()
+        for p in root.rglob("*")
+        if p.is_file() and p.name not in ("collection.json", "sha256.json")
+    }
+
+
+@pytest.fixture(scope="module")
+def ten(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Ten episodes in one go."""
+    root = tmp_path_factory.mktemp("service") / "ten"
+    assert main([*_SHORT, *_SMALL, f"--dataset.root={root}", "--episodes=10"]) == 0
+    return root
+
+
+@pytest.fixture
+def endless(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
+    """A long collection into ``cut``, in a process group of its own, that has sealed something."""
+    command = [sys.executable, "-m", "egovcp_collect.collect", *_SHORT, *_SMALL]
+    process = subprocess.Popen(
+        [*command, f"--dataset.root={tmp_path / 'cut'}", "--episodes=100000", "--num_workers=1"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    _wait_for(lambda: any(_sealed(tmp_path / "cut").glob("*.arrow")))
+    yield process
+    process.kill()
+    process.wait()
+
+
+def _sealed(root: Path) -> Path:
+    return work_folder(root) / "sealed"
+
+
+def _wait_for(condition: object) -> None:
+    deadline = time.monotonic() + 100
+    while time.monotonic() < deadline:
+        if condition():  # type: ignore[operator]
+            return
+        time.sleep(0.02)
+    raise TimeoutError("nothing happened")
+
+
+def _require_resumable(root: Path, ten: Path) -> None:
+    """Ten episodes are what they would have been without any interruption."""
+    if root.exists():
+        verify_hashes(root)
+    flags = [*_SHORT, "--num_envs=5", "--num_workers=2", f"--dataset.root={root}", "--resume"]
+    have = len(DatasetReader.open(DatasetConfig(root=str(root)))) if root.exists() else 0
+    assert main([*flags, f"--episodes={max(10, have)}", "--shard_episodes=4"]) == 0
+    reader, expected = (DatasetReader.open(DatasetConfig(root=str(r))) for r in (root, ten))
+    for i in range(10):
+        assert reader.read(i).digest() == expected.read(i).digest()
+    if have <= 10 and len(reader) == 10:
+        assert _tree(root) == _tree(ten)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_it_and_keeps_every_finished_episode(
+    endless: subprocess.Popen[str], tmp_path: Path, ten: Path, number: int
+) -> None:
+    os.killpg(endless.pid, number)  # as a terminal does: the workers get it, too
+    out, err = endless.communicate(timeout=10)  # the issue's bound
+    assert endless.returncode == 130, err
+    assert "Traceback" not in err
+    root = tmp_path / "cut"
+    count = len(DatasetReader.open(DatasetConfig(root=str(root)))) if root.exists() else 0
+    assert out.strip().splitlines()[-1].startswith(f"{count} episodes, ")
+    _require_resumable(root, ten)
+
+
+def test_kill_loses_nothing_that_was_sealed(
+    endless: subprocess.Popen[str], tmp_path: Path, ten: Path
+) -> None:
+    root = tmp_path / "cut"
+    _wait_for(root.exists)
+    endless.kill()
+    endless.wait()
+    _wait_for(lambda: not _children_of_the_dead(root))
+    sealed = {path.name for path in _sealed(root).glob("*.arrow")}
+    committed = len(DatasetReader.open(DatasetConfig(root=str(root))))
+    assert committed >= 4
+    _require_resumable(root, ten)
+    count = len(DatasetReader.open(DatasetConfig(root=str(root))))
+    lost = [n for n in sealed if int(n[:9]) >= count and not (_sealed(root) / n).exists()]
+    assert lost == []
+
+
+def _children_of_the_dead(root: Path) -> list[str]:
+    """Workers that outlive their parent end by themselves."""
+    out = subprocess.run(["pgrep", "-f", f"spawn_main.*{root}"], capture_output=True, text=True)
+    return out.stdout.split()
+
+
+def test_a_killed_worker_is_replaced(
+    endless: subprocess.Popen[str], tmp_path: Path, ten: Path
+) -> None:
+    os.kill(_worker_of(endless.pid), signal.SIGKILL)
+    before = max(_numbers(tmp_path / "cut"), default=0)
+    _wait_for(lambda: max(_numbers(tmp_path / "cut"), default=0) > before + 4)
+    assert endless.poll() is None
+    os.killpg(endless.pid, signal.SIGINT)
+    endless.communicate(timeout=10)
+    _require_resumable(tmp_path / "cut", ten)
+
+
+def _worker_of(parent: int) -> int:
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    return next(
+        int(c) for c in children if b"spawn_main" in Path(f"/proc/{c}/cmdline").read_bytes()
+    )
+
+
+def _numbers(root: Path) -> list[int]:
+    """Sealed and committed episodes, roughly."""
+    sealed = [int(path.name[:9]) for path in _sealed(root).glob("*.arrow")]
+    shards = len(list(root.glob("data/*/*.parquet")))
+    return [*sealed, 4 * shards - 1]
+
+
+def test_extending_equals_collecting_more_at_once(tmp_path: Path, ten: Path) -> None:
+    root = tmp_path / "grown"
+    for episodes in (3, 9, 10):
+        flags = [*_SHORT, *_SMALL, f"--dataset.root={root}", f"--episodes={episodes}", "--resume"]
+        assert main(flags) == 0
+    assert _tree(root) == _tree(ten)
+
+
+def test_nothing_is_left_to_do(ten: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = _tree(ten)
+    flags = [*_SHORT, *_SMALL, f"--dataset.root={ten}", "--resume"]
+    assert main([*flags, "--episodes=10"]) == 0
+    assert capsys.readouterr().out.startswith("10 episodes, ")
+    assert _tree(ten) == before
+
+
+@pytest.mark.parametrize(
+    ("flag", "what"),
+    [
+        ("--seed=4", "--seed was 3, is 4"),
+        ("--eta=0.2", "--eta was 0.32, is 0.2"),
+        ("--env.ball.grace=0.2", "--env.ball.grace was 0.3, is 0.2"),
+        ("--env.controller=walk", "low-level controller was"),
+        ("--task=wall", "--task was ball, is wall"),
+    ],
+)
+def test_other_episodes_are_not_mixed_in(
+    ten: Path, capsys: pytest.CaptureFixture[str], flag: str, what: str
+) -> None:
+    before = _tree(ten)
+    flags = [*_SHORT, *_SMALL, f"--dataset.root={ten}", "--resume", "--episodes=12", flag]
+    assert main(flags) == 2
+    assert what in capsys.readouterr().err
+    assert _tree(ten) == before
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_killed_at_two_hundred_random_moments(tmp_path: Path, ten: Path) -> None:
+    """The whole service, again and again on one root."""
+    root = tmp_path / "cut"
+    command = [sys.executable, "-m", "egovcp_collect.collect", *_SHORT, *_SMALL, "--resume"]
+    command += [f"--dataset.root={root}", "--episodes=100000", "--num_workers=2"]
+    before = 0
+    for n in range(200):
+        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(4 + 4 * (n * 0.618 % 1))
+        process.kill()
+        process.wait()
+        if root.exists():
+            verify_hashes(root)
+            count = len(DatasetReader.open(DatasetConfig(root=str(root))))
+            assert count >= before
+            before = count
+    assert before > 100
+    _require_resumable(root, ten)
