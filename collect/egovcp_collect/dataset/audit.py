@@ -19,7 +19,7 @@ from egovcp.robot.controllers import make_controller
 from egovcp.sim.scenario import Scenario
 from egovcp_collect.config import SHAPING, CollectConfig
 from egovcp_collect.dataset.origin import origin_of, source_of
-from egovcp_collect.dataset.output import write_report
+from egovcp_collect.dataset.replace import write_report
 from egovcp_collect.simulation import Simulation
 from egovcp_collect.versions import installed_versions
 

@@ -15,7 +15,7 @@ from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetConfig, metadata
 from egovcp.data.source import local_root, locate
 from egovcp.errors import DataError, UsageError
-from egovcp_collect.dataset.output import write_report
+from egovcp_collect.dataset.replace import write_report
 
 
 @dataclass(frozen=True)

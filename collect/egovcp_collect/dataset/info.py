@@ -8,7 +8,7 @@ from typing import Any
 
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.data.split import HELDOUT_FRACTION, in_split
-from egovcp_collect.dataset.output import write_report
+from egovcp_collect.dataset.replace import write_report
 
 
 @dataclass(frozen=True)

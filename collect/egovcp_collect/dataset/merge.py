@@ -14,7 +14,8 @@ from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter
 from egovcp.data.continued import read_provenance
 from egovcp.errors import DataError, UsageError
 from egovcp_collect.dataset.origin import joint, moved, require_one_controller
-from egovcp_collect.dataset.output import new_folder, write_report
+from egovcp_collect.dataset.output import new_folder
+from egovcp_collect.dataset.replace import write_report
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader, schema
-from egovcp.data.files import rename, sync, sync_tree, write_json
+from egovcp.data.files import rename, sync, sync_tree
 from egovcp.data.hashes import verify_hashes
 from egovcp.data.lock import only_writer
 from egovcp.data.source import Source, is_repo_id, record, recorded
 from egovcp.data.writer import require_new
 from egovcp.errors import DataError, UsageError
 from egovcp.hub import Patience, fetch, resolve
+from egovcp_collect.dataset.replace import write_report
 
 
 @dataclass(frozen=True)
@@ -94,12 +95,11 @@ def _report(config: PullConfig, reader: DatasetReader) -> None:
     print(f"{source.root}: {source.repo_id}@{source.commit}")
     print(f"{len(reader)} episodes, {reader.num_frames} steps")
     print(f"egovcp-train --dataset.root={source.root}")
-    if config.json:
-        facts = {
-            "repo_id": source.repo_id,
-            "commit": source.commit,
-            "root": str(source.root),
-            "episodes": len(reader),
-            "frames": reader.num_frames,
-        }
-        write_json(Path(config.json), facts)
+    facts = {
+        "repo_id": source.repo_id,
+        "commit": source.commit,
+        "root": str(source.root),
+        "episodes": len(reader),
+        "frames": reader.num_frames,
+    }
+    write_report(config.json, facts)

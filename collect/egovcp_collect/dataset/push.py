@@ -13,11 +13,11 @@ from tqdm import tqdm
 from egovcp.checks import check_dataset
 from egovcp.data import DatasetConfig, DatasetReader, schema
 from egovcp.data.committer import work_folder
-from egovcp.data.files import write_json
 from egovcp.data.source import is_repo_id
 from egovcp.errors import DataError, UsageError
 from egovcp.hub import Content, Patience, Publication, Published, publish
 from egovcp_collect.dataset.card import ASSETS, CARD, card_text
+from egovcp_collect.dataset.replace import write_report
 
 #: Folders of a LeRobot dataset: whatever else lies in them on the Hub is of an earlier version.
 _OWNED: Final = ("data", "meta", "videos", "images", ASSETS)
@@ -137,6 +137,5 @@ def _report(config: PushConfig, published: Published) -> None:
     name, commit = config.repo_id, published.commit
     print(f"{name}@{config.branch} {'is now' if published.new else 'was already'} {commit}")
     print(f"egovcp-train --dataset.repo_id={name} --dataset.revision={commit}")
-    if config.json:
-        facts = {"repo_id": name, "branch": config.branch, "tag": config.tag, **asdict(published)}
-        write_json(Path(config.json), facts)
+    facts = {"repo_id": name, "branch": config.branch, "tag": config.tag, **asdict(published)}
+    write_report(config.json, facts)

@@ -16,7 +16,8 @@ from egovcp.data.source import Source, local_root
 from egovcp.errors import DataError
 from egovcp_collect.dataset.book import Book, open_book
 from egovcp_collect.dataset.check import as_json
-from egovcp_collect.dataset.output import new_folder, write_report
+from egovcp_collect.dataset.output import new_folder
+from egovcp_collect.dataset.replace import write_report
 from egovcp_collect.dataset.salvage import Found, salvage
 
 

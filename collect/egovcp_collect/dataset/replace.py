@@ -8,6 +8,22 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from egovcp.errors import UsageError
+
+
+def write_report(file: str, content: Any) -> None:
+    """Write the result of a command to ``--json=file``; nothing if it is empty.
+
+    Raises:
+        UsageError: the path is a folder, or lies below a file.
+    """
+    if not file:
+        return
+    try:
+        replace_json(Path(file).expanduser(), content)
+    except (FileExistsError, IsADirectoryError, NotADirectoryError) as error:
+        raise UsageError(f"--json={file} cannot be a file: {error.strerror}") from error
+
 
 def replace_json(path: Path, content: Any) -> None:
     """Write ``content`` as JSON, strictly: NaN and infinities raise `ValueError`."""

@@ -38,6 +38,7 @@ def test_every_subcommand_explains_its_options(
         (["check"], "which dataset?"),
         (["check", "{sound}", "--max_problem=3"], "did you mean '--max_problems'"),
         (["check", "{sound}", "--max_problems=0"], "expected at least 1"),
+        (["info", "{sound}", "--json={sound}"], "cannot be a file"),
         (["audit", "{sound}", "--episodes=[0,6]"], "no episode 6"),
     ],
 )

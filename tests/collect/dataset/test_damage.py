@@ -1,6 +1,7 @@
 """Each kind of damage is refused: by the check, by training, and by name."""
 
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -237,7 +238,7 @@ CASES = [
 ]
 
 
-@pytest.fixture(params=CASES, ids=[case.name for case in CASES])
+@pytest.fixture
 def case(request: pytest.FixtureRequest, copy: Path) -> Case:
     """A damaged copy; without the list of hashes, unless only that can tell."""
     case: Case = request.param
@@ -247,6 +248,12 @@ def case(request: pytest.FixtureRequest, copy: Path) -> Case:
     return case
 
 
+def _cases(cases: Iterable[Case]) -> pytest.MarkDecorator:
+    chosen = [pytest.param(case, id=case.name) for case in cases]
+    return pytest.mark.parametrize("case", chosen, indirect=True)
+
+
+@_cases(CASES)
 def test_the_check_names_file_episode_and_frame(
     case: Case, copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -261,9 +268,8 @@ def test_the_check_names_file_episode_and_frame(
     assert (case.file, case.episode, case.frame) in places
 
 
+@_cases(case for case in CASES if case.training)
 def test_training_does_not_start(case: Case, copy: Path) -> None:
-    if not case.training:
-        pytest.skip("a training reads no such file")
     with pytest.raises(DataError, match=case.file.rpartition("/")[2]):
         EpisodeStore.load([DatasetReader.open(DatasetConfig(root=str(copy)))])
 
