@@ -51,15 +51,15 @@ def bare_rate(args: tuple[str, str, int, int]) -> float:
     return ticks / (time.perf_counter() - start)
 
 
-def collection_rate(task: str, cores: int, episodes: int) -> float:
+def collection_rate(task: str, controller: str, cores: int, episodes: int) -> float:
     """Planner ticks per second of `egovcp-collect`, all processes together, as it prints it."""
     output = io.StringIO()
     with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(output):
         code = collect(
             [
                 f"--task={task}",
-                "--dataset.repo_id=bench/rate",
                 f"--dataset.root={folder}/dataset",
+                f"--env.controller={controller}",
                 f"--episodes={episodes}",
                 f"--num_workers={cores}",
                 f"--num_envs={ENVS}",
@@ -143,27 +143,25 @@ def main() -> None:
     args = p.parse_args()
     cores = len(os.sched_getaffinity(0))
     os.environ.setdefault("OMP_NUM_THREADS", "1")
-    collects = args.controller == EnvConfig().controller  # only the default one is compared
     bare: list[float] = []
     collected: list[float] = []
     jobs = [(args.task, args.controller, worker, args.groups) for worker in range(cores)]
     with multiprocessing.get_context("spawn").Pool(cores) as pool:
         for _ in range(args.rounds):
             bare.append(sum(pool.map(bare_rate, jobs, chunksize=1)) / cores)
-            if collects:
-                episodes = cores * args.groups * ENVS
-                collected.append(collection_rate(args.task, cores, episodes) / cores)
+            episodes = cores * args.groups * ENVS
+            rate = collection_rate(args.task, args.controller, cores, episodes)
+            collected.append(rate / cores)
         resident = pool.apply(resident_megabytes)
+    ratios = [c / b for c, b in zip(collected, bare, strict=True)]
     figures: dict[str, object] = {
         "task": args.task,
         "controller": args.controller,
         "simulation_ticks_per_s_core": statistics.median(bare),
         "simulation_resident_mb": resident,
+        "collection_ticks_per_s_core": statistics.median(collected),
+        "collection_ratio": statistics.median(ratios),
     }
-    if collects:
-        ratios = [c / b for c, b in zip(collected, bare, strict=True)]
-        figures["collection_ticks_per_s_core"] = statistics.median(collected)
-        figures["collection_ratio"] = statistics.median(ratios)
     publish({**figures, **milliseconds_per_tick(args.task, args.controller)}, args.json)
 
 

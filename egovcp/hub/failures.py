@@ -82,7 +82,7 @@ def _explain(error: Exception, repo_id: str, revision: str, writing: bool) -> Ex
             return _refused(link, repo_id, writing)
         if isinstance(link, OfflineModeIsEnabled):
             return EnvironmentFailure(
-                f"dataset {name} is not on this machine, and HF_HUB_OFFLINE forbids to fetch it"
+                f"HF_HUB_OFFLINE is set, so the Hub cannot be asked for dataset {name}; unset it"
             )
         if isinstance(link, HFValidationError):
             return UsageError(f"{repo_id!r} is no id of a dataset on the Hub: {_line(link)}")
@@ -122,7 +122,8 @@ def _refused(error: httpx.HTTPError, repo_id: str, writing: bool) -> EgovcpError
 
 
 def _is_local(error: BaseException) -> bool:
-    return isinstance(error, OSError) and error.errno is not None and error.filename is not None
+    network = isinstance(error, (ConnectionError, TimeoutError))
+    return isinstance(error, OSError) and error.errno is not None and not network
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:

@@ -23,6 +23,7 @@ from egovcp.errors import EnvironmentFailure
 
 _LOG = logging.getLogger(__name__)
 _TRANSIENT = {408, 429, 500, 502, 503, 504}
+_OPTIONAL_S = 5.0  # what the library itself would wait less long for, it can do without
 _PROGRESS_BYTES = 1 << 20  # a broken download that brought this much was worth its try
 
 
@@ -88,6 +89,8 @@ class _Sender:
         kinds = ("connect", "read", "write", "pool")
         limits = {kind: min(asked.get(kind) or limit, limit) for kind in kinds}
         request.extensions["timeout"] = limits
+        if limits["read"] < _OPTIONAL_S and limits["read"] < limit:
+            return self._send(request, **options)
         if _is_commit(request):
             return self._once(request, options)
         if not isinstance(request.stream, httpx.ByteStream):

@@ -71,6 +71,10 @@ def _sealed(root: Path) -> Path:
     return work_folder(root) / "sealed"
 
 
+def _sealed_names(root: Path) -> set[str]:
+    return {path.name for path in _sealed(root).glob("*.arrow")}
+
+
 def _wait_for(condition: object) -> None:
     deadline = time.monotonic() + 100
     while time.monotonic() < deadline:
@@ -226,7 +230,13 @@ def test_killed_at_two_hundred_random_moments(tmp_path: Path, ten: Path) -> None
     before = 0
     for n in range(200):
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(4 + 4 * (n * 0.618 % 1))
+        moment = n * 0.618 % 1
+        if n % 4:
+            known = _sealed_names(root)
+            _wait_for(lambda known=known: _sealed_names(root) - known)
+            time.sleep(moment)
+        else:
+            time.sleep(6 * moment)
         process.kill()
         process.wait()
         if root.exists():

@@ -12,7 +12,7 @@ from egovcp.data.hashes import verify_hashes
 from egovcp.data.lock import only_writer
 from egovcp.data.source import Source, is_repo_id, record, recorded
 from egovcp.data.writer import require_new
-from egovcp.errors import UsageError
+from egovcp.errors import DataError, UsageError
 from egovcp.hub import Patience, fetch, resolve
 from egovcp_collect.dataset.replace import write_report
 
@@ -75,9 +75,13 @@ def _bring(source: Source, patience: Patience) -> None:
     files.mkdir(parents=True, exist_ok=True)
     with only_writer(source.root, aside):
         fetch(source.repo_id, source.commit, files, patience)
-        (files / schema.SOURCE_PATH).unlink(missing_ok=True)
-        verify_hashes(files)
-        DatasetReader.open(DatasetConfig(root=str(files)))
+        try:
+            (files / schema.SOURCE_PATH).unlink(missing_ok=True)
+            verify_hashes(files)
+            DatasetReader.open(DatasetConfig(root=str(files)))
+        except DataError:  # that is the commit itself: fetching it again would not help
+            shutil.rmtree(aside)
+            raise
         record(Source(files, source.repo_id, source.commit))
         sync_tree(files)
         require_new(source.root)

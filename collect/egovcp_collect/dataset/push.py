@@ -13,7 +13,6 @@ from tqdm import tqdm
 from egovcp.checks import check_dataset
 from egovcp.data import DatasetConfig, DatasetReader, schema
 from egovcp.data.committer import work_folder
-from egovcp.data.hashes import verify_hashes
 from egovcp.data.source import is_repo_id
 from egovcp.errors import DataError, UsageError
 from egovcp.hub import Content, Patience, Publication, Published, publish
@@ -114,7 +113,6 @@ def _contents(root: Path) -> dict[str, Content]:
 
 
 def _require_sound(root: Path) -> None:
-    verify_hashes(root)
     with _progress() as progress:
         check_dataset(DatasetConfig(root=str(root)), progress)
 

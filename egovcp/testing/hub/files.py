@@ -50,7 +50,7 @@ def resolve(store: Store, request: Request) -> Answer:
     file = commit.files.get(request.parts["path"])
     if file is None:
         raise Refusal(404, "Entry not found", "EntryNotFound")
-    start, stop = _range(request.headers.get("Range", ""), file.size)
+    start, stop = _range(request.headers.get("range", ""), file.size)
     headers = {
         "X-Repo-Commit": commit.sha,
         "ETag": f'"{file.sha256 if file.lfs else file.oid}"',

@@ -22,6 +22,7 @@ class Request:
     """What the route's pattern found in the path, unquoted."""
     query: Mapping[str, str]
     headers: Mapping[str, str]
+    """By name in lower case."""
     body: Iterator[bytes]
 
     def content(self) -> bytes:
@@ -81,13 +82,13 @@ def say(content: object, status: int = 200, headers: Mapping[str, str] | None = 
 
 def arriving(file: BinaryIO, headers: Mapping[str, str]) -> Iterator[bytes]:
     """The body of a request as it arrives, whatever way it is framed."""
-    if headers.get("Transfer-Encoding", "").lower() == "chunked":
+    if headers.get("transfer-encoding", "").lower() == "chunked":
         while size := int(file.readline().split(b";")[0], 16):
             yield file.read(size)
             file.readline()
         file.readline()
         return
-    left = int(headers.get("Content-Length") or 0)
+    left = int(headers.get("content-length") or 0)
     while left > 0 and (chunk := file.read(min(CHUNK, left))):
         left -= len(chunk)
         yield chunk

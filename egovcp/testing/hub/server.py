@@ -115,12 +115,13 @@ class _Handler(BaseHTTPRequestHandler):
     def _handle(self) -> None:
         url = urlsplit(self.path)
         route, parts = _find(self.command, url.path)
+        headers = {name.lower(): value for name, value in self.headers.items()}
         request = Request(
             endpoint=self.hub.endpoint,
             parts=parts,
             query=dict(parse_qsl(url.query)),
-            headers=dict(self.headers.items()),
-            body=arriving(self.rfile, self.headers),  # type: ignore[arg-type]
+            headers=headers,
+            body=arriving(self.rfile, headers),  # type: ignore[arg-type]
         )
         fault = self.hub.faults.take(route.name if route else "unknown")
         trouble = fault.trouble if fault else None
@@ -151,7 +152,7 @@ class _Handler(BaseHTTPRequestHandler):
             return _refuse(refusal, None)
 
     def _authorize(self, route: Route, request: Request) -> None:
-        token = request.headers.get("Authorization", "").removeprefix("Bearer ")
+        token = request.headers.get("authorization", "").removeprefix("Bearer ")
         if not self.hub.token or token == self.hub.token or route.name.startswith("lfs_"):
             return
         public = route.method in _READING or route.name == "paths"

@@ -179,7 +179,7 @@ def test_a_damaged_dataset_on_the_hub_does_not_appear(
     hub.store.advance(REPO, "main", "", "by hand", {schema.STATS_PATH: other})
     assert pull(tmp_path / "copy") == 3
     assert "stats.json" in capsys.readouterr().err
-    assert not (tmp_path / "copy").exists()
+    assert not list(tmp_path.glob("*copy*"))
 
 
 @pytest.mark.parametrize("trouble", [401, 403, 404, 429, 503, "reset", "truncate", "lose"])

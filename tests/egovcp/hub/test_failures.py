@@ -1,8 +1,10 @@
 """Errors say what to do, and never the token."""
 
+import errno
 from pathlib import Path
 
 import pytest
+from huggingface_hub import constants
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.hub import Patience, Publication, explained, publish, token
@@ -29,3 +31,18 @@ def test_a_token_that_the_server_echoes_is_hidden(
 def test_the_disk_is_not_the_network(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError), explained("me/small"):
         (tmp_path / "none").read_bytes()
+
+
+def test_a_full_disk_is_not_the_network() -> None:
+    with pytest.raises(OSError, match="No space left") as caught, explained("me/small"):
+        raise OSError(errno.ENOSPC, "No space left on device")
+    assert caught.value.errno == errno.ENOSPC
+
+
+def test_offline_means_offline(
+    hub: FakeHub, publication: Publication, quick: Patience, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    with pytest.raises(EnvironmentFailure, match="HF_HUB_OFFLINE is set"):
+        publish(publication, quick)
+    assert not hub.requests
