@@ -1,6 +1,7 @@
 """Synthetic episodes, a small dataset on disk, and a disk that fails."""
 
 import errno
+import io
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -100,8 +101,7 @@ class Disk:
 
     def install(self, monkeypatch: pytest.MonkeyPatch) -> "Disk":
         """Put the disk between `egovcp.data.files` and the real one."""
-        create = files.create
-        monkeypatch.setattr(files, "create", lambda path: _File(self, create(path)))
+        monkeypatch.setattr(files, "create", lambda path: io.BufferedWriter(_File(self, path)))
         for name in ("sync", "rename", "link", "exchange"):
             monkeypatch.setattr(files, name, self._counted(getattr(files, name)))
         return self
@@ -114,26 +114,19 @@ class Disk:
         return counted
 
 
-class _File:
-    """A file that writes what fits."""
+class _File(io.FileIO):
+    """What lies below a buffer: each write is one of the system's."""
 
-    def __init__(self, disk: Disk, file: Any) -> None:
-        self._disk, self._file = disk, file
-        disk.operate(file.name)
+    def __init__(self, disk: Disk, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        disk.operate(path)
+        super().__init__(path, "xb")
+        self._disk = disk
 
     def write(self, content: Any) -> int:
-        self._disk.operate(self._file.name)
-        self._disk.fill(len(memoryview(content).cast("B")), self._file.name)
-        return int(self._file.write(content))
-
-    def __enter__(self) -> "_File":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._file, name)
+        self._disk.operate(self.name)
+        self._disk.fill(len(memoryview(content).cast("B")), self.name)
+        return super().write(content)
 
 
 type MakeDisk = Callable[..., Disk]

@@ -290,7 +290,7 @@ def test_a_damaged_dataset_is_not_extended(tmp_path: Path, episodes: list[Episod
     content[len(content) // 2] ^= 1
     path.write_bytes(content)
     with (
-        pytest.raises(DataError, match=r"file-000\.parquet is damaged"),
+        pytest.raises(DataError, match=r"file-000\.parquet: damaged"),
         committing(root, _RUN, _SHARD, _agree),
     ):
         pass
