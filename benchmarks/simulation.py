@@ -1,8 +1,8 @@
 """Planner ticks per second and core: bare simulation, and collection into a LeRobot dataset.
 
-Both run the same episodes with one process per core, in turn. Bare simulation is physics,
-low-level controller, sensors and depth camera under the random walk, with nothing recorded;
-collection is `egovcp-collect` as a user runs it, disk and the start of its processes included.
+Both run as many episodes with one process per core, in turn, the start of the processes included.
+Bare simulation is physics, low-level controller, sensors and depth camera under the random walk,
+with nothing recorded; collection is `egovcp-collect` as a user runs it, with all that it writes.
 """
 
 from __future__ import annotations
@@ -34,12 +34,20 @@ from egovcp_collect.collect import main as collect
 ENVS = 16
 
 
-def bare_rate(args: tuple[str, str, int, int]) -> float:
-    """Planner ticks per second of one process over ``groups`` groups of episodes."""
+def bare_rate(task: str, controller: str, cores: int, groups: int) -> tuple[float, float]:
+    """Planner ticks per second of all processes together, and the most that one holds, MB."""
+    start = time.perf_counter()
+    with multiprocessing.get_context("spawn").Pool(cores) as pool:
+        jobs = [(task, controller, worker, groups) for worker in range(cores)]
+        ticks = sum(pool.map(bare_ticks, jobs, chunksize=1))
+        return ticks / (time.perf_counter() - start), pool.apply(resident_megabytes)
+
+
+def bare_ticks(args: tuple[str, str, int, int]) -> int:
+    """Planner ticks that one process does in ``groups`` groups of episodes."""
     task, controller, worker, groups = args
     env, policy = VectorEnv(replace(EnvConfig(), controller=controller), ENVS), RandomWalk()
-    env.reset([Scenario(task, 0, i) for i in range(ENVS)])  # builds the models
-    ticks, start = 0, time.perf_counter()
+    ticks = 0
     for group in range(groups):
         first = (worker * groups + group) * ENVS
         scenarios = [Scenario(task, 1, first + i) for i in range(ENVS)]
@@ -48,7 +56,7 @@ def bare_rate(args: tuple[str, str, int, int]) -> float:
         while not env.done.all():
             ticks += int((~env.done).sum())
             env.step(policy.act(env))
-    return ticks / (time.perf_counter() - start)
+    return ticks
 
 
 def collection_rate(task: str, controller: str, cores: int, episodes: int) -> float:
@@ -145,14 +153,12 @@ def main() -> None:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     bare: list[float] = []
     collected: list[float] = []
-    jobs = [(args.task, args.controller, worker, args.groups) for worker in range(cores)]
-    with multiprocessing.get_context("spawn").Pool(cores) as pool:
-        for _ in range(args.rounds):
-            bare.append(sum(pool.map(bare_rate, jobs, chunksize=1)) / cores)
-            episodes = cores * args.groups * ENVS
-            rate = collection_rate(args.task, args.controller, cores, episodes)
-            collected.append(rate / cores)
-        resident = pool.apply(resident_megabytes)
+    for _ in range(args.rounds):
+        rate, resident = bare_rate(args.task, args.controller, cores, args.groups)
+        bare.append(rate / cores)
+        episodes = cores * args.groups * ENVS
+        rate = collection_rate(args.task, args.controller, cores, episodes)
+        collected.append(rate / cores)
     ratios = [c / b for c, b in zip(collected, bare, strict=True)]
     figures: dict[str, object] = {
         "task": args.task,

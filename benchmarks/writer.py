@@ -19,6 +19,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
+from datasets import disable_progress_bars
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from report import parser, publish
 
@@ -106,6 +107,7 @@ def main() -> None:
     options.add_argument("--episodes", type=int, default=12)
     options.add_argument("--ticks", type=int, default=150)
     args = options.parse_args()
+    disable_progress_bars()  # one per episode
     episodes = [make_episode(i, args.ticks) for i in range(args.episodes)]
     for write in (writer, service):
         rate(write, episodes[:1])  # imports, first allocations

@@ -87,6 +87,7 @@ def _collect(config: CollectConfig, committer: Committer, progress: Progress) ->
         while not crew.over and not stopped:
             for report in crew.poll():
                 for sealed in report.sealed:
+                    sealed.require_whole()
                     committer.spool.put(sealed)
                 for brief in report.done:
                     committer.note(brief.number)

@@ -37,6 +37,14 @@ class SealedEpisode:
         payload = to_bytes(encoded).to_pybytes()
         return cls(number, hashlib.sha256(payload).hexdigest(), payload)
 
+    def require_whole(self) -> None:
+        """Raise `EnvironmentFailure` unless the bytes are those that were sealed; for episodes
+        that have travelled."""
+        if hashlib.sha256(self.payload).hexdigest() != self.sha256:
+            raise EnvironmentFailure(
+                f"episode {self.number} arrived damaged: its SHA-256 is not {self.sha256}"
+            )
+
 
 class Spool:
     """A folder of sealed episodes."""
@@ -45,15 +53,7 @@ class Spool:
         self.folder = folder
 
     def put(self, sealed: SealedEpisode) -> None:
-        """Store an episode; it is there, whole and flushed to the disk, or not at all.
-
-        Raises:
-            EnvironmentFailure: the bytes are not those that were sealed.
-        """
-        if hashlib.sha256(sealed.payload).hexdigest() != sealed.sha256:
-            raise EnvironmentFailure(
-                f"episode {sealed.number} arrived damaged: its SHA-256 is not {sealed.sha256}"
-            )
+        """Store an episode; it is there, whole and flushed to the disk, or not at all."""
         name = f"{sealed.number:09d}-{sealed.sha256}.arrow"
         partial = self.folder / f".{name}.{os.getpid()}"
         try:
