@@ -26,7 +26,7 @@ from egovcp.data.provenance import Provenance
 from egovcp.data.spool import Spool
 from egovcp.data.version import Contents, Version, publish, recover
 from egovcp.data.writer import make_parent
-from egovcp.errors import DataError, UsageError
+from egovcp.errors import DataError, EnvironmentFailure, UsageError
 
 type Agree = Callable[[Provenance], None]
 
@@ -165,14 +165,17 @@ def committing(
 
     Raises:
         UsageError: something is there and ``resume`` is None, or ``root`` cannot exist.
-        EnvironmentFailure: another process writes it.
+        EnvironmentFailure: another process writes it, or nothing can be written there.
         DataError: what is there is damaged.
     """
     make_parent(root)
     work = work_folder(root)
     if resume is None:
         _require_nothing(root, work)
-    work.mkdir(exist_ok=True)
+    try:
+        work.mkdir(exist_ok=True)
+    except OSError as error:
+        raise EnvironmentFailure(f"cannot write beside {root}: {error.strerror}") from error
     with only_writer(root, work):
         committer = Committer(root, provenance, shard_episodes)
         try:

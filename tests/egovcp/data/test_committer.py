@@ -248,6 +248,14 @@ def test_a_second_writer_is_refused_at_once(tmp_path: Path, episodes: list[Episo
         committer.commit()
 
 
+def test_a_place_where_nothing_can_be_written() -> None:
+    with (
+        pytest.raises(EnvironmentFailure, match="cannot write beside /proc/dataset"),
+        committing(Path("/proc/dataset"), _RUN),
+    ):
+        pass
+
+
 def test_something_that_is_there_needs_resume(tmp_path: Path, episodes: list[Episode]) -> None:
     root = tmp_path / "d"
     with committing(root, _RUN, _SHARD) as committer:
