@@ -44,6 +44,8 @@ def run(config: CheckConfig) -> None:
     if config.max_problems < 1:
         raise UsageError(f"--max_problems={config.max_problems}: expected at least 1")
     root = local_root(config.dataset) if config.dataset.root else locate(config.dataset).root
+    if not root.is_dir():
+        raise DataError(f"no dataset at {root}: there is no such folder")
     with _progress() as progress:
         found = list(islice(dataset_problems(root, progress), config.max_problems))
     episodes, frames = _size(root)

@@ -69,4 +69,4 @@ def test_a_missing_folder_is_told_without_asking_the_hub(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["check", str(tmp_path / "none")]) == 3
-    assert "meta/info.json" in capsys.readouterr().err
+    assert "there is no such folder" in capsys.readouterr().err
