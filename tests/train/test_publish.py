@@ -177,6 +177,18 @@ def test_a_run_that_is_stopped_is_not_published(
     assert hub.requests["commit"] == 0
 
 
+def test_a_resumed_run_is_published_as_it_was_told_at_first(
+    hub: FakeHub, arguments: Arguments, tmp_path: Path
+) -> None:
+    run = tmp_path / "run"
+    hub.fail("commit", 503)
+    assert train(arguments(run, *TO_HUB)) == 5
+    hub.heal()
+    assert train([f"--output_dir={run}", "--resume"]) == 0
+    assert hub.requests["commit"] == 1
+    assert load_artefact("me/policy").manifest["step"] == 6
+
+
 # --- egovcp-push ------------------------------------------------------------------------
 def test_pushing_again_changes_nothing(hub: FakeHub, policy: Path, tmp_path: Path) -> None:
     report = tmp_path / "push.json"
