@@ -4,7 +4,8 @@
     model.safetensors  weights and normalisation statistics
     manifest.json      schema version, SHA-256 of each file, data, controller, code version
 
-safetensors and JSON only: loading an artefact never executes code.
+safetensors and JSON only: loading an artefact never executes code. Other files beside these, such
+as a model card and its pictures, are no part of it: neither read nor, from the Hub, fetched.
 """
 
 from __future__ import annotations
@@ -19,23 +20,19 @@ from pathlib import Path
 from typing import Any
 
 import draccus
-import httpx
-from huggingface_hub import snapshot_download
-from huggingface_hub.errors import (
-    HFValidationError,
-    RepositoryNotFoundError,
-    RevisionNotFoundError,
-)
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
 from egovcp import spec
-from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.errors import ArtefactError, UsageError
+from egovcp.hub import Patience, snapshot
 from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.plan import PlannerConfig, Policy
 
 SCHEMA_VERSION = 1
 CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
+_PATTERNS = ("*.json", "*.safetensors")
+_PATIENCE = Patience()
 
 
 @dataclass(frozen=True)
@@ -141,14 +138,23 @@ def _replace(path: Path, new: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def load_artefact(path: str, revision: str = "") -> Artefact:
+def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE) -> Artefact:
     """Load and validate a policy from a folder or, failing that, a Hub model id.
+
+    If the Hub cannot be reached, an earlier download of that revision serves.
+
+    Args:
+        path: the folder, or `user/name`.
+        revision: branch, tag or commit SHA on the Hub; empty: the latest. The name of
+            `Artefact.path` is the commit's SHA then.
+        patience: how often and how long the Hub is asked.
 
     Raises:
         ArtefactError: missing, tampered with, or made for another feature spec.
-        EnvironmentFailure: the Hub cannot be reached.
+        UsageError: a revision is asked of a folder.
+        EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
-    folder = _locate(path, revision)
+    folder = _locate(path, revision, patience)
     manifest = _read_json(folder / MANIFEST)
     _check_manifest(folder, manifest)
     config = _read_json(folder / CONFIG)
@@ -179,27 +185,32 @@ def _decode[C](config_class: type[C], config: dict[str, Any], key: str) -> C:
     return decoded
 
 
-def _locate(path: str, revision: str) -> Path:
+def _locate(path: str, revision: str, patience: Patience) -> Path:
     folder = Path(path)
-    if folder.is_dir():
+    if folder.is_dir() and not revision:
         return folder
-    if folder.exists() or path.count("/") != 1 or path.startswith((".", "/")):
+    if folder.is_dir():
+        raise UsageError(
+            f"{path} is a folder, and revision {revision} pins a policy of the Hub; drop the one "
+            "or the other"
+        )
+    if folder.exists() or not _is_hub_id(path):
         raise ArtefactError(
             f"no policy artefact at {path!r}: expected a folder with {CONFIG}, {WEIGHTS} and "
             f"{MANIFEST} (a run's checkpoints/last/pretrained_model) or a Hub id 'user/name'"
         )
+    return snapshot(path, revision, patience, "model", patterns=_PATTERNS)
+
+
+def _is_hub_id(text: str) -> bool:
+    from huggingface_hub.errors import HFValidationError
+    from huggingface_hub.utils._validators import validate_repo_id
+
     try:
-        return Path(snapshot_download(path, revision=revision or None))
-    except (RepositoryNotFoundError, RevisionNotFoundError, HFValidationError) as error:
-        reason = str(error).splitlines()[0]
-        raise ArtefactError(
-            f"{path!r} is neither a folder here nor a policy on the Hub: {reason}"
-        ) from error
-    except (OSError, httpx.HTTPError) as error:
-        raise EnvironmentFailure(
-            f"{path!r} is not a folder here, and the Hub cannot be reached: "
-            f"{str(error).splitlines()[0]}"
-        ) from error
+        validate_repo_id(text)
+    except HFValidationError:
+        return False
+    return "/" in text
 
 
 def _check_manifest(folder: Path, manifest: dict[str, Any]) -> None:

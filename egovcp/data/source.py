@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import re
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from egovcp.cli import DatasetConfig
 from egovcp.data import schema
 from egovcp.data.files import write_json
 from egovcp.errors import DataError, UsageError
-from egovcp.hub import HubUnreachable, Patience, explained, patient, token
+from egovcp.hub import Patience, snapshot
 
-_LOG = logging.getLogger(__name__)
 _PATIENCE = Patience()
 _REPO_ID = re.compile(r"\w[\w.-]*/\w[\w.-]*", re.ASCII)
 
@@ -110,28 +107,6 @@ def _require_repo_id(repo_id: str) -> None:
 
 
 def _download(config: DatasetConfig, patience: Patience) -> Source:
-    fetch = partial(_snapshot, config.repo_id, config.revision or "main")
-    try:
-        with explained(config.repo_id, config.revision), patient(patience):
-            token()
-            return fetch(local_files_only=False)
-    except HubUnreachable as error:
-        try:
-            found = fetch(local_files_only=True)
-        except OSError:  # nothing, or not all of it
-            raise error from None
-        _LOG.warning("%s; taking the earlier download of commit %s", error, found.commit)
-        return found
-
-
-def _snapshot(repo_id: str, revision: str, *, local_files_only: bool) -> Source:
-    from huggingface_hub import snapshot_download
-
-    folder = snapshot_download(
-        repo_id,
-        repo_type="dataset",
-        revision=revision,
-        cache_dir=lerobot_home() / "hub",
-        local_files_only=local_files_only,
-    )
-    return Source(Path(folder), repo_id, commit=Path(folder).name)
+    repo_id, cache = config.repo_id, lerobot_home() / "hub"
+    folder = snapshot(repo_id, config.revision, patience, cache_dir=cache)
+    return Source(folder, repo_id, commit=folder.name)

@@ -1,13 +1,14 @@
 """The Hugging Face Hub over a network that fails: bounded requests, whole versions, clear errors.
 
-`publish` puts files there in one commit, `fetch` brings a commit to a folder; `patient` and
-`explained` hold every other call of Hugging Face's library to the same limits and errors.
+`publish` puts files there in one commit, `fetch` brings a commit to a folder, `snapshot` to the
+cache; `patient` and `explained` hold every other call of Hugging Face's library to the same limits
+and errors. Datasets and models alike.
 """
 
-from egovcp.hub.failures import LostUpdate, explained, token
-from egovcp.hub.fetch import fetch, resolve
+from egovcp.hub.failures import LostUpdate, RepoType, explained, token
+from egovcp.hub.fetch import fetch, resolve, snapshot
 from egovcp.hub.patience import HubUnreachable, Patience, patient
-from egovcp.hub.publish import Content, Publication, Published, publish
+from egovcp.hub.publish import Content, Publication, Published, publish, reserve
 
 __all__ = [
     "Content",
@@ -16,10 +17,13 @@ __all__ = [
     "Patience",
     "Publication",
     "Published",
+    "RepoType",
     "explained",
     "fetch",
     "patient",
     "publish",
+    "reserve",
     "resolve",
+    "snapshot",
     "token",
 ]

@@ -5,10 +5,22 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Iterator
+from typing import Final, Literal
 
 import httpx
 
-from egovcp.errors import DataError, EgovcpError, EnvironmentFailure, UsageError
+from egovcp.errors import (
+    ArtefactError,
+    DataError,
+    EgovcpError,
+    EnvironmentFailure,
+    UsageError,
+)
+
+type RepoType = Literal["dataset", "model"]
+"""What a repository of the Hub holds; the two have their ids apart from each other."""
+
+_MISSING: Final[dict[RepoType, type[EgovcpError]]] = {"dataset": DataError, "model": ArtefactError}
 
 
 class LostUpdate(EnvironmentFailure):
@@ -16,20 +28,23 @@ class LostUpdate(EnvironmentFailure):
 
 
 @contextlib.contextmanager
-def explained(repo_id: str, revision: str = "", writing: bool = False) -> Iterator[None]:
+def explained(
+    repo_id: str, revision: str = "", writing: bool = False, repo_type: RepoType = "dataset"
+) -> Iterator[None]:
     """Turn every failure of the Hub's library within the block into an `EgovcpError`.
 
     Put nothing but calls of that library inside.
 
     Raises:
         DataError: there is no such dataset or revision.
+        ArtefactError: there is no such model or revision.
         UsageError: the id is not one.
         EnvironmentFailure: no network, no access, no space, or no sensible answer.
     """
     try:
         yield
     except (OSError, httpx.HTTPError, ValueError, KeyError, RuntimeError, EgovcpError) as error:
-        explanation = _explain(error, repo_id, revision or "main", writing)
+        explanation = _explain(error, repo_id, revision or "main", writing, repo_type)
         if explanation is error:
             raise
         raise explanation from error
@@ -52,7 +67,9 @@ def token() -> str | None:
     return found
 
 
-def _explain(error: Exception, repo_id: str, revision: str, writing: bool) -> Exception:
+def _explain(
+    error: Exception, repo_id: str, revision: str, writing: bool, repo_type: RepoType
+) -> Exception:
     from huggingface_hub.errors import (
         GatedRepoError,
         HfHubHTTPError,
@@ -68,39 +85,45 @@ def _explain(error: Exception, repo_id: str, revision: str, writing: bool) -> Ex
         if isinstance(link, EgovcpError):
             return link
         if isinstance(link, RevisionNotFoundError):
-            return DataError(f"the Hub has dataset {repo_id}, but not {name}; check the revision")
+            return _MISSING[repo_type](
+                f"the Hub has {repo_type} {repo_id}, but not {name}; check the revision"
+            )
         if isinstance(link, GatedRepoError):
             return EnvironmentFailure(
-                f"dataset {repo_id} is gated: ask for access on its page, then run `hf auth login`"
+                f"{repo_type} {repo_id} is gated: ask for access on its page, then run "
+                "`hf auth login`"
             )
         if isinstance(link, HfHubHTTPError) and link.response.status_code == 404:
-            return DataError(
-                f"the Hub has no dataset {repo_id} (404 at {link.response.url.path}), or it is "
+            return _MISSING[repo_type](
+                f"the Hub has no {repo_type} {repo_id} (404 at {link.response.url.path}), or it is "
                 "private and yours to see only after `hf auth login`; check the id"
             )
         if isinstance(link, HfHubHTTPError):
-            return _refused(link, repo_id, writing)
+            return _refused(link, repo_id, writing, repo_type)
         if isinstance(link, OfflineModeIsEnabled):
             return EnvironmentFailure(
-                f"HF_HUB_OFFLINE is set, so the Hub cannot be asked for dataset {name}; unset it"
+                f"HF_HUB_OFFLINE is set, so the Hub cannot be asked for {repo_type} {name}; "
+                "unset it"
             )
         if isinstance(link, HFValidationError):
-            return UsageError(f"{repo_id!r} is no id of a dataset on the Hub: {_line(link)}")
+            return UsageError(f"{repo_id!r} is no id of a {repo_type} on the Hub: {_line(link)}")
     if _is_local(error) and not isinstance(error, LocalEntryNotFoundError):
         return error  # the disk, not the network
     return EnvironmentFailure(
-        f"the Hub gave no usable answer about dataset {name}: {_line(chain[-1])}; check the "
+        f"the Hub gave no usable answer about {repo_type} {name}: {_line(chain[-1])}; check the "
         "network and HF_ENDPOINT, or try again later"
     )
 
 
-def _refused(error: httpx.HTTPError, repo_id: str, writing: bool) -> EgovcpError:
+def _refused(
+    error: httpx.HTTPError, repo_id: str, writing: bool, repo_type: RepoType
+) -> EgovcpError:
     from huggingface_hub.errors import HfHubHTTPError
 
     assert isinstance(error, HfHubHTTPError)
     status, path = error.response.status_code, error.response.url.path
     user = repo_id.split("/")[0]
-    need = f"write access to datasets of {user}" if writing else f"read access to {repo_id}"
+    need = f"write access to {repo_type}s of {user}" if writing else f"read access to {repo_id}"
     if status == 401:
         return EnvironmentFailure(
             f"the Hub does not know you (401 at {path}): run `hf auth login`, or set HF_TOKEN, "

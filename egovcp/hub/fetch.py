@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import shutil
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egovcp.errors import DataError, EnvironmentFailure
-from egovcp.hub.failures import explained, token
-from egovcp.hub.patience import Patience, patient
+from egovcp.hub.failures import RepoType, explained, token
+from egovcp.hub.patience import HubUnreachable, Patience, patient
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
     from huggingface_hub.hf_api import RepoFile
 
+_LOG = logging.getLogger(__name__)
 #: What the Hub keeps beside a dataset, and is none of it.
 _FOREIGN = (".gitattributes", ".gitignore")
 _WORKERS = 4
@@ -33,6 +37,53 @@ def resolve(repo_id: str, revision: str, patience: Patience) -> str:
         commit = HfApi(token=token()).dataset_info(repo_id, revision=revision or None).sha
         assert commit is not None
         return commit
+
+
+def snapshot(
+    repo_id: str,
+    revision: str,
+    patience: Patience,
+    repo_type: RepoType = "dataset",
+    cache_dir: Path | None = None,
+    patterns: Sequence[str] | None = None,
+) -> Path:
+    """The folder, in the library's cache, of a revision's files; its name is the commit SHA.
+
+    If the Hub cannot be reached, a complete earlier download serves.
+
+    Args:
+        repo_id: `user/name`.
+        revision: branch, tag or commit SHA; empty: the latest.
+        patience: how often and how long to try.
+        repo_type: what kind of repository it is.
+        cache_dir: the cache; None: the library's own.
+        patterns: of the files to bring; None: all.
+
+    Raises:
+        DataError: there is no such dataset or revision.
+        ArtefactError: there is no such model or revision.
+        EnvironmentFailure: the Hub cannot be reached, or refuses.
+    """
+    from huggingface_hub import snapshot_download
+
+    bring = partial(
+        snapshot_download,
+        repo_id,
+        repo_type=repo_type,
+        revision=revision or "main",
+        cache_dir=cache_dir,
+        allow_patterns=None if patterns is None else list(patterns),
+    )
+    try:
+        with explained(repo_id, revision, repo_type=repo_type), patient(patience):
+            return Path(bring(token=token()))
+    except HubUnreachable as error:
+        try:
+            found = Path(bring(local_files_only=True))
+        except OSError:  # nothing, or not all of it
+            raise error from None
+        _LOG.warning("%s; taking the earlier download of commit %s", error, found.name)
+        return found
 
 
 def fetch(repo_id: str, commit: str, folder: Path, patience: Patience) -> None:

@@ -6,13 +6,14 @@ import contextlib
 import hashlib
 import time
 from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.hub.failures import LostUpdate, explained, token
+from egovcp.hub.failures import LostUpdate, RepoType, explained, token
 from egovcp.hub.patience import HubUnreachable, Patience, patient
 
 if TYPE_CHECKING:
@@ -46,7 +47,7 @@ class Content:
 
 @dataclass(frozen=True)
 class Publication:
-    """What a dataset's repository shall hold."""
+    """What a repository shall hold."""
 
     repo_id: str
     contents: Mapping[str, Content]
@@ -62,6 +63,13 @@ class Publication:
     """A tag that follows the branch."""
     tag: str = ""
     """A tag for this commit, for good."""
+    repo_type: RepoType = "dataset"
+    """What kind of repository it is."""
+
+    @property
+    def failures(self) -> AbstractContextManager[None]:
+        """`explained` for what is done to this repository."""
+        return explained(self.repo_id, self.branch, writing=True, repo_type=self.repo_type)
 
 
 @dataclass(frozen=True)
@@ -93,46 +101,65 @@ def publish(publication: Publication, patience: Patience) -> Published:
         LostUpdate: somebody else has changed the branch meanwhile.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
-    with explained(publication.repo_id, publication.branch, writing=True), patient(patience):
+    with publication.failures, patient(patience):
         from huggingface_hub import HfApi
 
         api = HfApi(token=token())
         _prepare(api, publication)
-        seen = _look(api, publication.repo_id, publication.branch)
-        tags = _tags(api, publication.repo_id)
+        seen = _look(api, publication, publication.branch)
+        tags = _tags(api, publication)
         _require_free(publication, tags, seen)
         commit = seen.head
         if _operations(publication, seen):
             commit = _commit(api, publication, seen, patience)
         for tag in filter(None, (publication.moving_tag, publication.tag)):
-            _set_tag(api, publication.repo_id, tag, commit, tags.get(tag))
+            _set_tag(api, publication, tag, commit, tags.get(tag))
     return Published(commit, commit != seen.head)
+
+
+def reserve(publication: Publication, patience: Patience) -> None:
+    """Make the repository that a long computation is to fill, or see that one may write there.
+
+    Raises:
+        UsageError: the id is none, or names a public repository and a private one is asked for.
+        EnvironmentFailure: nobody is logged in, the Hub refuses, or cannot be reached.
+    """
+    with publication.failures, patient(patience):
+        from huggingface_hub import HfApi
+
+        if (known := token()) is None:
+            raise EnvironmentFailure(
+                f"nobody is logged in to the Hub, so {publication.repo_id} could not be "
+                "published; run `hf auth login`, or set HF_TOKEN"
+            )
+        _prepare(HfApi(token=known), publication)
 
 
 def _prepare(api: HfApi, publication: Publication) -> None:
     """The repository and the branch."""
-    repo_id, private = publication.repo_id, publication.private
-    api.create_repo(repo_id, repo_type="dataset", private=private or None, exist_ok=True)
-    if private and not api.dataset_info(repo_id).private:
+    repo_id, repo_type, private = publication.repo_id, publication.repo_type, publication.private
+    api.create_repo(repo_id, repo_type=repo_type, private=private or None, exist_ok=True)
+    if private and not api.repo_info(repo_id, repo_type=repo_type).private:
         raise UsageError(
             f"{repo_id} exists and is public, --private was given; nothing was published; make "
-            "it private on the Hub, or choose another --repo_id"
+            "it private on the Hub, or choose another id"
         )
     if publication.branch != _MAIN:
-        api.create_branch(repo_id, repo_type="dataset", branch=publication.branch, exist_ok=True)
+        api.create_branch(repo_id, repo_type=repo_type, branch=publication.branch, exist_ok=True)
 
 
-def _look(api: HfApi, repo_id: str, revision: str) -> _State:
+def _look(api: HfApi, publication: Publication, revision: str) -> _State:
     from huggingface_hub.hf_api import RepoFile
 
-    head = api.dataset_info(repo_id, revision=revision).sha
+    repo_id, repo_type = publication.repo_id, publication.repo_type
+    head = api.repo_info(repo_id, repo_type=repo_type, revision=revision).sha
     assert head is not None
-    tree = api.list_repo_tree(repo_id, repo_type="dataset", revision=head, recursive=True)
+    tree = api.list_repo_tree(repo_id, repo_type=repo_type, revision=head, recursive=True)
     return _State(head, {entry.path: entry for entry in tree if isinstance(entry, RepoFile)})
 
 
-def _tags(api: HfApi, repo_id: str) -> dict[str, str]:
-    refs = api.list_repo_refs(repo_id, repo_type="dataset")
+def _tags(api: HfApi, publication: Publication) -> dict[str, str]:
+    refs = api.list_repo_refs(publication.repo_id, repo_type=publication.repo_type)
     return {tag.name: tag.target_commit for tag in refs.tags}
 
 
@@ -182,24 +209,28 @@ def _commit(api: HfApi, publication: Publication, seen: _State, patience: Patien
     from huggingface_hub import CommitOperationAdd
 
     operations = _operations(publication, seen)
-    repo_id, branch = publication.repo_id, publication.branch
+    repo_id, repo_type = publication.repo_id, publication.repo_type
     additions = [o for o in operations if isinstance(o, CommitOperationAdd)]
     api.preupload_lfs_files(
-        repo_id, additions, repo_type="dataset", revision=branch, free_memory=False
+        repo_id,
+        additions,
+        repo_type=repo_type,
+        revision=publication.branch,
+        free_memory=False,
     )
     for attempt in range(1, patience.attempts + 1):
         try:
-            with explained(repo_id, branch, writing=True):
+            with publication.failures:
                 made = api.create_commit(
                     repo_id,
                     operations,
                     commit_message=publication.message,
-                    repo_type="dataset",
-                    revision=branch,
+                    repo_type=repo_type,
+                    revision=publication.branch,
                     parent_commit=seen.head,
                 )
         except (HubUnreachable, LostUpdate) as error:
-            now = _look(api, repo_id, branch)
+            now = _look(api, publication, publication.branch)
             if not _operations(publication, now):
                 return now.head  # it has arrived, only the answer was lost
             if now.head != seen.head:
@@ -208,7 +239,7 @@ def _commit(api: HfApi, publication: Publication, seen: _State, patience: Patien
                 raise
             time.sleep(patience.pause(attempt))
         else:
-            _require_complete(publication, _look(api, repo_id, made.oid))
+            _require_complete(publication, _look(api, publication, made.oid))
             return made.oid
     raise AssertionError("unreachable")
 
@@ -230,13 +261,14 @@ def _require_complete(publication: Publication, state: _State) -> None:
         )
 
 
-def _set_tag(api: HfApi, repo_id: str, tag: str, commit: str, at: str | None) -> None:
+def _set_tag(api: HfApi, publication: Publication, tag: str, commit: str, at: str | None) -> None:
     """Set a tag, as LeRobot does: the Hub cannot move one, only remove and create it."""
     from huggingface_hub.errors import RevisionNotFoundError
 
+    repo_id, repo_type = publication.repo_id, publication.repo_type
     if at == commit:
         return
     if at is not None:
         with contextlib.suppress(RevisionNotFoundError):
-            api.delete_tag(repo_id, tag=tag, repo_type="dataset")
-    api.create_tag(repo_id, tag=tag, revision=commit, repo_type="dataset", exist_ok=True)
+            api.delete_tag(repo_id, tag=tag, repo_type=repo_type)
+    api.create_tag(repo_id, tag=tag, revision=commit, repo_type=repo_type, exist_ok=True)

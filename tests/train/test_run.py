@@ -256,7 +256,7 @@ def test_the_paper_preset_adds_nothing_to_the_paper() -> None:
     """Also outside the world model; a single flag still overrides it."""
     argv = ["--output_dir=x", "--preset=paper", "--planner.samples=64", "--optimizer.ema=0.9"]
     config = parse_config(TrainConfig, argv, "egovcp-train", "", option_defaults)
-    assert config.policy == PRESETS["paper"]
+    assert config.policy.world_model() == PRESETS["paper"]
     assert not config.sampling.mirror
     assert config.value_fit.steps == 0
     assert config.returns.keep_truncated

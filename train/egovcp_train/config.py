@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from egovcp.data import DatasetConfig, ReturnConfig
+from egovcp.data.source import is_repo_id
+from egovcp.errors import UsageError
 from egovcp.model import WorldModelConfig
 from egovcp.plan import PlannerConfig
 from egovcp_train.passing import PassingConfig
@@ -43,6 +45,35 @@ class SamplingConfig:
 
 
 @dataclass(frozen=True)
+class PolicyConfig(WorldModelConfig):
+    """Sizes of the networks, the losses they are trained with, and where they are published."""
+
+    push_to_hub: bool = False
+    """Publish the finished policy and its card as a model on the Hub."""
+    repo_id: str = ""
+    """Where to publish it, `user/name`."""
+    private: bool = False
+    """A new repository is private."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.push_to_hub and not is_repo_id(self.repo_id):
+            raise UsageError(
+                f"--policy.repo_id={self.repo_id!r}: expected user/name, where to publish"
+            )
+        if self.repo_id and not self.push_to_hub:
+            raise UsageError(
+                f"--policy.repo_id={self.repo_id} says where to publish the policy; give "
+                "--policy.push_to_hub to do so, or leave it empty"
+            )
+
+    def world_model(self) -> WorldModelConfig:
+        """What the networks themselves need to know."""
+        names = (f.name for f in fields(WorldModelConfig))
+        return WorldModelConfig(**{name: getattr(self, name) for name in names})
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Train the ego-vision world model from a LeRobot dataset and write a policy artefact.
 
@@ -57,8 +88,8 @@ class TrainConfig:
     """Dataset to train on."""
     preset: Literal["default", "paper", "debug"] = "default"
     """Starting point of all options; paper: equal weights, nothing added to the paper."""
-    policy: WorldModelConfig = field(default_factory=WorldModelConfig)
-    """World model and losses."""
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    """World model, losses, and where to publish."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     """Planner settings stored in the artefact."""
     returns: ReturnConfig = field(default_factory=ReturnConfig)

@@ -19,6 +19,7 @@ from egovcp.data import DatasetReader, EpisodeStore, SequenceStream, StreamConfi
 from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
 from egovcp.model import PRESETS, WorldModel
 from egovcp_train.batches import set_normalisation, to_tensors, whole_episodes
+from egovcp_train.card import versions, write_card
 from egovcp_train.checkpoint import (
     begin_checkpoint,
     checkpoint_dir,
@@ -30,6 +31,7 @@ from egovcp_train.evaluation import evaluate
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options, stop_on_signal
 from egovcp_train.passing import label
+from egovcp_train.publish import publish_trained, reserve_policy
 from egovcp_train.records import Recorder
 from egovcp_train.value_fit import fit_value
 
@@ -70,7 +72,7 @@ def train(config: TrainConfig) -> None:
     reader = DatasetReader.open(config.dataset)
     learning, heldout = _load(reader, config)
     torch.manual_seed(config.seed)
-    model = WorldModel(config.policy)
+    model = WorldModel(config.policy.world_model())
     set_normalisation(model, learning)
     sampling = _stream_config(config)
     sampling.check()
@@ -80,6 +82,7 @@ def train(config: TrainConfig) -> None:
     stream = SequenceStream(learning, sampling)
     if config.resume:
         _restore(output, learner, stream)
+    reserve_policy(config.policy)
     output.mkdir(parents=True, exist_ok=True)
     save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
     run = Run(config, output, learner, stream, heldout, device, _provenance(reader, config))
@@ -117,6 +120,9 @@ class Run:
                 self.finish(fit=finished)
         self.recorder.close()
         print(self._last_words(final, stopped=not finished))
+        write_card(final / "pretrained_model", self.output, self.config.policy.repo_id)
+        if finished and self.config.policy.push_to_hub:
+            publish_trained(final / "pretrained_model", self.config.policy)
 
     def _learn(self, budget: Budget, stopped: list[int]) -> None:
         """Step until the budget is spent or ``stopped`` fills."""
@@ -247,6 +253,8 @@ def _stream_config(config: TrainConfig) -> StreamConfig:
 def _provenance(reader: DatasetReader, config: TrainConfig) -> dict[str, Any]:
     return {
         "controller_id": reader.controller_id,
+        "tasks": sorted({reader.task(i) for i in range(len(reader))}),
+        "versions": versions(),
         "datasets": [{"repo_id": reader.source.repo_id, "revision": reader.source.commit}],
         "train_config": draccus.encode(config),
         "command": [PROG, *sys.argv[1:]],

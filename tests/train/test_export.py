@@ -1,0 +1,227 @@
+"""egovcp-export: the networks say what the world model says, in another runtime."""
+
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from egovcp import spec
+from egovcp.artefact import load_artefact, save_artefact
+from egovcp.errors import ArtefactError
+from egovcp.model import PRESETS, Carry, WorldModel
+from egovcp.model.depth import nearness
+from egovcp.plan import PlannerConfig
+from egovcp_train import export as module
+from egovcp_train.export import GOLDEN, REPORT, TOLERANCE, main, verify
+from egovcp_train.onnx_networks import NETWORKS, golden_inputs, pooled_nearness
+
+type Run = Callable[..., list[Any]]
+
+FILES = {*(f"{name}.onnx" for name in NETWORKS), GOLDEN, REPORT}
+
+
+def _lively(model: WorldModel) -> WorldModel:
+    """Heads that start at zero would agree by saying nothing."""
+    generator = torch.Generator().manual_seed(3)
+    for value in model.parameters():
+        value.data += 0.05 * torch.randn(value.shape, generator=generator)
+    model.state_mean.uniform_(-1, 1, generator=generator)
+    model.state_std.uniform_(0.5, 2, generator=generator)
+    model.return_mean.fill_(-3.0)
+    model.return_std.fill_(2.0)
+    model.return_floor.fill_(-9.0)
+    return model.eval()
+
+
+@pytest.fixture(scope="module")
+def artefact(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("artefact") / "policy"
+    torch.manual_seed(0)
+    planner = PlannerConfig(samples=16, elites=4)
+    save_artefact(path, _lively(WorldModel(PRESETS["debug"])), planner, {"controller_id": "s-1"})
+    return path
+
+
+@pytest.fixture(scope="module")
+def exported(artefact: Path) -> Path:
+    """An export; tests must not change it."""
+    output = artefact.parent / "onnx"
+    assert main([f"--policy.path={artefact}", f"--output_dir={output}"]) == 0
+    return output
+
+
+@pytest.fixture(scope="module")
+def run(exported: Path) -> Run:
+    """Run a network on named arrays."""
+    sessions = {n: onnxruntime.InferenceSession(exported / f"{n}.onnx") for n in NETWORKS}
+
+    def answer(name: str, **inputs: Any) -> list[Any]:
+        arrays = {key: np.asarray(value) for key, value in inputs.items()}
+        found: list[Any] = sessions[name].run(None, arrays)
+        return found
+
+    return answer
+
+
+def test_the_golden_vectors_hold_in_another_runtime(exported: Path, run: Run) -> None:
+    golden = load_file(exported / GOLDEN)
+    for name, network in NETWORKS.items():
+        found = run(name, **{key: golden[f"inputs/{key}"] for key in network.inputs})
+        for key, value in zip(network.outputs, found, strict=True):
+            expected = golden[f"outputs/{name}/{key}"].numpy()
+            np.testing.assert_allclose(value, expected, atol=TOLERANCE, rtol=TOLERANCE)
+            assert expected.std() > 1e-3, "they would not show a difference"
+
+
+@pytest.mark.parametrize("batch", [1, 3, 64])
+def test_any_batch_of_other_inputs_agrees(artefact: Path, run: Run, batch: int) -> None:
+    model = load_artefact(str(artefact)).world_model
+    inputs = golden_inputs(model, batch, seed=11)
+    carry = Carry(inputs["h"], inputs["z"])
+    with torch.no_grad():
+        value = model.value(carry, inputs["action"])
+        seen = model.observe(
+            carry,
+            inputs["action"],
+            inputs["depth"].to(torch.int32),
+            inputs["state"],
+            inputs["is_first"],
+        )
+    named = {key: inputs[key] for key in ("h", "z", "action")}
+    np.testing.assert_allclose(run("value", **named)[0], value, atol=1e-4)
+    h, z = run("observe", **inputs)
+    np.testing.assert_allclose(h, seen.h, atol=1e-4)
+    np.testing.assert_allclose(z, seen.z, atol=1e-4)
+
+
+def test_a_first_tick_heals_a_broken_memory(artefact: Path, run: Run) -> None:
+    inputs = golden_inputs(load_artefact(str(artefact)).world_model, 1)
+    healthy = run("observe", **inputs)
+    broken = inputs | {"h": torch.full_like(inputs["h"], torch.nan)}
+    for a, b in zip(run("observe", **broken), healthy, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_an_episode_filtered_and_imagined_stays_together(artefact: Path, run: Run) -> None:
+    """Errors do not grow with the recurrence."""
+    model = load_artefact(str(artefact)).world_model
+    carry = model.initial(2)
+    h, z = carry.h.numpy(), carry.z.numpy()
+    with torch.no_grad():
+        for tick in range(20):
+            inputs = golden_inputs(model, 2, seed=tick) | {
+                "is_first": torch.tensor([tick == 0] * 2)
+            }
+            depth = inputs["depth"].to(torch.int32)
+            carry = model.observe(
+                carry, inputs["action"], depth, inputs["state"], inputs["is_first"]
+            )
+            h, z = run("observe", **(inputs | {"h": h, "z": z}))
+        carry = model.imagine(carry, inputs["action"])
+    h, z = run("imagine", h=h, z=z, action=inputs["action"])
+    np.testing.assert_allclose(h, carry.h, atol=1e-4)
+    np.testing.assert_allclose(z, carry.z, atol=1e-4)
+
+
+def test_pooling_closes_holes_as_training_does() -> None:
+    generator = torch.Generator().manual_seed(0)
+    depth = torch.randint(0, 7000, (4, spec.DEPTH_ROWS, spec.DEPTH_COLS), generator=generator)
+    depth[torch.rand(depth.shape, generator=generator) < 0.3] = 0
+    expected = nearness(depth.int(), 5.0)
+    torch.testing.assert_close(pooled_nearness(depth.float(), 5.0), expected, atol=1e-6, rtol=0)
+
+
+def test_the_description_fits_the_files(exported: Path, artefact: Path) -> None:
+    assert {path.name for path in exported.iterdir()} == FILES
+    report = json.loads((exported / REPORT).read_text())
+    assert report["controller_id"] == "s-1"
+    assert report["return_floor"] == -9.0
+    assert report["features"] == load_artefact(str(artefact)).manifest["features"]
+    for name, entry in report["networks"].items():
+        path = exported / entry["file"]
+        assert entry["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
+        graph = onnx.load(path).graph
+        for side, there in (("inputs", graph.input), ("outputs", graph.output)):
+            shapes = {
+                v.name: [d.dim_param or d.dim_value for d in v.type.tensor_type.shape.dim]
+                for v in there
+            }
+            assert shapes == {key: value["shape"] for key, value in entry[side].items()}, name
+
+
+def test_the_preset_paper_is_exported_too(tmp_path: Path) -> None:
+    """It has neither the narrow head nor that of what is on its way."""
+    torch.manual_seed(0)
+    config = PRESETS["paper"]
+    small = type(config)(**{**vars(config), "hidden": 16, "latent": 4, "units": 16})
+    save_artefact(
+        tmp_path / "policy", _lively(WorldModel(small)), PlannerConfig(), {"controller_id": "s-1"}
+    )
+    argv = [f"--policy.path={tmp_path / 'policy'}", f"--output_dir={tmp_path / 'onnx'}"]
+    assert main(argv) == 0
+    assert max(verify(tmp_path / "onnx").values()) <= TOLERANCE
+
+
+# --- refusals ---------------------------------------------------------------------------
+def test_a_network_that_says_something_else_is_refused(exported: Path, tmp_path: Path) -> None:
+    for path in exported.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    golden = load_file(tmp_path / GOLDEN)
+    golden["outputs/value/value"][3] += 1e-2
+    save_file(golden, tmp_path / GOLDEN)
+    with pytest.raises(ArtefactError, match=r"value\.onnx differs from the original by"):
+        verify(tmp_path)
+
+
+def test_a_failed_export_leaves_nothing(
+    artefact: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(module, "TOLERANCE", 0.0)
+    assert main([f"--policy.path={artefact}", f"--output_dir={tmp_path / 'onnx'}"]) == 4
+    assert "the export is wrong" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "message"),
+    [
+        ([], 2, "--policy.path and --output_dir are needed"),
+        (["--policy.path=absent"], 2, "--policy.path and --output_dir are needed"),
+        (["--policy.path=absent", "--output_dir=new"], 4, "no policy artefact"),
+        (["--policy.path=absent", "--output_dir=."], 2, "exists and is not empty"),
+    ],
+)
+def test_misuse_is_explained(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    flags: list[str],
+    code: int,
+    message: str,
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.chdir(tmp_path)
+    assert main(flags) == code
+    assert message in capsys.readouterr().err
+
+
+def test_without_the_packages_it_says_what_to_install(
+    artefact: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(module, "find_spec", lambda name: None if name == "onnx" else object())
+    assert main([f"--policy.path={artefact}", f"--output_dir={tmp_path / 'onnx'}"]) == 5
+    assert "this needs onnx, not installed here" in capsys.readouterr().err

@@ -1,0 +1,214 @@
+"""``egovcp-export``: the planner's networks as ONNX, with vectors that prove them.
+
+observe.onnx ... termination.onnx   see `egovcp_train.onnx_networks`
+golden.safetensors                  inputs/NAME and outputs/NETWORK/NAME, from the original
+export.json                         features, controller, planner, SHA-256 and shapes
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, Final
+
+import draccus
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+
+from egovcp.artefact import MANIFEST, WEIGHTS, Artefact, load_artefact
+from egovcp.cli import run_command
+from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp_train.onnx_networks import (
+    NETWORKS,
+    OPSET,
+    Network,
+    golden_inputs,
+    reference,
+    write_graph,
+)
+from egovcp_train.output import prepare_output
+
+PROG = "egovcp-export"
+SCHEMA: Final = "egovcp-onnx-1"
+GOLDEN, REPORT = "golden.safetensors", "export.json"
+TOLERANCE: Final = 1e-4  # of the reference's magnitude where that exceeds 1
+_ROWS: Final = 7  # of the golden vectors; other than what is traced
+_TRACED_ROWS: Final = 2
+
+
+@dataclass(frozen=True)
+class ArtefactConfig:
+    """Which policy artefact."""
+
+    path: str = ""
+    """Folder of the artefact, or its Hub id `user/name`."""
+    revision: str = ""
+    """Branch, tag or commit SHA on the Hub; empty: the latest."""
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """Write the networks that the planner calls as ONNX, and prove them with onnxruntime.
+
+    Beside them lie golden vectors, inputs and the outputs of the original, by which any other
+    runtime can be proved as well.
+    """
+
+    policy: ArtefactConfig = field(default_factory=ArtefactConfig)
+    """The artefact."""
+    output_dir: str = ""
+    """New folder for the networks."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run_command(ExportConfig, export, argv, prog=PROG)
+
+
+def export(config: ExportConfig) -> None:
+    """Write, prove, and say how far the networks are from the original.
+
+    Raises:
+        UsageError: artefact or folder are not named, or the folder holds something.
+        ArtefactError: the artefact is damaged, or a network does not say what the original says.
+        EnvironmentFailure: onnx or onnxruntime is missing, or the folder cannot be written.
+    """
+    if not config.policy.path or not config.output_dir:
+        raise UsageError(
+            "--policy.path and --output_dir are needed: the artefact, and a new folder"
+        )
+    _require_packages()
+    output = prepare_output(config.output_dir, resume=False)
+    artefact = load_artefact(config.policy.path, config.policy.revision)
+    work = output.with_name(output.name + ".partial")
+    shutil.rmtree(work, ignore_errors=True)
+    work.mkdir(parents=True)
+    try:
+        errors = write_export(artefact, work)
+        os.replace(work, output)
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
+    for name, error in errors.items():
+        print(f"{output / name}.onnx: at most {error:.1e} from the original")
+    print(f"golden vectors: {output / GOLDEN}; description: {output / REPORT}")
+
+
+def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:
+    """Write everything to the existing ``folder``; network -> its largest error.
+
+    Raises:
+        ArtefactError: a network does not say what the original says.
+    """
+    model = artefact.world_model
+    for name, network in NETWORKS.items():
+        write_graph(network(model), golden_inputs(model, _TRACED_ROWS, 1), folder / f"{name}.onnx")
+    inputs = golden_inputs(model, _ROWS)
+    golden = {f"inputs/{name}": tensor for name, tensor in inputs.items()}
+    for name, outputs in reference(model, inputs).items():
+        golden |= {f"outputs/{name}/{key}": tensor for key, tensor in outputs.items()}
+    save_file({name: t.contiguous() for name, t in golden.items()}, folder / GOLDEN)
+    errors = verify(folder)
+    report = _report(artefact, folder, golden) | {"largest_error": errors}
+    text = json.dumps(report, indent=2, allow_nan=False) + "\n"
+    (folder / REPORT).write_text(text, encoding="utf-8")
+    return errors
+
+
+def verify(folder: Path) -> dict[str, float]:
+    """Run every network on the golden inputs, whole and row by row; its largest error.
+
+    Errors are relative where the reference exceeds 1, absolute elsewhere.
+
+    Raises:
+        ArtefactError: one exceeds `TOLERANCE`.
+        EnvironmentFailure: onnxruntime is missing.
+    """
+    _require_packages()
+    golden = load_file(folder / GOLDEN)
+    errors: dict[str, float] = {}
+    for name, network in NETWORKS.items():
+        inputs = {key: golden[f"inputs/{key}"].numpy() for key in network.inputs}
+        expected = [golden[f"outputs/{name}/{key}"].numpy() for key in network.outputs]
+        errors[name] = _largest_error(folder / f"{name}.onnx", network, inputs, expected)
+        if not errors[name] <= TOLERANCE:  # NaN is more, too
+            raise ArtefactError(
+                f"{folder / name}.onnx differs from the original by {errors[name]:.1e}, more than "
+                f"{TOLERANCE:g}; the export is wrong"
+            )
+    return errors
+
+
+def _largest_error(
+    path: Path, network: type[Network], inputs: dict[str, Any], expected: list[Any]
+) -> float:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
+    names, rows = list(network.outputs), len(expected[0])
+    whole = session.run(names, inputs)
+    single = [session.run(names, {k: v[i : i + 1] for k, v in inputs.items()}) for i in range(rows)]
+    found = [whole, [np.concatenate(parts) for parts in zip(*single, strict=True)]]
+    return float(
+        np.max(
+            [
+                np.max(np.abs(a - b) / np.maximum(1.0, np.abs(b)))
+                for answer in found
+                for a, b in zip(answer, expected, strict=True)
+            ]
+        )
+    )
+
+
+def _report(artefact: Artefact, folder: Path, golden: dict[str, torch.Tensor]) -> dict[str, Any]:
+    """What another runtime must know besides the graphs."""
+
+    def described(key: str) -> dict[str, Any]:
+        tensor = golden[key]
+        kind = str(tensor.dtype).removeprefix("torch.")
+        return {"dtype": kind, "shape": ["batch", *tensor.shape[1:]]}
+
+    return {
+        "schema": SCHEMA,
+        "opset": OPSET,
+        "networks": {
+            name: {
+                "file": f"{name}.onnx",
+                "sha256": _sha256(folder / f"{name}.onnx"),
+                "inputs": {key: described(f"inputs/{key}") for key in network.inputs},
+                "outputs": {key: described(f"outputs/{name}/{key}") for key in network.outputs},
+            }
+            for name, network in NETWORKS.items()
+        },
+        "golden": {"file": GOLDEN, "sha256": _sha256(folder / GOLDEN), "tolerance": TOLERANCE},
+        "return_floor": float(artefact.world_model.return_floor),
+        "planner": draccus.encode(artefact.planner),
+        "controller_id": artefact.controller_id,
+        "features": artefact.manifest["features"],
+        "artefact": {
+            "manifest_sha256": _sha256(artefact.path / MANIFEST),
+            "weights_sha256": artefact.manifest["files"][WEIGHTS],
+            "datasets": artefact.manifest.get("datasets", []),
+        },
+    }
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def _require_packages() -> None:
+    missing = [name for name in ("onnx", "onnxruntime") if find_spec(name) is None]
+    if missing:
+        raise EnvironmentFailure(
+            f"this needs {' and '.join(missing)}, not installed here: pip install 'egovcp[onnx]'"
+        )

@@ -1,0 +1,82 @@
+"""``egovcp-push``: a policy artefact to the Hub."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+
+from egovcp.artefact import load_artefact
+from egovcp.cli import run_command
+from egovcp.data.source import is_repo_id
+from egovcp.errors import UsageError
+from egovcp.hub import Patience, publish
+from egovcp_train.publish import publication, report
+
+PROG = "egovcp-push"
+
+
+@dataclass(frozen=True)
+class FolderConfig:
+    """Which policy artefact."""
+
+    path: str = ""
+    """Folder of the artefact, OUTPUT_DIR/checkpoints/last/pretrained_model of a run."""
+
+
+@dataclass(frozen=True)
+class PushConfig:
+    """Publish a policy artefact and its card on the Hub in one commit.
+
+    The artefact is checked first. A push that failed can be repeated: it completes what is
+    missing, and commits nothing if nothing differs.
+    """
+
+    policy: FolderConfig = field(default_factory=FolderConfig)
+    """The artefact."""
+    repo_id: str = ""
+    """Where to publish it, `user/name`."""
+    private: bool = False
+    """A new repository is private."""
+    branch: str = "main"
+    """Branch; made if need be."""
+    tag: str = ""
+    """A tag for this version; empty: none. It cannot be moved later."""
+    message: str = ""
+    """Title of the commit; empty: how long it was trained."""
+    network: Patience = field(default_factory=Patience)
+    """How long to try."""
+    json: str = ""
+    """File for {"repo_id", "branch", "tag", "commit", "new"}; empty: none."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run_command(PushConfig, push, argv, prog=PROG)
+
+
+def push(config: PushConfig) -> None:
+    """Check, publish, and say how to use it.
+
+    Raises:
+        UsageError: the folder or the id is missing or wrong.
+        ArtefactError: the artefact is damaged.
+        EnvironmentFailure: the Hub cannot be reached, or refuses.
+    """
+    if not Path(config.policy.path).is_dir() or not config.policy.path:
+        raise UsageError(
+            f"--policy.path={config.policy.path!r}: expected the folder of an artefact, such as "
+            "runs/ball/checkpoints/last/pretrained_model"
+        )
+    if not is_repo_id(config.repo_id):
+        raise UsageError(f"--repo_id={config.repo_id!r}: expected user/name, where to publish")
+    artefact = load_artefact(config.policy.path)
+    plain = publication(artefact, config.repo_id, config.private, config.message)
+    target = replace(plain, branch=config.branch, tag=config.tag)
+    published = publish(target, config.network)
+    report(target, published)
+    if config.json:
+        facts = {"repo_id": config.repo_id, "branch": config.branch, "tag": config.tag}
+        text = json.dumps({**facts, **asdict(published)}, indent=1) + "\n"
+        Path(config.json).expanduser().write_text(text, encoding="utf-8")
