@@ -46,7 +46,8 @@ def test_a_run_writes_checkpoints_and_an_artefact_that_plans(
     assert artefact.controller_id == "stance-test"
     assert artefact.planner.samples == 16
     assert artefact.manifest["step"] == 6
-    assert {"value/r2", "latent/kl"} <= artefact.manifest["heldout"].keys()
+    assert {"latent/active", "latent/kl"} <= artefact.manifest["heldout"].keys()
+    assert artefact.manifest["heldout_tasks"]["ball"]["episodes"] == 1
     printed = capsys.readouterr().out
     assert "done at step 6" in printed
     assert str(output / "checkpoints" / "000006" / "pretrained_model") in printed

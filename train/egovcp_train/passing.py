@@ -34,6 +34,10 @@ _TORSO: Final = LINK_NAMES.index("torso_link")
 _FEET: Final = [LINK_NAMES.index(f"{side}_ankle_roll_link") for side in ("left", "right")]
 _STANDING: Final = 0.70  # m, about the height of the pelvis above the ankles in the neutral pose
 
+#: Places of the pixels' rows and columns in the picture, from -1 to 1.
+_ROWS: Final = torch.linspace(-1, 1, spec.DEPTH_ROWS)[None, :, None]
+_COLS: Final = torch.linspace(-1, 1, spec.DEPTH_COLS)[None, None]
+
 
 @dataclass(frozen=True)
 class PassingConfig:
@@ -80,27 +84,47 @@ class Path(NamedTuple):
 def sightings(depth: NDArray[np.uint16], config: PassingConfig) -> tuple[Array, NDArray[np.bool_]]:
     """(T, 48, 64) mm -> where something approaches, in the camera frame, (T, 3) m; (T,) seen."""
     near = nearness(torch.from_numpy(depth.astype(np.int32)), spec.DEPTH_MAX_M)
-    centre, seen = approaching(near[None])
-    centre, seen = centre[0], seen[0]
-    focal = spec.DEPTH_ROWS / 2 / np.tan(config.vertical_fov / 2)
-    rows = torch.linspace(-1, 1, spec.DEPTH_ROWS)[None, :, None]
-    cols = torch.linspace(-1, 1, spec.DEPTH_COLS)[None, None]
-    t = torch.nonzero(seen)[:, 0]
-    at = centre[t]
-    reach = 0.3 * focal / ((1 - at[:, 2]) * spec.DEPTH_MAX_M)  # pixels that 0.3 m cover there
-    mask = (near[t] - at[:, 2, None, None]).abs() < 0.08
-    mask &= (cols - at[:, 0, None, None]).abs() * (spec.DEPTH_COLS / 2) < reach[:, None, None]
-    mask &= (rows - at[:, 1, None, None]).abs() * (spec.DEPTH_ROWS / 2) < reach[:, None, None]
+    t, mask = sighted_pixels(near, config)
+    focal = _focal(config)
     weight = mask.float()
     n = weight.sum((1, 2)).clamp_min(1)
-    u = (weight * cols).sum((1, 2)) / n
-    v = (weight * rows).sum((1, 2)) / n
+    u = (weight * _COLS).sum((1, 2)) / n
+    v = (weight * _ROWS).sum((1, 2)) / n
     z = (1 - (weight * near[t]).sum((1, 2)) / n) * spec.DEPTH_MAX_M + config.radius
     out = np.zeros((len(depth), 3))
     right = u * ((spec.DEPTH_COLS - 1) / 2) / focal
     down = v * ((spec.DEPTH_ROWS - 1) / 2) / focal
     out[t.numpy()] = torch.stack([z, -z * right, -z * down], -1).numpy()
-    return out, seen.numpy()
+    seen = np.zeros(len(depth), dtype=np.bool_)
+    seen[t.numpy()] = True
+    return out, seen
+
+
+def sighted_pixels(
+    near: torch.Tensor, config: PassingConfig, reach: float = 0.3
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Which pixels belong to what approaches.
+
+    Args:
+        near: (T, 48, 64) nearness of one episode.
+        reach: m from the middle of what has come nearer, to each side.
+
+    Returns:
+        (n,) the rows in which something does; (n, 48, 64) its pixels there.
+    """
+    centre, seen = approaching(near[None])
+    t = torch.nonzero(seen[0])[:, 0]
+    at = centre[0, t, :, None, None]
+    pixels = reach * _focal(config) / ((1 - at[:, 2]) * spec.DEPTH_MAX_M)  # that it covers there
+    mask = (near[t] - at[:, 2]).abs() < 0.08
+    mask &= (_COLS - at[:, 0]).abs() * (spec.DEPTH_COLS / 2) < pixels
+    mask &= (_ROWS - at[:, 1]).abs() * (spec.DEPTH_ROWS / 2) < pixels
+    return t, mask
+
+
+def _focal(config: PassingConfig) -> float:
+    """Focal length, pixels."""
+    return spec.DEPTH_ROWS / 2 / math.tan(config.vertical_fov / 2)
 
 
 def to_ground(point: Array, state: NDArray[np.floating], config: PassingConfig) -> Array:
@@ -164,6 +188,18 @@ def fit_path(t: Array, point: Array, config: PassingConfig) -> Path | None:
     return Path(p, v, t[keep])
 
 
+def find_path(
+    depth: NDArray[np.uint16], state: NDArray[np.floating], config: PassingConfig
+) -> tuple[NDArray[np.intp], Path | None]:
+    """The rows of one episode in which something approaches, and the path of what is thrown."""
+    point, seen = sightings(depth, config)
+    rows = np.flatnonzero(seen)
+    if len(rows) < config.min_sightings:
+        return rows, None
+    ground = to_ground(point, state, config)
+    return rows, fit_path(rows.astype(np.float64) * spec.PLANNER_DT, ground[rows], config)
+
+
 def label(store: EpisodeStore, config: PassingConfig) -> EpisodeStore:
     """The same episodes with ``passing`` filled in."""
     passing = np.zeros((store.num_frames, spec.PASSING_DIM), dtype=np.float32)
@@ -187,12 +223,9 @@ def label_episode(
     """
     out = np.zeros((len(depth), spec.PASSING_DIM), dtype=np.float32)
     out[:, 4] = 1.0
-    point, seen = sightings(depth, config)
-    rows = np.flatnonzero(seen)
+    rows, path = find_path(depth, state, config)
     if len(rows) < config.min_sightings:
         return out
-    ground = to_ground(point, state, config)
-    path = fit_path(rows.astype(np.float64) * spec.PLANNER_DT, ground[rows], config)
     if path is None:
         out[rows[0] : rows[-1] + 1, 4] = 0.0
         return out
