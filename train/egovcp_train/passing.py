@@ -34,10 +34,6 @@ _TORSO: Final = LINK_NAMES.index("torso_link")
 _FEET: Final = [LINK_NAMES.index(f"{side}_ankle_roll_link") for side in ("left", "right")]
 _STANDING: Final = 0.70  # m, about the height of the pelvis above the ankles in the neutral pose
 
-#: Places of the pixels' rows and columns in the picture, from -1 to 1.
-_ROWS: Final = torch.linspace(-1, 1, spec.DEPTH_ROWS)[None, :, None]
-_COLS: Final = torch.linspace(-1, 1, spec.DEPTH_COLS)[None, None]
-
 
 @dataclass(frozen=True)
 class PassingConfig:
@@ -64,6 +60,11 @@ class PassingConfig:
     max_offset: float = 1.0
     """A path that passes farther to the side or in height is a mistake, m."""
 
+    @property
+    def focal(self) -> float:
+        """Focal length, pixels."""
+        return spec.DEPTH_ROWS / 2 / math.tan(self.vertical_fov / 2)
+
 
 class Path(NamedTuple):
     """A ballistic path, and the times (n,) s of the sightings that support it."""
@@ -84,47 +85,27 @@ class Path(NamedTuple):
 def sightings(depth: NDArray[np.uint16], config: PassingConfig) -> tuple[Array, NDArray[np.bool_]]:
     """(T, 48, 64) mm -> where something approaches, in the camera frame, (T, 3) m; (T,) seen."""
     near = nearness(torch.from_numpy(depth.astype(np.int32)), spec.DEPTH_MAX_M)
-    t, mask = sighted_pixels(near, config)
-    focal = _focal(config)
+    centre, seen = approaching(near[None])
+    centre, seen = centre[0], seen[0]
+    focal = config.focal
+    rows = torch.linspace(-1, 1, spec.DEPTH_ROWS)[None, :, None]
+    cols = torch.linspace(-1, 1, spec.DEPTH_COLS)[None, None]
+    t = torch.nonzero(seen)[:, 0]
+    at = centre[t]
+    reach = 0.3 * focal / ((1 - at[:, 2]) * spec.DEPTH_MAX_M)  # pixels that 0.3 m cover there
+    mask = (near[t] - at[:, 2, None, None]).abs() < 0.08
+    mask &= (cols - at[:, 0, None, None]).abs() * (spec.DEPTH_COLS / 2) < reach[:, None, None]
+    mask &= (rows - at[:, 1, None, None]).abs() * (spec.DEPTH_ROWS / 2) < reach[:, None, None]
     weight = mask.float()
     n = weight.sum((1, 2)).clamp_min(1)
-    u = (weight * _COLS).sum((1, 2)) / n
-    v = (weight * _ROWS).sum((1, 2)) / n
+    u = (weight * cols).sum((1, 2)) / n
+    v = (weight * rows).sum((1, 2)) / n
     z = (1 - (weight * near[t]).sum((1, 2)) / n) * spec.DEPTH_MAX_M + config.radius
     out = np.zeros((len(depth), 3))
     right = u * ((spec.DEPTH_COLS - 1) / 2) / focal
     down = v * ((spec.DEPTH_ROWS - 1) / 2) / focal
     out[t.numpy()] = torch.stack([z, -z * right, -z * down], -1).numpy()
-    seen = np.zeros(len(depth), dtype=np.bool_)
-    seen[t.numpy()] = True
-    return out, seen
-
-
-def sighted_pixels(
-    near: torch.Tensor, config: PassingConfig, reach: float = 0.3
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Which pixels belong to what approaches.
-
-    Args:
-        near: (T, 48, 64) nearness of one episode.
-        reach: m from the middle of what has come nearer, to each side.
-
-    Returns:
-        (n,) the rows in which something does; (n, 48, 64) its pixels there.
-    """
-    centre, seen = approaching(near[None])
-    t = torch.nonzero(seen[0])[:, 0]
-    at = centre[0, t, :, None, None]
-    pixels = reach * _focal(config) / ((1 - at[:, 2]) * spec.DEPTH_MAX_M)  # that it covers there
-    mask = (near[t] - at[:, 2]).abs() < 0.08
-    mask &= (_COLS - at[:, 0]).abs() * (spec.DEPTH_COLS / 2) < pixels
-    mask &= (_ROWS - at[:, 1]).abs() * (spec.DEPTH_ROWS / 2) < pixels
-    return t, mask
-
-
-def _focal(config: PassingConfig) -> float:
-    """Focal length, pixels."""
-    return spec.DEPTH_ROWS / 2 / math.tan(config.vertical_fov / 2)
+    return out, seen.numpy()
 
 
 def to_ground(point: Array, state: NDArray[np.floating], config: PassingConfig) -> Array:
