@@ -131,7 +131,8 @@ class OpenLoop:
 
 def _starts(episodes: Recorded, stride: int) -> Starts:
     batch = episodes.batch
-    rows = torch.arange(CONTEXT - 1, batch.valid.shape[1] - 1, stride, device=batch.valid.device)
+    end = max(CONTEXT - 1, batch.valid.shape[1] - 1)
+    rows = torch.arange(CONTEXT - 1, end, stride, device=batch.valid.device)
     sighted = episodes.ball.flatten(2).any(-1)
     since = (sighted.cumsum(1) > 0).long().cumsum(1)
     return Starts(rows, since[:, rows])

@@ -59,7 +59,7 @@ def _starts(episodes: Recorded, near: Tensor) -> tuple[Tensor, Tensor]:
     flying = episodes.ball.sum((-2, -1)).float()
     moving = (moving_pixels(near, 0.04).sum((-2, -1)) * batch.valid).cumsum(1)
     window = torch.full_like(moving, -1.0)
-    window[:, : -ahead or None] = moving[:, ahead:] - moving[:, :-ahead]
+    window[:, :-ahead] = moving[:, ahead:] - moving[:, :-ahead]
     rows = torch.arange(window.shape[1], device=window.device)
     possible = (rows >= CONTEXT - 1) & (rows <= latest[:, None])
     window = window.masked_fill(~possible, -1.0)
