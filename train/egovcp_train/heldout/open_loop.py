@@ -98,7 +98,7 @@ class OpenLoop:
             still = (rollout.near[bs, ts - k] - truth).abs()
             for name, pixels in regions.items():
                 inside = pixels[bs, ts] & _counts(name, watched[some])[:, None, None]
-                sums = [wrong[inside].sum(), still[inside].sum(), inside.sum()]
+                sums = [(wrong * inside).sum(), (still * inside).sum(), inside.sum()]
                 scale = torch.tensor([1e3 * model.config.depth_max_m] * 2 + [1.0])
                 self._depth[name, k] += torch.stack([x.double() for x in sums]).cpu() * scale
 
