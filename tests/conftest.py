@@ -1,6 +1,7 @@
-"""What all tests share: one computing thread each, and random streams of their own."""
+"""What all tests share: one computing thread each, and Ctrl-C as a terminal has it."""
 
 import os
+import signal
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # before torch: tests are many and small
 os.environ.setdefault("TOKENIZERS_PARALLELISM", "false")
@@ -10,6 +11,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+# a shell that starts the tests in the background has them, and what they start, ignore it
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 from egovcp.testing.hub import FakeHub, in_this_process
 

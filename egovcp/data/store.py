@@ -75,8 +75,13 @@ class EpisodeStore:
         split: str = "all",
         returns: ReturnConfig | None = None,
         heldout_fraction: float = HELDOUT_FRACTION,
+        per_task: int | None = None,
     ) -> Self:
         """Read the episodes of a split into memory (6.3 kB per frame, nearly all depth).
+
+        Args:
+            per_task: read at most this many episodes of each task, evenly spread over those of
+                the split; None: all.
 
         Raises:
             DataError: the datasets cannot be mixed, are damaged, or the split is empty.
@@ -90,6 +95,8 @@ class EpisodeStore:
             raise DataError(
                 f"none of the {len(episodes)} episodes falls into split {split!r}; collect more"
             )
+        if per_task is not None:
+            chosen = _spread(chosen, per_task)
         length = np.array([reader.lengths[index] for reader, index in chosen], dtype=np.int64)
         arrays = _allocate(int(length.sum()))
         start = length.cumsum() - length
@@ -128,6 +135,21 @@ def require_mixable(readers: Sequence[DatasetReader]) -> None:
                     f"{other.root} has {what} {have}, {first.root} has {want}; such datasets do "
                     "not mix"
                 )
+
+
+def _spread(
+    episodes: list[tuple[DatasetReader, int]], per_task: int
+) -> list[tuple[DatasetReader, int]]:
+    """At most ``per_task`` episodes of each task, evenly spread, in their order."""
+    of_task: dict[str, list[int]] = {}
+    for place, (reader, index) in enumerate(episodes):
+        of_task.setdefault(reader.task(index), []).append(place)
+    kept = [
+        places[i]
+        for places in of_task.values()
+        for i in np.linspace(0, len(places) - 1, min(per_task, len(places))).round().astype(int)
+    ]
+    return [episodes[place] for place in sorted(kept)]
 
 
 def _allocate(frames: int) -> dict[str, NDArray[Any]]:

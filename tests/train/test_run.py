@@ -46,7 +46,8 @@ def test_a_run_writes_checkpoints_and_an_artefact_that_plans(
     assert artefact.controller_id == "stance-test"
     assert artefact.planner.samples == 16
     assert artefact.manifest["step"] == 6
-    assert {"value/r2", "latent/kl"} <= artefact.manifest["heldout"].keys()
+    assert {"latent/active", "latent/kl"} <= artefact.manifest["heldout"].keys()
+    assert artefact.manifest["heldout_tasks"]["ball"]["episodes"] == 1
     printed = capsys.readouterr().out
     assert "done at step 6" in printed
     assert str(output / "checkpoints" / "000006" / "pretrained_model") in printed
@@ -90,12 +91,16 @@ def test_a_preset_is_where_the_policy_options_start(arguments: Arguments, tmp_pa
     assert (config.hidden, config.latent, config.loss.value) == (32, 5, 2.5)
 
 
-def test_scalars_go_to_tensorboard(arguments: Arguments, tmp_path: Path) -> None:
+def test_scalars_and_pictures_go_to_tensorboard(arguments: Arguments, tmp_path: Path) -> None:
     assert main(arguments(tmp_path / "run", tensorboard="true", eval_freq=2, steps=4)) == 0
     (events,) = (tmp_path / "run" / "tensorboard").iterdir()
     content = events.read_bytes()
-    for name in (b"loss/total", b"loss/value", b"heldout/value/r2", b"grad_norm"):
+    for name in (b"loss/total", b"loss/value", b"heldout/latent/kl", b"grad_norm"):
         assert name in content
+    for name in (b"depth_valid_h16", b"state_joint_position_repeat_h4", b"latent_active"):
+        assert b"heldout/ball/" + name in content
+    assert b"heldout/open_loop_ball" in content
+    assert b"PNG" in content
 
 
 def test_a_run_under_a_clock_ends_early_and_whole(arguments: Arguments, tmp_path: Path) -> None:

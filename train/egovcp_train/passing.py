@@ -60,6 +60,11 @@ class PassingConfig:
     max_offset: float = 1.0
     """A path that passes farther to the side or in height is a mistake, m."""
 
+    @property
+    def focal(self) -> float:
+        """Focal length, pixels."""
+        return spec.DEPTH_ROWS / 2 / math.tan(self.vertical_fov / 2)
+
 
 class Path(NamedTuple):
     """A ballistic path, and the times (n,) s of the sightings that support it."""
@@ -82,7 +87,7 @@ def sightings(depth: NDArray[np.uint16], config: PassingConfig) -> tuple[Array, 
     near = nearness(torch.from_numpy(depth.astype(np.int32)), spec.DEPTH_MAX_M)
     centre, seen = approaching(near[None])
     centre, seen = centre[0], seen[0]
-    focal = spec.DEPTH_ROWS / 2 / np.tan(config.vertical_fov / 2)
+    focal = config.focal
     rows = torch.linspace(-1, 1, spec.DEPTH_ROWS)[None, :, None]
     cols = torch.linspace(-1, 1, spec.DEPTH_COLS)[None, None]
     t = torch.nonzero(seen)[:, 0]
@@ -164,6 +169,18 @@ def fit_path(t: Array, point: Array, config: PassingConfig) -> Path | None:
     return Path(p, v, t[keep])
 
 
+def find_path(
+    depth: NDArray[np.uint16], state: NDArray[np.floating], config: PassingConfig
+) -> tuple[NDArray[np.intp], Path | None]:
+    """The rows of one episode in which something approaches, and the path of what is thrown."""
+    point, seen = sightings(depth, config)
+    rows = np.flatnonzero(seen)
+    if len(rows) < config.min_sightings:
+        return rows, None
+    ground = to_ground(point, state, config)
+    return rows, fit_path(rows.astype(np.float64) * spec.PLANNER_DT, ground[rows], config)
+
+
 def label(store: EpisodeStore, config: PassingConfig) -> EpisodeStore:
     """The same episodes with ``passing`` filled in."""
     passing = np.zeros((store.num_frames, spec.PASSING_DIM), dtype=np.float32)
@@ -187,12 +204,9 @@ def label_episode(
     """
     out = np.zeros((len(depth), spec.PASSING_DIM), dtype=np.float32)
     out[:, 4] = 1.0
-    point, seen = sightings(depth, config)
-    rows = np.flatnonzero(seen)
+    rows, path = find_path(depth, state, config)
     if len(rows) < config.min_sightings:
         return out
-    ground = to_ground(point, state, config)
-    path = fit_path(rows.astype(np.float64) * spec.PLANNER_DT, ground[rows], config)
     if path is None:
         out[rows[0] : rows[-1] + 1, 4] = 0.0
         return out

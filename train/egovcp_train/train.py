@@ -16,9 +16,9 @@ from tqdm import tqdm
 from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
 from egovcp.data import DatasetReader, EpisodeStore, SequenceStream, StreamConfig
-from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.errors import ArtefactError, UsageError
 from egovcp.model import PRESETS, WorldModel
-from egovcp_train.batches import set_normalisation, to_tensors, whole_episodes
+from egovcp_train.batches import set_normalisation, to_tensors
 from egovcp_train.card import versions, write_card
 from egovcp_train.checkpoint import (
     begin_checkpoint,
@@ -27,7 +27,11 @@ from egovcp_train.checkpoint import (
     load_training_state,
 )
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
-from egovcp_train.evaluation import evaluate
+from egovcp_train.device import choose_device
+from egovcp_train.heldout.episodes import recorded
+from egovcp_train.heldout.pictures import draw
+from egovcp_train.heldout.report import measure, scalars
+from egovcp_train.heldout.table import table
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options, stop_on_signal
 from egovcp_train.passing import label
@@ -36,7 +40,7 @@ from egovcp_train.records import Recorder
 from egovcp_train.value_fit import fit_value
 
 PROG = "egovcp-train"
-EVALUATION_EPISODES = 64
+EVALUATION_EPISODES = 64  # of each task
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -68,7 +72,7 @@ def train(config: TrainConfig) -> None:
     """Run training to its end, or to the first SIGINT or SIGTERM, and write the artefact."""
     output = _prepare_output(config)
     torch.set_num_threads(config.threads or torch.get_num_threads())
-    device = _device(config.device)
+    device = choose_device(config.device)
     reader = DatasetReader.open(config.dataset)
     learning, heldout = _load(reader, config)
     torch.manual_seed(config.seed)
@@ -105,6 +109,7 @@ class Run:
         self.config, self.output, self.learner, self.stream = config, output, learner, stream
         self.heldout, self.device, self.provenance = heldout, device, provenance
         self.metrics: dict[str, float] = {}
+        self.tasks: dict[str, dict[str, Any]] = {}
         self.recorder = Recorder(output, enabled=config.tensorboard)
 
     def execute(self) -> None:
@@ -154,16 +159,21 @@ class Run:
 
     def evaluate(self, model: WorldModel) -> None:
         """Measure a model on held-out episodes."""
-        episodes = whole_episodes(self.heldout, self.device, limit=EVALUATION_EPISODES)
-        self.metrics = evaluate(model, episodes)
-        self.recorder.scalars(
-            self.learner.step, {f"heldout/{k}": v for k, v in self.metrics.items()}
-        )
+        config, step = self.config, self.learner.step
+        episodes = recorded(self.heldout, self.device, config.passing, EVALUATION_EPISODES)
+        report = measure(model, episodes)
+        self.metrics, self.tasks = report.metrics, report.tasks
+        found = self.metrics | scalars(self.tasks)
+        self.recorder.scalars(step, {f"heldout/{k}": v for k, v in found.items()})
+        if config.tensorboard:
+            for name, picture in draw(report).items():
+                self.recorder.picture(step, f"heldout/{name}", picture)
 
     def save(self, model: WorldModel) -> Path:
         """Write a checkpoint: the model as artefact, and the training state."""
         partial = begin_checkpoint(self.output, self.learner.step)
-        provenance = self.provenance | {"step": self.learner.step, "heldout": self.metrics}
+        found = {"heldout": self.metrics, "heldout_tasks": self.tasks}
+        provenance = self.provenance | {"step": self.learner.step, **found}
         save_artefact(partial / "pretrained_model", model, self.config.planner, provenance)
         state = {"learner": self.learner.state_dict(), "stream": self.stream.state_dict()}
         return finish_checkpoint(partial, state)
@@ -184,6 +194,7 @@ class Run:
             [
                 f"{PROG}: {state} at step {self.learner.step}; on held-out episodes:",
                 *lines,
+                table(self.tasks),
                 f"artefact: {artefact}",
                 f"continue: {PROG} --output_dir={self.output} --resume"
                 if stopped
@@ -217,18 +228,6 @@ def _restore(output: Path, learner: Learner, stream: SequenceStream) -> None:
             f"{output}: its checkpoint does not fit the --policy options given ({reason}); resume "
             "without them, or start a new run"
         ) from error
-
-
-def _device(name: str) -> torch.device:
-    available = torch.cuda.is_available()
-    if name == "auto":
-        return torch.device("cuda" if available else "cpu")
-    if name.startswith("cuda") and not available:
-        raise EnvironmentFailure("--device=cuda, but torch finds no CUDA device; use --device=cpu")
-    try:
-        return torch.device(name)
-    except RuntimeError as error:
-        raise UsageError(f"unknown --device {name!r}; expected cpu, cuda or auto") from error
 
 
 def _load(reader: DatasetReader, config: TrainConfig) -> tuple[EpisodeStore, EpisodeStore]:

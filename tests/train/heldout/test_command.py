@@ -1,0 +1,110 @@
+"""``egovcp-eval-model``: what it writes, what it refuses."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from egovcp.artefact import load_artefact, save_artefact
+from egovcp.cli import DatasetConfig
+from egovcp.data import DatasetReader
+from egovcp.plan import PlannerConfig
+from egovcp.testing import toy_model
+from egovcp_train.heldout.command import main
+from egovcp_train.train import main as train
+
+type Arguments = Callable[..., list[str]]
+
+
+@pytest.fixture(scope="module")
+def policy(arguments: Arguments, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The artefact of a run of two steps."""
+    output = tmp_path_factory.mktemp("policy") / "run"
+    assert train(arguments(output, steps=2)) == 0
+    return output / "checkpoints" / "last" / "pretrained_model"
+
+
+def _argv(policy: Path, root: Path, output: Path, *flags: str) -> list[str]:
+    named = {"policy.path": policy, "dataset.root": root, "output_dir": output, "threads": 1}
+    return [*(f"--{k}={v}" for k, v in named.items()), "--device=cpu", *flags]
+
+
+def test_figures_pictures_and_a_table(
+    policy: Path, dataset_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "out"
+    assert main(_argv(policy, dataset_root, output, "--split=all", "--stride=2")) == 0
+    content = json.loads((output / "heldout.json").read_text("utf-8"))
+    found = content["tasks"]["ball"]
+    assert (found["episodes"], found["rows"]) == (8, 7 * 24 + 15)
+    assert found["termination"]["1"]["failing"] == 1
+    # The returns are those of the training, over 5 steps: 20 rows of 24 have room for them.
+    assert found["value"]["rows"] == 7 * 20 + 15
+    assert content["_run"]["split"] == "all"
+    assert {p.name for p in output.iterdir()} == {
+        "heldout.json",
+        "open_loop_ball.png",
+        "value_ball.png",
+    }
+    with Image.open(output / "open_loop_ball.png") as picture:
+        assert picture.width > picture.height
+    assert "ball: 8 episodes" in capsys.readouterr().out
+
+
+def test_the_figures_of_a_run_are_measured_again(
+    policy: Path, dataset_root: Path, tmp_path: Path
+) -> None:
+    argv = _argv(policy, dataset_root, tmp_path, "--pictures=false")
+    assert main(argv) == 0
+    assert {p.name for p in tmp_path.iterdir()} == {"heldout.json"}
+    content = json.loads((tmp_path / "heldout.json").read_text("utf-8"))
+    trained = load_artefact(str(policy)).manifest
+    assert content["tasks"] == trained["heldout_tasks"]
+    assert content["all_tasks"] == trained["heldout"]
+
+
+def test_few_episodes_are_enough(policy: Path, dataset_root: Path, tmp_path: Path) -> None:
+    argv = _argv(policy, dataset_root, tmp_path, "--split=all", "--episodes=2", "--pictures=false")
+    assert main(argv) == 0
+    content = json.loads((tmp_path / "heldout.json").read_text("utf-8"))
+    assert content["tasks"]["ball"]["episodes"] == 2
+
+
+@pytest.mark.parametrize(
+    ("flag", "code", "message"),
+    [
+        ("--episodes=-1", 2, "--episodes=-1"),
+        ("--stride=0", 2, "--stride=0"),
+        ("--policy.path=", 2, "no policy given"),
+        ("--split=test", 2, "unknown split 'test'"),
+        ("--policy.path=/nowhere", 4, "no policy artefact"),
+        ("--dataset.root=/nowhere", 3, "/nowhere"),
+        ("--device=tpu9", 2, "unknown --device"),
+    ],
+)
+def test_refusals(
+    policy: Path,
+    dataset_root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    flag: str,
+    code: int,
+    message: str,
+) -> None:
+    name = flag.split("=")[0]
+    argv = [a for a in _argv(policy, dataset_root, tmp_path / "out") if not a.startswith(name)]
+    assert main([*argv, flag]) == code
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_data_of_another_controller_is_refused(
+    dataset_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    save_artefact(tmp_path / "p", toy_model(), PlannerConfig(), {"controller_id": "walk-of-others"})
+    assert main(_argv(tmp_path / "p", dataset_root, tmp_path / "out")) == 4
+    said = capsys.readouterr().err
+    assert "walk-of-others" in said
+    assert DatasetReader.open(DatasetConfig(root=str(dataset_root))).controller_id in said

@@ -1,0 +1,160 @@
+"""``egovcp-eval-model``: what a trained world model foresees, on episodes it has not seen."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+import draccus
+import torch
+
+from egovcp.artefact import Artefact, load_artefact
+from egovcp.cli import DatasetConfig, run_command
+from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
+from egovcp.errors import ArtefactError, UsageError
+from egovcp_train.device import choose_device
+from egovcp_train.heldout.episodes import recorded
+from egovcp_train.heldout.pictures import draw
+from egovcp_train.heldout.report import Report, measure
+from egovcp_train.heldout.table import table
+from egovcp_train.output import require_writable
+from egovcp_train.passing import PassingConfig, label
+
+PROG: Final = "egovcp-eval-model"
+RESULT: Final = "heldout.json"
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Which policy artefact."""
+
+    path: str = ""
+    """Folder of the artefact, or its Hub id `user/name`."""
+    revision: str = ""
+    """Branch, tag or commit SHA on the Hub; empty: the latest."""
+
+
+@dataclass(frozen=True)
+class HeldoutConfig:
+    """Measure a trained world model on whole recorded episodes, without a simulator.
+
+    Open-loop prediction of depth and proprioception 1 to 16 ticks ahead beside "the last one
+    repeated", how well terminations are foretold, the calibration of Q, the latent dimensions in
+    use; per task, as a table, heldout.json and pictures. docs/world_model.md explains each.
+    """
+
+    output_dir: str
+    """Folder for heldout.json and the pictures; its other files are left alone."""
+    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    """Policy to measure."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """Dataset with the episodes."""
+    split: str = "heldout"
+    """heldout, train or all; episodes are held out by a hash, the same ones in each training."""
+    episodes: int = 64
+    """At most this many episodes of each task, evenly spread over the split; 0: all."""
+    stride: int = 4
+    """Rows between the starts of open-loop predictions; 1: from each row."""
+    pictures: bool = True
+    """Write open_loop_TASK.png and value_TASK.png."""
+    threads: int = 0
+    """CPU threads; 0: all cores."""
+    device: str = "auto"
+    """cpu, cuda, or auto (cuda if there is one)."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run_command(HeldoutConfig, evaluate, argv, prog=PROG)
+
+
+def evaluate(config: HeldoutConfig) -> None:
+    """Measure, print the table, write the JSON and the pictures."""
+    output = _check(config)
+    torch.set_num_threads(config.threads or torch.get_num_threads())
+    device = choose_device(config.device)
+    artefact = load_artefact(config.policy.path, config.policy.revision)
+    reader = DatasetReader.open(config.dataset)
+    _require_same_controller(artefact, reader)
+    passing = _trained_with(artefact, "passing", PassingConfig)
+    returns = _trained_with(artefact, "returns", ReturnConfig)
+    limit = config.episodes or None
+    store = label(EpisodeStore.load([reader], config.split, returns, per_task=limit), passing)
+    model = artefact.world_model.to(device)
+    report = measure(model, recorded(store, device, passing), config.stride)
+    print(table(report.tasks))
+    _write(output, report, _run(config, artefact, reader), config.pictures)
+    print(f"figures: {output / RESULT}")
+
+
+def _check(config: HeldoutConfig) -> Path:
+    """Refuse options that make no sense before any work starts."""
+    if config.episodes < 0 or config.stride < 1:
+        raise UsageError(
+            f"--episodes={config.episodes} --stride={config.stride}: expected at least 0 and 1"
+        )
+    if not config.policy.path:
+        raise UsageError("no policy given: --policy.path=RUN/checkpoints/last/pretrained_model")
+    output = Path(config.output_dir)
+    require_writable(output)
+    return output
+
+
+def _require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
+    """Raise `ArtefactError` where the data's actions were given to another controller."""
+    if artefact.controller_id != reader.controller_id:
+        raise ArtefactError(
+            f"{artefact.path} was trained on data of low-level controller "
+            f"{artefact.controller_id!r}, {reader.root} was collected with "
+            f"{reader.controller_id!r}: the same actions lead elsewhere; choose a dataset of the "
+            "policy's controller"
+        )
+
+
+def _trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
+    """The options of the training under ``name``; the defaults where the manifest has none.
+
+    Raises:
+        ArtefactError: they cannot be read.
+    """
+    options: Any = artefact.manifest.get("train_config", {})
+    try:
+        found: C = draccus.decode(kind, options.get(name, {}))
+    except (AttributeError, draccus.utils.DraccusException) as error:
+        raise ArtefactError(
+            f"{artefact.path}: its manifest's train_config.{name} cannot be read "
+            f"({' '.join(str(error).split())}); train again with this version"
+        ) from error
+    return found
+
+
+def _run(config: HeldoutConfig, artefact: Artefact, reader: DatasetReader) -> dict[str, Any]:
+    return {
+        "policy": str(artefact.path),
+        "step": artefact.manifest.get("step"),
+        "dataset": {"repo_id": reader.source.repo_id, "revision": reader.source.commit},
+        "split": config.split,
+        "stride": config.stride,
+        "command": [PROG, *sys.argv[1:]],
+    }
+
+
+def _write(output: Path, report: Report, run: dict[str, Any], pictures: bool) -> None:
+    output.mkdir(parents=True, exist_ok=True)
+    content = {"tasks": report.tasks, "all_tasks": report.metrics, "_run": run}
+    (output / RESULT).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    if not pictures:
+        return
+    from PIL import Image
+
+    for name, picture in draw(report).items():
+        Image.fromarray(picture).save(output / f"{name}.png", optimize=True)
+        print(f"picture: {output / name}.png")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
