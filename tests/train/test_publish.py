@@ -79,7 +79,7 @@ def test_the_card_says_what_the_manifest_knows(
     assert manifest["tasks"] == ["ball"]
     for fact in ("stance-test", "**ball**", *manifest["versions"].values(), "me/policy"):
         assert fact in card
-    assert {"latent/kl", "value/r2"} <= manifest["heldout"].keys()
+    assert {"latent/kl", "value/slope"} <= manifest["heldout"].keys()
     for name, value in manifest["heldout"].items():
         assert f"| `{name}` | {value:.4g} |" in card
     assert "training.png" not in card, "nothing was recorded, so there is no picture"
