@@ -182,7 +182,8 @@ def committing(
             committer._load(resume or _nothing_to_agree)
             yield committer
         finally:
-            if not committer.sealed:
+            # asked of the disk: a run that was refused has not looked at what is sealed
+            if not any((work / "sealed").glob("*.arrow")):
                 with suppress(OSError):
                     shutil.rmtree(work)
 

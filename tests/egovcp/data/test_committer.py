@@ -277,7 +277,9 @@ def _commit_once(root: Path) -> None:
 def test_a_run_that_does_not_agree_changes_nothing(tmp_path: Path, episodes: list[Episode]) -> None:
     root = tmp_path / "d"
     _commit_all(root, episodes, [3])
-    before = _tree(root)
+    with committing(root, _RUN, _SHARD, _agree) as committer:
+        _seal(committer, episodes, [4])  # 3 is missing: it stays sealed
+    before = _tree(tmp_path)
 
     def disagree(provenance: Provenance) -> None:
         raise UsageError("another seed")
@@ -287,7 +289,9 @@ def test_a_run_that_does_not_agree_changes_nothing(tmp_path: Path, episodes: lis
         committing(root, _RUN, _SHARD, disagree),
     ):
         pass
-    assert _tree(root) == before
+    assert _tree(tmp_path) == before
+    with committing(root, _RUN, _SHARD, _agree) as committer:
+        assert committer.sealed == 1
 
 
 def test_a_damaged_dataset_is_not_extended(tmp_path: Path, episodes: list[Episode]) -> None:
