@@ -8,6 +8,8 @@ In one line, a dataset as padded arrays [Batch, Time, Data]::
 from egovcp.cli import DatasetConfig
 from egovcp.data.arrays import load_arrays, open_dataset
 from egovcp.data.episode import Episode
+from egovcp.data.index import EpisodeIndex
+from egovcp.data.mix import Mix
 from egovcp.data.provenance import Provenance
 from egovcp.data.reader import DatasetReader
 from egovcp.data.store import EpisodeStore, ReturnConfig
@@ -21,7 +23,9 @@ __all__ = [
     "DatasetReader",
     "DatasetWriter",
     "Episode",
+    "EpisodeIndex",
     "EpisodeStore",
+    "Mix",
     "Provenance",
     "ReturnConfig",
     "SequenceStream",

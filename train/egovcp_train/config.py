@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from egovcp.cli import WeightedDatasetConfig
 from egovcp.data import DatasetConfig, ReturnConfig
 from egovcp.model import WorldModelConfig
 from egovcp.plan import PlannerConfig
@@ -40,21 +41,27 @@ class SamplingConfig:
     """Share of windows that are placed around events instead of anywhere."""
     mirror: bool = True
     """Left-right mirror half of the windows (the robot is symmetric)."""
+    tasks: dict[str, float] = field(default_factory=dict)
+    """How much more often than by chance windows of a task are drawn, '{ball: 2, wall: 1}'; 1 for
+    those not named."""
 
 
 @dataclass(frozen=True)
 class TrainConfig:
     """Train the ego-vision world model from a LeRobot dataset and write a policy artefact.
 
-    The dataset comes from disk (--dataset.root) or from the Hub (--dataset.repo_id).
-    Checkpoints follow LeRobot's layout: OUTPUT_DIR/checkpoints/last/pretrained_model is the
-    artefact for egovcp-deploy.
+    The dataset comes from disk (--dataset.root) or from the Hub (--dataset.repo_id); --datasets
+    mixes several. Checkpoints follow LeRobot's layout:
+    OUTPUT_DIR/checkpoints/last/pretrained_model is the artefact for egovcp-deploy.
     """
 
     output_dir: str
     """Folder of the run; must not exist unless --resume."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Dataset to train on."""
+    datasets: tuple[WeightedDatasetConfig, ...] = ()
+    """Several datasets to train on instead, '[{root: data/ball, weight: 2}, {repo_id: me/wall,
+    weight: 1}]'; without weights every frame counts alike."""
     preset: Literal["default", "paper", "debug"] = "default"
     """Starting point of all options; paper: equal weights, nothing added to the paper."""
     policy: WorldModelConfig = field(default_factory=WorldModelConfig)

@@ -26,6 +26,7 @@ from egovcp_train.checkpoint import (
     load_training_state,
 )
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
+from egovcp_train.datasets import mix_of, open_readers
 from egovcp_train.evaluation import evaluate
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options, stop_on_signal
@@ -67,8 +68,9 @@ def train(config: TrainConfig) -> None:
     output = _prepare_output(config)
     torch.set_num_threads(config.threads or torch.get_num_threads())
     device = _device(config.device)
-    reader = DatasetReader.open(config.dataset)
-    learning, heldout = _load(reader, config)
+    mix = mix_of(config)
+    readers = open_readers(config)
+    learning, heldout = _load(readers, config)
     torch.manual_seed(config.seed)
     model = WorldModel(config.policy)
     set_normalisation(model, learning)
@@ -77,12 +79,12 @@ def train(config: TrainConfig) -> None:
     if config.policy.loss.passing:
         learning, heldout = label(learning, config.passing), label(heldout, config.passing)
     learner = Learner(model.to(device), config.optimizer, config.seed)
-    stream = SequenceStream(learning, sampling)
+    stream = SequenceStream(learning, sampling, mix)
     if config.resume:
         _restore(output, learner, stream)
     output.mkdir(parents=True, exist_ok=True)
     save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
-    run = Run(config, output, learner, stream, heldout, device, _provenance(reader, config))
+    run = Run(config, output, learner, stream, heldout, device, _provenance(readers, config))
     run.execute()
 
 
@@ -225,9 +227,11 @@ def _device(name: str) -> torch.device:
         raise UsageError(f"unknown --device {name!r}; expected cpu, cuda or auto") from error
 
 
-def _load(reader: DatasetReader, config: TrainConfig) -> tuple[EpisodeStore, EpisodeStore]:
+def _load(
+    readers: Sequence[DatasetReader], config: TrainConfig
+) -> tuple[EpisodeStore, EpisodeStore]:
     learning, heldout = (
-        EpisodeStore.load([reader], split, config.returns) for split in ("train", "heldout")
+        EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
     return learning, heldout
 
@@ -244,10 +248,10 @@ def _stream_config(config: TrainConfig) -> StreamConfig:
     )
 
 
-def _provenance(reader: DatasetReader, config: TrainConfig) -> dict[str, Any]:
+def _provenance(readers: Sequence[DatasetReader], config: TrainConfig) -> dict[str, Any]:
     return {
-        "controller_id": reader.controller_id,
-        "datasets": [{"repo_id": reader.source.repo_id, "revision": reader.source.commit}],
+        "controller_id": readers[0].controller_id,
+        "datasets": [{"repo_id": r.source.repo_id, "revision": r.source.commit} for r in readers],
         "train_config": draccus.encode(config),
         "command": [PROG, *sys.argv[1:]],
     }
