@@ -16,16 +16,13 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
 from egovcp.data.mix import Mix, Pools, group
 from egovcp.data.store import EpisodeStore
+from egovcp.data.survey import EventBound
+from egovcp.data.windows import Batch, finish, gather
 from egovcp.errors import DataError, UsageError
 
-_EVENT_SHARE = 0.1  # of the farthest reward, below which a row is no event
-
 PLAIN: Final = Mix()  # no weights
-
-type Batch = dict[str, NDArray[Any]]
 
 
 @dataclass(frozen=True)
@@ -91,14 +88,8 @@ class SequenceStream:
         config, rng = self.config, self._rng
         start, episode = self._draw_windows()
         batch = gather(self.store, start, episode, config.burn_in + config.length)
-        warm_up = (np.arange(config.burn_in + config.length) < config.burn_in) & (
-            batch["t"][:, :1] > 0
-        )
-        batch["valid"] &= ~warm_up
-        if config.mirror:
-            mirror_rows(batch, np.flatnonzero(rng.random(config.batch_size) < 0.5))
         self._batches += 1
-        return batch
+        return finish(batch, config.burn_in, config.mirror, rng)
 
     def state_dict(self) -> dict[str, Any]:
         """JSON-compatible state; a stream that loads it continues with exactly the next batch."""
@@ -119,6 +110,8 @@ class SequenceStream:
         """
         if state["fingerprint"] != self.store.fingerprint:
             raise DataError("cannot resume the data stream: the dataset's episodes have changed")
+        if "held" in state:
+            raise UsageError("cannot resume in memory as a whole what was a bounded stream")
         require_same(state["config"], vars(self.config))
         require_same(state.get("mix", PLAIN.as_dict()), self.mix.as_dict())
         self._rng.bit_generator.state = state["rng"]
@@ -165,52 +158,11 @@ def require_same(then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
 
 
 def event_rows(store: EpisodeStore, quantile: float) -> NDArray[np.int64]:
-    """Rows with an exceptional reward for their task, and rows that end in failure.
-
-    Judged by the reward column alone: no simulator truth, no knowledge of the tasks. A
-    reward is exceptional if it is farther from the task's median than ``quantile`` of all
-    rows and than a tenth of the farthest: a dense cost, such as that of the pose, has its
-    outliers too, but they are no events beside a contact or a fall.
-    """
+    """Rows with an exceptional reward for their task (see `EventBound`), and those that end in
+    failure."""
     task_of = np.repeat(np.array(store.tasks), store.length)
     events = store.terminal_next.copy()
     for task in set(store.tasks):
         rows = np.flatnonzero(task_of == task)
-        distance = np.abs(store.reward[rows] - np.median(store.reward[rows]))
-        bound = max(np.quantile(distance, quantile), _EVENT_SHARE * distance.max())
-        events[rows[distance > bound]] = True
+        events[rows] |= EventBound.of(store.reward[rows], quantile).marks(store.reward[rows])
     return np.flatnonzero(events)
-
-
-def gather(
-    store: EpisodeStore, start: NDArray[np.int64], episode: NDArray[np.int64], span: int
-) -> Batch:
-    """Windows of ``span`` rows, each from one episode, as arrays ``[B, span, ...]``.
-
-    Keys: depth (uint16 mm), state, action, prev_action, reward, done, success, is_first,
-    valid, mc_return, mc_valid, passing, terminal_next; episode [B] and t [B, span] for reports.
-    Past the episode's end the last row is repeated with ``valid``, ``mc_valid`` and the
-    flags false.
-    """
-    end = store.start[episode] + store.length[episode]
-    wanted = start[:, None] + np.arange(span)
-    valid = wanted < end[:, None]
-    rows = np.minimum(wanted, end[:, None] - 1)
-    t = rows - store.start[episode][:, None]
-    batch: Batch = {
-        name: getattr(store, name)[rows]
-        for name in ("depth", "state", "action", "prev_action", "reward", "mc_return", "passing")
-    }
-    for name in ("done", "success", "terminal_next", "mc_valid"):
-        batch[name] = getattr(store, name)[rows] & valid
-    batch |= {"is_first": (t == 0) & valid, "valid": valid, "episode": episode, "t": t}
-    return batch
-
-
-def mirror_rows(batch: Batch, rows: NDArray[np.intp]) -> None:
-    """Reflect the windows ``rows`` of a batch left to right, in place."""
-    batch["depth"][rows] = mirror_depth(batch["depth"][rows])
-    batch["state"][rows] = mirror_state(batch["state"][rows])
-    for name in ("action", "prev_action"):
-        batch[name][rows] = mirror_action(batch[name][rows])
-    batch["passing"][rows, :, 0] *= -1.0  # y

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from egovcp.data import EpisodeStore
-from egovcp.data.stream import gather, mirror_rows
+from egovcp.data.windows import gather, mirror_rows
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
 
