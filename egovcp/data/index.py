@@ -60,7 +60,11 @@ class EpisodeIndex:
 
     def first(self, count: int) -> EpisodeIndex:
         """Its first ``count`` episodes."""
-        return EpisodeIndex(self.readers, self.dataset[:count], self.number[:count])
+        return self.select(np.arange(min(count, len(self))))
+
+    def select(self, episodes: NDArray[np.int64]) -> EpisodeIndex:
+        """Some of its episodes."""
+        return EpisodeIndex(self.readers, self.dataset[episodes], self.number[episodes])
 
     @cached_property
     def length(self) -> NDArray[np.int64]:

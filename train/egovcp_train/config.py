@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from egovcp.cli import WeightedDatasetConfig
-from egovcp.data import DatasetConfig, ReturnConfig
+from egovcp.data import DatasetConfig, ReturnConfig, ShuffleConfig
 from egovcp.model import WorldModelConfig
 from egovcp.plan import PlannerConfig
 from egovcp_train.passing import PassingConfig
@@ -47,6 +47,17 @@ class SamplingConfig:
 
 
 @dataclass(frozen=True)
+class LoadingConfig:
+    """Where the episodes are while the run draws from them."""
+
+    mode: Literal["auto", "ram", "stream"] = "auto"
+    """ram: all in memory, 6.3 kB per frame; stream: read from the disk through a shuffle window;
+    auto: ram if that takes at most half of the free memory."""
+    shuffle: ShuffleConfig = field(default_factory=ShuffleConfig)
+    """Shuffle window of mode stream."""
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """Train the ego-vision world model from a LeRobot dataset and write a policy artefact.
 
@@ -74,6 +85,8 @@ class TrainConfig:
     """Labels of what is on its way."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     """Batches."""
+    loading: LoadingConfig = field(default_factory=LoadingConfig)
+    """Episodes in memory or on disk."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Optimiser."""
     value_fit: ValueFitConfig = field(default_factory=ValueFitConfig)
