@@ -10,11 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.data.episode import Episode
 from egovcp.data.index import EpisodeIndex
 from egovcp.data.mix import Mix, group
 from egovcp.data.order import EpisodeOrder, Shard
@@ -26,7 +27,8 @@ from egovcp.errors import DataError, UsageError
 
 type Label = Callable[[NDArray[np.uint16], NDArray[np.float32]], NDArray[np.float32]]
 
-_ONE_SHARD = Shard()
+_ONE_SHARD: Final = Shard()
+_LABELS_KEPT: Final = 20_000  # 60 MB; what is beyond is made again
 
 
 @dataclass(frozen=True)
@@ -83,6 +85,7 @@ class BoundedStream:
             raise UsageError("event_fraction needs to know which rewards are events")
         self.index, self.config, self.mix, self.shard = index, config, mix, shard
         self._returns, self._events, self._label = returns or ReturnConfig(), events, label
+        self._labels: dict[int, NDArray[np.float32]] = {}
         groups = group(mix, index.dataset, index.tasks, index.length)
         self._group = groups.of
         self._order = EpisodeOrder(index, groups, shard, config.seed)
@@ -180,10 +183,20 @@ class BoundedStream:
         self._held[slot] = number
         rows = slice(int(store.start[slot]), int(store.start[slot]) + len(episode))
         if self._label is not None:
-            store.passing[rows] = self._label(episode.depth, episode.state)
+            store.passing[rows] = self._labelled(number, episode)
         if self._events is not None:
             event = self._events[episode.task].marks(episode.reward) | store.terminal_next[rows]
             self._event_rows[slot] = np.flatnonzero(event)
+
+    def _labelled(self, number: int, episode: Episode) -> NDArray[np.float32]:
+        """The label (T, 5) of an episode, made once: it takes longer than to read the episode."""
+        assert self._label is not None
+        found = self._labels.get(number)
+        if found is None:
+            found = self._label(episode.depth, episode.state)
+            if len(self._labels) < _LABELS_KEPT:
+                self._labels[number] = found
+        return found
 
     def _windows(self, slots: NDArray[np.int64]) -> Batch:
         """A window of each of these slots, at a place that is drawn."""

@@ -92,7 +92,7 @@ class EpisodeIndex:
         """(E,) the file that holds each episode."""
         return tuple(self.readers[d].data_path(i) for d, i in self._places)
 
-    @property
+    @cached_property
     def fingerprint(self) -> str:
         """Hash of which episodes these are, in order."""
         return fingerprint(self.identities, self.length)

@@ -23,6 +23,7 @@ from egovcp.data import (
     StreamConfig,
     survey,
 )
+from egovcp.data.ahead import Ahead
 from egovcp.data.memory import available_bytes
 from egovcp.errors import UsageError
 from egovcp.model import Batch, WorldModel
@@ -39,7 +40,8 @@ EVALUATION_EPISODES = 64
 FIT_EPISODES = 2048  # of a dataset that is not in memory: half a GB of states to fit Q to
 FRAME_BYTES = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (spec.STATE_DIM + 2 * spec.ACTION_DIM + 8)
 
-type Stream = SequenceStream | BoundedStream
+type Stream = SequenceStream | Ahead
+type Learning = EpisodeStore | EpisodeIndex
 
 
 @dataclass(frozen=True)
@@ -50,17 +52,18 @@ class Material:
     """The datasets."""
     config: TrainConfig
     """The options, ``loading.mode`` no longer auto."""
+    learning: Learning
+    """Episodes to train on."""
     stream: Stream
-    """Training batches."""
+    """Batches of their windows."""
     heldout: EpisodeStore
     """Episodes to evaluate on."""
 
     def training_episodes(self, device: torch.device) -> Iterator[Batch]:
         """Whole training episodes, and their mirror images; a random part of a large dataset."""
-        mirror = self.config.sampling.mirror
-        if isinstance(self.stream, SequenceStream):
-            return whole_episodes(self.stream.store, device, mirror)
-        return _from_disk(self.stream.index, self.config, device)
+        if isinstance(self.learning, EpisodeIndex):
+            return _from_disk(self.learning, self.config, device)
+        return whole_episodes(self.learning, device, self.config.sampling.mirror)
 
 
 def prepare(config: TrainConfig, model: WorldModel) -> Material:
@@ -77,8 +80,7 @@ def prepare(config: TrainConfig, model: WorldModel) -> Material:
     readers = open_readers(config)
     config = _decided(config, readers)
     build = _in_memory if config.loading.mode == "ram" else _on_disk
-    stream, heldout = build(readers, config, sampling, mix, model)
-    return Material(readers, config, stream, heldout)
+    return Material(readers, config, *build(readers, config, sampling, mix, model))
 
 
 def open_readers(config: TrainConfig) -> tuple[DatasetReader, ...]:
@@ -138,14 +140,14 @@ def _in_memory(
     sampling: StreamConfig,
     mix: Mix,
     model: WorldModel,
-) -> tuple[Stream, EpisodeStore]:
+) -> tuple[Learning, Stream, EpisodeStore]:
     learning, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
     set_normalisation(model, learning)
     if config.policy.loss.passing:
         learning, heldout = label(learning, config.passing), label(heldout, config.passing)
-    return SequenceStream(learning, sampling, mix), heldout
+    return learning, SequenceStream(learning, sampling, mix), heldout
 
 
 def _on_disk(
@@ -154,7 +156,7 @@ def _on_disk(
     sampling: StreamConfig,
     mix: Mix,
     model: WorldModel,
-) -> tuple[Stream, EpisodeStore]:
+) -> tuple[Learning, Stream, EpisodeStore]:
     learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
     heldout = EpisodeStore.read(unseen.first(EVALUATION_EPISODES), config.returns)
     facts = survey(learning, config.returns, sampling.event_quantile)
@@ -173,7 +175,7 @@ def _on_disk(
         events=facts.events,
         label=labelling,
     )
-    return stream, heldout
+    return learning, Ahead(stream), heldout
 
 
 def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -> Iterator[Batch]:
