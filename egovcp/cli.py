@@ -42,6 +42,15 @@ class DatasetConfig:
     """Branch, tag or commit SHA on the Hub; empty: the latest."""
 
 
+@dataclass(frozen=True)
+class WeightedDatasetConfig(DatasetConfig):
+    """One of several datasets to mix."""
+
+    weight: float | None = None
+    """Share of the windows, relative to the other datasets; null, and then for all: in proportion
+    to the frames."""
+
+
 type Kind = Literal["switch", "text", "value"]
 
 

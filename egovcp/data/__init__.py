@@ -7,28 +7,41 @@ In one line, a dataset as padded arrays [Batch, Time, Data]::
 
 from egovcp.cli import DatasetConfig
 from egovcp.data.arrays import load_arrays, open_dataset
+from egovcp.data.bounded import BoundedStream, ShuffleConfig
 from egovcp.data.episode import Episode
+from egovcp.data.index import EpisodeIndex
+from egovcp.data.mix import Mix
+from egovcp.data.order import Shard
 from egovcp.data.provenance import Provenance
 from egovcp.data.reader import DatasetReader
 from egovcp.data.store import EpisodeStore, ReturnConfig
-from egovcp.data.stream import Batch, SequenceStream, StreamConfig
+from egovcp.data.stream import SequenceStream, StreamConfig
+from egovcp.data.survey import Survey, survey
 from egovcp.data.targets import is_terminal, mc_return, mc_valid
+from egovcp.data.windows import Batch
 from egovcp.data.writer import DatasetWriter
 
 __all__ = [
     "Batch",
+    "BoundedStream",
     "DatasetConfig",
     "DatasetReader",
     "DatasetWriter",
     "Episode",
+    "EpisodeIndex",
     "EpisodeStore",
+    "Mix",
     "Provenance",
     "ReturnConfig",
     "SequenceStream",
+    "Shard",
+    "ShuffleConfig",
     "StreamConfig",
+    "Survey",
     "is_terminal",
     "load_arrays",
     "mc_return",
     "mc_valid",
     "open_dataset",
+    "survey",
 ]

@@ -221,7 +221,8 @@ class DatasetReader:
 
     def _rows(self, file: pq.ParquetFile, index: int, names: Sequence[str]) -> pa.Table:
         """The rows of an episode, from the row groups that hold them."""
-        groups = [file.metadata.row_group(g).num_rows for g in range(file.num_row_groups)]
+        content = file.metadata
+        groups = [content.row_group(g).num_rows for g in range(content.num_row_groups)]
         edges = np.concatenate([[0], np.cumsum(groups)])
         first = int(self._table.start[index] - self._file_start[index])
         last = first + int(self._table.length[index])

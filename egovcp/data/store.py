@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import compress
 from typing import Any, Self
 
 import numpy as np
@@ -14,9 +12,9 @@ from numpy.typing import NDArray
 from egovcp import spec
 from egovcp.data import targets
 from egovcp.data.episode import Episode
+from egovcp.data.index import EpisodeIndex, fingerprint
 from egovcp.data.reader import DatasetReader
-from egovcp.data.split import HELDOUT_FRACTION, in_split
-from egovcp.errors import DataError
+from egovcp.data.split import HELDOUT_FRACTION
 
 
 @dataclass(frozen=True)
@@ -63,6 +61,8 @@ class EpisodeStore:
     """(E,) first frame of each episode."""
     length: NDArray[np.int64]
     """(E,) frames of each episode."""
+    dataset: NDArray[np.int64]
+    """(E,) which dataset each episode is of."""
     tasks: tuple[str, ...]
     """(E,) task of each episode; for sampling and reports, never for the network."""
     identities: tuple[str, ...]
@@ -87,27 +87,53 @@ class EpisodeStore:
             DataError: the datasets cannot be mixed, are damaged, or the split is empty.
             UsageError: there is no such split.
         """
-        require_mixable(readers)
-        episodes = [(reader, index) for reader in readers for index in range(len(reader))]
-        identities = [reader.identity(index) for reader, index in episodes]
-        chosen = list(compress(episodes, in_split(identities, split, heldout_fraction)))
-        if not chosen:
-            raise DataError(
-                f"none of the {len(episodes)} episodes falls into split {split!r}; collect more"
-            )
-        if per_task is not None:
-            chosen = _spread(chosen, per_task)
-        length = np.array([reader.lengths[index] for reader, index in chosen], dtype=np.int64)
+        index = EpisodeIndex.of(readers, split, heldout_fraction)
+        return cls.read(index if per_task is None else index.spread(per_task), returns)
+
+    @classmethod
+    def read(cls, index: EpisodeIndex, returns: ReturnConfig | None = None) -> Self:
+        """Read all episodes of an index into memory, each validated.
+
+        Raises:
+            DataError: a dataset is damaged.
+        """
+        store = cls.empty(index.length, index.dataset, index.tasks, index.identities)
+        for number in range(len(index)):
+            store.fill(number, index.read(number), returns or ReturnConfig())
+        return store
+
+    @classmethod
+    def empty(
+        cls,
+        length: NDArray[np.int64],
+        dataset: NDArray[np.int64],
+        tasks: tuple[str, ...] = (),
+        identities: tuple[str, ...] = (),
+    ) -> Self:
+        """Room for episodes of these lengths."""
         arrays = _allocate(int(length.sum()))
         start = length.cumsum() - length
-        for (reader, index), first in zip(chosen, start, strict=True):
-            _fill(arrays, int(first), reader.read(index), returns or ReturnConfig())
         return cls(
             **arrays,
             start=start,
             length=length,
-            tasks=tuple(reader.task(index) for reader, index in chosen),
-            identities=tuple(reader.identity(index) for reader, index in chosen),
+            dataset=dataset,
+            tasks=tasks,
+            identities=identities,
+        )
+
+    def fill(self, number: int, episode: Episode, config: ReturnConfig) -> None:
+        """Write an episode and its targets to where episode ``number`` starts."""
+        first = int(self.start[number])
+        rows = slice(first, first + len(episode))
+        for name in ("depth", "state", "action", "reward", "done", "success"):
+            getattr(self, name)[rows] = getattr(episode, name)
+        self.prev_action[first] = 0.0
+        self.prev_action[first + 1 : rows.stop] = episode.action[:-1]
+        self.terminal_next[rows] = targets.is_terminal(episode.done, episode.truncated)
+        self.mc_return[rows] = targets.mc_return(episode.reward, config.gamma, config.steps)
+        self.mc_valid[rows] = targets.mc_valid(
+            len(episode), episode.time_limit, config.steps, config.keep_truncated
         )
 
     @property
@@ -118,38 +144,7 @@ class EpisodeStore:
     @property
     def fingerprint(self) -> str:
         """Hash of which episodes these are, in order."""
-        text = "\n".join(f"{i} {n}" for i, n in zip(self.identities, self.length, strict=True))
-        return hashlib.sha256(text.encode()).hexdigest()
-
-
-def require_mixable(readers: Sequence[DatasetReader]) -> None:
-    """Raise `DataError` unless all datasets share controller and rate."""
-    if not readers:
-        raise DataError("no dataset given")
-    first = readers[0]
-    for other in readers[1:]:
-        for what in ("controller_id", "fps"):
-            have, want = getattr(other, what), getattr(first, what)
-            if have != want:
-                raise DataError(
-                    f"{other.root} has {what} {have}, {first.root} has {want}; such datasets do "
-                    "not mix"
-                )
-
-
-def _spread(
-    episodes: list[tuple[DatasetReader, int]], per_task: int
-) -> list[tuple[DatasetReader, int]]:
-    """At most ``per_task`` episodes of each task, evenly spread, in their order."""
-    of_task: dict[str, list[int]] = {}
-    for place, (reader, index) in enumerate(episodes):
-        of_task.setdefault(reader.task(index), []).append(place)
-    kept = [
-        places[i]
-        for places in of_task.values()
-        for i in np.linspace(0, len(places) - 1, min(per_task, len(places))).round().astype(int)
-    ]
-    return [episodes[place] for place in sorted(kept)]
+        return fingerprint(self.identities, self.length)
 
 
 def _allocate(frames: int) -> dict[str, NDArray[Any]]:
@@ -167,18 +162,3 @@ def _allocate(frames: int) -> dict[str, NDArray[Any]]:
         "mc_valid": np.empty(frames, dtype=np.bool_),
         "passing": np.zeros((frames, spec.PASSING_DIM), dtype=np.float32),
     }
-
-
-def _fill(
-    arrays: dict[str, NDArray[Any]], first: int, episode: Episode, config: ReturnConfig
-) -> None:
-    rows = slice(first, first + len(episode))
-    for name in ("depth", "state", "action", "reward", "done", "success"):
-        arrays[name][rows] = getattr(episode, name)
-    arrays["prev_action"][first] = 0.0
-    arrays["prev_action"][first + 1 : rows.stop] = episode.action[:-1]
-    arrays["terminal_next"][rows] = targets.is_terminal(episode.done, episode.truncated)
-    arrays["mc_return"][rows] = targets.mc_return(episode.reward, config.gamma, config.steps)
-    arrays["mc_valid"][rows] = targets.mc_valid(
-        len(episode), episode.time_limit, config.steps, config.keep_truncated
-    )

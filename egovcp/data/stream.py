@@ -11,18 +11,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
+from egovcp.data.mix import Mix, Pools, group
 from egovcp.data.store import EpisodeStore
+from egovcp.data.survey import EventBound
+from egovcp.data.windows import Batch, finish, gather
 from egovcp.errors import DataError, UsageError
 
-_EVENT_SHARE = 0.1  # of the farthest reward, below which a row is no event
-
-type Batch = dict[str, NDArray[Any]]
+PLAIN: Final = Mix()  # no weights
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class StreamConfig:
 class SequenceStream:
     """Iterator over batches from an `EpisodeStore`."""
 
-    def __init__(self, store: EpisodeStore, config: StreamConfig) -> None:
+    def __init__(self, store: EpisodeStore, config: StreamConfig, mix: Mix = PLAIN) -> None:
         """Find the events and seed the generator.
 
         Raises:
@@ -70,10 +70,15 @@ class SequenceStream:
         config.check()
         self.store = store
         self.config = config
+        self.mix = mix
         self._rng = np.random.default_rng(config.seed)
         self._batches = 0
         self._episode_of = np.repeat(np.arange(len(store.length)), store.length)
         self._events = event_rows(store, config.event_quantile)
+        self._groups = group(mix, store.dataset, store.tasks, store.length)
+        of_rows, count = self._groups.of[self._episode_of], len(self._groups.share)
+        self._row_pools = Pools(np.arange(store.num_frames), of_rows, count)
+        self._event_pools = Pools(self._events, of_rows[self._events], count)
 
     def __iter__(self) -> Iterator[Batch]:
         return self
@@ -83,14 +88,8 @@ class SequenceStream:
         config, rng = self.config, self._rng
         start, episode = self._draw_windows()
         batch = gather(self.store, start, episode, config.burn_in + config.length)
-        warm_up = (np.arange(config.burn_in + config.length) < config.burn_in) & (
-            batch["t"][:, :1] > 0
-        )
-        batch["valid"] &= ~warm_up
-        if config.mirror:
-            mirror_rows(batch, np.flatnonzero(rng.random(config.batch_size) < 0.5))
         self._batches += 1
-        return batch
+        return finish(batch, config.burn_in, config.mirror, rng)
 
     def state_dict(self) -> dict[str, Any]:
         """JSON-compatible state; a stream that loads it continues with exactly the next batch."""
@@ -98,6 +97,7 @@ class SequenceStream:
             "rng": self._rng.bit_generator.state,
             "batches": self._batches,
             "config": vars(self.config).copy(),
+            "mix": self.mix.as_dict(),
             "fingerprint": self.store.fingerprint,
         }
 
@@ -110,14 +110,10 @@ class SequenceStream:
         """
         if state["fingerprint"] != self.store.fingerprint:
             raise DataError("cannot resume the data stream: the dataset's episodes have changed")
-        own = vars(self.config)
-        changed = [
-            f"{k} {state['config'].get(k)} -> {v}"
-            for k, v in own.items()
-            if state["config"].get(k) != v
-        ]
-        if changed:
-            raise UsageError(f"cannot resume the data stream with {', '.join(changed)}")
+        if "held" in state:
+            raise UsageError("cannot resume in memory as a whole what was a bounded stream")
+        require_same(state["config"], vars(self.config))
+        require_same(state.get("mix", PLAIN.as_dict()), self.mix.as_dict())
         self._rng.bit_generator.state = state["rng"]
         self._batches = int(state["batches"])
         return self
@@ -126,64 +122,47 @@ class SequenceStream:
         """First frame and episode of each window, (B,) each."""
         config, rng, store = self.config, self._rng, self.store
         span = config.burn_in + config.length
-        rows = rng.integers(store.num_frames, size=config.batch_size)
-        if len(self._events):
-            events = rng.choice(self._events, size=config.batch_size)
-            rows = np.where(rng.random(config.batch_size) < config.event_fraction, events, rows)
+        rows = self._draw_rows() if self.mix.is_plain else self._draw_mixed_rows()
         episode = self._episode_of[rows]
         place = rng.integers(config.burn_in, span, size=config.batch_size)
         first = store.start[episode]
         latest = first + np.maximum(store.length[episode] - span, 0)
         return np.clip(rows - place, first, latest), episode
 
+    def _draw_rows(self) -> NDArray[np.int64]:
+        """A row for each window, (B,), all alike."""
+        config, rng = self.config, self._rng
+        rows = rng.integers(self.store.num_frames, size=config.batch_size)
+        if len(self._events):
+            events = rng.choice(self._events, size=config.batch_size)
+            rows = np.where(rng.random(config.batch_size) < config.event_fraction, events, rows)
+        return rows
+
+    def _draw_mixed_rows(self) -> NDArray[np.int64]:
+        """A row for each window, (B,): first its group, then a row or an event of that group."""
+        config, rng, share = self.config, self._rng, self._groups.share
+        groups = rng.choice(len(share), size=config.batch_size, p=share)
+        rows = self._row_pools.pick(rng, groups)
+        if len(self._events):
+            wanted = rng.random(config.batch_size) < config.event_fraction
+            events = self._event_pools.pick(rng, groups)
+            rows = np.where(wanted & self._event_pools.has(groups), events, rows)
+        return rows
+
+
+def require_same(then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
+    """Raise `UsageError` unless a resumed stream has the options that it had."""
+    changed = [f"{k} {then.get(k)} -> {v}" for k, v in now.items() if then.get(k) != v]
+    if changed:
+        raise UsageError(f"cannot resume the data stream with {', '.join(changed)}")
+
 
 def event_rows(store: EpisodeStore, quantile: float) -> NDArray[np.int64]:
-    """Rows with an exceptional reward for their task, and rows that end in failure.
-
-    Judged by the reward column alone: no simulator truth, no knowledge of the tasks. A
-    reward is exceptional if it is farther from the task's median than ``quantile`` of all
-    rows and than a tenth of the farthest: a dense cost, such as that of the pose, has its
-    outliers too, but they are no events beside a contact or a fall.
-    """
+    """Rows with an exceptional reward for their task (see `EventBound`), and those that end in
+    failure."""
     task_of = np.repeat(np.array(store.tasks), store.length)
     events = store.terminal_next.copy()
     for task in set(store.tasks):
         rows = np.flatnonzero(task_of == task)
-        distance = np.abs(store.reward[rows] - np.median(store.reward[rows]))
-        bound = max(np.quantile(distance, quantile), _EVENT_SHARE * distance.max())
-        events[rows[distance > bound]] = True
+        events[rows] |= EventBound.of(store.reward[rows], quantile).marks(store.reward[rows])
     return np.flatnonzero(events)
-
-
-def gather(
-    store: EpisodeStore, start: NDArray[np.int64], episode: NDArray[np.int64], span: int
-) -> Batch:
-    """Windows of ``span`` rows, each from one episode, as arrays ``[B, span, ...]``.
-
-    Keys: depth (uint16 mm), state, action, prev_action, reward, done, success, is_first,
-    valid, mc_return, mc_valid, passing, terminal_next; episode [B] and t [B, span] for reports.
-    Past the episode's end the last row is repeated with ``valid``, ``mc_valid`` and the
-    flags false.
-    """
-    end = store.start[episode] + store.length[episode]
-    wanted = start[:, None] + np.arange(span)
-    valid = wanted < end[:, None]
-    rows = np.minimum(wanted, end[:, None] - 1)
-    t = rows - store.start[episode][:, None]
-    batch: Batch = {
-        name: getattr(store, name)[rows]
-        for name in ("depth", "state", "action", "prev_action", "reward", "mc_return", "passing")
-    }
-    for name in ("done", "success", "terminal_next", "mc_valid"):
-        batch[name] = getattr(store, name)[rows] & valid
-    batch |= {"is_first": (t == 0) & valid, "valid": valid, "episode": episode, "t": t}
-    return batch
-
-
-def mirror_rows(batch: Batch, rows: NDArray[np.intp]) -> None:
-    """Reflect the windows ``rows`` of a batch left to right, in place."""
-    batch["depth"][rows] = mirror_depth(batch["depth"][rows])
-    batch["state"][rows] = mirror_state(batch["state"][rows])
-    for name in ("action", "prev_action"):
-        batch[name][rows] = mirror_action(batch[name][rows])
-    batch["passing"][rows, :, 0] *= -1.0  # y

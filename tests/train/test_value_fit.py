@@ -1,5 +1,6 @@
 """The final fit of Q: which states it sees, what it changes, and that it helps."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -38,7 +39,11 @@ class _Counting(CountingModel):
 
 
 def _collect(model: WorldModel, store: EpisodeStore, ahead: int) -> Rows:
-    return collect_rows(model, store, ahead, False, torch.Generator().manual_seed(0))
+    return collect_rows(model, _whole(store), ahead, torch.Generator().manual_seed(0))
+
+
+def _whole(store: EpisodeStore, mirror: bool = False) -> Iterator[Batch]:
+    return whole_episodes(store, torch.device("cpu"), mirror)
 
 
 def test_every_row_with_a_complete_return_is_collected_once(store: EpisodeStore) -> None:
@@ -48,7 +53,7 @@ def test_every_row_with_a_complete_return_is_collected_once(store: EpisodeStore)
     expected = torch.from_numpy(store.mc_return[store.mc_valid])
     torch.testing.assert_close(rows.target.sort().values, expected.sort().values)
     assert not rows.h[:, IMAGINED].any()
-    mirrored = collect_rows(model, store, 0, True, torch.Generator().manual_seed(0))
+    mirrored = collect_rows(model, _whole(store, mirror=True), 0, torch.Generator().manual_seed(0))
     assert len(mirrored.target) == 2 * len(rows.target)
 
 
@@ -93,7 +98,7 @@ def test_the_fit_improves_q_and_touches_nothing_else(store: EpisodeStore) -> Non
     before = {k: v.clone() for k, v in model.state_dict().items()}
     rows = _collect(model, store, ahead=3)
     start = _error(model, rows)
-    fit_value(model, store, ValueFitConfig(steps=60, rows=64), mirror=False, seed=0)
+    fit_value(model, _whole(store), ValueFitConfig(steps=60, rows=64), seed=0)
     assert _error(model, rows) < 0.5 * start
     changed = {k for k, v in model.state_dict().items() if not torch.equal(v, before[k])}
     assert changed
@@ -126,7 +131,7 @@ def test_what_an_action_earns_is_not_credited_to_the_state_that_goes_with_it() -
 def test_a_seed_repeats_the_fit_and_no_steps_leave_the_model_alone(store: EpisodeStore) -> None:
     def fitted(steps: int, seed: int) -> dict[str, Tensor]:
         model = toy_model()
-        fit_value(model, store, ValueFitConfig(steps=steps, rows=16), mirror=True, seed=seed)
+        fit_value(model, _whole(store, mirror=True), ValueFitConfig(steps, rows=16), seed)
         return model.state_dict()
 
     def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:

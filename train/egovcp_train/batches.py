@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from egovcp.data import EpisodeStore
-from egovcp.data.stream import gather, mirror_rows
+from egovcp.data.windows import gather, mirror_rows
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
 
@@ -54,17 +54,31 @@ def set_normalisation(model: WorldModel, store: EpisodeStore) -> None:
     Raises:
         DataError: no return is usable, because the episodes are too short.
     """
+    state = store.state.astype(np.float64)
     returns = store.mc_return[store.mc_valid]
+    fix_normalisation(model, state.mean(0), state.std(0), returns, int(store.length.max()))
+
+
+def fix_normalisation(
+    model: WorldModel,
+    state_mean: NDArray[np.float64],
+    state_std: NDArray[np.float64],
+    returns: NDArray[np.float32],
+    longest: int,
+) -> None:
+    """Fix the model's statistics: state (74,) each, complete returns (N,), longest episode.
+
+    Raises:
+        DataError: no return is usable, because the episodes are too short.
+    """
     if len(returns) == 0:
         raise DataError(
-            f"no row has a complete Monte Carlo return: the episodes (at most "
-            f"{int(store.length.max())} ticks) are not longer than --returns.steps; lower it, or "
-            "collect longer episodes"
+            f"no row has a complete Monte Carlo return: the episodes (at most {longest} ticks) "
+            "are not longer than --returns.steps; lower it, or collect longer episodes"
         )
-    state = store.state.astype(np.float64)
     values = {
-        "state_mean": state.mean(0),
-        "state_std": np.maximum(state.std(0), STD_FLOOR),
+        "state_mean": state_mean,
+        "state_std": np.maximum(state_std, STD_FLOOR),
         "return_mean": returns.mean(dtype=np.float64),
         "return_std": max(float(returns.std(dtype=np.float64)), 1e-6),
         "return_floor": np.quantile(returns, WORST_RETURN_QUANTILE),

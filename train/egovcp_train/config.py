@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from egovcp.data import DatasetConfig, ReturnConfig
+from egovcp.cli import WeightedDatasetConfig
+from egovcp.data import DatasetConfig, ReturnConfig, ShuffleConfig
 from egovcp.data.source import is_repo_id
 from egovcp.errors import UsageError
 from egovcp.model import WorldModelConfig
@@ -42,6 +43,20 @@ class SamplingConfig:
     """Share of windows that are placed around events instead of anywhere."""
     mirror: bool = True
     """Left-right mirror half of the windows (the robot is symmetric)."""
+    tasks: dict[str, float] = field(default_factory=dict)
+    """How much more often than by chance windows of a task are drawn, '{ball: 2, wall: 1}'; 1 for
+    those not named."""
+
+
+@dataclass(frozen=True)
+class LoadingConfig:
+    """Where the episodes are while the run draws from them."""
+
+    mode: Literal["auto", "ram", "stream"] = "auto"
+    """ram: all in memory, 6.3 kB per frame; stream: read from the disk through a shuffle window;
+    auto: ram if that takes at most half of the free memory."""
+    shuffle: ShuffleConfig = field(default_factory=ShuffleConfig)
+    """Shuffle window of mode stream."""
 
 
 @dataclass(frozen=True)
@@ -77,15 +92,18 @@ class PolicyConfig(WorldModelConfig):
 class TrainConfig:
     """Train the ego-vision world model from a LeRobot dataset and write a policy artefact.
 
-    The dataset comes from disk (--dataset.root) or from the Hub (--dataset.repo_id).
-    Checkpoints follow LeRobot's layout: OUTPUT_DIR/checkpoints/last/pretrained_model is the
-    artefact for egovcp-deploy.
+    The dataset comes from disk (--dataset.root) or from the Hub (--dataset.repo_id); --datasets
+    mixes several. Checkpoints follow LeRobot's layout:
+    OUTPUT_DIR/checkpoints/last/pretrained_model is the artefact for egovcp-deploy.
     """
 
     output_dir: str
     """Folder of the run; must not exist unless --resume."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """Dataset to train on."""
+    datasets: tuple[WeightedDatasetConfig, ...] = ()
+    """Several datasets to train on instead, '[{root: data/ball, weight: 2}, {repo_id: me/wall,
+    weight: 1}]'; without weights every frame counts alike."""
     preset: Literal["default", "paper", "debug"] = "default"
     """Starting point of all options; paper: equal weights, nothing added to the paper."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
@@ -98,6 +116,8 @@ class TrainConfig:
     """Labels of what is on its way."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     """Batches."""
+    loading: LoadingConfig = field(default_factory=LoadingConfig)
+    """Episodes in memory or on disk."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Optimiser."""
     value_fit: ValueFitConfig = field(default_factory=ValueFitConfig)

@@ -15,10 +15,9 @@ from tqdm import tqdm
 
 from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
-from egovcp.data import DatasetReader, EpisodeStore, SequenceStream, StreamConfig
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.model import PRESETS, WorldModel
-from egovcp_train.batches import set_normalisation, to_tensors
+from egovcp_train.batches import to_tensors
 from egovcp_train.card import versions, write_card
 from egovcp_train.checkpoint import (
     begin_checkpoint,
@@ -27,6 +26,7 @@ from egovcp_train.checkpoint import (
     load_training_state,
 )
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
+from egovcp_train.datasets import EVALUATION_EPISODES, Material, Stream, prepare
 from egovcp_train.device import choose_device
 from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
@@ -34,13 +34,11 @@ from egovcp_train.heldout.report import measure, scalars
 from egovcp_train.heldout.table import table
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options, stop_on_signal
-from egovcp_train.passing import label
 from egovcp_train.publish import publish_trained, reserve_policy
 from egovcp_train.records import Recorder
 from egovcp_train.value_fit import fit_value
 
 PROG = "egovcp-train"
-EVALUATION_EPISODES = 64  # of each task
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -73,24 +71,17 @@ def train(config: TrainConfig) -> None:
     output = _prepare_output(config)
     torch.set_num_threads(config.threads or torch.get_num_threads())
     device = choose_device(config.device)
-    reader = DatasetReader.open(config.dataset)
-    learning, heldout = _load(reader, config)
     torch.manual_seed(config.seed)
     model = WorldModel(config.policy.world_model())
-    set_normalisation(model, learning)
-    sampling = _stream_config(config)
-    sampling.check()
-    if config.policy.loss.passing:
-        learning, heldout = label(learning, config.passing), label(heldout, config.passing)
+    material = prepare(config, model)
+    config = material.config
     learner = Learner(model.to(device), config.optimizer, config.seed)
-    stream = SequenceStream(learning, sampling)
     if config.resume:
-        _restore(output, learner, stream)
+        _restore(output, learner, material.stream)
     reserve_policy(config.policy)
     output.mkdir(parents=True, exist_ok=True)
     save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
-    run = Run(config, output, learner, stream, heldout, device, _provenance(reader, config))
-    run.execute()
+    Run(config, output, learner, material, device, _provenance(material)).execute()
 
 
 class Run:
@@ -101,13 +92,12 @@ class Run:
         config: TrainConfig,
         output: Path,
         learner: Learner,
-        stream: SequenceStream,
-        heldout: EpisodeStore,
+        material: Material,
         device: torch.device,
         provenance: dict[str, Any],
     ) -> None:
-        self.config, self.output, self.learner, self.stream = config, output, learner, stream
-        self.heldout, self.device, self.provenance = heldout, device, provenance
+        self.config, self.output, self.learner, self.material = config, output, learner, material
+        self.device, self.provenance = device, provenance
         self.metrics: dict[str, float] = {}
         self.tasks: dict[str, dict[str, Any]] = {}
         self.recorder = Recorder(output, enabled=config.tensorboard)
@@ -139,7 +129,7 @@ class Run:
             while budget.progress(learner.step) < 1.0 and not stopped:
                 if learner.step > start and learner.step % config.save_freq == 0:
                     self.save(learner.averaged)
-                batch = to_tensors(next(self.stream), self.device)
+                batch = to_tensors(next(self.material.stream), self.device)
                 terms = learner.update(batch, budget.progress(learner.step))
                 bar.update()
                 if learner.step % config.log_freq == 0:
@@ -152,15 +142,16 @@ class Run:
         """Fit Q on the states of the finished model, evaluate, and save what is shipped."""
         shipped = copy.deepcopy(self.learner.averaged)
         if fit:
-            sampling, seed = self.config.sampling, self.config.seed
-            fit_value(shipped, self.stream.store, self.config.value_fit, sampling.mirror, seed)
+            episodes = self.material.training_episodes(self.device)
+            fit_value(shipped, episodes, self.config.value_fit, self.config.seed)
         self.evaluate(shipped)
         self.save(shipped)
 
     def evaluate(self, model: WorldModel) -> None:
         """Measure a model on held-out episodes."""
         config, step = self.config, self.learner.step
-        episodes = recorded(self.heldout, self.device, config.passing, EVALUATION_EPISODES)
+        heldout = self.material.heldout
+        episodes = recorded(heldout, self.device, config.passing, EVALUATION_EPISODES)
         report = measure(model, episodes)
         self.metrics, self.tasks = report.metrics, report.tasks
         found = self.metrics | scalars(self.tasks)
@@ -175,7 +166,7 @@ class Run:
         found = {"heldout": self.metrics, "heldout_tasks": self.tasks}
         provenance = self.provenance | {"step": self.learner.step, **found}
         save_artefact(partial / "pretrained_model", model, self.config.planner, provenance)
-        state = {"learner": self.learner.state_dict(), "stream": self.stream.state_dict()}
+        state = {"learner": self.learner.state_dict(), "stream": self.material.stream.state_dict()}
         return finish_checkpoint(partial, state)
 
     def _summary(self, terms: dict[str, Any], bar: Any, frames: int) -> dict[str, str]:
@@ -210,7 +201,7 @@ def _prepare_output(config: TrainConfig) -> Path:
     return prepare_output(config.output_dir, config.resume)
 
 
-def _restore(output: Path, learner: Learner, stream: SequenceStream) -> None:
+def _restore(output: Path, learner: Learner, stream: Stream) -> None:
     """Continue from the last checkpoint.
 
     Raises:
@@ -230,31 +221,13 @@ def _restore(output: Path, learner: Learner, stream: SequenceStream) -> None:
         ) from error
 
 
-def _load(reader: DatasetReader, config: TrainConfig) -> tuple[EpisodeStore, EpisodeStore]:
-    learning, heldout = (
-        EpisodeStore.load([reader], split, config.returns) for split in ("train", "heldout")
-    )
-    return learning, heldout
-
-
-def _stream_config(config: TrainConfig) -> StreamConfig:
-    sampling = config.sampling
-    return StreamConfig(
-        batch_size=config.batch_size,
-        length=sampling.length,
-        burn_in=sampling.burn_in,
-        event_fraction=sampling.event_fraction,
-        mirror=sampling.mirror,
-        seed=config.seed,
-    )
-
-
-def _provenance(reader: DatasetReader, config: TrainConfig) -> dict[str, Any]:
+def _provenance(material: Material) -> dict[str, Any]:
+    readers = material.readers
     return {
-        "controller_id": reader.controller_id,
-        "tasks": sorted({reader.task(i) for i in range(len(reader))}),
+        "controller_id": readers[0].controller_id,
+        "tasks": sorted({reader.task(i) for reader in readers for i in range(len(reader))}),
         "versions": versions(),
-        "datasets": [{"repo_id": reader.source.repo_id, "revision": reader.source.commit}],
-        "train_config": draccus.encode(config),
+        "datasets": [{"repo_id": r.source.repo_id, "revision": r.source.commit} for r in readers],
+        "train_config": draccus.encode(material.config),
         "command": [PROG, *sys.argv[1:]],
     }

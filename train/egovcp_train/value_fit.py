@@ -8,7 +8,7 @@ explains on held-out episodes doubled (0.04 to 0.08).
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,11 +16,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from egovcp.data import EpisodeStore
 from egovcp.model import Batch, Carry, WorldModel
 from egovcp.model.losses import filter_sequence
 from egovcp.model.nets import SplitMlp, ValueHead
-from egovcp_train.batches import whole_episodes
 
 
 @dataclass(frozen=True)
@@ -52,22 +50,24 @@ class Rows(NamedTuple):
 
 
 def fit_value(
-    model: WorldModel, store: EpisodeStore, config: ValueFitConfig, mirror: bool, seed: int
+    model: WorldModel, episodes: Iterable[Batch], config: ValueFitConfig, seed: int
 ) -> None:
-    """Fit the heads of Q in place, from scratch, to the Monte Carlo returns of ``store``.
+    """Fit the heads of Q in place, from scratch, to the Monte Carlo returns of whole episodes.
 
     First the part that sees only what is on its way, then the part that sees the whole state,
     to what the first leaves unexplained. Fitted together, the second, which sees where the
     hands are going anyway, takes over what belongs to the action.
 
     Args:
-        mirror: also use the left-right mirrored episodes.
+        model: the finished world model.
+        episodes: batches of whole episodes from their start.
+        config: the fit.
         seed: of the heads' start, of the sampled rows and of how far each state is imagined.
     """
     if config.steps == 0:
         return
     generator = torch.Generator().manual_seed(seed)
-    rows = collect_rows(model, store, config.imagined_steps, mirror, generator)
+    rows = collect_rows(model, episodes, config.imagined_steps, generator)
     device = model.state_mean.device
     with torch.random.fork_rng([device] if device.type == "cuda" else []):
         torch.manual_seed(seed)
@@ -131,9 +131,8 @@ def _pick(rows: Rows, which: Tensor, device: torch.device) -> Rows:
 @torch.no_grad()
 def collect_rows(
     model: WorldModel,
-    store: EpisodeStore,
+    episodes: Iterable[Batch],
     imagined_steps: int,
-    mirror: bool,
     generator: torch.Generator,
 ) -> Rows:
     """Every row with a complete return, as the planner would meet it.
@@ -141,10 +140,7 @@ def collect_rows(
     The planner judges filtered states (k = 0) and states imagined k < N steps ahead, so
     each row is reached by a k drawn from 0 .. ``imagined_steps``.
     """
-    parts = [
-        _rows_of(model, batch, imagined_steps, generator)
-        for batch in whole_episodes(store, model.state_mean.device, mirror=mirror)
-    ]
+    parts = [_rows_of(model, batch, imagined_steps, generator) for batch in episodes]
     return Rows(*(torch.cat(column) for column in zip(*parts, strict=True)))
 
 

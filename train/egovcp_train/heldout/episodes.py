@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from egovcp.data import EpisodeStore
-from egovcp.data.stream import gather
+from egovcp.data.index import spread
+from egovcp.data.windows import gather
 from egovcp.model import Batch
 from egovcp_train.batches import to_tensors
 from egovcp_train.heldout.flight import flight_pixels
@@ -39,18 +40,11 @@ def recorded(
     """
     for task in sorted(set(store.tasks)):
         own = np.flatnonzero(np.array(store.tasks) == task)
-        own = own[spread(len(own), per_task)]
+        own = spread(own, per_task)
         own = own[np.argsort(store.length[own], kind="stable")]  # little padding
         for first in range(0, len(own), EPISODES_AT_ONCE):
             which = own[first : first + EPISODES_AT_ONCE]
             yield _together(task, store, which, device, config)
-
-
-def spread(count: int, limit: int | None) -> NDArray[np.intp]:
-    """At most ``limit`` of the indices below ``count``, evenly spread."""
-    if limit is None or limit >= count:
-        return np.arange(count)
-    return np.linspace(0, count - 1, limit).round().astype(np.intp)
 
 
 def _together(

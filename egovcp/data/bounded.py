@@ -1,0 +1,230 @@
+"""The batches of `SequenceStream` from a few episodes at a time, whatever the dataset's size.
+
+A shuffle window of slots holds episodes. Each gives as many windows of rows as cover it,
+drawn in turn with those of the other slots, and then makes room for the next one. Every
+draw comes from one generator; its state, the order's, and what the slots hold are the
+state of the stream.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.data.episode import Episode
+from egovcp.data.index import EpisodeIndex
+from egovcp.data.mix import Mix, group
+from egovcp.data.order import EpisodeOrder, Shard
+from egovcp.data.store import EpisodeStore, ReturnConfig
+from egovcp.data.stream import PLAIN, StreamConfig, require_same
+from egovcp.data.survey import EventBound
+from egovcp.data.windows import Batch, finish, gather
+from egovcp.errors import DataError, UsageError
+
+type Label = Callable[[NDArray[np.uint16], NDArray[np.float32]], NDArray[np.float32]]
+
+_ONE_SHARD: Final = Shard()
+_LABELS_KEPT: Final = 20_000  # 60 MB; what is beyond is made again
+
+
+@dataclass(frozen=True)
+class ShuffleConfig:
+    """The episodes in memory."""
+
+    episodes: int = 128
+    """Episodes that are in memory at a time, about 1 MB each."""
+    reuse: float = 1.0
+    """How often the rows of an episode are used, on average, before the next one is read."""
+
+    def check(self) -> None:
+        """Raise `UsageError` for values that make no sense."""
+        if self.episodes < 1 or not 0 < self.reuse < float("inf"):
+            raise UsageError(
+                f"a shuffle window of {self.episodes} episodes, each used {self.reuse} times: "
+                "expected at least 1, and more than 0"
+            )
+
+
+class BoundedStream:
+    """Iterator over batches from an `EpisodeIndex`; the keys are those of `gather`."""
+
+    def __init__(
+        self,
+        index: EpisodeIndex,
+        config: StreamConfig,
+        mix: Mix = PLAIN,
+        shuffle: ShuffleConfig | None = None,
+        shard: Shard = _ONE_SHARD,
+        returns: ReturnConfig | None = None,
+        events: Mapping[str, EventBound] | None = None,
+        label: Label | None = None,
+    ) -> None:
+        """Make room; nothing is read before the first batch.
+
+        Args:
+            index: the episodes to draw from.
+            config: how windows are drawn.
+            mix: weights of datasets and tasks.
+            shuffle: the episodes in memory.
+            shard: the part of the episodes that this stream reads.
+            returns: the Monte Carlo target.
+            events: task -> which rewards are events; needed where they are drawn more often.
+            label: what makes ``passing`` (T, 5) of an episode's depth and state; None: zeros.
+
+        Raises:
+            UsageError: the configuration makes no sense.
+        """
+        self._shuffle = shuffle or ShuffleConfig()
+        self._shuffle.check()
+        config.check()
+        if config.event_fraction and events is None:
+            raise UsageError("event_fraction needs to know which rewards are events")
+        self.index, self.config, self.mix, self.shard = index, config, mix, shard
+        self._returns, self._events, self._label = returns or ReturnConfig(), events, label
+        self._labels: dict[int, NDArray[np.float32]] = {}
+        groups = group(mix, index.dataset, index.tasks, index.length)
+        self._group = groups.of
+        self._order = EpisodeOrder(index, groups, shard, config.seed)
+        self._rng = np.random.default_rng([config.seed, shard.index])
+        self._batches = 0
+        slots = self._shuffle.episodes
+        room = np.full(slots, int(index.length[self._order.episodes].max()))
+        self._slots = EpisodeStore.empty(room, np.zeros(slots, dtype=np.int64))
+        self._held: NDArray[np.int64] = np.full(slots, -1)  # episode in each slot
+        self._left: NDArray[np.int64] = np.zeros(
+            slots, dtype=np.int64
+        )  # windows that it has still to give
+        self._event_rows: list[NDArray[np.int64]] = [np.empty(0, dtype=np.int64)] * slots
+
+    @property
+    def episodes(self) -> NDArray[np.int64]:
+        """The episodes of the index that this stream draws from."""
+        return self._order.episodes
+
+    def __iter__(self) -> Iterator[Batch]:
+        return self
+
+    def __next__(self) -> Batch:
+        """The next batch.
+
+        Raises:
+            DataError: a file is damaged.
+        """
+        parts: list[Batch] = []
+        wanted = self.config.batch_size
+        while wanted:
+            self._refill()
+            tickets = np.repeat(np.arange(len(self._left)), self._left)
+            slots = self._rng.choice(tickets, min(wanted, len(tickets)), replace=False)
+            self._left -= np.bincount(slots, minlength=len(self._left))
+            parts.append(self._windows(slots))
+            wanted -= len(slots)
+        batch = parts[0]
+        if len(parts) > 1:
+            batch = {key: np.concatenate([part[key] for part in parts]) for key in batch}
+        self._batches += 1
+        return finish(batch, self.config.burn_in, self.config.mirror, self._rng)
+
+    def state_dict(self) -> dict[str, Any]:
+        """JSON-compatible state; a stream that loads it continues with exactly the next batch."""
+        return {
+            "rng": self._rng.bit_generator.state,
+            "batches": self._batches,
+            "order": self._order.state_dict(),
+            "held": self._held.tolist(),
+            "left": self._left.tolist(),
+            "config": self._options(),
+            "fingerprint": self.index.fingerprint,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> Self:
+        """Continue where another stream over the same episodes stopped; reads its window again.
+
+        Raises:
+            DataError: the episodes differ, or a file is damaged.
+            UsageError: the configuration differs.
+        """
+        if state["fingerprint"] != self.index.fingerprint:
+            raise DataError("cannot resume the data stream: the dataset's episodes have changed")
+        if "held" not in state:
+            raise UsageError("cannot resume with a bounded stream what was in memory as a whole")
+        require_same(state["config"], self._options())
+        self._rng.bit_generator.state = state["rng"]
+        self._batches = int(state["batches"])
+        self._order.load_state_dict(state["order"])
+        self._left = np.array(state["left"])
+        for slot, episode in enumerate(state["held"]):
+            if episode >= 0 and self._left[slot]:
+                self._read(slot, episode)
+        self._held = np.array(state["held"])
+        return self
+
+    def _options(self) -> dict[str, Any]:
+        parts = (vars(self.config), self.mix.as_dict(), vars(self._shuffle), vars(self.shard))
+        return {name: value for part in parts for name, value in part.items()}
+
+    def _refill(self) -> None:
+        """Give every slot that is used up the next episode that has a window to give."""
+        for slot in np.flatnonzero(self._left == 0).tolist():
+            while self._left[slot] == 0:
+                episode = self._order.draw(self._rng)
+                windows = self.index.length[episode] * self._shuffle.reuse / self.config.length
+                self._left[slot] = int(windows + self._rng.random())  # on average exactly so many
+            self._read(slot, episode)
+
+    def _read(self, slot: int, number: int) -> None:
+        episode, store = self.index.read_again(number), self._slots
+        store.fill(slot, episode, self._returns)
+        store.length[slot] = len(episode)
+        self._held[slot] = number
+        rows = slice(int(store.start[slot]), int(store.start[slot]) + len(episode))
+        if self._label is not None:
+            store.passing[rows] = self._labelled(number, episode)
+        if self._events is not None:
+            event = self._events[episode.task].marks(episode.reward) | store.terminal_next[rows]
+            self._event_rows[slot] = np.flatnonzero(event)
+
+    def _labelled(self, number: int, episode: Episode) -> NDArray[np.float32]:
+        """The label (T, 5) of an episode, made once: it takes longer than to read the episode."""
+        assert self._label is not None
+        found = self._labels.get(number)
+        if found is None:
+            found = self._label(episode.depth, episode.state)
+            if len(self._labels) < _LABELS_KEPT:
+                self._labels[number] = found
+        return found
+
+    def _windows(self, slots: NDArray[np.int64]) -> Batch:
+        """A window of each of these slots, at a place that is drawn."""
+        config, rng, store = self.config, self._rng, self._slots
+        span = config.burn_in + config.length
+        row = (rng.random(len(slots)) * store.length[slots]).astype(np.int64)
+        if config.event_fraction:
+            slots, row = self._around_events(slots, row)
+        place = rng.integers(config.burn_in, span, size=len(slots))
+        latest = np.maximum(store.length[slots] - span, 0)
+        first = np.clip(row - place, 0, latest)
+        batch = gather(store, store.start[slots] + first, slots, span)
+        batch["episode"] = self._held[slots]
+        return batch
+
+    def _around_events(
+        self, slots: NDArray[np.int64], row: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Some of the windows moved to the events of their episodes.
+
+        The weights hold: the event is one of an episode in memory of the same dataset and task.
+        """
+        slots, row = slots.copy(), row.copy()
+        eventful = np.array([len(rows) > 0 for rows in self._event_rows])
+        kind = self._group[self._held]
+        for i in np.flatnonzero(self._rng.random(len(slots)) < self.config.event_fraction):
+            candidates = np.flatnonzero(eventful & (kind == kind[slots[i]]))
+            if len(candidates):
+                slots[i] = self._rng.choice(candidates)
+                row[i] = self._rng.choice(self._event_rows[slots[i]])
+        return slots, row

@@ -1,0 +1,270 @@
+"""Batches from a few episodes at a time: the same contract, bounded, sharded, resumable."""
+
+import json
+import tracemalloc
+from collections import Counter
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egovcp.data import (
+    BoundedStream,
+    DatasetConfig,
+    DatasetReader,
+    DatasetWriter,
+    EpisodeIndex,
+    EpisodeStore,
+    Mix,
+    Provenance,
+    ReturnConfig,
+    SequenceStream,
+    Shard,
+    ShuffleConfig,
+    StreamConfig,
+    survey,
+)
+from egovcp.data.stream import event_rows
+from egovcp.errors import DataError, UsageError
+
+from .conftest import MakeEpisode
+
+RETURNS = ReturnConfig(steps=5)
+FEW = ShuffleConfig(episodes=3)
+
+type MakeIndex = Callable[..., EpisodeIndex]
+
+
+@pytest.fixture(scope="module")
+def make_index(make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFactory) -> MakeIndex:
+    """An index of new datasets with so many episodes, of 9 to 14 rows; one file per dataset."""
+
+    def build(*counts: int, split: str = "train", task: str = "ball") -> EpisodeIndex:
+        readers = []
+        for number, count in enumerate(counts):
+            root = tmp_path_factory.mktemp("bounded") / "dataset"
+            with DatasetWriter(root, Provenance("stance-1", seed=0, command="collect")) as writer:
+                for i in range(count):
+                    writer.add(make_episode(i, 9 + i % 6, task=task, seed=number))
+            readers.append(DatasetReader.open(DatasetConfig(root=str(root))))
+        return EpisodeIndex.of(readers, split, heldout_fraction=0.2)
+
+    return build
+
+
+@pytest.fixture(scope="module")
+def six(reader: DatasetReader) -> EpisodeIndex:
+    return EpisodeIndex.of([reader])
+
+
+def _config(**changes: object) -> StreamConfig:
+    return StreamConfig(**{"batch_size": 8, "length": 4, "mirror": False, **changes})
+
+
+def _same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
+    return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
+
+
+def test_a_batch_is_that_of_the_stream_in_memory(six: EpisodeIndex, reader: DatasetReader) -> None:
+    """Same keys, shapes and types; every valid row is that of its episode, targets included."""
+    store = EpisodeStore.load([reader], returns=RETURNS)
+    pattern = next(SequenceStream(store, _config(burn_in=2)))
+    stream = BoundedStream(six, _config(burn_in=2), shuffle=FEW, returns=RETURNS)
+    for batch in (next(stream) for _ in range(30)):
+        assert {k: (v.shape, v.dtype) for k, v in batch.items()} == {
+            k: (v.shape, v.dtype) for k, v in pattern.items()
+        }
+        rows = store.start[batch["episode"]][:, None] + batch["t"]
+        inside = rows < (store.start + store.length)[batch["episode"]][:, None]
+        assert inside.all()
+        for name in set(batch) - {"episode", "t", "valid", "is_first"}:
+            np.testing.assert_array_equal(
+                batch[name][batch["valid"]], getattr(store, name)[rows][batch["valid"]]
+            )
+        np.testing.assert_array_equal(batch["is_first"], (batch["t"] == 0) & batch["is_first"])
+        assert not batch["valid"][batch["t"][:, 0] > 0, :2].any()
+
+
+def test_every_row_is_visited(six: EpisodeIndex) -> None:
+    stream = BoundedStream(six, _config(), shuffle=FEW)
+    seen = set()
+    for batch in (next(stream) for _ in range(200)):
+        pairs = zip(np.repeat(batch["episode"], 4), batch["t"].ravel(), strict=True)
+        seen |= {pair for pair, valid in zip(pairs, batch["valid"].ravel(), strict=True) if valid}
+    assert len(seen) == six.num_frames
+
+
+def test_episodes_are_drawn_in_proportion_to_their_frames(six: EpisodeIndex) -> None:
+    stream = BoundedStream(six, _config(batch_size=32), shuffle=FEW)
+    drawn = np.bincount(
+        np.concatenate([next(stream)["episode"] for _ in range(150)]), minlength=len(six)
+    )
+    np.testing.assert_allclose(drawn / drawn.sum(), six.length / six.num_frames, atol=0.02)
+
+
+@pytest.mark.parametrize("batch_size", [1, 8, 50])
+def test_resuming_any_number_of_times_continues_with_exactly_the_next_batches(
+    six: EpisodeIndex, batch_size: int
+) -> None:
+    """Across many epochs: six episodes yield about 16 windows in each."""
+    facts = survey(six, RETURNS)
+    config = _config(batch_size=batch_size, mirror=True, event_fraction=0.5, burn_in=1)
+
+    def make() -> BoundedStream:
+        mix = Mix(tasks={"wall": 2.0})
+        return BoundedStream(six, config, mix, FEW, returns=RETURNS, events=facts.events)
+
+    straight, stopped = make(), make()
+    for _ in range(8):
+        for _ in range(5):
+            assert _same(next(straight), next(stopped))
+        stopped = make().load_state_dict(json.loads(json.dumps(stopped.state_dict())))
+    assert min(straight.state_dict()["order"]["epoch"]) >= 1
+
+
+def test_a_seed_repeats_the_batches_and_another_gives_others(six: EpisodeIndex) -> None:
+    one, two = (next(BoundedStream(six, _config(), shuffle=FEW)) for _ in range(2))
+    assert _same(one, two)
+    assert not _same(one, next(BoundedStream(six, _config(seed=1), shuffle=FEW)))
+
+
+def test_other_options_or_data_are_not_resumed(six: EpisodeIndex, reader: DatasetReader) -> None:
+    state = BoundedStream(six, _config(), shuffle=FEW).state_dict()
+    with pytest.raises(UsageError, match="episodes 3 -> 4"):
+        BoundedStream(six, _config(), shuffle=ShuffleConfig(4)).load_state_dict(state)
+    with pytest.raises(UsageError, match="workers 1 -> 2"):
+        BoundedStream(six, _config(), shuffle=FEW, shard=Shard(workers=2)).load_state_dict(state)
+    with pytest.raises(DataError, match="episodes have changed"):
+        BoundedStream(six.first(5), _config(), shuffle=FEW).load_state_dict(state)
+    store = EpisodeStore.load([reader])
+    with pytest.raises(UsageError, match="bounded"):
+        SequenceStream(store, _config()).load_state_dict(state)
+    with pytest.raises(UsageError, match="bounded"):
+        BoundedStream(six, _config()).load_state_dict(SequenceStream(store, _config()).state_dict())
+
+
+def test_event_windows_hold_an_event(six: EpisodeIndex, reader: DatasetReader) -> None:
+    store = EpisodeStore.load([reader], returns=RETURNS)
+    events = set(event_rows(store, 0.9).tolist())
+    facts = survey(six, RETURNS, 0.9)
+    config = _config(event_fraction=1.0)
+    everything = ShuffleConfig(episodes=6)
+    stream = BoundedStream(six, config, shuffle=everything, events=facts.events)
+    for batch in (next(stream) for _ in range(20)):
+        rows = store.start[batch["episode"]][:, None] + batch["t"]
+        assert all(events & set(r[v].tolist()) for r, v in zip(rows, batch["valid"], strict=True))
+
+
+def test_passing_is_what_the_label_says(six: EpisodeIndex) -> None:
+    def label(depth: np.ndarray, state: np.ndarray) -> np.ndarray:
+        return np.stack([state[:, 0]] * 5, axis=1)
+
+    batch = next(BoundedStream(six, _config(), shuffle=FEW, label=label))
+    np.testing.assert_array_equal(batch["passing"][..., 2], batch["state"][..., 0])
+
+
+# --- several workers, several datasets --------------------------------------------------------
+@pytest.mark.parametrize(("ranks", "workers"), [(1, 2), (2, 1), (3, 2)])
+def test_every_worker_of_every_rank_yields_its_own_episodes(
+    make_index: MakeIndex, ranks: int, workers: int
+) -> None:
+    """Fewer files than workers, too."""
+    index = make_index(10, 7)
+    drawn: list[set[int]] = []
+    for rank in range(ranks):
+        for worker in range(workers):
+            shard = Shard(rank, ranks, worker, workers)
+            stream = BoundedStream(index, _config(), shuffle=FEW, shard=shard)
+            drawn.append({e for _ in range(60) for e in next(stream)["episode"].tolist()})
+            assert drawn[-1] == set(stream.episodes.tolist())
+    assert sum(map(len, drawn)) == len(index)
+    assert set.union(*drawn) == set(range(len(index)))
+
+
+def test_files_stay_whole_where_there_are_enough_of_them(make_index: MakeIndex) -> None:
+    index = make_index(4, 6, 5, 3)
+    shards = [BoundedStream(index, _config(), shard=Shard(i, 2)).episodes for i in range(2)]
+    datasets = [set(index.dataset[episodes].tolist()) for episodes in shards]
+    assert not datasets[0] & datasets[1]
+
+
+def test_too_many_workers_are_refused(six: EpisodeIndex) -> None:
+    with pytest.raises(UsageError, match="use fewer workers"):
+        BoundedStream(six, _config(), shard=Shard(ranks=7))
+    with pytest.raises(UsageError, match="rank 2 of 2"):
+        BoundedStream(six, _config(), shard=Shard(rank=2, ranks=2))
+
+
+def test_datasets_are_drawn_by_weight_whatever_their_size(make_index: MakeIndex) -> None:
+    index = make_index(20, 6)
+    stream = BoundedStream(index, _config(batch_size=32), Mix((1.0, 3.0)), ShuffleConfig(8))
+    episodes = np.concatenate([next(stream)["episode"] for _ in range(100)])
+    drawn = Counter(index.dataset[episodes].tolist())
+    assert drawn[1] / drawn.total() == pytest.approx(0.75, abs=0.04)
+
+
+def test_held_out_episodes_are_never_read(
+    make_index: MakeIndex, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    index = make_index(20)
+    heldout = set(EpisodeIndex.of(index.readers, "heldout", 0.2).identities)
+    assert len(heldout) > 1
+    read = set()
+    read_again = EpisodeIndex.read_again
+
+    def noted(self: EpisodeIndex, episode: int) -> object:
+        read.add(self.identities[episode])
+        return read_again(self, episode)
+
+    monkeypatch.setattr(EpisodeIndex, "read_again", noted)
+    stream = BoundedStream(index, _config(), shuffle=FEW)
+    for _ in range(40):
+        next(stream)
+    assert read == set(index.identities)
+    assert not read & heldout
+
+
+# --- memory -----------------------------------------------------------------------------------
+def _peak(index: EpisodeIndex) -> int:
+    """Bytes, of arrays, while batches are drawn."""
+    len(index.length)
+    tracemalloc.start()
+    stream = BoundedStream(index, _config(), shuffle=FEW)
+    for _ in range(40):
+        next(stream)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    return peak
+
+
+def test_memory_does_not_grow_with_the_number_of_episodes(make_index: MakeIndex) -> None:
+    few, many = make_index(12), make_index(120)
+    _peak(few)  # imports, caches
+    assert _peak(many) < 1.1 * _peak(few)
+
+
+def test_a_file_that_is_damaged_under_way_is_named(make_index: MakeIndex) -> None:
+    index = make_index(20)
+    stream = BoundedStream(index, _config(), shuffle=FEW)
+    next(stream)
+    path: Path = index.files[0]
+    index.readers[0]._open_file.cache_clear()
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(DataError, match=path.name):
+        list(islice(stream, 40))
+
+
+@pytest.mark.parametrize("shuffle", [ShuffleConfig(0), ShuffleConfig(3, 0.0)])
+def test_senseless_windows_are_refused(six: EpisodeIndex, shuffle: ShuffleConfig) -> None:
+    with pytest.raises(UsageError, match="expected at least 1"):
+        BoundedStream(six, _config(), shuffle=shuffle)
+
+
+def test_a_survey_says_what_the_arrays_say(six: EpisodeIndex, reader: DatasetReader) -> None:
+    store = EpisodeStore.load([reader], returns=RETURNS)
+    facts = survey(six, RETURNS)
+    np.testing.assert_allclose(facts.state_mean, store.state.mean(0, dtype=np.float64), atol=1e-9)
+    np.testing.assert_allclose(facts.state_std, store.state.std(0, dtype=np.float64), rtol=1e-9)
+    np.testing.assert_array_equal(facts.returns, store.mc_return[store.mc_valid])

@@ -1,0 +1,104 @@
+"""Several datasets in one stream: shares, repeatability, resuming."""
+
+import json
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from egovcp.data import (
+    DatasetConfig,
+    DatasetReader,
+    DatasetWriter,
+    EpisodeStore,
+    Mix,
+    Provenance,
+    SequenceStream,
+    StreamConfig,
+)
+from egovcp.data.stream import event_rows
+from egovcp.errors import UsageError
+
+from .conftest import MakeEpisode
+
+CONFIG = StreamConfig(batch_size=32, length=4, mirror=True)
+
+
+@pytest.fixture(scope="module")
+def both(
+    reader: DatasetReader, make_episode: MakeEpisode, tmp_path_factory: pytest.TempPathFactory
+) -> EpisodeStore:
+    """The six episodes of ball and wall, and four of arch from another dataset."""
+    root = tmp_path_factory.mktemp("mix") / "four"
+    with DatasetWriter(root, Provenance("stance-1", seed=5, command="collect")) as writer:
+        for number in range(4):
+            writer.add(make_episode(number, 15, task="arch", seed=5))
+    return EpisodeStore.load([reader, DatasetReader.open(DatasetConfig(root=str(root)))])
+
+
+def _windows(store: EpisodeStore, mix: Mix, config: StreamConfig = CONFIG) -> np.ndarray:
+    stream = SequenceStream(store, config, mix)
+    return np.concatenate([next(stream)["episode"] for _ in range(100)])
+
+
+def test_a_dataset_is_drawn_by_its_weight_whatever_its_size(both: EpisodeStore) -> None:
+    drawn = Counter(both.dataset[_windows(both, Mix(datasets=(3.0, 1.0)))].tolist())
+    assert drawn[0] / drawn.total() == pytest.approx(0.75, abs=0.03)
+
+
+def test_a_task_is_drawn_more_often_than_by_chance_by_its_weight(both: EpisodeStore) -> None:
+    tasks = np.array(both.tasks)
+    frames = {task: both.length[tasks == task].sum() for task in set(both.tasks)}
+    drawn = Counter(tasks[_windows(both, Mix(tasks={"wall": 3.0, "arch": 0.0}))].tolist())
+    assert drawn["arch"] == 0
+    odds = 3 * frames["wall"] / frames["ball"]
+    assert drawn["wall"] / drawn["ball"] == pytest.approx(odds, rel=0.15)
+
+
+def test_without_weights_every_frame_counts_alike(both: EpisodeStore) -> None:
+    drawn = np.bincount(_windows(both, Mix()), minlength=len(both.length))
+    np.testing.assert_allclose(drawn / drawn.sum(), both.length / both.num_frames, atol=0.03)
+
+
+def test_event_windows_keep_the_shares_and_hold_an_event(both: EpisodeStore) -> None:
+    config = StreamConfig(batch_size=32, length=4, mirror=False, event_fraction=1.0)
+    stream = SequenceStream(both, config, Mix(datasets=(1.0, 1.0)))
+    events = set(event_rows(both, config.event_quantile).tolist())
+    drawn: Counter[int] = Counter()
+    for batch in (next(stream) for _ in range(60)):
+        drawn.update(both.dataset[batch["episode"]].tolist())
+        rows = both.start[batch["episode"]][:, None] + batch["t"]
+        assert all(events & set(r[v].tolist()) for r, v in zip(rows, batch["valid"], strict=True))
+    assert drawn[0] / drawn.total() == pytest.approx(0.5, abs=0.05)
+
+
+def test_a_mixed_stream_resumes_with_exactly_the_next_batches(both: EpisodeStore) -> None:
+    mix = Mix((1.0, 2.0), {"ball": 2.0})
+    straight, stopped = (SequenceStream(both, CONFIG, mix) for _ in range(2))
+    for _ in range(3):  # three times stopped and resumed
+        for _ in range(4):
+            expected, found = next(straight), next(stopped)
+            assert all(np.array_equal(expected[k], found[k]) for k in expected)
+        state = json.loads(json.dumps(stopped.state_dict()))
+        stopped = SequenceStream(both, CONFIG, mix).load_state_dict(state)
+
+
+def test_other_weights_are_not_resumed(both: EpisodeStore) -> None:
+    state = SequenceStream(both, CONFIG, Mix((1.0, 2.0))).state_dict()
+    with pytest.raises(UsageError, match=r"datasets \[1.0, 2.0\] -> \[2.0, 2.0\]"):
+        SequenceStream(both, CONFIG, Mix((2.0, 2.0))).load_state_dict(state)
+
+
+@pytest.mark.parametrize(
+    ("mix", "message"),
+    [
+        (Mix(datasets=(1.0,)), "1 weights for 2 datasets"),
+        (Mix(datasets=(1.0, -1.0)), "weight of -1.0"),
+        (Mix(datasets=(0.0, 0.0)), "no episode to draw"),
+        (Mix(tasks={"wal": 1.0}), "did you mean 'wall'"),
+        (Mix(tasks={"ball": float("nan")}), "weight of nan"),
+    ],
+)
+def test_senseless_weights_are_refused(both: EpisodeStore, mix: Mix, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        SequenceStream(both, CONFIG, mix)

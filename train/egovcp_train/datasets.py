@@ -1,0 +1,193 @@
+"""What a run trains on: which datasets, how often each is drawn, in memory or from the disk."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import chain
+from typing import Literal
+
+import torch
+
+from egovcp import spec
+from egovcp.cli import DatasetConfig
+from egovcp.data import (
+    BoundedStream,
+    DatasetReader,
+    EpisodeIndex,
+    EpisodeStore,
+    Mix,
+    SequenceStream,
+    StreamConfig,
+    survey,
+)
+from egovcp.data.ahead import Ahead
+from egovcp.data.memory import available_bytes
+from egovcp.errors import UsageError
+from egovcp.model import Batch, WorldModel
+from egovcp_train.batches import (
+    EPISODES_AT_ONCE,
+    fix_normalisation,
+    set_normalisation,
+    whole_episodes,
+)
+from egovcp_train.config import TrainConfig
+from egovcp_train.passing import label, label_episode
+
+EVALUATION_EPISODES = 64  # of each task
+FIT_EPISODES = 2048  # of a dataset that is not in memory: half a GB of states to fit Q to
+FRAME_BYTES = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (spec.STATE_DIM + 2 * spec.ACTION_DIM + 8)
+
+type Stream = SequenceStream | Ahead
+type Learning = EpisodeStore | EpisodeIndex
+
+
+@dataclass(frozen=True)
+class Material:
+    """The episodes of a run."""
+
+    readers: tuple[DatasetReader, ...]
+    """The datasets."""
+    config: TrainConfig
+    """The options, ``loading.mode`` no longer auto."""
+    learning: Learning
+    """Episodes to train on."""
+    stream: Stream
+    """Batches of their windows."""
+    heldout: EpisodeStore
+    """Episodes to evaluate on."""
+
+    def training_episodes(self, device: torch.device) -> Iterator[Batch]:
+        """Whole training episodes, and their mirror images; a random part of a large dataset."""
+        if isinstance(self.learning, EpisodeIndex):
+            return _from_disk(self.learning, self.config, device)
+        return whole_episodes(self.learning, device, self.config.sampling.mirror)
+
+
+def prepare(config: TrainConfig, model: WorldModel) -> Material:
+    """Open the datasets, read all of them once, and fix the model's statistics.
+
+    Raises:
+        UsageError: the options make no sense.
+        DataError: a dataset is missing, damaged, not a number, or of another specification.
+        EnvironmentFailure: the Hub cannot be reached.
+    """
+    mix, sampling = mix_of(config), stream_config(config)
+    sampling.check()
+    config.loading.shuffle.check()
+    readers = open_readers(config)
+    config = _decided(config, readers)
+    build = _in_memory if config.loading.mode == "ram" else _on_disk
+    return Material(readers, config, *build(readers, config, sampling, mix, model))
+
+
+def open_readers(config: TrainConfig) -> tuple[DatasetReader, ...]:
+    """The datasets, in the order given.
+
+    Raises:
+        UsageError: none is named, or --dataset and --datasets both are.
+        DataError: one is missing, damaged, or of another specification.
+        EnvironmentFailure: the Hub cannot be reached.
+    """
+    if not config.datasets:
+        return (DatasetReader.open(config.dataset),)
+    if config.dataset != DatasetConfig():
+        raise UsageError("--dataset and --datasets both name data; give one of them")
+    return tuple(DatasetReader.open(dataset) for dataset in config.datasets)
+
+
+def mix_of(config: TrainConfig) -> Mix:
+    """The weights of datasets and tasks.
+
+    Raises:
+        UsageError: some datasets have a weight and others none, or a weight makes no sense.
+    """
+    weights = [d.weight for d in config.datasets if d.weight is not None]
+    if len(weights) not in (0, len(config.datasets)):
+        raise UsageError("--datasets: give every dataset a weight, or none")
+    mix = Mix(tuple(weights), config.sampling.tasks)
+    mix.check()
+    return mix
+
+
+def stream_config(config: TrainConfig) -> StreamConfig:
+    """How windows are drawn."""
+    sampling = config.sampling
+    return StreamConfig(
+        batch_size=config.batch_size,
+        length=sampling.length,
+        burn_in=sampling.burn_in,
+        event_fraction=sampling.event_fraction,
+        mirror=sampling.mirror,
+        seed=config.seed,
+    )
+
+
+def _decided(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:
+    """The options with the mode that auto stands for here, so that a resumed run keeps it."""
+    if config.loading.mode != "auto":
+        return config
+    needed = sum(reader.num_frames for reader in readers) * FRAME_BYTES
+    mode: Literal["ram", "stream"] = "ram" if 2 * needed <= available_bytes() else "stream"
+    return dataclasses.replace(config, loading=dataclasses.replace(config.loading, mode=mode))
+
+
+def _in_memory(
+    readers: Sequence[DatasetReader],
+    config: TrainConfig,
+    sampling: StreamConfig,
+    mix: Mix,
+    model: WorldModel,
+) -> tuple[Learning, Stream, EpisodeStore]:
+    learning, heldout = (
+        EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
+    )
+    set_normalisation(model, learning)
+    if config.policy.loss.passing:
+        learning, heldout = label(learning, config.passing), label(heldout, config.passing)
+    return learning, SequenceStream(learning, sampling, mix), heldout
+
+
+def _on_disk(
+    readers: Sequence[DatasetReader],
+    config: TrainConfig,
+    sampling: StreamConfig,
+    mix: Mix,
+    model: WorldModel,
+) -> tuple[Learning, Stream, EpisodeStore]:
+    learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
+    heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.returns)
+    facts = survey(learning, config.returns, sampling.event_quantile)
+    longest = int(learning.length.max())
+    fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest)
+    labelling = None
+    if config.policy.loss.passing:
+        heldout = label(heldout, config.passing)
+        labelling = partial(label_episode, config=config.passing)
+    stream = BoundedStream(
+        learning,
+        sampling,
+        mix,
+        config.loading.shuffle,
+        returns=config.returns,
+        events=facts.events,
+        label=labelling,
+    )
+    return learning, Ahead(stream), heldout
+
+
+def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -> Iterator[Batch]:
+    """Whole episodes of at most `FIT_EPISODES`, a few in memory at a time."""
+    order = torch.randperm(len(index), generator=torch.Generator().manual_seed(config.seed))
+    chosen = order[:FIT_EPISODES].sort().values.numpy()
+
+    def batches(first: int) -> Iterator[Batch]:
+        part = index.select(chosen[first : first + EPISODES_AT_ONCE])
+        store = EpisodeStore.read(part, config.returns)
+        if config.policy.loss.passing:
+            store = label(store, config.passing)
+        yield from whole_episodes(store, device, config.sampling.mirror)
+
+    return chain.from_iterable(map(batches, range(0, len(chosen), EPISODES_AT_ONCE)))
