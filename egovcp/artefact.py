@@ -2,6 +2,7 @@
 
     config.json        "type": "egovcp", network and planner configuration, features
     model.safetensors  weights and normalisation statistics
+    policy_*.json      the steps LeRobot takes before and after the policy
     manifest.json      schema version, SHA-256 of each file, data, controller, code version
 
 safetensors and JSON only: loading an artefact never executes code. Other files beside these, such
@@ -14,6 +15,7 @@ import dataclasses
 import hashlib
 import json
 import shutil
+from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -22,12 +24,14 @@ from typing import Any
 import draccus
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch import Tensor
 
 from egovcp import spec
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.hub import Patience, snapshot
 from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.plan import PlannerConfig, Policy
+from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
 
 SCHEMA_VERSION = 1
 CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
@@ -92,8 +96,7 @@ def save_artefact(
     Raises:
         ArtefactError: the provenance names no controller.
     """
-    if not isinstance(provenance.get("controller_id"), str):
-        raise ArtefactError(f"{path}: the provenance of a policy must hold its controller_id")
+    _require_controller_id(path, provenance)
     work = path.with_name(path.name + ".partial")
     shutil.rmtree(work, ignore_errors=True)
     work.mkdir(parents=True)
@@ -101,26 +104,48 @@ def save_artefact(
         "type": "egovcp",
         "world_model": draccus.encode(model.config),
         "planner": draccus.encode(planner),
-        "input_features": {
-            spec.DEPTH_KEY: {
-                "type": "VISUAL",
-                "shape": [1, spec.DEPTH_ROWS, spec.DEPTH_COLS],
-            },
-            spec.STATE_KEY: {"type": "STATE", "shape": [spec.STATE_DIM]},
-        },
-        "output_features": {spec.ACTION_KEY: {"type": "ACTION", "shape": [spec.ACTION_DIM]}},
+        "input_features": INPUT_FEATURES,
+        "output_features": OUTPUT_FEATURES,
     }
-    _write_json(work / CONFIG, config)
-    save_file({k: v.contiguous().cpu() for k, v in model.state_dict().items()}, work / WEIGHTS)
+    write_artefact(work, config, model.state_dict(), provenance, PROCESSORS)
+    _replace(path, work)
+
+
+def write_artefact(
+    folder: Path,
+    config: Mapping[str, Any],
+    weights: Mapping[str, Tensor],
+    provenance: Mapping[str, Any],
+    processors: Mapping[str, Any],
+) -> None:
+    """Write the files of an artefact into a folder that exists; see `save_artefact`.
+
+    Args:
+        config: LeRobot's configuration of the policy, with ``world_model`` and ``planner``.
+        weights: the state of the world model.
+        processors: JSON file name -> content; may be empty if somebody else writes them.
+
+    Raises:
+        ArtefactError: the provenance names no controller.
+    """
+    _require_controller_id(folder, provenance)
+    _write_json(folder / CONFIG, config)
+    for name, content in processors.items():
+        _write_json(folder / name, content)
+    save_file({k: v.contiguous().cpu() for k, v in weights.items()}, folder / WEIGHTS)
     manifest = {
         "schema_version": SCHEMA_VERSION,
         "egovcp_version": version("egovcp"),
         "features": feature_spec(),
-        "files": {name: _sha256(work / name) for name in (CONFIG, WEIGHTS)},
+        "files": {name: _sha256(folder / name) for name in (CONFIG, WEIGHTS, *processors)},
         **provenance,
     }
-    _write_json(work / MANIFEST, manifest)
-    _replace(path, work)
+    _write_json(folder / MANIFEST, manifest)
+
+
+def _require_controller_id(path: Path, provenance: Mapping[str, Any]) -> None:
+    if not isinstance(provenance.get("controller_id"), str):
+        raise ArtefactError(f"{path}: the provenance of a policy must hold its controller_id")
 
 
 def _replace(path: Path, new: Path) -> None:
@@ -229,8 +254,9 @@ def _check_manifest(folder: Path, manifest: dict[str, Any]) -> None:
         )
     if not isinstance(manifest.get("controller_id"), str):
         raise ArtefactError(f"{folder / MANIFEST}: no controller_id; the file is damaged")
-    for name in (CONFIG, WEIGHTS):
-        expected, found = _object(manifest, "files").get(name), _sha256(folder / name)
+    files = _object(manifest, "files")
+    for name in (CONFIG, WEIGHTS, *(name for name in PROCESSORS if name in files)):
+        expected, found = files.get(name), _sha256(folder / name)
         if found != expected:
             raise ArtefactError(
                 f"{folder / name}: SHA-256 is {found[:12]}..., the manifest says "
@@ -264,5 +290,5 @@ def _read_json(path: Path) -> dict[str, Any]:
     return content
 
 
-def _write_json(path: Path, content: dict[str, Any]) -> None:
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")

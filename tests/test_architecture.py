@@ -13,6 +13,8 @@ PACKAGES = {
     "egovcp_collect": ROOT / "collect" / "egovcp_collect",
     "egovcp_train": ROOT / "train" / "egovcp_train",
     "egovcp_deploy": ROOT / "deploy" / "egovcp_deploy",
+    "lerobot_env_egovcp": ROOT / "plugins" / "lerobot_env_egovcp" / "lerobot_env_egovcp",
+    "lerobot_policy_egovcp": ROOT / "plugins" / "lerobot_policy_egovcp" / "lerobot_policy_egovcp",
 }
 
 #: Part of the library -> what it must not import, anywhere in its files.

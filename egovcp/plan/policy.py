@@ -47,13 +47,14 @@ class Policy:
     def reset(self, rows: NDArray[np.intp] | None = None) -> None:
         """Forget the past of ``rows`` (None: of all, and restart the random stream)."""
         if rows is None:
-            self._carry = self.model.initial(self.num_envs)
-            self._sent = torch.zeros(self.num_envs, spec.ACTION_DIM)
-            self._first = torch.ones(self.num_envs, dtype=torch.bool)
-            self._warm = torch.zeros(self.num_envs, self.config.horizon, spec.ACTION_DIM)
-            self._generator = torch.Generator().manual_seed(self._seed)
+            device, envs = self._device, self.num_envs
+            self._carry = self.model.initial(envs)
+            self._sent = torch.zeros(envs, spec.ACTION_DIM, device=device)
+            self._first = torch.ones(envs, dtype=torch.bool, device=device)
+            self._warm = torch.zeros(envs, self.config.horizon, spec.ACTION_DIM, device=device)
+            self._generator = torch.Generator(device).manual_seed(self._seed)
             return
-        index = torch.as_tensor(rows)
+        index = torch.as_tensor(rows, device=self._device)
         self._first[index] = True
         self._sent[index] = 0.0
         self._warm[index] = 0.0
@@ -64,8 +65,8 @@ class Policy:
         self._carry = self.model.observe(
             self._carry,
             self._sent,
-            torch.from_numpy(depth.astype(np.int32)),
-            torch.as_tensor(state, dtype=torch.float32),
+            torch.from_numpy(depth.astype(np.int32)).to(self._device),
+            torch.as_tensor(state, dtype=torch.float32, device=self._device),
             self._first,
         )
         self._first = torch.zeros_like(self._first)
@@ -79,18 +80,23 @@ class Policy:
         )
         self._warm = shift(plan.deltas)
         return PolicyStep(
-            plan.actions[:, 0].numpy().copy(),
-            plan.actions.numpy(),
-            plan.value.numpy(),
-            self.model.termination(self._carry).numpy(),
-            plan.candidates.numpy(),
-            plan.candidate_values.numpy(),
+            _numpy(plan.actions[:, 0]).copy(),
+            _numpy(plan.actions),
+            _numpy(plan.value),
+            _numpy(self.model.termination(self._carry)),
+            _numpy(plan.candidates),
+            _numpy(plan.candidate_values),
             plan.iterations,
         )
 
     def advance(self, sent: NDArray[np.floating]) -> None:
         """Tell the recurrence which action (E, 7) was really sent."""
-        self._sent = torch.as_tensor(sent, dtype=torch.float32).clone()
+        self._sent = torch.as_tensor(sent, dtype=torch.float32, device=self._device).clone()
+
+    @property
+    def _device(self) -> torch.device:
+        """Where the model lies; noise differs between devices, and so do plans."""
+        return self.model.state_mean.device
 
     @property
     def carry(self) -> Carry:
@@ -108,7 +114,7 @@ class Policy:
 
         Beyond the plan's end its last action is held.
         """
-        actions = torch.as_tensor(plan, dtype=torch.float32)
+        actions = torch.as_tensor(plan, dtype=torch.float32, device=self._device)
         carry, frames = self._carry, []
         for k in range(horizon):
             carry = self.model.imagine(carry, actions[:, min(k, actions.shape[1] - 1)])
@@ -117,5 +123,5 @@ class Policy:
 
 
 def _numpy(x: Tensor) -> Array:
-    array: Array = x.numpy()
+    array: Array = x.cpu().numpy()
     return array

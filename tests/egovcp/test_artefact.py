@@ -18,6 +18,7 @@ from egovcp.artefact import CONFIG, MANIFEST, WEIGHTS, load_artefact, save_artef
 from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
 from egovcp.hub import Content, Patience, Publication, publish
 from egovcp.plan import PlannerConfig, Policy
+from egovcp.processors import PROCESSORS
 from egovcp.testing import toy_model
 from egovcp.testing.hub import FakeHub
 from egovcp.testing.hub.faults import Trouble
@@ -25,6 +26,8 @@ from egovcp.testing.hub.faults import Trouble
 PLANNER = PlannerConfig(samples=32, elites=4, iterations=1, termination_rule="survival")
 QUICK = Patience(attempts=2, wait_s=0.01, timeout_s=20)
 PROVENANCE = {"controller_id": "stance-1", "datasets": [{"repo_id": "me/ball"}]}
+
+FILES = {CONFIG, WEIGHTS, MANIFEST, *PROCESSORS}
 
 type Json = dict[str, Any]
 
@@ -98,7 +101,7 @@ def test_weights_statistics_and_settings_survive(tmp_path: Path) -> None:
 def test_saving_what_was_loaded_is_the_identity(original: Path, tmp_path: Path) -> None:
     loaded = load_artefact(str(original))
     save_artefact(tmp_path / "again", loaded.world_model, loaded.planner, PROVENANCE)
-    for name in (CONFIG, WEIGHTS, MANIFEST):
+    for name in FILES:
         assert (tmp_path / "again" / name).read_bytes() == (original / name).read_bytes()
 
 
@@ -108,14 +111,14 @@ def test_another_planner_can_be_asked_for(original: Path) -> None:
 
 
 # --- refusals --------------------------------------------------------------------------
-@pytest.mark.parametrize("name", [CONFIG, WEIGHTS, MANIFEST])
+@pytest.mark.parametrize("name", sorted(FILES))
 def test_a_missing_file_is_named(folder: Path, name: str) -> None:
     (folder / name).unlink()
     with pytest.raises(ArtefactError, match=name):
         load_artefact(str(folder))
 
 
-@pytest.mark.parametrize("name", [CONFIG, WEIGHTS])
+@pytest.mark.parametrize("name", sorted(FILES - {MANIFEST}))
 @pytest.mark.parametrize("where", [0, -1])
 def test_a_changed_byte_is_noticed(folder: Path, name: str, where: int) -> None:
     content = bytearray((folder / name).read_bytes())
@@ -125,7 +128,14 @@ def test_a_changed_byte_is_noticed(folder: Path, name: str, where: int) -> None:
         load_artefact(str(folder))
 
 
-@pytest.mark.parametrize("name", [CONFIG, WEIGHTS, MANIFEST])
+def test_an_older_artefact_without_files_for_lerobot_still_loads(folder: Path) -> None:
+    for name in PROCESSORS:
+        (folder / name).unlink()
+    _edit(folder / MANIFEST, lambda m: [m["files"].pop(name) for name in PROCESSORS])
+    assert load_artefact(str(folder)).planner == PLANNER
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
 def test_a_truncated_file_is_noticed(folder: Path, name: str) -> None:
     content = (folder / name).read_bytes()
     (folder / name).write_bytes(content[: len(content) // 2])
@@ -217,7 +227,7 @@ def test_loading_never_unpickles(original: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_it_holds_only_json_and_safetensors(original: Path) -> None:
-    assert {path.name for path in original.iterdir()} == {CONFIG, WEIGHTS, MANIFEST}
+    assert {path.name for path in original.iterdir()} == FILES
 
 
 def test_another_controller_is_refused(original: Path) -> None:
@@ -335,7 +345,7 @@ def test_what_was_tampered_with_on_the_hub_is_refused(hub: FakeHub, original: Pa
 def test_an_older_artefact_is_replaced_and_nothing_is_left_over(folder: Path) -> None:
     (folder / "stale").touch()
     save_artefact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
-    assert {path.name for path in folder.iterdir()} == {CONFIG, WEIGHTS, MANIFEST}
+    assert {path.name for path in folder.iterdir()} == FILES
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
     loaded = load_artefact(str(folder)).world_model.state_dict()
     expected = toy_model(seed=1).state_dict()

@@ -13,9 +13,8 @@ from egovcp.data import EpisodeStore
 from egovcp.data.windows import gather, mirror_rows
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
+from egovcp.model.statistics import set_statistics
 
-STD_FLOOR = 0.02  # a constant value (v of the standing tasks) must not be blown up
-WORST_RETURN_QUANTILE = 0.001
 EPISODES_AT_ONCE = 32
 
 
@@ -76,12 +75,4 @@ def fix_normalisation(
             f"no row has a complete Monte Carlo return: the episodes (at most {longest} ticks) "
             "are not longer than --returns.steps; lower it, or collect longer episodes"
         )
-    values = {
-        "state_mean": state_mean,
-        "state_std": np.maximum(state_std, STD_FLOOR),
-        "return_mean": returns.mean(dtype=np.float64),
-        "return_std": max(float(returns.std(dtype=np.float64)), 1e-6),
-        "return_floor": np.quantile(returns, WORST_RETURN_QUANTILE),
-    }
-    for name, value in values.items():
-        getattr(model, name).copy_(torch.as_tensor(value, dtype=torch.float32))
+    set_statistics(model, state_mean, state_std, returns)

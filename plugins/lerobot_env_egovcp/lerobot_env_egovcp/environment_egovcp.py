@@ -1,0 +1,77 @@
+"""One simulated robot with LeRobot's names for what it sees."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp import spec
+from egovcp.sim.config import EnvConfig
+from egovcp.sim.gym import EgovcpEnv, GymObservation
+
+_GREY_PER_MM = 255 / (spec.DEPTH_MAX_M * 1e3)
+_MAGNIFY = 4  # video encoders want more than 64 columns
+
+
+class LeRobotView(gymnasium.Env[GymObservation, NDArray[np.float32]]):
+    """`EgovcpEnv` as LeRobot's rollouts read it.
+
+    Observation: ``images.ego_depth`` (1, 48, 64) float32 mm, 0 = invalid, and ``agent_pos`` (74,),
+    which LeRobot calls ``observation.state``. ``info["is_success"]`` is the episode's outcome: it
+    is set at the end alone, because LeRobot counts an episode that was ever successful.
+    """
+
+    observation_space: gymnasium.Space[Any]
+    action_space: gymnasium.Space[Any]
+
+    def __init__(self, task: str, config: EnvConfig) -> None:
+        self.task = self.task_description = task
+        self._max_episode_steps = config.episode(task).ticks
+        self._env = EgovcpEnv(task, config)
+        self.metadata = {"render_modes": ["rgb_array"], "render_fps": spec.PLANNER_HZ}
+        self.render_mode = "rgb_array"
+        self.action_space = self._env.action_space
+        shape = (1, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+        self.observation_space = gymnasium.spaces.Dict(
+            {
+                "images.ego_depth": gymnasium.spaces.Box(0, spec.DEPTH_MAX_M * 1e3, shape),
+                "agent_pos": gymnasium.spaces.Box(-np.inf, np.inf, (spec.STATE_DIM,), np.float32),
+            }
+        )
+        self._depth: NDArray[np.uint16] = np.zeros(shape[1:], dtype=np.uint16)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[GymObservation, dict[str, Any]]:
+        """Start the next episode, or episode 0 of ``seed``."""
+        super().reset(seed=seed)
+        seen, info = self._env.reset(seed=seed, options=options)
+        return self._renamed(seen), info | {"is_success": False}
+
+    def step(
+        self, action: NDArray[np.float32]
+    ) -> tuple[GymObservation, float, bool, bool, dict[str, Any]]:
+        """One planner tick of 40 ms."""
+        seen, reward, terminated, truncated, info = self._env.step(action)
+        success = bool(info["success"]) and (terminated or truncated)
+        return self._renamed(seen), reward, terminated, truncated, {"is_success": success}
+
+    def render(self) -> NDArray[np.uint8]:
+        """What the robot sees, (192, 256, 3): the nearer, the brighter; black: nothing."""
+        near = np.where(self._depth == 0, 0.0, 255.0 - self._depth * _GREY_PER_MM)
+        grey = near.clip(0, 255).astype(np.uint8).repeat(_MAGNIFY, 0).repeat(_MAGNIFY, 1)
+        return np.stack([grey] * 3, -1)
+
+    def close(self) -> None:
+        """End the threads of the simulation."""
+        self._env.close()
+
+    def _renamed(self, seen: GymObservation) -> GymObservation:
+        self._depth = seen["depth"]
+        return {
+            "images.ego_depth": seen["depth"][None].astype(np.float32),
+            "agent_pos": seen["state"],
+        }

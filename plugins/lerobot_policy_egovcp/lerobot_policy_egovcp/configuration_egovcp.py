@@ -1,0 +1,120 @@
+"""``--policy.type=egovcp``: what LeRobot must know of the world model before it exists."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from lerobot.configs import NormalizationMode, PreTrainedConfig
+from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
+
+from egovcp import spec
+from egovcp.data import ReturnConfig
+from egovcp.errors import DataError, UsageError
+from egovcp.model import LossConfig, WorldModelConfig
+from egovcp.plan import PlannerConfig
+
+FEATURE_SHAPES = {
+    spec.DEPTH_KEY: (1, spec.DEPTH_ROWS, spec.DEPTH_COLS),
+    spec.STATE_KEY: (spec.STATE_DIM,),
+    spec.ACTION_KEY: (spec.ACTION_DIM,),
+}
+
+
+def _world_model() -> WorldModelConfig:
+    """The default without the labels of what is on its way, which take whole episodes to find."""
+    return WorldModelConfig(value_of_passing=False, loss=LossConfig(passing=0.0))
+
+
+def _no_normalisation() -> dict[str, NormalizationMode]:
+    return dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
+
+
+@PreTrainedConfig.register_subclass("egovcp")
+@dataclass
+class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
+    """World model, planner and training of an egovcp policy; the first two are the artefact's."""
+
+    world_model: WorldModelConfig = field(default_factory=_world_model)
+    """World model and losses."""
+    planner: PlannerConfig = field(default_factory=PlannerConfig)
+    """Planner that turns the world model into actions."""
+    planner_seed: int = 0
+    """Seed of the planner's samples; `reset` restarts them."""
+    returns: ReturnConfig = field(default_factory=ReturnConfig)
+    """Monte Carlo target of Q."""
+    sequence_length: int = 20
+    """Ticks per training window, which begins at the row that LeRobot draws."""
+    drop_n_last_frames: int = 0
+    """Rows at the end of an episode at which no window begins; windows past the end are padded."""
+    normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_no_normalisation)
+    """None: the statistics are in the weights, as on the robot."""
+    optimizer_lr: float = 1e-3
+    """Peak learning rate."""
+    optimizer_weight_decay: float = 1e-3
+    """Decoupled weight decay."""
+    optimizer_grad_clip_norm: float = 10.0
+    """Largest gradient norm."""
+    scheduler_warmup_steps: int = 100
+    """Steps of linear warm-up."""
+    scheduler_decay_steps: int = 20_000
+    """Steps of cosine decay to a tenth; a shorter run is decayed faster."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.sequence_length < 2 or self.drop_n_last_frames < 0:
+            raise UsageError(
+                f"--policy.sequence_length={self.sequence_length} and --policy.drop_n_last_frames="
+                f"{self.drop_n_last_frames}; expected at least 2 and 0"
+            )
+        if any(mode is not NormalizationMode.IDENTITY for mode in self._modes()):
+            raise UsageError(
+                "the world model normalises by itself; leave --policy.normalization_mapping alone"
+            )
+
+    def _modes(self) -> list[NormalizationMode]:
+        return [NormalizationMode(mode) for mode in self.normalization_mapping.values()]
+
+    @property
+    def observation_delta_indices(self) -> list[int]:
+        """The rows of a window."""
+        return list(range(self.sequence_length))
+
+    @property
+    def action_delta_indices(self) -> list[int]:
+        """The rows of a window and the one before: o_t is filtered after a_{t-1}."""
+        return list(range(-1, self.sequence_length))
+
+    @property
+    def reward_delta_indices(self) -> None:
+        """None: returns reach past the window and come from the whole reward column."""
+        return
+
+    def get_optimizer_preset(self) -> AdamWConfig:
+        """AdamW as in ``egovcp-train``."""
+        return AdamWConfig(
+            lr=self.optimizer_lr,
+            weight_decay=self.optimizer_weight_decay,
+            grad_clip_norm=self.optimizer_grad_clip_norm,
+        )
+
+    def get_scheduler_preset(self) -> CosineDecayWithWarmupSchedulerConfig:
+        """Linear warm-up, then cosine decay to a tenth of the peak."""
+        return CosineDecayWithWarmupSchedulerConfig(
+            num_warmup_steps=self.scheduler_warmup_steps,
+            num_decay_steps=self.scheduler_decay_steps,
+            peak_lr=self.optimizer_lr,
+            decay_lr=self.optimizer_lr / 10,
+        )
+
+    def validate_features(self) -> None:
+        """Raise `DataError` unless depth, state and action are those of egovcp."""
+        features = {**(self.input_features or {}), **(self.output_features or {})}
+        for name, expected in FEATURE_SHAPES.items():
+            if name not in features:
+                raise DataError(
+                    f"no feature {name!r} among {', '.join(sorted(features)) or 'none'}; an egovcp "
+                    "policy needs a dataset of egovcp-collect, or an environment that has it"
+                )
+            found = tuple(features[name].shape)
+            if found != expected:
+                raise DataError(f"feature {name!r} has shape {found}, expected {expected}")

@@ -1,0 +1,216 @@
+"""The world model and its planner behind LeRobot's `PreTrainedPolicy`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any, Self
+
+import draccus
+import numpy as np
+import torch
+from lerobot.configs import PreTrainedConfig
+from lerobot.datasets import LeRobotDatasetMetadata
+from lerobot.policies import PreTrainedPolicy
+from torch import Tensor, nn
+
+from egovcp import spec
+from egovcp.artefact import Artefact, load_artefact, write_artefact
+from egovcp.data import DatasetReader
+from egovcp.errors import ArtefactError, UsageError
+from egovcp.model import WorldModel, world_model_loss
+from egovcp.model.statistics import set_statistics
+from egovcp.plan import Policy
+from lerobot_policy_egovcp.configuration_egovcp import EgovcpConfig
+from lerobot_policy_egovcp.training_rows import Targets, open_reader, to_batch, to_millimetres
+
+type Stats = Mapping[str, Mapping[str, Any]]
+
+_PREFIX = "world_model."
+_OWN_KEYS = ("schema_version", "egovcp_version", "features", "files")  # of the manifest
+
+
+class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
+    """Filters every observation into the world model's memory, then plans.
+
+    What it saves is an artefact as ``egovcp-train`` writes it (see `egovcp.artefact`).
+    """
+
+    config_class = EgovcpConfig
+    name = "egovcp"
+    config: EgovcpConfig
+
+    def __init__(
+        self,
+        config: EgovcpConfig,
+        dataset_stats: Stats | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> None:
+        """A new policy, with the statistics of the dataset if there is one.
+
+        Args:
+            dataset_stats: LeRobot's statistics of the dataset.
+            dataset_meta: the dataset to train on, written by egovcp.
+
+        Raises:
+            DataError: the dataset is not one of egovcp's, or damaged.
+        """
+        super().__init__(config)
+        config.validate_features()
+        self.world_model = WorldModel(config.world_model)
+        self._reader = _reader(dataset_meta)
+        self._targets: Targets | None = None
+        self._provenance = _provenance(self._reader)
+        self._planner: Policy | None = None
+        if self._reader is not None and dataset_stats is not None:
+            state = dataset_stats[spec.STATE_KEY]
+            returns = self._dataset_targets().usable.numpy()
+            set_statistics(
+                self.world_model, np.asarray(state["mean"]), np.asarray(state["std"]), returns
+            )
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        pretrained_name_or_path: str | Path,
+        *,
+        config: EgovcpConfig | None = None,
+        revision: str | None = None,
+        dataset_stats: Stats | None = None,
+        dataset_meta: LeRobotDatasetMetadata | None = None,
+    ) -> Self:
+        """Load and validate an artefact of ``egovcp-train`` or ``lerobot-train``, for evaluation.
+
+        Args:
+            config: replaces the artefact's own, for another planner or other loss weights.
+            dataset_stats: not used: the artefact has its own.
+            dataset_meta: a dataset to train on further.
+
+        Raises:
+            ArtefactError: missing, tampered with, of another spec, not of this ``config``, or
+                of another low-level controller than the dataset.
+            EnvironmentFailure: the Hub cannot be reached.
+        """
+        artefact = load_artefact(str(pretrained_name_or_path), revision or "")
+        if config is None:
+            config = PreTrainedConfig.from_pretrained(artefact.path)
+        policy = cls(config, dataset_meta=dataset_meta)
+        if policy._reader is not None:
+            artefact.require_controller(policy._reader.controller_id)
+        policy._take(artefact)
+        policy.to(config.device)
+        policy.eval()
+        return policy
+
+    def _take(self, artefact: Artefact) -> None:
+        """The weights and, for want of a dataset of its own, the provenance of an artefact."""
+        try:
+            self.world_model.load_state_dict(artefact.world_model.state_dict())
+        except RuntimeError as error:
+            reason = " ".join(str(error).split())[:300]
+            raise ArtefactError(
+                f"{artefact.path}: its weights are not those of --policy.world_model ({reason}); "
+                "leave the sizes as the artefact has them"
+            ) from error
+        older = {k: v for k, v in artefact.manifest.items() if k not in _OWN_KEYS}
+        self._provenance = self._provenance or older
+
+    # --- acting --------------------------------------------------------------------------
+    def reset(self) -> None:
+        """Forget the past of all robots; the next batch may have another size."""
+        self._planner = None
+
+    @torch.no_grad()
+    def select_action(self, batch: dict[str, Tensor]) -> Tensor:
+        """Filter one observation of E robots and plan: the action (E, 7) in [-1, 1] to execute.
+
+        The memory advances with this action, as if it were sent unchanged.
+        """
+        return self.predict_action_chunk(batch)[:, 0]
+
+    @torch.no_grad()
+    def predict_action_chunk(self, batch: dict[str, Tensor]) -> Tensor:
+        """The same, but the whole plan (E, N, 7). One call is one tick of 40 ms.
+
+        Args:
+            batch: ``observation.images.ego_depth`` (E, 1, 48, 64) float mm, 0 = invalid, and
+                ``observation.state`` (E, 74).
+
+        Raises:
+            UsageError: E changed without a `reset`.
+        """
+        depth, state = to_millimetres(batch[spec.DEPTH_KEY]), batch[spec.STATE_KEY]
+        planner = self._planner_for(len(state))
+        step = planner.act(depth.cpu().numpy().astype(np.uint16), state.float().cpu().numpy())
+        planner.advance(step.action)
+        return torch.from_numpy(step.plan).to(state.device)
+
+    def _planner_for(self, robots: int) -> Policy:
+        if self._planner is None:
+            config = self.config
+            self._planner = Policy(self.world_model, config.planner, robots, config.planner_seed)
+        if self._planner.num_envs != robots:
+            raise UsageError(
+                f"the policy follows {self._planner.num_envs} robots and was shown {robots}; call "
+                "reset() first"
+            )
+        return self._planner
+
+    # --- training ------------------------------------------------------------------------
+    def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
+        """Loss of the world model on windows (see `to_batch`), and its terms.
+
+        Raises:
+            UsageError: the policy was made without a dataset.
+            DataError: the dataset is damaged.
+        """
+        rows = to_batch(batch, self._dataset_targets())
+        loss, terms = world_model_loss(self.world_model, rows)
+        return loss, {name.removeprefix("loss/"): float(value) for name, value in terms.items()}
+
+    def get_optim_params(self) -> Iterator[nn.Parameter]:
+        """All parameters, one group."""
+        return self.world_model.parameters()
+
+    def _dataset_targets(self) -> Targets:
+        if self._targets is None:
+            if self._reader is None:
+                raise UsageError(
+                    "an egovcp policy learns from the rewards of a whole dataset: make it with "
+                    "dataset_meta, as lerobot-train does"
+                )
+            self._targets = Targets.of(self._reader, self.config.returns)
+        return self._targets
+
+    # --- saving --------------------------------------------------------------------------
+    def _save_pretrained(
+        self, save_directory: Path, state_dict: dict[str, Tensor] | None = None
+    ) -> None:
+        """Write the artefact; LeRobot adds its processors, and so the manifest is without them.
+
+        Raises:
+            ArtefactError: it is not known which low-level controller the policy drives.
+        """
+        weights = {
+            name.removeprefix(_PREFIX): value
+            for name, value in (state_dict or self.state_dict()).items()
+        }
+        config = draccus.encode(self.config, PreTrainedConfig)
+        write_artefact(Path(save_directory), config, weights, self._provenance, {})
+
+
+def _reader(meta: LeRobotDatasetMetadata | None) -> DatasetReader | None:
+    return None if meta is None else open_reader(Path(meta.root), meta.repo_id)
+
+
+def _provenance(reader: DatasetReader | None) -> dict[str, Any]:
+    """What the manifest says about where the policy comes from; empty without a dataset."""
+    if reader is None:
+        return {}
+    source = reader.source
+    return {
+        "controller_id": reader.controller_id,
+        "datasets": [{"repo_id": source.repo_id, "revision": source.commit}],
+        "command": [Path(sys.argv[0]).name, *sys.argv[1:]],
+    }

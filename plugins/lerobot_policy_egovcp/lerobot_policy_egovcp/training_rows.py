@@ -1,0 +1,137 @@
+"""What the losses need of a LeRobot batch and of the dataset's rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid
+from egovcp.data.source import recorded
+from egovcp.errors import DataError
+from egovcp.model import Batch
+
+_COLUMNS = (spec.REWARD_KEY, spec.DONE_KEY, spec.TRUNCATED_KEY)
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Return and termination targets of every row of a dataset, by LeRobot's row ``index``.
+
+    LeRobot reads no windows of scalar columns, and a return reaches farther than a window;
+    so the targets are computed once, from the whole columns of reward and done.
+    """
+
+    mc_return: Tensor  # (N,)
+    mc_valid: Tensor  # (N,) bool
+    terminal_next: Tensor  # (N,) bool
+
+    @classmethod
+    def of(cls, reader: DatasetReader, config: ReturnConfig) -> Self:
+        """Compute the targets of a dataset.
+
+        Raises:
+            DataError: the dataset is damaged, or its episodes are too short for any return.
+        """
+        parts = [_episode_targets(reader, i, config) for i in range(len(reader))]
+        returns, valid, terminal = (np.concatenate(column) for column in zip(*parts, strict=True))
+        if not valid.any():
+            raise DataError(
+                f"{reader.root}: no row has a complete Monte Carlo return: the episodes (at most "
+                f"{int(reader.lengths.max())} ticks) are not longer than --policy.returns.steps; "
+                "lower it, or collect longer episodes"
+            )
+        return cls(*(torch.from_numpy(x) for x in (returns, valid, terminal)))
+
+    @property
+    def usable(self) -> Tensor:
+        """The returns that are complete, (n,)."""
+        return self.mc_return[self.mc_valid]
+
+    def window(self, index: Tensor, length: int) -> dict[str, Tensor]:
+        """Targets (B, length) of the windows that begin at rows ``index`` (B,).
+
+        Past the dataset's end the last row is repeated.
+        """
+        rows = index.reshape(-1, 1).cpu() + torch.arange(length)
+        rows = rows.clamp_max(len(self.mc_return) - 1)
+        return {name: values[rows].to(index.device) for name, values in vars(self).items()}
+
+
+def _episode_targets(reader: DatasetReader, index: int, config: ReturnConfig) -> tuple[Any, ...]:
+    columns = reader.read_episode_columns(index, _COLUMNS)
+    reward, done, truncated = (columns[name] for name in _COLUMNS)
+    if not np.isfinite(reward).all():
+        raise DataError.at(reader.data_path(index), "a reward is not a number", index)
+    limit = reader.time_limit(index)
+    return (
+        mc_return(reward, config.gamma, config.steps),
+        mc_valid(len(reward), limit, config.steps, config.keep_truncated),
+        is_terminal(done, truncated),
+    )
+
+
+def open_reader(root: Path, repo_id: str) -> DatasetReader:
+    """The dataset that LeRobot has loaded from ``root``.
+
+    Raises:
+        DataError: it was not written by egovcp, or is damaged.
+    """
+    return DatasetReader(recorded(Path(root), repo_id))
+
+
+def to_batch(batch: Mapping[str, Tensor], targets: Targets) -> Batch:
+    """A batch of LeRobot's windows as the losses read it.
+
+    Args:
+        batch: observations (B, T, ...) of rows t .. t + T - 1 and actions (B, T + 1, 7) from
+            row t - 1 on, with LeRobot's ``_is_pad`` masks and the ``index`` (B,) of row t.
+
+    Raises:
+        DataError: the depth is not in millimetres, or of another shape.
+    """
+    state, action = batch[spec.STATE_KEY], batch[spec.ACTION_KEY]
+    size, length = state.shape[:2]
+    valid = ~batch[f"{spec.STATE_KEY}_is_pad"]
+    is_first = torch.zeros_like(valid)
+    is_first[:, 0] = batch[f"{spec.ACTION_KEY}_is_pad"][:, 0]  # nothing comes before it
+    rows = targets.window(batch["index"], length)
+    return Batch(
+        depth=to_millimetres(batch[spec.DEPTH_KEY]),
+        state=state,
+        action=action[:, 1:],
+        prev_action=action[:, :-1].masked_fill(is_first[..., None], 0.0),
+        is_first=is_first,
+        valid=valid,
+        mc_return=rows["mc_return"],
+        mc_valid=rows["mc_valid"] & valid,
+        terminal_next=rows["terminal_next"] & valid,
+        passing=state.new_zeros(size, length, spec.PASSING_DIM),
+    )
+
+
+def to_millimetres(depth: Tensor) -> Tensor:
+    """LeRobot's depth (..., 1, 48, 64), float millimetres -> (..., 48, 64) whole ones, int32.
+
+    Raises:
+        DataError: another shape; or no millimetres.
+    """
+    expected = (1, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+    if tuple(depth.shape[-3:]) != expected:
+        raise DataError(
+            f"{spec.DEPTH_KEY} has shape {tuple(depth.shape)}, expected (..., "
+            f"{', '.join(map(str, expected))})"
+        )
+    whole = depth.squeeze(-3).nan_to_num(0.0, 0.0, 0.0).round()
+    if depth.is_floating_point() and 0 < float(whole.max()) < spec.DEPTH_MIN_M * 1e3:
+        raise DataError(
+            f"{spec.DEPTH_KEY} is at most {float(depth.max()):g}, less than the camera's nearest "
+            f"{spec.DEPTH_MIN_M * 1e3:g} mm: the policy reads millimetres, not metres"
+        )
+    return whole.clamp(0, torch.iinfo(torch.uint16).max).to(torch.int32)

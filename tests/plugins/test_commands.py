@@ -1,0 +1,125 @@
+"""``lerobot-train`` and ``lerobot-eval`` find the plugins, train a policy and play it."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from egovcp.checks import check_artefact
+from lerobot_policy_egovcp import EgovcpPolicy
+
+PLUGINS = sorted((Path(__file__).resolve().parents[2] / "plugins").iterdir())
+
+
+@pytest.fixture(scope="module")
+def surroundings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """An environment in which the plugins' distributions are installed, without a network."""
+    place = tmp_path_factory.mktemp("site")
+    for plugin in PLUGINS:
+        project = tomllib.loads((plugin / "pyproject.toml").read_text())["project"]
+        name, version = project["name"], project["version"]
+        note = place / f"{name}-{version}.dist-info" / "METADATA"
+        note.parent.mkdir()
+        note.write_text(f"Metadata-Version: 2.3\nName: {name}\nVersion: {version}\n")
+    paths = [str(place), *map(str, PLUGINS), os.environ.get("PYTHONPATH", "")]
+    return os.environ | {
+        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
+        "HF_HUB_OFFLINE": "1",
+        "HF_HOME": str(place / "hub"),
+    }
+
+
+def _run(surroundings: dict[str, str], program: str, *options: str) -> str:
+    """The log of ``lerobot-train`` or ``lerobot-eval`` with these options."""
+    start = f"from lerobot.scripts.lerobot_{program} import main; main()"
+    command = [sys.executable, "-c", start, *options]
+    done = subprocess.run(
+        command, env=surroundings, capture_output=True, text=True, timeout=280, check=False
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout + done.stderr
+
+
+def _checkpoint(output: Path, step: int) -> Path:
+    return output / "checkpoints" / f"{step:06d}" / "pretrained_model"
+
+
+@pytest.fixture(scope="module")
+def run(
+    surroundings: dict[str, str], dataset_root: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, str]:
+    """Two steps from scratch: the output folder, and the log."""
+    output = tmp_path_factory.mktemp("lerobot-train") / "run"
+    small = {"hidden": 32, "latent": 8, "units": 32, "channels": "[4,8,8]"}
+    log = _run(
+        surroundings,
+        "train",
+        "--policy.type=egovcp",
+        "--policy.device=cpu",
+        "--policy.push_to_hub=false",
+        "--policy.sequence_length=6",
+        "--policy.returns.steps=4",
+        "--policy.planner.samples=16",
+        "--policy.planner.elites=4",
+        *(f"--policy.world_model.{name}={value}" for name, value in small.items()),
+        "--dataset.repo_id=me/ball",
+        f"--dataset.root={dataset_root}",
+        f"--output_dir={output}",
+        "--steps=2",
+        "--batch_size=4",
+        "--num_workers=0",
+        "--log_freq=1",
+    )
+    return output, log
+
+
+def test_it_trains_a_policy_that_egovcp_and_lerobot_load(run: tuple[Path, str]) -> None:
+    output, log = run
+    assert re.search(r"step:2 .*kl_prior:", log)
+    artefact = check_artefact(str(_checkpoint(output, 2)))
+    assert artefact.controller_id == "stance-test"
+    assert "--policy.type=egovcp" in artefact.manifest["command"]
+    policy = EgovcpPolicy.from_pretrained(_checkpoint(output, 2))
+    assert policy.config.planner == artefact.planner
+    assert policy.config.planner.samples == 16
+
+
+@pytest.mark.slow
+def test_a_run_is_resumed(surroundings: dict[str, str], run: tuple[Path, str]) -> None:
+    output, _ = run
+    options = _checkpoint(output, 2) / "train_config.json"
+    log = _run(surroundings, "train", f"--config_path={options}", "--resume=true", "--steps=3")
+    assert "Resuming data order at epoch 0, sample 8" in log
+    before, after = (
+        check_artefact(str(_checkpoint(output, step))).world_model.state_dict() for step in (2, 3)
+    )
+    assert before.keys() == after.keys()
+    assert any(not before[name].equal(after[name]) for name in before)
+
+
+@pytest.mark.slow
+def test_lerobot_eval_plays_it(
+    surroundings: dict[str, str], run: tuple[Path, str], tmp_path: Path
+) -> None:
+    _run(
+        surroundings,
+        "eval",
+        f"--policy.path={_checkpoint(run[0], 2)}",
+        "--policy.device=cpu",
+        "--env.type=egovcp",
+        "--env.task=ball",
+        "--env.simulation.controller=stance",
+        "--env.simulation.ball_episode.ticks=6",
+        "--env.simulation.ball_episode.event_ticks=[2,3]",
+        "--eval.n_episodes=2",
+        "--eval.batch_size=2",
+        f"--output_dir={tmp_path}",
+    )
+    result = json.loads((tmp_path / "eval_info.json").read_text())
+    assert result["overall"]["n_episodes"] == 2
+    assert len(list(tmp_path.rglob("*.mp4"))) == 2

@@ -1,0 +1,174 @@
+"""LeRobot's windows become the batches that egovcp-train learns from."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lerobot.datasets import LeRobotDataset, LeRobotDatasetMetadata
+from lerobot.datasets.factory import resolve_delta_timestamps
+from lerobot.policies import make_policy
+from torch import Tensor
+
+from egovcp.artefact import load_artefact
+from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
+from egovcp.data.stream import gather
+from egovcp.errors import ArtefactError, DataError, UsageError
+from egovcp.model import Batch
+from egovcp_train.batches import set_normalisation
+from lerobot_policy_egovcp import EgovcpConfig, EgovcpPolicy, make_egovcp_pre_post_processors
+from lerobot_policy_egovcp.training_rows import Targets, open_reader, to_batch
+
+ROWS = [0, 1, 5, 11, 12, 26, 32, 33, 92]  # first, middle and last rows; 24 to 32 end in a fall
+
+
+def _reader(meta: LeRobotDatasetMetadata) -> DatasetReader:
+    return open_reader(Path(meta.root), meta.repo_id)
+
+
+def _store(meta: LeRobotDatasetMetadata, returns: ReturnConfig) -> EpisodeStore:
+    return EpisodeStore.load([_reader(meta)], "all", returns)
+
+
+def _windows(
+    config: EgovcpConfig, meta: LeRobotDatasetMetadata, rows: list[int]
+) -> dict[str, Tensor]:
+    """What lerobot-train hands to the policy."""
+    dataset = LeRobotDataset(
+        meta.repo_id,
+        root=meta.root,
+        delta_timestamps=resolve_delta_timestamps(config, meta),
+        return_uint8=True,
+    )
+    batch = torch.utils.data.default_collate([dataset[row] for row in rows])
+    before, _ = make_egovcp_pre_post_processors(config, meta.stats)
+    prepared: dict[str, Tensor] = before(batch)
+    return prepared
+
+
+@pytest.fixture
+def policy(config: EgovcpConfig, meta: LeRobotDatasetMetadata) -> EgovcpPolicy:
+    return make_policy(config, ds_meta=meta)
+
+
+def test_a_window_of_lerobot_is_a_window_of_the_stream(
+    policy: EgovcpPolicy, config: EgovcpConfig, meta: LeRobotDatasetMetadata
+) -> None:
+    store = _store(meta, config.returns)
+    ends = store.start + store.length
+    episode = np.searchsorted(ends, ROWS, side="right")
+    expected = gather(store, np.array(ROWS), episode, config.sequence_length)
+    found = to_batch(_windows(config, meta, ROWS), Targets.of(_reader(meta), config.returns))
+    valid = expected["valid"]
+    for name in Batch._fields:
+        value = getattr(found, name).numpy()
+        np.testing.assert_array_equal(value[valid], expected[name][valid], err_msg=name)
+        assert value.shape == expected[name].shape
+    for flag in ("valid", "is_first", "mc_valid", "terminal_next"):
+        np.testing.assert_array_equal(getattr(found, flag), expected[flag], err_msg=flag)
+    assert found.terminal_next.any()
+    assert 0 < found.is_first.sum() < len(ROWS)
+
+
+def test_a_new_policy_has_the_statistics_of_the_dataset(
+    policy: EgovcpPolicy, config: EgovcpConfig, meta: LeRobotDatasetMetadata
+) -> None:
+    trained = EgovcpPolicy(config).world_model
+    set_normalisation(trained, _store(meta, config.returns))
+    for name, expected in trained.named_buffers():
+        found = policy.world_model.get_buffer(name)
+        torch.testing.assert_close(found, expected, rtol=1e-4, atol=1e-4, msg=name)
+        assert expected.ne(0).any()
+
+
+def test_the_loss_falls_and_every_part_is_reported(
+    policy: EgovcpPolicy, config: EgovcpConfig, meta: LeRobotDatasetMetadata
+) -> None:
+    batch = _windows(config, meta, ROWS)
+    optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
+    losses = []
+    for _ in range(30):
+        loss, parts = policy.forward(batch)
+        assert loss.item() == pytest.approx(sum(parts.values()), rel=1e-4)
+        assert {"depth", "state", "value", "termination", "kl_prior"} <= parts.keys()
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        losses.append(loss.item())
+    assert np.mean(losses[-5:]) < 0.8 * np.mean(losses[:5])
+
+
+def test_what_is_saved_is_an_artefact(
+    policy: EgovcpPolicy, meta: LeRobotDatasetMetadata, tmp_path: Path
+) -> None:
+    (tmp_path / "notes.md").write_text("mine")
+    policy.save_pretrained(tmp_path)
+    loaded = load_artefact(str(tmp_path))
+    assert loaded.controller_id == "stance-test"
+    assert loaded.manifest["datasets"] == [{"repo_id": "me/ball", "revision": ""}]
+    assert loaded.planner == policy.config.planner
+    for name, value in policy.world_model.state_dict().items():
+        assert torch.equal(loaded.world_model.state_dict()[name], value), name
+    assert (tmp_path / "notes.md").read_text() == "mine"
+
+
+def test_saving_what_was_loaded_keeps_where_it_comes_from(artefact: Path, tmp_path: Path) -> None:
+    EgovcpPolicy.from_pretrained(artefact).save_pretrained(tmp_path)
+    old, new = load_artefact(str(artefact)), load_artefact(str(tmp_path))
+    for key in ("controller_id", "datasets", "heldout", "train_config", "step"):
+        assert new.manifest[key] == old.manifest[key]
+    assert new.world_model.config == old.world_model.config
+
+
+def test_an_artefact_of_egovcp_train_learns_on(
+    artefact: Path, meta: LeRobotDatasetMetadata
+) -> None:
+    policy = EgovcpPolicy.from_pretrained(artefact, dataset_meta=meta)
+    policy.config.sequence_length, policy.config.returns = 6, ReturnConfig(steps=4)
+    statistics = {k: v.clone() for k, v in policy.world_model.named_buffers()}
+    loss, _ = policy.train().forward(_windows(policy.config, meta, ROWS))
+    loss.backward()
+    assert policy.world_model.gru.project.parts[0].weight.grad.abs().max() > 0
+    for name, value in policy.world_model.named_buffers():
+        assert torch.equal(value, statistics[name]), name
+
+
+# --- refusals -----------------------------------------------------------------------------
+def test_a_dataset_that_is_not_ours_is_refused(
+    config: EgovcpConfig, dataset_root: Path, tmp_path: Path
+) -> None:
+    root = Path(shutil.copytree(dataset_root, tmp_path / "foreign"))
+    (root / "meta" / "collection.json").unlink()
+    with pytest.raises(DataError, match=r"collection\.json"):
+        make_policy(config, ds_meta=LeRobotDatasetMetadata("me/foreign", root=root))
+
+
+def test_episodes_shorter_than_the_return_are_refused(
+    config: EgovcpConfig, meta: LeRobotDatasetMetadata
+) -> None:
+    config.returns = ReturnConfig(steps=50)
+    with pytest.raises(DataError, match=r"--policy\.returns\.steps"):
+        make_policy(config, ds_meta=meta)
+
+
+def test_a_policy_without_dataset_neither_learns_nor_says_whom_it_drives(
+    artefact: Path, tmp_path: Path, config: EgovcpConfig, meta: LeRobotDatasetMetadata
+) -> None:
+    make_policy(config, ds_meta=meta)  # fills in the features
+    lonely = EgovcpPolicy(config)
+    with pytest.raises(UsageError, match="dataset_meta"):
+        lonely.forward(_windows(config, meta, [0]))
+    with pytest.raises(ArtefactError, match="controller_id"):
+        lonely.save_pretrained(tmp_path)
+
+
+@pytest.mark.parametrize("options", [{"sequence_length": 1}, {"drop_n_last_frames": -1}])
+def test_senseless_options_are_refused(options: dict[str, int]) -> None:
+    with pytest.raises(UsageError, match="--policy"):
+        EgovcpConfig(device="cpu", **options)
+
+
+def test_normalising_twice_is_refused() -> None:
+    with pytest.raises(UsageError, match="normalises by itself"):
+        EgovcpConfig(device="cpu", normalization_mapping={"STATE": "MEAN_STD"})
