@@ -12,7 +12,6 @@ from egovcp_train.evaluation import evaluate
 from egovcp_train.heldout.episodes import Recorded, recorded, spread
 from egovcp_train.heldout.report import measure, scalars
 from egovcp_train.heldout.table import table
-from egovcp_train.passing import PassingConfig
 
 
 def _group(task: str, seed: int) -> Recorded:
@@ -92,11 +91,11 @@ def test_recorded_episodes_are_whole_and_padded(dataset_root) -> None:
 
     reader = DatasetReader.open(DatasetConfig(root=str(dataset_root)))
     store = EpisodeStore.load([reader], "all", ReturnConfig(steps=5))
-    (group,) = recorded(store, torch.device("cpu"), PassingConfig())
+    (group,) = recorded(store, torch.device("cpu"))
     assert group.task == "ball"
     assert sorted(group.batch.valid.sum(1).tolist()) == [15, *[24] * 7]
     assert group.batch.terminal_next.sum() == 1
     few = EpisodeStore.load([reader], "all", ReturnConfig(steps=5), per_task=3)
     assert few.identities == tuple(store.identities[i] for i in (0, 4, 7))
-    (group,) = recorded(store, torch.device("cpu"), PassingConfig(), per_task=2)
+    (group,) = recorded(store, torch.device("cpu"), per_task=2)
     assert len(group.batch.valid) == 2
