@@ -7,7 +7,7 @@ recorded is checked bit for bit.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp import spec
-from egovcp.data import DatasetReader
-from egovcp.data.index import fingerprint
+from egovcp.data import DatasetReader, Episode
 from egovcp.errors import DataError
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
@@ -109,42 +108,51 @@ def _heading(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
 def true_states(reader: DatasetReader, chosen: Sequence[int], folder: Path) -> Columns:
     """Truth and recorded ``state``, ``action``, ``reward`` (N, width) of episodes, in their order.
 
-    Kept in ``folder``, and read from there the next time.
+    Each episode is kept in ``folder`` as soon as it is known, and read from there the next time.
 
     Raises:
         DataError: an episode does not come out as it was recorded.
     """
-    identities = [reader.identity(index) for index in chosen]
-    lengths = np.array([_LAYOUT, *reader.lengths[list(chosen)]])
-    key = fingerprint(["layout", *identities], lengths)
-    path = folder / f"true_state_{key[:16]}.npz"
-    if not path.is_file():
-        parts = dict(_episodes(reader, chosen))
-        names = parts[chosen[0]]
-        _keep(path, {name: np.concatenate([parts[i][name] for i in chosen]) for name in names})
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = {index: _path(reader, index, folder) for index in chosen}
+    missing = [index for index, path in paths.items() if not path.is_file()]
+    if missing:
+        _simulate(reader, missing, paths)
+    parts = [_kept(path) for path in paths.values()]
+    return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+
+
+def _path(reader: DatasetReader, index: int, folder: Path) -> Path:
+    """Named by what was recorded, so that other choices and datasets find it, too."""
+    digest = reader.digest(index) or reader.read(index).digest()
+    return folder / f"true_state{_LAYOUT}_{digest}.npz"
+
+
+def _kept(path: Path) -> Columns:
     with np.load(path, allow_pickle=False) as kept:
         return {name: kept[name] for name in kept.files}
 
 
 def _keep(path: Path, columns: Columns) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
     new = path.with_suffix(".new.npz")
     np.savez(new, allow_pickle=False, **columns)
     os.replace(new, path)
 
 
-def _episodes(reader: DatasetReader, chosen: Sequence[int]) -> Iterator[tuple[int, Columns]]:
-    """Index and columns of each episode, in the order in which they end."""
+def _simulate(reader: DatasetReader, chosen: Sequence[int], paths: Mapping[int, Path]) -> None:
+    """Keep each of the episodes."""
     watch, different = Watch(), []
     with tqdm(total=len(chosen), unit="ep", desc="simulate again", delay=1) as bar:
         for index, episode in simulated_again(reader, chosen, watch, pictures=False):
-            recorded = reader.read_episode_columns(index, tuple(_RECORDED.values()))
-            found = {name: getattr(episode, name) for name in _RECORDED}
-            if any(found[n].tobytes() != recorded[f].tobytes() for n, f in _RECORDED.items()):
+            truth = watch.take(scenario_of(reader, index))
+            if _agrees(episode, reader.read_episode_columns(index, tuple(_RECORDED.values()))):
+                rows = {"state": episode.state, "action": episode.action}
+                _keep(
+                    paths[index],
+                    {**rows, "reward": episode.reward[:, None], **_remembered(truth)},
+                )
+            else:
                 different.append(index)
-            rows = {"state": found["state"], "action": found["action"]}
-            truth = _remembered(watch.take(scenario_of(reader, index)))
-            yield index, {**rows, "reward": found["reward"][:, None], **truth}
             bar.update(1)
     if different:
         raise DataError(
@@ -152,6 +160,14 @@ def _episodes(reader: DatasetReader, chosen: Sequence[int]) -> Iterator[tuple[in
             f"recorded, the first is {min(different)}; versions: "
             f"{changed_versions(reader, chosen) or 'as recorded, so the code was changed'}"
         )
+
+
+def _agrees(episode: Episode, recorded: Columns) -> bool:
+    """Whether all but the pictures is the same, bit for bit."""
+    return all(
+        getattr(episode, name).tobytes() == recorded[feature].tobytes()
+        for name, feature in _RECORDED.items()
+    )
 
 
 def _remembered(truth: Columns) -> Columns:
