@@ -130,12 +130,12 @@ def _wall(c: Columns) -> NDArray[np.floating]:
 
     def gap(points: NDArray[np.floating]) -> NDArray[np.floating]:
         away = c["object_b"][:, None] - points.reshape(len(points), -1, 3)
-        return np.einsum("npi,ni->np", away, normal)
+        return np.asarray(np.einsum("npi,ni->np", away, normal))
 
     where = [gap(p) for p in (c["hands_b"], _commanded_hands(c), c["camera_b"], 0 * c["camera_b"])]
     speed = (c["velocity_b"] * normal).sum(axis=1, keepdims=True)
-    braced = (c["force"][:, :2] > _BRACE_FORCE).any(axis=1, keepdims=True)
-    leaning = (c["force"][:, 2:] > 0).any(axis=1, keepdims=True)
+    braced = c["force"][:, :2].max(axis=1, keepdims=True) > _BRACE_FORCE
+    leaning = c["force"][:, 2:].max(axis=1, keepdims=True) > 0
     tilt = -c["gravity"][:, 2:]
     return _stack(*where, speed, braced, leaning, braced & ~leaning, tilt)
 
