@@ -80,13 +80,12 @@ def thing_pixels(near: Tensor, place: Tensor, max_m: float) -> Tensor:
     return within(near, place) & at_its_depth & (near > 0)
 
 
-def within(near: Tensor, place: Tensor, times: float = 1.0) -> Tensor:
-    """(N, H, W) bool: pixels within so many times a thing's radius of its middle, see
-    `thing_pixels`."""
+def within(near: Tensor, place: Tensor) -> Tensor:
+    """(N, H, W) bool: the disc in which a thing's pixels are, see `thing_pixels`."""
     rows = torch.arange(near.shape[-2], device=near.device)[:, None]
     cols = torch.arange(near.shape[-1], device=near.device)
     row, column, radius = (place[:, i, None, None] for i in range(3))
-    return (rows - row).square() + (cols - column).square() < (times * radius).square()
+    return (rows - row).square() + (cols - column).square() < radius.square()
 
 
 #: Nearness below which a change is noise at the end of the range, and above which it is the

@@ -119,8 +119,8 @@ def depth_loss(
 def pixel_weights(near: Tensor, batch: Batch, config: LossConfig) -> Tensor:
     """How much each pixel of (B, T, H, W) nearness counts: 1, and more where something moves.
 
-    What flies is weighted in a disc twice its size, so that painting it beside its place is
-    no cheaper than not painting it.
+    What flies is weighted in a disc somewhat larger than itself, so that painting it beside its
+    place is no cheaper than not painting it.
     """
     weight = torch.ones_like(near)
     if config.moving > 0:
@@ -129,7 +129,7 @@ def pixel_weights(near: Tensor, batch: Batch, config: LossConfig) -> Tensor:
     if config.flight > 0:
         place = batch.passing[..., spec.IN_PICTURE]
         flies = place[..., 2] > 0
-        weight[flies] += config.flight * within(near[flies], place[flies], times=2.0)
+        weight[flies] += config.flight * within(near[flies], place[flies])
     return weight
 
 

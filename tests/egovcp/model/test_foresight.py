@@ -59,6 +59,6 @@ def test_what_flies_weighs_more_in_a_disc_around_its_place() -> None:
     near = torch.zeros((1, 3, spec.DEPTH_ROWS, spec.DEPTH_COLS))
     weight = pixel_weights(near, batch, model.config.loss)
     assert weight[0, 1, 20, 30] == 8.0
-    assert weight[0, 1, 20, 33] == 8.0
-    assert weight[0, 1, 20, 35] == 1.0
+    assert weight[0, 1, 20, 31] == 8.0
+    assert weight[0, 1, 20, 33] == 1.0
     assert (weight[0, [0, 2]] == 1.0).all()
