@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import pickle
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -92,3 +94,12 @@ class Backend(Protocol):
     def close(self) -> None:
         """Free what the backend itself holds."""
         ...
+
+
+def portable(error: Exception) -> Exception:
+    """The error, or what it says if it cannot travel between processes."""
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes, made one call before
+    except Exception:  # noqa: BLE001 - an exception class may fail in any way here
+        return RuntimeError("".join(traceback.format_exception_only(error)).strip())
+    return error

@@ -15,9 +15,8 @@ from egovcp.data.encoded import encode
 from egovcp.data.spool import SealedEpisode
 from egovcp.errors import EnvironmentFailure
 from egovcp.sim.scenario import Scenario
-from egovcp_collect.backend import Brief, Report
+from egovcp_collect.backend import Brief, Report, portable
 from egovcp_collect.config import CollectConfig
-from egovcp_collect.local import portable
 from egovcp_collect.simulation import Simulation
 
 _REPORT_EVERY: Final = 1.0  # s; each report is a round trip

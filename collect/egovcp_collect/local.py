@@ -18,7 +18,7 @@ from egovcp.data.encoded import encode
 from egovcp.data.spool import SealedEpisode, Spool
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
-from egovcp_collect.backend import Brief, Report
+from egovcp_collect.backend import Brief, Report, portable
 from egovcp_collect.config import CollectConfig
 from egovcp_collect.simulation import Simulation
 
@@ -148,12 +148,3 @@ class _Sealer:
         while self._pending and (wait or len(self._pending) > _UNSEALED or self._pending[0].done()):
             out.append(self._pending.popleft().result())
         return tuple(out)
-
-
-def portable(error: Exception) -> Exception:
-    """The error, or what it says if it cannot travel between processes."""
-    try:
-        pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes, made one call before
-    except Exception:  # noqa: BLE001 - an exception class may fail in any way here
-        return RuntimeError("".join(traceback.format_exception_only(error)).strip())
-    return error
