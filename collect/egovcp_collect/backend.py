@@ -8,8 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from egovcp.data.encoded import EncodedEpisode
+from egovcp.data import Episode
+from egovcp.data.encoded import EncodedEpisode, encode
 from egovcp.data.spool import SealedEpisode
+from egovcp.errors import DataError
 from egovcp.sim.scenario import Scenario
 
 
@@ -94,6 +96,19 @@ class Backend(Protocol):
     def close(self) -> None:
         """Free what the backend itself holds."""
         ...
+
+
+def encode_numbered(number: int, episode: Episode) -> EncodedEpisode:
+    """Validate and encode an episode of the run.
+
+    Raises:
+        DataError: it is not valid; the error's ``episode`` is ``number``.
+    """
+    try:
+        return encode(episode, f"episode {number}")
+    except DataError as error:
+        error.episode = number
+        raise
 
 
 def portable(error: Exception) -> Exception:

@@ -11,11 +11,10 @@ import os
 from collections.abc import Sequence
 from typing import Any, Final
 
-from egovcp.data.encoded import encode
 from egovcp.data.spool import SealedEpisode
 from egovcp.errors import EnvironmentFailure
 from egovcp.sim.scenario import Scenario
-from egovcp_collect.backend import Brief, Report, portable
+from egovcp_collect.backend import Brief, Report, encode_numbered, portable
 from egovcp_collect.config import CollectConfig
 from egovcp_collect.simulation import Simulation
 
@@ -43,7 +42,7 @@ class RemoteSimulation:
         try:
             self._simulation.add(scenarios)
             progress = self._simulation.advance(_REPORT_EVERY)
-            encoded = [(n, encode(e, f"episode {n}")) for n, e in progress.episodes]
+            encoded = [(n, encode_numbered(n, e)) for n, e in progress.episodes]
         except Exception as error:  # noqa: BLE001 - whatever it is, the collection must hear of it
             return Report(0, failure=portable(error))
         briefs = tuple(Brief.of(number, episode) for number, episode in encoded)

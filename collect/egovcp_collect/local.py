@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Final
 
 from egovcp.data import Episode
-from egovcp.data.encoded import encode
 from egovcp.data.spool import SealedEpisode, Spool
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
-from egovcp_collect.backend import Brief, Report, portable
+from egovcp_collect.backend import Brief, Report, encode_numbered, portable
 from egovcp_collect.config import CollectConfig
 from egovcp_collect.simulation import Simulation
 
@@ -132,7 +131,7 @@ class _Sealer:
         self._pending.append(self._pool.submit(self._put, number, episode))
 
     def _put(self, number: int, episode: Episode) -> Brief:
-        encoded = encode(episode, f"episode {number}")
+        encoded = encode_numbered(number, episode)
         self._spool.put(SealedEpisode.of(number, encoded))
         return Brief.of(number, encoded)
 
