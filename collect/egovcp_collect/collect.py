@@ -65,11 +65,23 @@ def collect(config: CollectConfig, command: str = "") -> None:
         with Progress(config.episodes, already, lambda: _disk_bytes(committer)) as progress:
             try:
                 _collect(config, committer, progress)
-            finally:
-                committer.commit()
+            except BaseException as error:
+                _commit_after(error, committer)
+                raise
+            committer.commit()
         print(_summary(committer, progress))
         if committer.committed < config.episodes:
             raise KeyboardInterrupt
+
+
+def _commit_after(error: BaseException, committer: Committer) -> None:
+    """Commit what is sealed; should that fail, too, the user still hears of ``error``."""
+    try:
+        committer.commit()
+    except Exception as second:  # noqa: BLE001 - whatever it is, it came after, and from, the first
+        words = f"what is sealed could not be committed, --resume will do it: {second}"
+        error.add_note(words)
+        print(f"{PROG}: warning: {words}", file=sys.stderr)
 
 
 def _collect(config: CollectConfig, committer: Committer, progress: Progress) -> None:

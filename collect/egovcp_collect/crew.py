@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Final, Self
@@ -78,9 +79,10 @@ class Crew:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        for post in self._posts:
-            post.worker.kill()
-        self._backend.close()
+        with ExitStack() as stack:  # one that fails to end does not keep the others
+            stack.callback(self._backend.close)
+            for post in self._posts:
+                stack.callback(post.worker.kill)
 
     def poll(self) -> list[Report]:
         """Wait a moment for reports, replace whom it takes, and hand out work.
