@@ -118,7 +118,10 @@ def to_batch(batch: Mapping[str, Tensor], targets: Targets) -> Batch:
 
 
 def mirrored(rows: Batch, which: Tensor) -> Batch:
-    """The batch with the windows ``which`` (B,) bool as the robot would live them in a mirror."""
+    """The batch with the windows ``which`` (B,) bool as the robot would live them in a mirror.
+
+    ``passing`` stays as it is: it holds no labels here (see `to_batch`).
+    """
 
     def swap(value: Tensor, source: NDArray[np.intp], sign: NDArray[np.float32]) -> Tensor:
         other = value[..., torch.from_numpy(source).to(value.device)]
