@@ -22,7 +22,8 @@ FEATURE_SHAPES = {
 
 def _world_model() -> WorldModelConfig:
     """The default without the labels of what is on its way, which take whole episodes to find."""
-    return WorldModelConfig(value_of_passing=False, loss=LossConfig(passing=0.0))
+    loss = LossConfig(passing=0.0, motion=0.0, flight=0.0)
+    return WorldModelConfig(value_of_passing=False, paint_flight=False, loss=loss)
 
 
 def _no_normalisation() -> dict[str, NormalizationMode]:
