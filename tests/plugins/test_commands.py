@@ -46,7 +46,12 @@ def surroundings(hub: FakeHub, tmp_path_factory: pytest.TempPathFactory) -> dict
 
 def _run(surroundings: dict[str, str], program: str, *options: str) -> str:
     """The log of ``lerobot-train`` or ``lerobot-eval`` with these options."""
-    start = f"from lerobot.scripts.lerobot_{program} import main; main()"
+    start = (
+        "from huggingface_hub import RepoCard\n"
+        "RepoCard.validate = lambda self, repo_type=None: None\n"  # it asks the real Hub
+        f"from lerobot.scripts.lerobot_{program} import main\n"
+        "main()"
+    )
     command = [sys.executable, "-c", start, *options]
     done = subprocess.run(
         command, env=surroundings, capture_output=True, text=True, timeout=280, check=False
@@ -106,7 +111,7 @@ def test_what_it_publishes_is_the_artefact(
 ) -> None:
     """LeRobot adds its card, its options and the processors, which the manifest does not seal."""
     output, log = run
-    assert f"Model pushed to {hub.endpoint}/{POLICY}" in log
+    assert re.search(rf"Model pushed to {hub.endpoint}/\S*{POLICY}", log)
     assert hub.store.refs(f"models/{POLICY}").private
     monkeypatch.setenv("HF_TOKEN", TOKEN)
     with in_this_process(hub.endpoint, tmp_path):
