@@ -109,7 +109,7 @@ def test_it_trains_a_policy_that_egovcp_and_lerobot_load(run: tuple[Path, str]) 
 def test_what_it_publishes_is_the_artefact(
     hub: FakeHub, run: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """LeRobot adds its card, its options and the processors, which the manifest does not seal."""
+    """LeRobot adds its options and the processors, which the manifest does not seal."""
     output, log = run
     assert re.search(rf"Model pushed to {hub.endpoint}/\S*{POLICY}", log)
     assert hub.store.refs(f"models/{POLICY}").private
@@ -117,7 +117,7 @@ def test_what_it_publishes_is_the_artefact(
     with in_this_process(hub.endpoint, tmp_path):
         published = check_artefact(POLICY)
         policy = EgovcpPolicy.from_pretrained(POLICY)
-    assert {"README.md", "train_config.json", *PROCESSORS} <= {
+    assert {"train_config.json", *PROCESSORS} <= {
         path.name for path in published.path.iterdir()
     }
     for name, value in load_artefact(str(_checkpoint(output, 2))).world_model.state_dict().items():
