@@ -43,6 +43,7 @@ class Rollout(NamedTuple):
     prior: Gaussian
     near: Tensor  # (B, T, 48, 64)
     state: Tensor  # (B, T, 74) standardised
+    embedding: Tensor  # (B, T, units) of the observation alone
 
 
 def filter_sequence(
@@ -80,6 +81,7 @@ def filter_sequence(
         model.predict(h_seq),
         near.view(size, length, *near.shape[1:]),
         state,
+        embedding,
     )
 
 
@@ -147,13 +149,15 @@ def motion_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
 
     In the image itself a distant ball is 10 of 3072 pixels, here it is the whole target. Asked
     for the future too, the state must hold the path, not only the place, and keep it while
-    the ball is out of the picture.
+    the ball is out of the picture. The encoder is asked as well: through a state that is not
+    yet worth reading it would learn late where to look.
     """
     row, column, radius, depth = batch.passing[..., spec.IN_PICTURE].unbind(-1)
     middle = [(size - 1) / 2 for size in rollout.near.shape[-2:]]
     place = [column / middle[1] - 1, row / middle[0] - 1, 1 - depth / model.config.depth_max_m]
     known = batch.valid & (batch.passing[..., 4] > 0)
     target = torch.stack([*place, radius > 0, known], -1)
+    sight = _motion_loss_at(model.sight(rollout.embedding), target, batch, 0)
     losses = [
         _motion_loss_at(prediction, target, batch, k)
         for prediction, k in zip(
@@ -161,7 +165,7 @@ def motion_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
         )
         if k < target.shape[1]
     ]
-    return torch.stack([target.new_zeros(()), *losses]).sum()
+    return torch.stack([sight, *losses]).sum()
 
 
 def _motion_loss_at(output: Tensor, target: Tensor, batch: Batch, k: int) -> Tensor:

@@ -94,6 +94,7 @@ class WorldModel(nn.Module):
         self.decode_depth = DepthDecoder(sum(state), c.channels[-1])
         self.decode_state = SplitMlp(state, c.units, spec.STATE_DIM)
         self.decode_motion = SplitMlp(state, c.units, 4 * len(c.motion_ahead) + 2)
+        self.decode_sight = nn.Sequential(nn.LayerNorm(c.units), nn.SiLU(), nn.Linear(c.units, 4))
         self.decode_passing = SplitMlp(state, c.units, 4)
         self.termination_head = SplitMlp(state, c.units, 1)
         self.value_head = ValueHead(state, c.value_state, c.units)
@@ -231,6 +232,11 @@ class WorldModel(nn.Module):
         and row of its middle in half pictures from the middle, nearness, log-odds that it does."""
         out: Tensor = self.decode_motion(carry.h, carry.z).float()[..., :-2].contiguous()
         return out.view(*out.shape[:-1], len(self.config.motion_ahead), 4)
+
+    def sight(self, embedding: Tensor) -> Tensor:
+        """What `motion` says of now, (..., 4), from one observation's embedding (..., units)."""
+        out: Tensor = self.decode_sight(embedding).float()
+        return out
 
     def picture(self, carry: Carry) -> Tensor:
         """Nearness (B, 48, 64) of the picture at a state (B, ...); not clamped.
