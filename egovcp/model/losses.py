@@ -32,6 +32,7 @@ class Batch(NamedTuple):
     mc_valid: Tensor  # (B, T) bool
     terminal_next: Tensor  # (B, T) bool: a_t ended the episode in failure
     passing: Tensor  # (B, T, 5), see `egovcp.data.EpisodeStore`
+    reward: Tensor  # (B, T), after a_t
 
 
 class Rollout(NamedTuple):
@@ -123,6 +124,8 @@ def depth_loss(
         moving = moving_pixels(rollout.near, config.moving_threshold)
         moving = moving.masked_fill(batch.is_first[..., None, None], 0.0)[rows]
         error = error * (1.0 + config.moving * moving.flatten(0, 1))
+    if config.near > 0:
+        error = error * near_weight(model, rollout.near[rows].flatten(0, 1))
     return masked_mean(error.mean((-2, -1)), batch.valid[rows].flatten())
 
 
@@ -130,6 +133,13 @@ def moving_pixels(near: Tensor, threshold: float) -> Tensor:
     """(B, T, H, W) nearness -> 1 where a pixel differs from the previous frame, else 0."""
     change = (near[:, 1:] - near[:, :-1]).abs() > threshold
     return F.pad(change, (0, 0, 0, 0, 1, 0)).to(near.dtype)
+
+
+def near_weight(model: WorldModel, near: Tensor) -> Tensor:
+    """(..., H, W) nearness -> the factor of each pixel's error that `loss.near` asks for."""
+    config = model.config.loss
+    close = near > 1.0 - config.near_m / model.config.depth_max_m
+    return 1.0 + config.near * close.to(near.dtype)
 
 
 def motion_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
@@ -192,12 +202,19 @@ def state_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
 def kl_losses(rollout: Rollout, valid: Tensor, config: LossConfig) -> dict[str, Tensor]:
     """The two terms of equation 8, each clipped below at the free nats."""
     q, p = rollout.posterior, rollout.prior
-    to_prior = kl_divergence(q.detach(), p).sum(-1).clamp_min(config.free_nats)
-    to_posterior = kl_divergence(q, p.detach()).sum(-1).clamp_min(config.free_nats)
+    to_prior = _beyond_free(kl_divergence(q.detach(), p), config)
+    to_posterior = _beyond_free(kl_divergence(q, p.detach()), config)
     return {
         "kl_prior": config.kl_prior * masked_mean(to_prior, valid),
         "kl_posterior": config.kl_posterior * masked_mean(to_posterior, valid),
     }
+
+
+def _beyond_free(kl: Tensor, config: LossConfig) -> Tensor:
+    """(..., Z) nats -> (...,), not below the free nats."""
+    if config.free_nats_per == "dimension":
+        return kl.clamp_min(config.free_nats / kl.shape[-1]).sum(-1)
+    return kl.sum(-1).clamp_min(config.free_nats)
 
 
 def value_and_termination_losses(
@@ -207,12 +224,17 @@ def value_and_termination_losses(
 
     The planner asks Q about imagined states, so Q learns on them as well: k steps after
     row t the model has imagined (h_{t+k}, z^_{t+k}) from the recorded actions, and its
-    value is regressed on the return of row t + k.
+    value is regressed on the return of row t + k. The reward, if it is predicted at all,
+    is asked of the same states.
     """
     target = (batch.mc_return - model.return_mean) / model.return_std
     usable = batch.valid & batch.mc_valid
-    error = (model.standardised_value(rollout.carry, batch.action) - target).square()
+    error = model.value_error(rollout.carry, batch.action, target)
     losses = {"value": config.value * masked_mean(error, usable)}
+    predicts_reward = model.reward_head is not None
+    rewards: list[Tensor] = []
+    if predicts_reward:
+        rewards.append(_reward_error(model, rollout.carry, batch, batch.valid))
 
     carry = rollout.carry
     length = batch.valid.shape[1]
@@ -230,12 +252,22 @@ def value_and_termination_losses(
         carry = Carry(carry.h[:, :-1], carry.z[:, :-1])  # (B, T - k): the rows that exist
         if config.imagined_steps and k < length:
             same_episode = _unbroken(batch, k)
-            q = model.standardised_value(carry, batch.action[:, k:])
-            error = (q - target[:, k:]).square()
+            error = model.value_error(carry, batch.action[:, k:], target[:, k:])
             imagined.append(masked_mean(error, usable[:, k:] & same_episode))
+            if predicts_reward:
+                rewards.append(_reward_error(model, carry, batch, same_episode))
     if imagined:
         losses["imagined_value"] = config.imagined_value * torch.stack(imagined).mean()
+    if rewards:
+        losses["reward"] = config.reward * torch.stack(rewards).mean()
     return losses
+
+
+def _reward_error(model: WorldModel, carry: Carry, batch: Batch, mask: Tensor) -> Tensor:
+    """Mean squared error of the reward at the last rows of a window, as many as ``mask`` has."""
+    rows = slice(batch.valid.shape[1] - mask.shape[1], None)
+    target = batch.reward[:, rows] / model.return_std
+    return masked_mean((model.scaled_reward(carry, batch.action[:, rows]) - target).square(), mask)
 
 
 def _unbroken(batch: Batch, k: int) -> Tensor:
