@@ -100,14 +100,14 @@ class WorldModel(nn.Module):
         self.decode_passing = SplitMlp(state, c.units, 4)
         self.termination_head = SplitMlp(state, c.units, 1)
         self.value_head = self._new_value_head()
-        self.passing_value_head = self._new_passing_value_head()
-        others = range(c.q_heads - 1)
-        self.more_value_heads = nn.ModuleList(self._new_value_head() for _ in others)
-        told = others if c.value_of_passing else ()
-        self.more_passing_value_heads = nn.ModuleList(self._new_passing_value_head() for _ in told)
-        self.reward_head = (
-            ValueHead(state, c.value_state, c.units) if c.loss.reward > 0 else None
-        )
+        self.passing_value_head = self._new_passing_value_head() if c.value_of_passing else None
+        self.more_value_heads = nn.ModuleList()
+        self.more_passing_value_heads = nn.ModuleList()
+        for _ in range(c.q_heads - 1):
+            self.more_value_heads.append(self._new_value_head())
+            if c.value_of_passing:
+                self.more_passing_value_heads.append(self._new_passing_value_head())
+        self.reward_head = ValueHead(state, c.value_state, c.units) if c.loss.reward > 0 else None
         self._start_at_zero()
         self.register_buffer("state_mean", torch.zeros(spec.STATE_DIM))
         self.register_buffer("state_std", torch.ones(spec.STATE_DIM))
@@ -120,9 +120,7 @@ class WorldModel(nn.Module):
         outputs = value.width(c.value_loss)
         return ValueHead((c.hidden, c.latent), c.value_state, c.units, outputs)
 
-    def _new_passing_value_head(self) -> SplitMlp | None:
-        if not self.config.value_of_passing:
-            return None
+    def _new_passing_value_head(self) -> SplitMlp:
         units, outputs = self.config.units // 2, value.width(self.config.value_loss)
         return SplitMlp((4, spec.ACTION_DIM), units, outputs, hidden_layers=2)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Literal, Protocol, runtime_checkable
+from typing import Any, Literal, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -19,7 +19,9 @@ Ensemble = Literal["mean", "min"]
 class Draws(Protocol):
     """A model whose next state is uncertain."""
 
-    def imagine_sample(self, carry: object, action: Tensor, generator: torch.Generator) -> object:
+    def imagine_sample(
+        self, carry: Any, action: Tensor, generator: torch.Generator | None = None
+    ) -> Any:
         """Advance by one tick under action (E, M, 7); one noise for all of them."""
         ...
 
@@ -28,7 +30,7 @@ class Draws(Protocol):
 class Doubts(Protocol):
     """A model that judges more than once."""
 
-    def lowest_value(self, carry: object, action: Tensor) -> Tensor:
+    def lowest_value(self, carry: Any, action: Tensor) -> Tensor:
         """The least that it thinks of action (E, M, 7), (E, M)."""
         ...
 
@@ -50,8 +52,7 @@ def step_of[L](
         raise UsageError(
             f"latent=sample: {type(model).__name__} has no imagine_sample; plan with latent=mean"
         )
-    drawn: Callable[[L, Tensor], L] = partial(model.imagine_sample, generator=generator)  # type: ignore[assignment]
-    return drawn
+    return partial(model.imagine_sample, generator=generator)
 
 
 def judge_of[L](
