@@ -34,7 +34,7 @@ from egovcp_train.batches import (
     whole_episodes,
 )
 from egovcp_train.config import TrainConfig
-from egovcp_train.passing import label, label_episode
+from egovcp_train.labels.passing import label, label_episode
 from egovcp_train.return_scale import ReturnScale, on_task_scales, task_scales
 
 EVALUATION_EPISODES = 64  # of each task
@@ -128,6 +128,11 @@ def stream_config(config: TrainConfig) -> StreamConfig:
     )
 
 
+def needs_labels(config: TrainConfig) -> bool:
+    """Whether a loss asks what is on its way."""
+    return config.policy.loss.passing > 0 or config.policy.loss.flight > 0
+
+
 def _decided(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:
     """The options with the mode that auto stands for here, so that a resumed run keeps it."""
     if config.loading.mode != "auto":
@@ -152,8 +157,9 @@ def _in_memory(
         scales = task_scales(learning)
         learning, heldout = (on_task_scales(store, scales) for store in (learning, heldout))
     set_normalisation(model, learning, config.returns.scale != "none")
-    if config.policy.loss.passing:
-        learning, heldout = label(learning, config.passing), label(heldout, config.passing)
+    heldout = label(heldout, config.passing)
+    if needs_labels(config):
+        learning = label(learning, config.passing)
     return learning, SequenceStream(learning, sampling, mix), heldout, scales
 
 
@@ -171,13 +177,13 @@ def _on_disk(
         )
     learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
     heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.returns)
+    heldout = label(heldout, config.passing)
     facts = survey(learning, config.returns, sampling.event_quantile)
     longest = int(learning.length.max())
     scaled = config.returns.scale != "none"
     fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest, scaled)
     labelling = None
-    if config.policy.loss.passing:
-        heldout = label(heldout, config.passing)
+    if needs_labels(config):
         labelling = partial(label_episode, config=config.passing)
     stream = BoundedStream(
         learning,
@@ -199,7 +205,7 @@ def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -
     def batches(first: int) -> Iterator[Batch]:
         part = index.select(chosen[first : first + EPISODES_AT_ONCE])
         store = EpisodeStore.read(part, config.returns)
-        if config.policy.loss.passing:
+        if needs_labels(config):
             store = label(store, config.passing)
         yield from whole_episodes(store, device, config.sampling.mirror)
 

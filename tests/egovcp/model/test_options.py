@@ -21,7 +21,7 @@ from egovcp.model.losses import (
     Rollout,
     filter_sequence,
     kl_losses,
-    near_weight,
+    pixel_weights,
     value_and_termination_losses,
 )
 from egovcp.testing import random_batch, toy_model
@@ -158,10 +158,10 @@ def test_the_reward_is_learned_on_filtered_and_imagined_states() -> None:
 
 # --- losses -----------------------------------------------------------------------------
 def test_near_pixels_count_more_and_only_they() -> None:
-    model = toy_model(_config(loss__near=9.0, loss__near_m=1.5))
-    metres = torch.tensor([[0.5, 1.4, 1.6, 4.0]])
-    near = 1.0 - metres / model.config.depth_max_m
-    assert near_weight(model, near).tolist() == [[10.0, 10.0, 1.0, 1.0]]
+    batch = random_batch(1, 1)
+    near = torch.tensor([[[[0.9, 0.72, 0.68, 0.2]]]])
+    config = LossConfig(near=9.0, near_threshold=0.7, moving=0.0, flight=0.0)
+    assert pixel_weights(near, batch, config).flatten().tolist() == [10.0, 10.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(("per", "expected"), [("step", 4.0), ("dimension", 4.75)])

@@ -21,8 +21,9 @@ from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
 from egovcp_train.heldout.report import Report, measure
 from egovcp_train.heldout.table import table
+from egovcp_train.labels.config import PassingConfig
+from egovcp_train.labels.passing import label
 from egovcp_train.output import require_writable
-from egovcp_train.passing import PassingConfig, label
 from egovcp_train.return_scale import ReturnScale, on_task_scales
 
 PROG: Final = "egovcp-eval-model"
@@ -88,7 +89,7 @@ def evaluate(config: HeldoutConfig) -> None:
     if returns.scale == "per_task":
         store = on_task_scales(store, _return_scales(artefact))
     model = artefact.world_model.to(device)
-    report = measure(model, recorded(store, device, passing), config.stride)
+    report = measure(model, recorded(store, device), config.stride)
     print(table(report.tasks))
     _write(output, report, _run(config, artefact, reader), config.pictures)
     print(f"figures: {output / RESULT}")
