@@ -19,6 +19,8 @@ TRAINING: Final[Mapping[str, tuple[str, ...]]] = {
     "pixels_summed": (f"--policy.loss.depth={_PIXELS}",),
     "state_summed": (f"--policy.loss.state={spec.STATE_DIM}",),
     "no_moving": ("--policy.loss.moving=0",),
+    "no_flight": ("--policy.loss.flight=0",),
+    "no_foresight": ("--policy.loss.foresight_depth=0", "--policy.loss.foresight_state=0"),
     "near": ("--policy.loss.near=10",),
     "no_motion": ("--policy.loss.motion=0",),
     "raw_returns": ("--returns.scale=none",),
