@@ -32,7 +32,8 @@ class LossConfig:
     near_threshold: float = 0.7
     """Nearness (1 at the camera, 0 at the end of the depth range) beyond which a pixel is near."""
     motion: float = 10.0
-    """Weight of the place of what approaches, mean squared error in half images; 0: none."""
+    """Weight of the place in the picture of what flies, where labels tell, Huber loss in half
+    pictures; 0: none."""
     passing: float = 3.0
     """Weight of where and when something thrown will pass, Huber loss in units of
     `PASSING_UNIT`; 0: none."""
@@ -82,7 +83,11 @@ class WorldModelConfig:
     channels: tuple[int, int, int] = (32, 64, 64)
     """Channels of the three layers of the depth CNN; the decoder uses the last."""
     motion_ahead: tuple[int, ...] = (0, 3, 6, 9)
-    """Ticks ahead at which the place of what approaches is predicted straight from the state."""
+    """Ticks ahead at which the place of what flies is predicted straight from the state; the first
+    is 0, now."""
+    paint_flight: bool = True
+    """What flies is painted as a disc where the state says that it is (`loss.motion` teaches it),
+    over the picture that the decoder paints."""
     value_state: int = 8
     """Numbers to which (h, z) is reduced for Q; 0: Q reads all of it."""
     value_of_passing: bool = True
@@ -109,6 +114,16 @@ class WorldModelConfig:
             )
         if self.q_heads < 1:
             raise UsageError(f"q_heads is {self.q_heads}; expected at least 1")
+        if self.paint_flight and self.loss.motion <= 0:
+            raise UsageError(
+                "paint_flight needs loss.motion above 0: nothing else teaches the place of what "
+                "flies; set --policy.paint_flight=false, or a weight"
+            )
+        if self.paint_flight and self.motion_ahead[:1] != (0,):
+            raise UsageError(
+                f"motion_ahead {list(self.motion_ahead)}: with paint_flight the first must be 0, "
+                "the place that is painted; put it there, or set --policy.paint_flight=false"
+            )
 
 
 #: The paper's plain sum: likelihoods summed over pixels and joints, unit variances, nothing added.
@@ -129,6 +144,8 @@ PAPER_LOSS = LossConfig(
 
 PRESETS = {
     "default": WorldModelConfig(),
-    "paper": WorldModelConfig(value_state=0, value_of_passing=False, loss=PAPER_LOSS),
+    "paper": WorldModelConfig(
+        value_state=0, value_of_passing=False, paint_flight=False, loss=PAPER_LOSS
+    ),
     "debug": WorldModelConfig(hidden=32, latent=8, units=32, channels=(4, 8, 8)),
 }

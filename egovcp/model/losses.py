@@ -15,7 +15,7 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.model.config import LossConfig
-from egovcp.model.depth import approaching, highest_3x3, lowest_3x3, nearness, within
+from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, within
 from egovcp.model.gaussian import Gaussian, kl_divergence
 from egovcp.model.world_model import PASSING_UNIT, Carry, WorldModel
 
@@ -111,7 +111,7 @@ def depth_loss(
     every = min(every, valid.shape[1])
     first = int(torch.randint(every, (), generator=generator, device=valid.device))
     rows = (slice(None), slice(first, None, every))
-    image = model.decode_depth(rollout.carry.features[rows].flatten(0, 1)).float()
+    image = model.picture(rollout.carry.rows(rows).flat())
     error = 0.5 * (image - rollout.near[rows].flatten(0, 1)).square()
     error = error * weight[rows].flatten(0, 1)
     return masked_mean(error.mean((-2, -1)), valid[rows].flatten())
@@ -146,38 +146,45 @@ def moving_pixels(near: Tensor, threshold: float) -> Tensor:
 
 
 def motion_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
-    """Where something approaches, now and some ticks ahead, and whether it is seen at all.
+    """Where in the picture something flies, now and some ticks ahead, and whether anything does.
 
-    A summary of the image that a ball dominates: in the image itself a distant ball is 10
-    of 3072 pixels, here it is the whole target. Asked for the future too, the state must
-    hold the path, not only the place, and keep it while the ball is out of the picture.
+    In the image itself a distant ball is 10 of 3072 pixels, here it is the whole target. Asked
+    for the future too, the state must hold the path, not only the place, and keep it while
+    the ball is out of the picture.
     """
-    centre, seen = approaching(rollout.near)
-    seen = seen & ~batch.is_first  # the image before belongs to another episode
-    ahead = model.config.motion_ahead
-    output = model.decode_motion(rollout.carry.h, rollout.carry.z).float()
-    predictions = output.unflatten(-1, (len(ahead), 4)).unbind(-2)
+    row, column, radius, depth = batch.passing[..., spec.IN_PICTURE].unbind(-1)
+    middle = [(size - 1) / 2 for size in rollout.near.shape[-2:]]
+    place = [column / middle[1] - 1, row / middle[0] - 1, 1 - depth / model.config.depth_max_m]
+    known = batch.valid & (batch.passing[..., 4] > 0)
+    target = torch.stack([*place, radius > 0, known], -1)
     losses = [
-        _motion_loss_at(prediction, centre, seen, batch, k)
-        for prediction, k in zip(predictions, ahead, strict=True)
-        if k < seen.shape[1]
+        _motion_loss_at(prediction, target, batch, k)
+        for prediction, k in zip(
+            model.motion(rollout.carry).unbind(-2), model.config.motion_ahead, strict=True
+        )
+        if k < target.shape[1]
     ]
-    return torch.stack([output.new_zeros(()), *losses]).sum()
+    return torch.stack([target.new_zeros(()), *losses]).sum()
 
 
-def _motion_loss_at(output: Tensor, centre: Tensor, seen: Tensor, batch: Batch, k: int) -> Tensor:
-    """Squared error of the place ``k`` ticks ahead, and cross entropy of its being seen."""
-    length = seen.shape[1]
-    output, centre, seen = output[:, : length - k], centre[:, k:], seen[:, k:]
-    known = unbroken(batch, k)
-    place = masked_mean((output[..., :3] - centre).square().sum(-1), known & seen)
-    presence = F.binary_cross_entropy_with_logits(
-        output[..., 3], seen.to(output.dtype), reduction="none"
+def _motion_loss_at(output: Tensor, target: Tensor, batch: Batch, k: int) -> Tensor:
+    """Error of the place ``k`` ticks ahead, and cross entropy of there being any.
+
+    Args:
+        output: (B, T, 4).
+        target: (B, T, 5) column and row in half pictures, nearness, whether, whether known.
+        batch: what was recorded.
+        k: ticks.
+    """
+    output, target = output[:, : target.shape[1] - k], target[:, k:]
+    flies = target[..., 3]
+    known = unbroken(batch, k) & (target[..., 4] > 0)
+    # Linear beyond a few pixels: else what is far off says everything and a pixel nothing.
+    place = (
+        F.huber_loss(output[..., :3], target[..., :3], reduction="none", delta=0.1).sum(-1) / 0.1
     )
-    judged = known & ~batch.is_first[:, k:]
-    if k == 0:
-        judged[:, 0] = False  # no previous image in the window
-    return place + 0.1 * masked_mean(presence, judged)
+    presence = F.binary_cross_entropy_with_logits(output[..., 3], flies, reduction="none")
+    return masked_mean(place, known & (flies > 0)) + 0.1 * masked_mean(presence, known)
 
 
 def passing_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:

@@ -130,7 +130,8 @@ def stream_config(config: TrainConfig) -> StreamConfig:
 
 def needs_labels(config: TrainConfig) -> bool:
     """Whether a loss asks what is on its way."""
-    return config.policy.loss.passing > 0 or config.policy.loss.flight > 0
+    loss = config.policy.loss
+    return max(loss.passing, loss.flight, loss.motion) > 0
 
 
 def _decided(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:

@@ -81,9 +81,9 @@ def evaluate(config: HeldoutConfig) -> None:
     device = choose_device(config.device)
     artefact = load_artefact(config.policy.path, config.policy.revision)
     reader = DatasetReader.open(config.dataset)
-    _require_same_controller(artefact, reader)
-    passing = _trained_with(artefact, "passing", PassingConfig)
-    returns = _trained_with(artefact, "returns", ReturnConfig)
+    require_same_controller(artefact, reader)
+    passing = trained_with(artefact, "passing", PassingConfig)
+    returns = trained_with(artefact, "returns", ReturnConfig)
     limit = config.episodes or None
     store = label(EpisodeStore.load([reader], config.split, returns, per_task=limit), passing)
     if returns.scale == "per_task":
@@ -108,7 +108,7 @@ def _check(config: HeldoutConfig) -> Path:
     return output
 
 
-def _require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
+def require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
     """Raise `ArtefactError` where the data's actions were given to another controller."""
     if artefact.controller_id != reader.controller_id:
         raise ArtefactError(
@@ -119,7 +119,7 @@ def _require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
         )
 
 
-def _trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
+def trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
     """The options of the training under ``name``; the defaults where the manifest has none.
 
     Raises:
