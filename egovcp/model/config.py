@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from egovcp import spec
 from egovcp.errors import UsageError
+
+ValueLoss = Literal["mse", "two_hot"]
+FreeNatsPer = Literal["step", "dimension"]
 
 
 @dataclass(frozen=True)
@@ -23,6 +27,10 @@ class LossConfig:
     """Extra weight of the pixels around a thing in flight, where labels tell; 0: none."""
     moving_threshold: float = 0.04
     """Change of nearness (fraction of the depth range) that counts as moving."""
+    near: float = 0.0
+    """Extra weight of near pixels; 0: none."""
+    near_threshold: float = 0.7
+    """Nearness (1 at the camera, 0 at the end of the depth range) beyond which a pixel is near."""
     motion: float = 10.0
     """Weight of the place in the picture of what flies, where labels tell, Huber loss in half
     pictures; 0: none."""
@@ -37,10 +45,14 @@ class LossConfig:
     """Weight of KL(q || sg p), which pulls the posterior to the prior."""
     free_nats: float = 1.0
     """KL below this many nats per step costs nothing."""
+    free_nats_per: FreeNatsPer = "step"
+    """step: the free nats are for the sum over z, however it is spread; dimension: each dimension
+    of z has an equal share of them to itself."""
     termination: float = 1.0
     """Weight of the termination cross entropy."""
     value: float = 1.0
-    """Weight of (Q - Monte Carlo return)^2, in units of the return's standard deviation."""
+    """Weight of (Q - Monte Carlo return)^2, in units of the return's standard deviation (see
+    `value_loss`)."""
     imagined_steps: int = 1
     """Also regress Q on states imagined this many steps ahead of the posterior; 0: never."""
     imagined_value: float = 1.0
@@ -53,6 +65,9 @@ class LossConfig:
     """Ticks ahead at which they are compared with what was recorded."""
     foresight_every: int = 4
     """Imagine from every n-th row of a window only, the first one drawn at random."""
+    reward: float = 0.0
+    """Weight of the reward predicted from (h, z, a), mean squared error in units of the return's
+    standard deviation, on the states that Q is trained on; 0: there is no such head."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +92,11 @@ class WorldModelConfig:
     """Numbers to which (h, z) is reduced for Q; 0: Q reads all of it."""
     value_of_passing: bool = True
     """Q is told what is on its way (`loss.passing` teaches it) by a head of its own."""
+    value_loss: ValueLoss = "mse"
+    """mse: Q is a number, fitted by its squared error; two_hot: a distribution over bins of
+    symlog returns, fitted by cross entropy, whose mean is the number."""
+    q_heads: int = 1
+    """Heads of Q that differ in their start; Q is their mean unless the planner wants the least."""
     min_std: float = 0.1
     """Floor of the latent standard deviation."""
     update_bias: float = -1.0
@@ -92,6 +112,8 @@ class WorldModelConfig:
                 "value_of_passing needs loss.passing above 0: nothing else teaches Q what is on "
                 "its way; set --policy.value_of_passing=false, or a weight"
             )
+        if self.q_heads < 1:
+            raise UsageError(f"q_heads is {self.q_heads}; expected at least 1")
         if self.paint_flight and self.loss.motion <= 0:
             raise UsageError(
                 "paint_flight needs loss.motion above 0: nothing else teaches the place of what "

@@ -33,6 +33,7 @@ class Batch(NamedTuple):
     mc_valid: Tensor  # (B, T) bool
     terminal_next: Tensor  # (B, T) bool: a_t ended the episode in failure
     passing: Tensor  # (B, T, 9), see `egovcp.data.EpisodeStore`
+    reward: Tensor  # (B, T), after a_t
 
 
 class Rollout(NamedTuple):
@@ -128,6 +129,8 @@ def pixel_weights(near: Tensor, batch: Batch, config: LossConfig) -> Tensor:
     if config.moving > 0:
         moving = moving_pixels(near, config.moving_threshold)
         weight += config.moving * moving.masked_fill(batch.is_first[..., None, None], 0.0)
+    if config.near > 0:
+        weight += config.near * (near > config.near_threshold)
     if config.flight > 0:
         place = batch.passing[..., spec.IN_PICTURE]
         flies = place[..., 2] > 0
@@ -213,12 +216,19 @@ def state_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
 def kl_losses(rollout: Rollout, valid: Tensor, config: LossConfig) -> dict[str, Tensor]:
     """The two terms of equation 8, each clipped below at the free nats."""
     q, p = rollout.posterior, rollout.prior
-    to_prior = kl_divergence(q.detach(), p).sum(-1).clamp_min(config.free_nats)
-    to_posterior = kl_divergence(q, p.detach()).sum(-1).clamp_min(config.free_nats)
+    to_prior = _beyond_free(kl_divergence(q.detach(), p), config)
+    to_posterior = _beyond_free(kl_divergence(q, p.detach()), config)
     return {
         "kl_prior": config.kl_prior * masked_mean(to_prior, valid),
         "kl_posterior": config.kl_posterior * masked_mean(to_posterior, valid),
     }
+
+
+def _beyond_free(kl: Tensor, config: LossConfig) -> Tensor:
+    """(..., Z) nats -> (...,), not below the free nats."""
+    if config.free_nats_per == "dimension":
+        return kl.clamp_min(config.free_nats / kl.shape[-1]).sum(-1)
+    return kl.sum(-1).clamp_min(config.free_nats)
 
 
 def value_and_termination_losses(
@@ -228,12 +238,17 @@ def value_and_termination_losses(
 
     The planner asks Q about imagined states, so Q learns on them as well: k steps after
     row t the model has imagined (h_{t+k}, z^_{t+k}) from the recorded actions, and its
-    value is regressed on the return of row t + k.
+    value is regressed on the return of row t + k. The reward, if it is predicted at all,
+    is asked of the same states.
     """
     target = (batch.mc_return - model.return_mean) / model.return_std
     usable = batch.valid & batch.mc_valid
-    error = (model.standardised_value(rollout.carry, batch.action) - target).square()
+    error = model.value_error(rollout.carry, batch.action, target)
     losses = {"value": config.value * masked_mean(error, usable)}
+    predicts_reward = model.reward_head is not None
+    rewards: list[Tensor] = []
+    if predicts_reward:
+        rewards.append(_reward_error(model, rollout.carry, batch, batch.valid))
 
     carry = rollout.carry
     length = batch.valid.shape[1]
@@ -251,12 +266,22 @@ def value_and_termination_losses(
         carry = Carry(carry.h[:, :-1], carry.z[:, :-1])  # (B, T - k): the rows that exist
         if config.imagined_steps and k < length:
             same_episode = unbroken(batch, k)
-            q = model.standardised_value(carry, batch.action[:, k:])
-            error = (q - target[:, k:]).square()
+            error = model.value_error(carry, batch.action[:, k:], target[:, k:])
             imagined.append(masked_mean(error, usable[:, k:] & same_episode))
+            if predicts_reward:
+                rewards.append(_reward_error(model, carry, batch, same_episode))
     if imagined:
         losses["imagined_value"] = config.imagined_value * torch.stack(imagined).mean()
+    if rewards:
+        losses["reward"] = config.reward * torch.stack(rewards).mean()
     return losses
+
+
+def _reward_error(model: WorldModel, carry: Carry, batch: Batch, mask: Tensor) -> Tensor:
+    """Mean squared error of the reward at the last rows of a window, as many as ``mask`` has."""
+    rows = slice(batch.valid.shape[1] - mask.shape[1], None)
+    target = batch.reward[:, rows] / model.return_std
+    return masked_mean((model.scaled_reward(carry, batch.action[:, rows]) - target).square(), mask)
 
 
 def unbroken(batch: Batch, k: int) -> Tensor:

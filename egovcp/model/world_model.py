@@ -22,6 +22,8 @@ import torch
 from torch import Tensor, nn
 
 from egovcp import spec
+from egovcp.errors import UsageError
+from egovcp.model import value
 from egovcp.model.config import WorldModelConfig
 from egovcp.model.depth import nearness, network_image, paint_disc, to_metres
 from egovcp.model.gaussian import Gaussian
@@ -70,6 +72,15 @@ class PosteriorHead(nn.Module):
         return logits
 
 
+class QHead(NamedTuple):
+    """The parts of one head of Q, whose outputs add up."""
+
+    state: ValueHead
+    """Reads (h, z) and the action."""
+    passing: SplitMlp | None
+    """Reads what is on its way and the action."""
+
+
 class WorldModel(nn.Module):
     """Networks, normalisation and the recurrence; the losses are in `egovcp.model.losses`."""
 
@@ -97,12 +108,15 @@ class WorldModel(nn.Module):
         self.decode_sight = nn.Sequential(nn.LayerNorm(c.units), nn.SiLU(), nn.Linear(c.units, 4))
         self.decode_passing = SplitMlp(state, c.units, 4)
         self.termination_head = SplitMlp(state, c.units, 1)
-        self.value_head = ValueHead(state, c.value_state, c.units)
-        self.passing_value_head = (
-            SplitMlp((4, spec.ACTION_DIM), c.units // 2, 1, hidden_layers=2)
-            if c.value_of_passing
-            else None
-        )
+        self.value_head = self._new_value_head()
+        self.passing_value_head = self._new_passing_value_head() if c.value_of_passing else None
+        self.more_value_heads = nn.ModuleList()
+        self.more_passing_value_heads = nn.ModuleList()
+        for _ in range(c.q_heads - 1):
+            self.more_value_heads.append(self._new_value_head())
+            if c.value_of_passing:
+                self.more_passing_value_heads.append(self._new_passing_value_head())
+        self.reward_head = ValueHead(state, c.value_state, c.units) if c.loss.reward > 0 else None
         self._start_at_zero()
         self.register_buffer("state_mean", torch.zeros(spec.STATE_DIM))
         self.register_buffer("state_std", torch.ones(spec.STATE_DIM))
@@ -110,9 +124,19 @@ class WorldModel(nn.Module):
         self.register_buffer("return_std", torch.ones(()))
         self.register_buffer("return_floor", torch.zeros(()))
 
+    def _new_value_head(self) -> ValueHead:
+        c = self.config
+        outputs = value.width(c.value_loss)
+        return ValueHead((c.hidden, c.latent), c.value_state, c.units, outputs)
+
+    def _new_passing_value_head(self) -> SplitMlp:
+        units, outputs = self.config.units // 2, value.width(self.config.value_loss)
+        return SplitMlp((4, spec.ACTION_DIM), units, outputs, hidden_layers=2)
+
     def _start_at_zero(self) -> None:
         """Value and termination start as constants, so that early plans are not random."""
-        for head in (self.value_head, self.passing_value_head, self.termination_head):
+        self.termination_head.start_at_zero()
+        for head in (*(part for q in self.q_heads for part in q), self.reward_head):
             if head is not None:
                 head.start_at_zero()
 
@@ -185,6 +209,17 @@ class WorldModel(nn.Module):
         h = self.transition(carry, action)
         return Carry(h, self.predict(h).mean)
 
+    def imagine_sample(
+        self, carry: Carry, action: Tensor, generator: torch.Generator | None = None
+    ) -> Carry:
+        """The same, but z is drawn from the prior, with one noise (latent,) for all rows: what
+        differs between two candidates is what they do, not their luck."""
+        h = self.transition(carry, action)
+        prior = self.predict(h)
+        size = (self.config.latent,)
+        noise = torch.randn(size, generator=generator, device=prior.mean.device)
+        return Carry(h, prior.mean + prior.std * noise)
+
     @staticmethod
     def spread(carry: Carry) -> Carry:
         """(E, ...) -> (E, 1, ...): one state that broadcasts over candidate actions."""
@@ -202,10 +237,60 @@ class WorldModel(nn.Module):
         of the state adds. The first part sees little else than the action: a regression on
         the whole state predicts the return better and ranks actions worse (`docs/log.md`).
         """
-        q: Tensor = self.value_head(carry.h, carry.z, action)
-        if self.passing_value_head is not None:
-            q = q + self.passing_value_head(self.passing(carry), action)
-        return q.squeeze(-1).float()
+        return self._all_values(carry, action).mean(0)
+
+    def lowest_value(self, carry: Carry, action: Tensor) -> Tensor:
+        """What the most doubtful of the heads of Q says, in units of return, (...,)."""
+        q = self._all_values(carry, action).amin(0)
+        return q * self.return_std + self.return_mean
+
+    def value_error(self, carry: Carry, action: Tensor, target: Tensor) -> Tensor:
+        """Loss of Q beside the standardised return (...,), mean over the heads, (...,)."""
+        kind = self.config.value_loss
+        outputs = self._value_outputs(carry, action)
+        return torch.stack([value.error(q, target, kind) for q in outputs]).mean(0)
+
+    @property
+    def q_heads(self) -> list[QHead]:
+        """The heads of Q; the first one alone unless `q_heads` asks for more."""
+        state = (self.value_head, *self.more_value_heads)
+        passing = (self.passing_value_head, *self.more_passing_value_heads)
+        if self.passing_value_head is None:
+            passing = (None,) * len(state)
+        return [QHead(*parts) for parts in zip(state, passing, strict=True)]
+
+    def _all_values(self, carry: Carry, action: Tensor) -> Tensor:
+        """Of each head, in units of the return's deviation from its mean, (heads, ...)."""
+        outputs = self._value_outputs(carry, action)
+        return torch.stack([value.read(q, self.config.value_loss) for q in outputs])
+
+    def _value_outputs(self, carry: Carry, action: Tensor) -> list[Tensor]:
+        """Of each head, (..., width of `egovcp.model.value`)."""
+        told = None if self.passing_value_head is None else self.passing(carry)
+        outputs = []
+        for head in self.q_heads:
+            q: Tensor = head.state(carry.h, carry.z, action)
+            if head.passing is not None:
+                q = q + head.passing(told, action)
+            outputs.append(q)
+        return outputs
+
+    def reward(self, carry: Carry, action: Tensor) -> Tensor:
+        """The reward that a (..., 7) earns at this state, in units of reward, (...,).
+
+        Raises:
+            UsageError: the model was trained without ``loss.reward``.
+        """
+        return self.scaled_reward(carry, action) * self.return_std
+
+    def scaled_reward(self, carry: Carry, action: Tensor) -> Tensor:
+        """The same in units of the return's deviation; zero stays zero."""
+        if self.reward_head is None:
+            raise UsageError(
+                "this world model predicts no rewards; train it with --policy.loss.reward=1"
+            )
+        r: Tensor = self.reward_head(carry.h, carry.z, action)
+        return r.squeeze(-1).float()
 
     def passing(self, carry: Carry) -> Tensor:
         """Is something on its way, and if so where and when will it pass, (..., 4).

@@ -73,7 +73,11 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
             state = dataset_stats[spec.STATE_KEY]
             returns = self._dataset_targets().usable.numpy()
             set_statistics(
-                self.world_model, np.asarray(state["mean"]), np.asarray(state["std"]), returns
+                self.world_model,
+                np.asarray(state["mean"]),
+                np.asarray(state["std"]),
+                returns,
+                scaled=config.returns.scale != "none",
             )
 
     @classmethod

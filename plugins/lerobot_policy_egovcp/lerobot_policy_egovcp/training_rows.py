@@ -23,7 +23,7 @@ _COLUMNS = (spec.REWARD_KEY, spec.DONE_KEY, spec.TRUNCATED_KEY)
 
 @dataclass(frozen=True)
 class Targets:
-    """Return and termination targets of every row of a dataset, by LeRobot's row ``index``.
+    """Reward, return and termination of every row of a dataset, by LeRobot's row ``index``.
 
     LeRobot reads no windows of scalar columns, and a return reaches farther than a window;
     so the targets are computed once, from the whole columns of reward and done.
@@ -32,6 +32,7 @@ class Targets:
     mc_return: Tensor  # (N,)
     mc_valid: Tensor  # (N,) bool
     terminal_next: Tensor  # (N,) bool
+    reward: Tensor  # (N,)
 
     @classmethod
     def of(cls, reader: DatasetReader, config: ReturnConfig) -> Self:
@@ -75,6 +76,7 @@ def _episode_targets(reader: DatasetReader, index: int, config: ReturnConfig) ->
         mc_return(reward, config.gamma, config.steps),
         mc_valid(len(reward), limit, config.steps, config.keep_truncated),
         is_terminal(done, truncated),
+        reward,
     )
 
 
@@ -114,6 +116,7 @@ def to_batch(batch: Mapping[str, Tensor], targets: Targets) -> Batch:
         mc_valid=rows["mc_valid"] & valid,
         terminal_next=rows["terminal_next"] & valid,
         passing=state.new_zeros(size, length, spec.PASSING_DIM),
+        reward=rows["reward"],
     )
 
 

@@ -131,9 +131,9 @@ class _Recorder(CountingModel):
         self.values: list[tuple[Carry, Tensor]] = []
         self.terminations: list[Carry] = []
 
-    def standardised_value(self, carry: Carry, action: Tensor) -> Tensor:
+    def value_error(self, carry: Carry, action: Tensor, target: Tensor) -> Tensor:
         self.values.append((carry, action))
-        return carry.h[..., 0]
+        return (carry.h[..., 0] - target).square()
 
     def termination_logit(self, carry: Carry) -> Tensor:
         self.terminations.append(carry)

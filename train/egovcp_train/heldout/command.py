@@ -24,6 +24,7 @@ from egovcp_train.heldout.table import table
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.labels.passing import label
 from egovcp_train.output import require_writable
+from egovcp_train.return_scale import ReturnScale, on_task_scales
 
 PROG: Final = "egovcp-eval-model"
 RESULT: Final = "heldout.json"
@@ -85,6 +86,8 @@ def evaluate(config: HeldoutConfig) -> None:
     returns = trained_with(artefact, "returns", ReturnConfig)
     limit = config.episodes or None
     store = label(EpisodeStore.load([reader], config.split, returns, per_task=limit), passing)
+    if returns.scale == "per_task":
+        store = on_task_scales(store, _return_scales(artefact))
     model = artefact.world_model.to(device)
     report = measure(model, recorded(store, device), config.stride)
     print(table(report.tasks))
@@ -131,6 +134,21 @@ def trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
             f"({' '.join(str(error).split())}); train again with this version"
         ) from error
     return found
+
+
+def _return_scales(artefact: Artefact) -> dict[str, ReturnScale]:
+    """The scales of the training.
+
+    Raises:
+        ArtefactError: they cannot be read.
+    """
+    try:
+        return {k: ReturnScale(*v) for k, v in artefact.manifest["return_scales"].items()}
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ArtefactError(
+            f"{artefact.path}: its manifest does not say on which scale each task's returns were "
+            "(return_scales); train again with this version"
+        ) from error
 
 
 def _run(config: HeldoutConfig, artefact: Artefact, reader: DatasetReader) -> dict[str, Any]:
