@@ -24,7 +24,8 @@ class LossConfig:
     moving: float = 10.0
     """Extra weight of pixels that changed since the previous frame; 0: none."""
     flight: float = 300.0
-    """Extra weight of the pixels around a thing in flight, where labels tell; 0: none."""
+    """Extra weight of the pixels around a thing in flight, where labels tell, if it is not painted
+    (`paint_flight`); 0: none."""
     moving_threshold: float = 0.04
     """Change of nearness (fraction of the depth range) that counts as moving."""
     near: float = 0.0
@@ -61,6 +62,8 @@ class LossConfig:
     """Weight of the pictures of states imagined several ticks ahead; 0: none."""
     foresight_state: float = 1.0
     """Weight of the proprioception of states imagined several ticks ahead; 0: none."""
+    foresight_motion: float = 10.0
+    """Weight of the place of what flies in states imagined several ticks ahead; 0: none."""
     foresight_ahead: tuple[int, ...] = (4, 8, 12)
     """Ticks ahead at which they are compared with what was recorded."""
     foresight_every: int = 4
@@ -140,6 +143,7 @@ PAPER_LOSS = LossConfig(
     imagined_steps=0,
     foresight_depth=0.0,
     foresight_state=0.0,
+    foresight_motion=0.0,
 )
 
 PRESETS = {

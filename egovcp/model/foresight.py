@@ -10,7 +10,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from egovcp.model.losses import Batch, Rollout, masked_mean, unbroken
+from egovcp.model.losses import Batch, Rollout, masked_mean, motion_error, motion_target, unbroken
 from egovcp.model.world_model import Carry, WorldModel
 
 
@@ -21,7 +21,7 @@ def foresight_losses(
     weight: Tensor,
     generator: torch.Generator | None = None,
 ) -> dict[str, Tensor]:
-    """Picture and proprioception of states imagined ``foresight_ahead`` ticks ahead.
+    """Picture, proprioception and what flies, of states imagined ``foresight_ahead`` ticks ahead.
 
     Args:
         model: the world model.
@@ -33,7 +33,8 @@ def foresight_losses(
     config = model.config.loss
     length = batch.valid.shape[1]
     ahead = [k for k in config.foresight_ahead if k < length]
-    if not (ahead and (config.foresight_depth or config.foresight_state)):
+    weights = (config.foresight_depth, config.foresight_state, config.foresight_motion)
+    if not (ahead and any(weights)):
         return {}
     device = batch.state.device
     every = min(config.foresight_every, length - min(ahead))
@@ -52,7 +53,13 @@ def foresight_losses(
             rows.append(start + k)
             known.append(unbroken(batch, k)[:, start])
     seen = Carry(*(torch.cat(parts, 1) for parts in zip(*carries, strict=True)))
-    return _compare(model, seen, rollout, weight, torch.cat(rows), torch.cat(known, 1))
+    at = torch.cat(rows)
+    losses = _compare(model, seen, rollout, weight, at, torch.cat(known, 1))
+    if config.foresight_motion:
+        target = motion_target(batch, model.config.depth_max_m)[:, at]
+        error = motion_error(model.motion(seen)[..., 0, :], target, torch.cat(known, 1))
+        losses["foresight_motion"] = config.foresight_motion * error
+    return losses
 
 
 def _compare(
@@ -66,7 +73,7 @@ def _compare(
     """Errors of imagined states (B, S, ...) against the rows (S,) that they stand for."""
     config = model.config.loss
     near = rollout.near[:, rows]
-    image = model.picture(seen.flat()).view_as(near)
+    image = model.decode_depth(seen.features.flatten(0, 1)).float().view_as(near)
     picture = (0.5 * weight[:, rows] * (image - near).square()).mean((-2, -1))
     state = 0.5 * (model.decode_state(*seen).float() - rollout.state[:, rows]).square().mean(-1)
     return {

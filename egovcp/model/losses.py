@@ -113,28 +113,33 @@ def depth_loss(
     every = min(every, valid.shape[1])
     first = int(torch.randint(every, (), generator=generator, device=valid.device))
     rows = (slice(None), slice(first, None, every))
-    image = model.picture(rollout.carry.rows(rows).flat())
+    image = model.decode_depth(rollout.carry.features[rows].flatten(0, 1)).float()
     error = 0.5 * (image - rollout.near[rows].flatten(0, 1)).square()
     error = error * weight[rows].flatten(0, 1)
     return masked_mean(error.mean((-2, -1)), valid[rows].flatten())
 
 
-def pixel_weights(near: Tensor, batch: Batch, config: LossConfig) -> Tensor:
+def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
     """How much each pixel of (B, T, H, W) nearness counts: 1, and more where something moves.
 
-    What flies is weighted in a disc somewhat larger than itself, so that painting it beside its
-    place is no cheaper than not painting it.
+    What flies is none of the decoder's business if it is painted over its picture. Else it is
+    weighted in a disc somewhat larger than itself, so that painting it beside its place is no
+    cheaper than not painting it.
     """
+    config = model.config.loss
     weight = torch.ones_like(near)
     if config.moving > 0:
         moving = moving_pixels(near, config.moving_threshold)
         weight += config.moving * moving.masked_fill(batch.is_first[..., None, None], 0.0)
     if config.near > 0:
         weight += config.near * (near > config.near_threshold)
-    if config.flight > 0:
-        place = batch.passing[..., spec.IN_PICTURE]
-        flies = place[..., 2] > 0
-        weight[flies] += config.flight * within(near[flies], place[flies])
+    place = batch.passing[..., spec.IN_PICTURE]
+    flies = place[..., 2] > 0
+    disc = within(near[flies], place[flies])
+    if model.config.paint_flight:
+        weight[flies] *= ~disc
+    elif config.flight > 0:
+        weight[flies] += config.flight * disc
     return weight
 
 
@@ -155,40 +160,41 @@ def motion_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
     the ball is out of the picture. The encoder is asked as well: through a state that is not
     yet worth reading it would learn late where to look.
     """
+    target = motion_target(batch, model.config.depth_max_m)
+    losses = [motion_error(model.sight(rollout.embedding), target, batch.valid)]
+    length = batch.valid.shape[1]
+    outputs = model.motion(rollout.carry).unbind(-2)
+    for output, k in zip(outputs, model.config.motion_ahead, strict=True):
+        if k < length:
+            losses.append(motion_error(output[:, : length - k], target[:, k:], unbroken(batch, k)))
+    return torch.stack(losses).sum()
+
+
+def motion_target(batch: Batch, max_m: float) -> Tensor:
+    """(B, T, 5): column and row in half pictures, nearness, whether anything flies, whether that
+    is known."""
     row, column, radius, depth = batch.passing[..., spec.IN_PICTURE].unbind(-1)
-    middle = [(size - 1) / 2 for size in rollout.near.shape[-2:]]
-    place = [column / middle[1] - 1, row / middle[0] - 1, 1 - depth / model.config.depth_max_m]
-    known = batch.valid & (batch.passing[..., 4] > 0)
-    target = torch.stack([*place, radius > 0, known], -1)
-    sight = _motion_loss_at(model.sight(rollout.embedding), target, batch, 0)
-    losses = [
-        _motion_loss_at(prediction, target, batch, k)
-        for prediction, k in zip(
-            model.motion(rollout.carry).unbind(-2), model.config.motion_ahead, strict=True
-        )
-        if k < target.shape[1]
-    ]
-    return torch.stack([sight, *losses]).sum()
+    across, down = (2 / (size - 1) for size in (spec.DEPTH_COLS, spec.DEPTH_ROWS))
+    place = [column * across - 1, row * down - 1, 1 - depth / max_m]
+    return torch.stack([*place, radius > 0, batch.passing[..., 4] > 0], -1)
 
 
-def _motion_loss_at(output: Tensor, target: Tensor, batch: Batch, k: int) -> Tensor:
-    """Error of the place ``k`` ticks ahead, and cross entropy of there being any.
+def motion_error(output: Tensor, target: Tensor, counts: Tensor) -> Tensor:
+    """Error of the place, and cross entropy of there being any.
 
     Args:
-        output: (B, T, 4).
-        target: (B, T, 5) column and row in half pictures, nearness, whether, whether known.
-        batch: what was recorded.
-        k: ticks.
+        output: (..., 4), see `WorldModel.motion`.
+        target: (..., 5), see `motion_target`.
+        counts: (...,) bool, rows that count.
     """
-    output, target = output[:, : target.shape[1] - k], target[:, k:]
     flies = target[..., 3]
-    known = unbroken(batch, k) & (target[..., 4] > 0)
+    known = counts & (target[..., 4] > 0)
     # Linear beyond a few pixels: else what is far off says everything and a pixel nothing.
     place = (
         F.huber_loss(output[..., :3], target[..., :3], reduction="none", delta=0.1).sum(-1) / 0.1
     )
     presence = F.binary_cross_entropy_with_logits(output[..., 3], flies, reduction="none")
-    return masked_mean(place, known & (flies > 0)) + 0.1 * masked_mean(presence, known)
+    return masked_mean(place, known & (flies > 0)) + 0.3 * masked_mean(presence, known)
 
 
 def passing_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:

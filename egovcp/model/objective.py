@@ -17,7 +17,7 @@ def world_model_loss(
     """Total loss of equation 6 and its terms (scalars, detached)."""
     config = model.config.loss
     rollout = losses.filter_sequence(model, batch, generator=generator)
-    weight = losses.pixel_weights(rollout.near, batch, config)
+    weight = losses.pixel_weights(rollout.near, batch, model)
     depth = losses.depth_loss(model, rollout, batch.valid, weight, config.decode_every, generator)
     terms = {
         "depth": config.depth * depth,

@@ -117,9 +117,7 @@ def test_what_it_publishes_is_the_artefact(
     with in_this_process(hub.endpoint, tmp_path):
         published = check_artefact(POLICY)
         policy = EgovcpPolicy.from_pretrained(POLICY)
-    assert {"train_config.json", *PROCESSORS} <= {
-        path.name for path in published.path.iterdir()
-    }
+    assert {"train_config.json", *PROCESSORS} <= {path.name for path in published.path.iterdir()}
     for name, value in load_artefact(str(_checkpoint(output, 2))).world_model.state_dict().items():
         assert policy.world_model.state_dict()[name].equal(value), name
 

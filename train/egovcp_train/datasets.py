@@ -131,7 +131,7 @@ def stream_config(config: TrainConfig) -> StreamConfig:
 def needs_labels(config: TrainConfig) -> bool:
     """Whether a loss asks what is on its way."""
     loss = config.policy.loss
-    return max(loss.passing, loss.flight, loss.motion) > 0
+    return max(loss.passing, loss.flight, loss.motion, loss.foresight_motion) > 0
 
 
 def _decided(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:

@@ -22,7 +22,7 @@ FEATURE_SHAPES = {
 
 def _world_model() -> WorldModelConfig:
     """The default without the labels of what is on its way, which take whole episodes to find."""
-    loss = LossConfig(passing=0.0, motion=0.0, flight=0.0)
+    loss = LossConfig(passing=0.0, motion=0.0, flight=0.0, foresight_motion=0.0)
     return WorldModelConfig(value_of_passing=False, paint_flight=False, loss=loss)
 
 

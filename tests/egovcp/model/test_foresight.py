@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import pytest
 import torch
 
 from egovcp import spec
@@ -20,7 +21,7 @@ def _model(**loss: object) -> WorldModel:
 
 def _losses(model: WorldModel, batch: Batch) -> dict[str, torch.Tensor]:
     rollout = filter_sequence(model, batch, sample=False)
-    weight = pixel_weights(rollout.near, batch, model.config.loss)
+    weight = pixel_weights(rollout.near, batch, model)
     return foresight_losses(model, rollout, batch, weight)
 
 
@@ -52,13 +53,17 @@ def test_nothing_is_foreseen_across_the_start_of_an_episode() -> None:
     )
 
 
-def test_what_flies_weighs_more_in_a_disc_around_its_place() -> None:
+@pytest.mark.parametrize(("painted", "weighs"), [(False, 8.0), (True, 0.0)])
+def test_what_flies_weighs_more_around_its_place_unless_it_is_painted(
+    painted: bool, weighs: float
+) -> None:
     model, batch = _model(moving=0.0, flight=7.0), random_batch(1, 3)
+    model.config = dataclasses.replace(model.config, paint_flight=painted)
     batch.passing.zero_()
     batch.passing[0, 1, spec.IN_PICTURE] = torch.tensor([20.0, 30.0, 2.0, 1.5])
     near = torch.zeros((1, 3, spec.DEPTH_ROWS, spec.DEPTH_COLS))
-    weight = pixel_weights(near, batch, model.config.loss)
-    assert weight[0, 1, 20, 30] == 8.0
-    assert weight[0, 1, 20, 31] == 8.0
+    weight = pixel_weights(near, batch, model)
+    assert weight[0, 1, 20, 30] == weighs
+    assert weight[0, 1, 20, 31] == weighs
     assert weight[0, 1, 20, 33] == 1.0
     assert (weight[0, [0, 2]] == 1.0).all()
