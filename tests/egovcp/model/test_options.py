@@ -159,9 +159,11 @@ def test_the_reward_is_learned_on_filtered_and_imagined_states() -> None:
 # --- losses -----------------------------------------------------------------------------
 def test_near_pixels_count_more_and_only_they() -> None:
     batch = random_batch(1, 1)
+    batch.passing.zero_()
     near = torch.tensor([[[[0.9, 0.72, 0.68, 0.2]]]])
-    config = LossConfig(near=9.0, near_threshold=0.7, moving=0.0, flight=0.0)
-    assert pixel_weights(near, batch, config).flatten().tolist() == [10.0, 10.0, 1.0, 1.0]
+    loss = LossConfig(near=9.0, near_threshold=0.7, moving=0.0)
+    model = WorldModel(dataclasses.replace(PRESETS["debug"], loss=loss))
+    assert pixel_weights(near, batch, model).flatten().tolist() == [10.0, 10.0, 1.0, 1.0]
 
 
 @pytest.mark.parametrize(("per", "expected"), [("step", 4.0), ("dimension", 4.75)])
