@@ -67,7 +67,8 @@ class PlainModel(nn.Module):
         self.decode_motion = mlp(model.decode_motion)
         self.decode_passing = mlp(model.decode_passing)
         self.termination = mlp(model.termination_head)
-        assert model.value_head.reduce is not None and model.passing_value_head is not None
+        assert model.value_head.reduce is not None
+        assert model.passing_value_head is not None
         self.reduce = linear(model.value_head.reduce)
         self.value_head = mlp(model.value_head.mlp)
         self.passing_value = mlp(model.passing_value_head)
