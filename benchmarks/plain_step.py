@@ -13,8 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from egovcp.model import Batch, WorldModel
-from egovcp.model.depth import CLOSER, MIN_PIXELS, OBJECT_NEARNESS
+from egovcp import spec
+from egovcp.model import Batch, LossConfig, WorldModel
+from egovcp.model.depth import paint_disc, within
 from egovcp.model.nets import SplitLinear, SplitMlp
 from egovcp.model.world_model import PASSING_UNIT
 from egovcp_train.config import OptimizerConfig
@@ -94,6 +95,14 @@ class PlainModel(nn.Module):
         new: Tensor = self.gru(self.mix(torch.cat([z, action], -1)), h)
         return new
 
+    def picture(self, features: Tensor) -> Tensor:
+        """(N, features) -> nearness (N, 48, 64), what flies painted over it."""
+        maps = self.decoder_input(features)
+        maps = maps.view(len(maps), -1, spec.DEPTH_ROWS // 8, spec.DEPTH_COLS // 8)
+        image: Tensor = self.decode_depth(maps)[:, 0]
+        out = self.decode_motion(features)
+        return paint_disc(image, out[:, :4], out[:, -2:], self.config.depth_max_m)
+
     def value(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
         """Standardised."""
         features = torch.cat([h, z], -1)
@@ -128,19 +137,16 @@ def unbroken(batch: Batch, k: int) -> Tensor:
     return (episode[:, k:] == episode[:, :last]) & batch.valid[:, k:] & batch.valid[:, :last]
 
 
-def approaching(near: Tensor, is_first: Tensor) -> tuple[Tensor, Tensor]:
-    """Centre (B, T, 3) of what has come nearer, and whether anything has (B, T)."""
-    before = widest(near[:, :-1].flatten(0, 1)).view_as(near[:, 1:])
-    now = near[:, 1:]
-    low, high = OBJECT_NEARNESS
-    mask = ((now - before > CLOSER) & (now > low) & (now < high)).float()
-    count = mask.sum((-2, -1))
-    rows = torch.linspace(-1, 1, near.shape[-2])[:, None]
-    cols = torch.linspace(-1, 1, near.shape[-1])
-    sums = [(mask * weight).sum((-2, -1)) for weight in (cols, rows, now)]
-    centre = torch.stack(sums, -1) / count.clamp(min=1)[..., None]
-    seen = F.pad(count >= MIN_PIXELS, (1, 0)) & ~is_first
-    return F.pad(centre, (0, 0, 1, 0)), seen
+def pixel_weights(near: Tensor, batch: Batch, loss: LossConfig) -> Tensor:
+    """Weight of every pixel, (B, T, H, W)."""
+    before = near[:, :-1].flatten(0, 1)
+    high, low = (x.view_as(near[:, 1:]) for x in (widest(before), -widest(-before)))
+    threshold = loss.moving_threshold
+    moving = (near[:, 1:] > high + threshold) | (near[:, 1:] < low - threshold)
+    moving = F.pad(moving, (0, 0, 0, 0, 1, 0)) & ~batch.is_first[..., None, None]
+    place = batch.passing[..., spec.IN_PICTURE].flatten(0, 1)
+    disc = within(near.flatten(0, 1), place).view_as(near)
+    return 1 + loss.moving * moving.float() + loss.flight * disc.float()
 
 
 def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> Tensor:
@@ -169,52 +175,56 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
     features = torch.cat([h, z], -1)
     prior_mean, prior_std = model.gaussian(model.prior(h))
 
+    weight = pixel_weights(near, batch, loss)
+    error = (0.5 * (model.decode_state(features) - state) ** 2).mean(-1)
     terms = [
-        loss.depth * depth_loss(model, features, near, batch, generator),
-        loss.motion * motion_loss(model, features, near, batch),
+        loss.depth * depth_loss(model, features, near, weight, batch, generator),
+        loss.motion * motion_loss(model, features, batch),
         loss.passing * passing_loss(model, features, batch),
-        loss.state
-        * mean_where((0.5 * (model.decode_state(features) - state) ** 2).mean(-1), batch.valid),
+        loss.state * mean_where(error, batch.valid),
         *kl_terms(model, (mean, std), (prior_mean, prior_std), batch),
         *value_terms(model, h, z, batch),
+        *foresight_terms(model, (h, z), near, state, weight, batch, generator),
     ]
     return torch.stack(terms).sum()
 
 
 def depth_loss(
-    model: PlainModel, features: Tensor, near: Tensor, batch: Batch, generator: torch.Generator
+    model: PlainModel,
+    features: Tensor,
+    near: Tensor,
+    weight: Tensor,
+    batch: Batch,
+    generator: torch.Generator,
 ) -> Tensor:
-    loss = model.config.loss
-    first = int(torch.randint(loss.decode_every, (), generator=generator))
-    chosen = slice(first, None, loss.decode_every)
-    maps = model.decoder_input(features[:, chosen].flatten(0, 1))
-    rows, cols = near.shape[2] // 8, near.shape[3] // 8
-    image = model.decode_depth(maps.view(len(maps), -1, rows, cols))[:, 0]
-    moving = ((near[:, 1:] - near[:, :-1]).abs() > loss.moving_threshold).float()
-    moving = F.pad(moving, (0, 0, 0, 0, 1, 0)) * (~batch.is_first[..., None, None]).float()
+    every = model.config.loss.decode_every
+    chosen = slice(int(torch.randint(every, (), generator=generator)), None, every)
+    image = model.picture(features[:, chosen].flatten(0, 1))
     error = 0.5 * (image - near[:, chosen].flatten(0, 1)) ** 2
-    error = error * (1 + loss.moving * moving[:, chosen].flatten(0, 1))
+    error = error * weight[:, chosen].flatten(0, 1)
     return mean_where(error.mean((-2, -1)), batch.valid[:, chosen].flatten())
 
 
-def motion_loss(model: PlainModel, features: Tensor, near: Tensor, batch: Batch) -> Tensor:
-    centre, seen = approaching(near, batch.is_first)
-    ahead = model.config.motion_ahead
-    output = model.decode_motion(features).unflatten(-1, (len(ahead), 4))
+def motion_loss(model: PlainModel, features: Tensor, batch: Batch) -> Tensor:
+    row, column, radius, depth = batch.passing[..., spec.IN_PICTURE].unbind(-1)
+    half = (spec.DEPTH_ROWS - 1) / 2, (spec.DEPTH_COLS - 1) / 2
+    place = [column / half[1] - 1, row / half[0] - 1, 1 - depth / model.config.depth_max_m]
+    target, flies = torch.stack(place, -1), radius > 0
+    labelled = batch.valid & (batch.passing[..., 4] > 0)
+    ahead, length = model.config.motion_ahead, target.shape[1]
+    output = model.decode_motion(features)[..., :-2].unflatten(-1, (len(ahead), 4))
     total = torch.zeros(())
     for i, k in enumerate(ahead):
-        if k >= seen.shape[1]:
+        if k >= length:
             continue
-        guess = output[:, : seen.shape[1] - k, i]
-        known, target, there = unbroken(batch, k), centre[:, k:], seen[:, k:]
-        place = mean_where(((guess[..., :3] - target) ** 2).sum(-1), known & there)
+        guess, there = output[:, : length - k, i], flies[:, k:]
+        known = unbroken(batch, k) & labelled[:, k:]
+        error = F.huber_loss(guess[..., :3], target[:, k:], reduction="none", delta=0.1)
         presence = F.binary_cross_entropy_with_logits(
             guess[..., 3], there.float(), reduction="none"
         )
-        judged = known & ~batch.is_first[:, k:]
-        if k == 0:
-            judged[:, 0] = False
-        total = total + place + 0.1 * mean_where(presence, judged)
+        total = total + mean_where(error.sum(-1) / 0.1, known & there)
+        total = total + 0.1 * mean_where(presence, known)
     return total
 
 
@@ -259,6 +269,41 @@ def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[T
         loss.value * value,
         loss.termination * mean_where(fall, batch.valid),
         loss.imagined_value * imagined,
+    ]
+
+
+def foresight_terms(
+    model: PlainModel,
+    states: tuple[Tensor, Tensor],
+    near: Tensor,
+    state: Tensor,
+    weight: Tensor,
+    batch: Batch,
+    generator: torch.Generator,
+) -> list[Tensor]:
+    loss, length = model.config.loss, near.shape[1]
+    ahead = [k for k in loss.foresight_ahead if k < length]
+    every = min(loss.foresight_every, length - min(ahead))
+    first = int(torch.randint(every, (), generator=generator))
+    start = torch.arange(first, length - min(ahead), every)
+    h, z = (x[:, start] for x in states)
+    seen, rows, known = [], [], []
+    for k in range(1, max(ahead) + 1):
+        start = start[start + k < length]
+        h, z = h[:, : len(start)], z[:, : len(start)]
+        h = model.transition(h, z, batch.action[:, start + k - 1])
+        z = model.gaussian(model.prior(h))[0]
+        if k in ahead:
+            seen.append(torch.cat([h, z], -1))
+            rows.append(start + k)
+            known.append(unbroken(batch, k)[:, start])
+    features, at, valid = torch.cat(seen, 1), torch.cat(rows), torch.cat(known, 1)
+    image = model.picture(features.flatten(0, 1)).view(len(near), len(at), *near.shape[2:])
+    picture = (0.5 * weight[:, at] * (image - near[:, at]) ** 2).mean((-2, -1))
+    proprioception = (0.5 * (model.decode_state(features) - state[:, at]) ** 2).mean(-1)
+    return [
+        loss.foresight_depth * mean_where(picture, valid),
+        loss.foresight_state * mean_where(proprioception, valid),
     ]
 
 

@@ -17,12 +17,15 @@ class LossConfig:
     decode_every: int = 2
     """Reconstruct every n-th image of a window, the first one drawn at random: the decoder is
     the dearest part of a step, and neighbouring images teach it the same."""
-    moving: float = 100.0
+    moving: float = 10.0
     """Extra weight of pixels that changed since the previous frame; 0: none."""
+    flight: float = 300.0
+    """Extra weight of the pixels around a thing in flight, where labels tell; 0: none."""
     moving_threshold: float = 0.04
     """Change of nearness (fraction of the depth range) that counts as moving."""
     motion: float = 10.0
-    """Weight of the place of what approaches, mean squared error in half images; 0: none."""
+    """Weight of the place in the picture of what flies, where labels tell, Huber loss in half
+    pictures; 0: none."""
     passing: float = 3.0
     """Weight of where and when something thrown will pass, Huber loss in units of
     `PASSING_UNIT`; 0: none."""
@@ -42,6 +45,14 @@ class LossConfig:
     """Also regress Q on states imagined this many steps ahead of the posterior; 0: never."""
     imagined_value: float = 1.0
     """Weight of the value loss on imagined states."""
+    foresight_depth: float = 30.0
+    """Weight of the pictures of states imagined several ticks ahead; 0: none."""
+    foresight_state: float = 1.0
+    """Weight of the proprioception of states imagined several ticks ahead; 0: none."""
+    foresight_ahead: tuple[int, ...] = (4, 8, 12)
+    """Ticks ahead at which they are compared with what was recorded."""
+    foresight_every: int = 4
+    """Imagine from every n-th row of a window only, the first one drawn at random."""
 
 
 @dataclass(frozen=True)
@@ -57,7 +68,11 @@ class WorldModelConfig:
     channels: tuple[int, int, int] = (32, 64, 64)
     """Channels of the three layers of the depth CNN; the decoder uses the last."""
     motion_ahead: tuple[int, ...] = (0, 3, 6, 9)
-    """Ticks ahead at which the place of what approaches is predicted straight from the state."""
+    """Ticks ahead at which the place of what flies is predicted straight from the state; the first
+    is 0, now."""
+    paint_flight: bool = True
+    """What flies is painted as a disc where the state says that it is (`loss.motion` teaches it),
+    over the picture that the decoder paints."""
     value_state: int = 8
     """Numbers to which (h, z) is reduced for Q; 0: Q reads all of it."""
     value_of_passing: bool = True
@@ -77,6 +92,16 @@ class WorldModelConfig:
                 "value_of_passing needs loss.passing above 0: nothing else teaches Q what is on "
                 "its way; set --policy.value_of_passing=false, or a weight"
             )
+        if self.paint_flight and self.loss.motion <= 0:
+            raise UsageError(
+                "paint_flight needs loss.motion above 0: nothing else teaches the place of what "
+                "flies; set --policy.paint_flight=false, or a weight"
+            )
+        if self.paint_flight and self.motion_ahead[:1] != (0,):
+            raise UsageError(
+                f"motion_ahead {list(self.motion_ahead)}: with paint_flight the first must be 0, "
+                "the place that is painted; put it there, or set --policy.paint_flight=false"
+            )
 
 
 #: The paper's plain sum: likelihoods summed over pixels and joints, unit variances, nothing added.
@@ -84,16 +109,21 @@ PAPER_LOSS = LossConfig(
     depth=float(spec.DEPTH_ROWS * spec.DEPTH_COLS),
     decode_every=1,
     moving=0.0,
+    flight=0.0,
     motion=0.0,
     passing=0.0,
     state=float(spec.STATE_DIM),
     kl_posterior=1.0,
     free_nats=0.0,
     imagined_steps=0,
+    foresight_depth=0.0,
+    foresight_state=0.0,
 )
 
 PRESETS = {
     "default": WorldModelConfig(),
-    "paper": WorldModelConfig(value_state=0, value_of_passing=False, loss=PAPER_LOSS),
+    "paper": WorldModelConfig(
+        value_state=0, value_of_passing=False, paint_flight=False, loss=PAPER_LOSS
+    ),
     "debug": WorldModelConfig(hidden=32, latent=8, units=32, channels=(4, 8, 8)),
 }

@@ -23,7 +23,7 @@ from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.model.config import WorldModelConfig
-from egovcp.model.depth import nearness, network_image, to_metres
+from egovcp.model.depth import nearness, network_image, paint_disc, to_metres
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.nets import (
     DepthDecoder,
@@ -47,6 +47,14 @@ class Carry(NamedTuple):
     @property
     def features(self) -> Tensor:
         return torch.cat([self.h, self.z], -1)
+
+    def rows(self, rows: tuple[slice, ...]) -> Carry:
+        """Some of the states, of all leading dimensions."""
+        return Carry(self.h[rows], self.z[rows])
+
+    def flat(self) -> Carry:
+        """(B, T, ...) -> (B T, ...)."""
+        return Carry(self.h.flatten(0, 1), self.z.flatten(0, 1))
 
 
 class PosteriorHead(nn.Module):
@@ -85,7 +93,7 @@ class WorldModel(nn.Module):
         self.prior = SplitMlp((c.hidden,), c.units, 2 * c.latent)
         self.decode_depth = DepthDecoder(sum(state), c.channels[-1])
         self.decode_state = SplitMlp(state, c.units, spec.STATE_DIM)
-        self.decode_motion = SplitMlp(state, c.units, 4 * len(c.motion_ahead))
+        self.decode_motion = SplitMlp(state, c.units, 4 * len(c.motion_ahead) + 2)
         self.decode_passing = SplitMlp(state, c.units, 4)
         self.termination_head = SplitMlp(state, c.units, 1)
         self.value_head = ValueHead(state, c.value_state, c.units)
@@ -218,7 +226,25 @@ class WorldModel(nn.Module):
         """Probability that the episode has failed at this state, (...,)."""
         return torch.sigmoid(self.termination_logit(carry))
 
+    def motion(self, carry: Carry) -> Tensor:
+        """Where in the picture something flies, ``motion_ahead`` ticks ahead, (..., A, 4): column
+        and row of its middle in half pictures from the middle, nearness, log-odds that it does."""
+        out: Tensor = self.decode_motion(carry.h, carry.z).float()[..., :-2].contiguous()
+        return out.view(*out.shape[:-1], len(self.config.motion_ahead), 4)
+
+    def picture(self, carry: Carry) -> Tensor:
+        """Nearness (B, 48, 64) of the picture at a state (B, ...); not clamped.
+
+        What flies is painted where `motion` says that it is: a network that paints every
+        pixel by itself learns late, and never sharply, to move ten of them.
+        """
+        image: Tensor = self.decode_depth(carry.features).float()
+        if not self.config.paint_flight:
+            return image
+        out = self.decode_motion(carry.h, carry.z).float()
+        return paint_disc(image, out[..., :4], out[..., -2:], self.config.depth_max_m)
+
     def decode(self, carry: Carry) -> tuple[Tensor, Tensor]:
         """Carry (B, ...) -> depth (B, 48, 64) in metres, 0 = nothing in range; state (B, 74)."""
-        depth = to_metres(self.decode_depth(carry.features).float(), self.config.depth_max_m)
+        depth = to_metres(self.picture(carry), self.config.depth_max_m)
         return depth, self.decode_state(carry.h, carry.z).float() * self.state_std + self.state_mean

@@ -34,7 +34,7 @@ from egovcp_train.batches import (
     whole_episodes,
 )
 from egovcp_train.config import TrainConfig
-from egovcp_train.passing import label, label_episode
+from egovcp_train.labels.passing import label, label_episode
 
 EVALUATION_EPISODES = 64  # of each task
 FIT_EPISODES = 2048  # of a dataset that is not in memory: half a GB of states to fit Q to
@@ -125,6 +125,12 @@ def stream_config(config: TrainConfig) -> StreamConfig:
     )
 
 
+def needs_labels(config: TrainConfig) -> bool:
+    """Whether a loss asks what is on its way."""
+    loss = config.policy.loss
+    return max(loss.passing, loss.flight, loss.motion) > 0
+
+
 def _decided(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:
     """The options with the mode that auto stands for here, so that a resumed run keeps it."""
     if config.loading.mode != "auto":
@@ -145,8 +151,9 @@ def _in_memory(
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
     set_normalisation(model, learning)
-    if config.policy.loss.passing:
-        learning, heldout = label(learning, config.passing), label(heldout, config.passing)
+    heldout = label(heldout, config.passing)
+    if needs_labels(config):
+        learning = label(learning, config.passing)
     return learning, SequenceStream(learning, sampling, mix), heldout
 
 
@@ -159,12 +166,12 @@ def _on_disk(
 ) -> tuple[Learning, Stream, EpisodeStore]:
     learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
     heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.returns)
+    heldout = label(heldout, config.passing)
     facts = survey(learning, config.returns, sampling.event_quantile)
     longest = int(learning.length.max())
     fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest)
     labelling = None
-    if config.policy.loss.passing:
-        heldout = label(heldout, config.passing)
+    if needs_labels(config):
         labelling = partial(label_episode, config=config.passing)
     stream = BoundedStream(
         learning,
@@ -186,7 +193,7 @@ def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -
     def batches(first: int) -> Iterator[Batch]:
         part = index.select(chosen[first : first + EPISODES_AT_ONCE])
         store = EpisodeStore.read(part, config.returns)
-        if config.policy.loss.passing:
+        if needs_labels(config):
             store = label(store, config.passing)
         yield from whole_episodes(store, device, config.sampling.mirror)
 

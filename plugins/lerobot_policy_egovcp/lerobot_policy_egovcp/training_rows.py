@@ -9,10 +9,11 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid
+from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid, mirror
 from egovcp.data.source import recorded
 from egovcp.errors import DataError
 from egovcp.model import Batch
@@ -113,6 +114,25 @@ def to_batch(batch: Mapping[str, Tensor], targets: Targets) -> Batch:
         mc_valid=rows["mc_valid"] & valid,
         terminal_next=rows["terminal_next"] & valid,
         passing=state.new_zeros(size, length, spec.PASSING_DIM),
+    )
+
+
+def mirrored(rows: Batch, which: Tensor) -> Batch:
+    """The batch with the windows ``which`` (B,) bool as the robot would live them in a mirror.
+
+    ``passing`` stays as it is: it holds no labels here (see `to_batch`).
+    """
+
+    def swap(value: Tensor, source: NDArray[np.intp], sign: NDArray[np.float32]) -> Tensor:
+        other = value[..., torch.from_numpy(source).to(value.device)]
+        other = other * torch.from_numpy(sign).to(value)
+        return torch.where(which[:, None, None], other, value)
+
+    return rows._replace(
+        depth=torch.where(which[:, None, None, None], rows.depth.flip(-1), rows.depth),
+        state=swap(rows.state, mirror.STATE_SOURCE, mirror.STATE_SIGN),
+        action=swap(rows.action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),
+        prev_action=swap(rows.prev_action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),
     )
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from egovcp import spec
 from egovcp.model import PRESETS, Batch, Carry, LossConfig, WorldModel, world_model_loss
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.losses import (
@@ -31,7 +32,7 @@ def _with_loss(config: LossConfig) -> WorldModel:
 
 
 #: Nothing left to chance but the noise of z: every image is reconstructed.
-EVERY_IMAGE = dataclasses.replace(PRESETS["debug"].loss, decode_every=1)
+EVERY_IMAGE = dataclasses.replace(PRESETS["debug"].loss, decode_every=1, foresight_every=1)
 
 
 def _pad(batch: Batch, rows: int, garbage: bool) -> Batch:
@@ -254,10 +255,26 @@ def test_a_window_of_one_row_is_trainable(model: WorldModel) -> None:
 def test_motion_may_be_foretold_for_any_ticks_ahead_or_none(ahead: tuple[int, ...]) -> None:
     """Ticks beyond the window ask for nothing."""
     torch.manual_seed(0)
-    model = WorldModel(dataclasses.replace(PRESETS["debug"], motion_ahead=ahead))
+    config = dataclasses.replace(PRESETS["debug"], motion_ahead=ahead, paint_flight=False)
+    model = WorldModel(config)
     batch = random_batch(2, 4)
     motion = _loss(model, batch)["loss/motion"]
     assert (motion > 0) == any(k < 4 for k in ahead)
+
+
+def test_a_place_is_asked_for_only_where_something_is_known_to_fly() -> None:
+    batch = random_batch(2, 4)
+    batch.passing[..., 4] = 1.0
+    batch.passing[..., spec.IN_PICTURE] = torch.tensor([20.0, 30.0, 0.0, 2.0])
+    nowhere = _loss(toy_model(), batch)["loss/motion"]
+    batch.passing[..., 5] = 40.0  # another row
+    assert _loss(toy_model(), batch)["loss/motion"] == nowhere
+    batch.passing[:, 1, 7] = 3.0
+    somewhere = _loss(toy_model(), batch)["loss/motion"]
+    assert somewhere > nowhere
+    batch.passing[:, 1, 4] = 0.0
+    unknown = _loss(toy_model(), batch)["loss/motion"]
+    assert unknown < somewhere
 
 
 def _leaves(seed: int) -> Gaussian:

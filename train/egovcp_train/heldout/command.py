@@ -21,8 +21,9 @@ from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
 from egovcp_train.heldout.report import Report, measure
 from egovcp_train.heldout.table import table
+from egovcp_train.labels.config import PassingConfig
+from egovcp_train.labels.passing import label
 from egovcp_train.output import require_writable
-from egovcp_train.passing import PassingConfig, label
 
 PROG: Final = "egovcp-eval-model"
 RESULT: Final = "heldout.json"
@@ -79,13 +80,13 @@ def evaluate(config: HeldoutConfig) -> None:
     device = choose_device(config.device)
     artefact = load_artefact(config.policy.path, config.policy.revision)
     reader = DatasetReader.open(config.dataset)
-    _require_same_controller(artefact, reader)
-    passing = _trained_with(artefact, "passing", PassingConfig)
-    returns = _trained_with(artefact, "returns", ReturnConfig)
+    require_same_controller(artefact, reader)
+    passing = trained_with(artefact, "passing", PassingConfig)
+    returns = trained_with(artefact, "returns", ReturnConfig)
     limit = config.episodes or None
     store = label(EpisodeStore.load([reader], config.split, returns, per_task=limit), passing)
     model = artefact.world_model.to(device)
-    report = measure(model, recorded(store, device, passing), config.stride)
+    report = measure(model, recorded(store, device), config.stride)
     print(table(report.tasks))
     _write(output, report, _run(config, artefact, reader), config.pictures)
     print(f"figures: {output / RESULT}")
@@ -104,7 +105,7 @@ def _check(config: HeldoutConfig) -> Path:
     return output
 
 
-def _require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
+def require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
     """Raise `ArtefactError` where the data's actions were given to another controller."""
     if artefact.controller_id != reader.controller_id:
         raise ArtefactError(
@@ -115,7 +116,7 @@ def _require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
         )
 
 
-def _trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
+def trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
     """The options of the training under ``name``; the defaults where the manifest has none.
 
     Raises:
