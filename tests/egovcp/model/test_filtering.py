@@ -69,6 +69,6 @@ def test_what_is_not_a_number_stays_in_its_episode(uneven: WorldModel, sequence:
     bad = embedding.detach().clone()
     bad[1, 3] = torch.nan
     found = filter_embeddings(uneven, bad, action, is_first, carry, None)
-    assert found.carry.h[1, 3].isnan().all()
-    assert found.carry.h[1, 4:].isfinite().all()
-    assert found.carry.h[[0, 2]].isfinite().all()
+    assert found.carry.z[1, 3].isnan().all()
+    assert found.carry.features[1, 4:].isfinite().all()
+    assert found.carry.features[[0, 2]].isfinite().all()
