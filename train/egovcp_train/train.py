@@ -17,6 +17,7 @@ from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.model import PRESETS, WorldModel
+from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
 from egovcp_train.card import versions, write_card
 from egovcp_train.checkpoint import (
@@ -69,6 +70,7 @@ def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
 def train(config: TrainConfig) -> None:
     """Run training to its end, or to the first SIGINT or SIGTERM, and write the artefact."""
     output = _prepare_output(config)
+    keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
     device = choose_device(config.device)
     torch.manual_seed(config.seed)

@@ -1,0 +1,334 @@
+"""A gradient step as one would write it down in eager PyTorch, for `train_step.py` to compare with.
+
+The same mathematics as `egovcp.model` and `egovcp_train.loop`: the same weights, loss terms and
+random draws, optimiser and averaging. Every network is a plain module on concatenated inputs, the
+encoder and all heads work on whole stacked sequences, and the recurrence is a loop over time.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from egovcp import spec
+from egovcp.model import Batch, LossConfig, WorldModel
+from egovcp.model.depth import paint_disc, within
+from egovcp.model.nets import SplitLinear, SplitMlp
+from egovcp.model.world_model import PASSING_UNIT
+from egovcp_train.config import OptimizerConfig
+
+
+def linear(split: SplitLinear) -> nn.Linear:
+    """One layer on the concatenated inputs, with the same weights."""
+    layer = nn.Linear(split.inputs, split.parts[0].weight.shape[0], bias=False)  # type: ignore[index, arg-type]
+    layer.weight.data = torch.cat([part.weight.data for part in split.parts], 1)  # type: ignore[misc]
+    return layer
+
+
+def mlp(split: SplitMlp) -> nn.Sequential:
+    """The same MLP on the concatenated inputs."""
+    return nn.Sequential(linear(split.first), *copy.deepcopy(split.rest))
+
+
+class PlainGru(nn.Module):
+    """GRU with a normalised projection."""
+
+    def __init__(self, model: WorldModel) -> None:
+        super().__init__()
+        self.project = linear(model.gru.project)
+        self.norm = copy.deepcopy(model.gru.norm)
+        self.update_bias = model.gru.update_bias
+
+    def forward(self, x: Tensor, h: Tensor) -> Tensor:
+        parts = self.norm(self.project(torch.cat([x, h], -1)))
+        reset, candidate, update = parts.chunk(3, -1)
+        candidate = torch.tanh(torch.sigmoid(reset) * candidate)
+        update = torch.sigmoid(update + self.update_bias)
+        return update * candidate + (1 - update) * h
+
+
+class PlainModel(nn.Module):
+    """The world model's networks."""
+
+    def __init__(self, model: WorldModel) -> None:
+        super().__init__()
+        self.config = model.config
+        self.encode_depth = copy.deepcopy(model.encode_depth.layers)
+        self.encode_state = mlp(model.encode_state)
+        self.mix = nn.Sequential(linear(model.mix), *copy.deepcopy(model.mix_act))
+        self.gru = PlainGru(model)
+        self.posterior = nn.Sequential(self._posterior(model), *copy.deepcopy(model.posterior.rest))
+        self.prior = mlp(model.prior)
+        self.decoder_input = copy.deepcopy(model.decode_depth.project)
+        self.decode_depth = copy.deepcopy(model.decode_depth.layers)
+        self.decode_state = mlp(model.decode_state)
+        self.decode_motion = mlp(model.decode_motion)
+        self.decode_passing = mlp(model.decode_passing)
+        self.termination = mlp(model.termination_head)
+        assert model.value_head.reduce is not None
+        assert model.passing_value_head is not None
+        self.reduce = linear(model.value_head.reduce)
+        self.value_head = mlp(model.value_head.mlp)
+        self.passing_value = mlp(model.passing_value_head)
+        for name, buffer in model.named_buffers():
+            self.register_buffer(name, buffer.clone())
+
+    @staticmethod
+    def _posterior(model: WorldModel) -> nn.Linear:
+        h, image, state = (
+            model.posterior.project_h,
+            *model.embed_observation.parts,
+        )
+        weight = torch.cat([h.weight.data, image.weight.data, state.weight.data], 1)  # type: ignore[list-item]
+        layer = nn.Linear(weight.shape[1], weight.shape[0], bias=False)
+        layer.weight.data = weight
+        return layer
+
+    def gaussian(self, logits: Tensor) -> tuple[Tensor, Tensor]:
+        mean, raw = logits.chunk(2, -1)
+        return mean, F.softplus(raw + 0.54) + self.config.min_std
+
+    def transition(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
+        new: Tensor = self.gru(self.mix(torch.cat([z, action], -1)), h)
+        return new
+
+    def picture(self, features: Tensor) -> Tensor:
+        """(N, features) -> nearness (N, 48, 64), what flies painted over it."""
+        maps = self.decoder_input(features)
+        maps = maps.view(len(maps), -1, spec.DEPTH_ROWS // 8, spec.DEPTH_COLS // 8)
+        image: Tensor = self.decode_depth(maps)[:, 0]
+        out = self.decode_motion(features)
+        return paint_disc(image, out[:, :4], out[:, -2:], self.config.depth_max_m)
+
+    def value(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
+        """Standardised."""
+        features = torch.cat([h, z], -1)
+        out = self.decode_passing(features).detach()
+        coming = torch.sigmoid(out[..., 3:])
+        passing = torch.cat([coming, coming * out[..., :3]], -1)
+        q = self.value_head(torch.cat([self.reduce(features), action], -1))
+        q = q + self.passing_value(torch.cat([passing, action], -1))
+        return q.squeeze(-1)
+
+
+def widest(x: Tensor) -> Tensor:
+    """(N, H, W) -> maximum over 3 x 3 pixels."""
+    return F.max_pool2d(x[:, None], 3, stride=1, padding=1)[:, 0]
+
+
+def nearness(depth_mm: Tensor, max_m: float) -> Tensor:
+    """(N, H, W) mm -> nearness in [0, 1], small holes closed."""
+    near = (1 - depth_mm.float() * (1e-3 / max_m)).clamp(0, 1)
+    near = torch.where(depth_mm == 0, torch.zeros_like(near), near)
+    return -widest(-widest(near))
+
+
+def mean_where(x: Tensor, mask: Tensor) -> Tensor:
+    mask = mask.float()
+    return (x * mask).sum() / mask.sum().clamp(min=1)
+
+
+def unbroken(batch: Batch, k: int) -> Tensor:
+    episode = batch.is_first.long().cumsum(1)
+    last = episode.shape[1] - k
+    return (episode[:, k:] == episode[:, :last]) & batch.valid[:, k:] & batch.valid[:, :last]
+
+
+def pixel_weights(near: Tensor, batch: Batch, loss: LossConfig) -> Tensor:
+    """Weight of every pixel, (B, T, H, W)."""
+    before = near[:, :-1].flatten(0, 1)
+    high, low = (x.view_as(near[:, 1:]) for x in (widest(before), -widest(-before)))
+    threshold = loss.moving_threshold
+    moving = (near[:, 1:] > high + threshold) | (near[:, 1:] < low - threshold)
+    moving = F.pad(moving, (0, 0, 0, 0, 1, 0)) & ~batch.is_first[..., None, None]
+    place = batch.passing[..., spec.IN_PICTURE].flatten(0, 1)
+    disc = within(near.flatten(0, 1), place).view_as(near)
+    return 1 + loss.moving * moving.float() + loss.flight * disc.float()
+
+
+def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> Tensor:
+    """The total loss of a batch."""
+    config, loss = model.config, model.config.loss
+    size, length = batch.valid.shape
+    near = nearness(batch.depth.flatten(0, 1), config.depth_max_m)
+    state = ((batch.state - model.state_mean) / model.state_std).clamp(-10, 10)  # type: ignore[operator]
+    image = model.encode_depth(torch.stack([near, (near > 0).float()], 1))
+    observation = torch.cat([image, model.encode_state(state.flatten(0, 1))], -1)
+    observation = observation.view(size, length, -1)
+    near = near.view(size, length, *near.shape[1:])
+
+    h, z = torch.zeros(size, config.hidden), torch.zeros(size, config.latent)
+    hs, zs, means, stds = [], [], [], []
+    for t in range(length):
+        keep = (~batch.is_first[:, t, None]).float()
+        h = model.transition(h * keep, z * keep, batch.prev_action[:, t] * keep)
+        mean, std = model.gaussian(model.posterior(torch.cat([h, observation[:, t]], -1)))
+        z = mean + std * torch.randn(mean.shape, generator=generator)
+        hs.append(h)
+        zs.append(z)
+        means.append(mean)
+        stds.append(std)
+    h, z, mean, std = (torch.stack(x, 1) for x in (hs, zs, means, stds))
+    features = torch.cat([h, z], -1)
+    prior_mean, prior_std = model.gaussian(model.prior(h))
+
+    weight = pixel_weights(near, batch, loss)
+    error = (0.5 * (model.decode_state(features) - state) ** 2).mean(-1)
+    terms = [
+        loss.depth * depth_loss(model, features, near, weight, batch, generator),
+        loss.motion * motion_loss(model, features, batch),
+        loss.passing * passing_loss(model, features, batch),
+        loss.state * mean_where(error, batch.valid),
+        *kl_terms(model, (mean, std), (prior_mean, prior_std), batch),
+        *value_terms(model, h, z, batch),
+        *foresight_terms(model, (h, z), near, state, weight, batch, generator),
+    ]
+    return torch.stack(terms).sum()
+
+
+def depth_loss(
+    model: PlainModel,
+    features: Tensor,
+    near: Tensor,
+    weight: Tensor,
+    batch: Batch,
+    generator: torch.Generator,
+) -> Tensor:
+    every = model.config.loss.decode_every
+    chosen = slice(int(torch.randint(every, (), generator=generator)), None, every)
+    image = model.picture(features[:, chosen].flatten(0, 1))
+    error = 0.5 * (image - near[:, chosen].flatten(0, 1)) ** 2
+    error = error * weight[:, chosen].flatten(0, 1)
+    return mean_where(error.mean((-2, -1)), batch.valid[:, chosen].flatten())
+
+
+def motion_loss(model: PlainModel, features: Tensor, batch: Batch) -> Tensor:
+    row, column, radius, depth = batch.passing[..., spec.IN_PICTURE].unbind(-1)
+    half = (spec.DEPTH_ROWS - 1) / 2, (spec.DEPTH_COLS - 1) / 2
+    place = [column / half[1] - 1, row / half[0] - 1, 1 - depth / model.config.depth_max_m]
+    target, flies = torch.stack(place, -1), radius > 0
+    labelled = batch.valid & (batch.passing[..., 4] > 0)
+    ahead, length = model.config.motion_ahead, target.shape[1]
+    output = model.decode_motion(features)[..., :-2].unflatten(-1, (len(ahead), 4))
+    total = torch.zeros(())
+    for i, k in enumerate(ahead):
+        if k >= length:
+            continue
+        guess, there = output[:, : length - k, i], flies[:, k:]
+        known = unbroken(batch, k) & labelled[:, k:]
+        error = F.huber_loss(guess[..., :3], target[:, k:], reduction="none", delta=0.1)
+        presence = F.binary_cross_entropy_with_logits(
+            guess[..., 3], there.float(), reduction="none"
+        )
+        total = total + mean_where(error.sum(-1) / 0.1, known & there)
+        total = total + 0.1 * mean_where(presence, known)
+    return total
+
+
+def passing_loss(model: PlainModel, features: Tensor, batch: Batch) -> Tensor:
+    output = model.decode_passing(features)
+    on, known = batch.passing[..., 3], (batch.passing[..., 4] > 0) & batch.valid
+    place = batch.passing[..., :3] / torch.tensor(PASSING_UNIT)
+    error = F.huber_loss(output[..., :3], place, reduction="none", delta=0.5).sum(-1)
+    presence = F.binary_cross_entropy_with_logits(output[..., 3], on, reduction="none")
+    return mean_where(error, known & (on > 0)) + mean_where(presence, known)
+
+
+def kl_terms(
+    model: PlainModel, q: tuple[Tensor, Tensor], p: tuple[Tensor, Tensor], batch: Batch
+) -> list[Tensor]:
+    loss = model.config.loss
+
+    def kl(q: tuple[Tensor, Tensor], p: tuple[Tensor, Tensor]) -> Tensor:
+        posterior, prior = (torch.distributions.Normal(*x, validate_args=False) for x in (q, p))
+        nats = torch.distributions.kl_divergence(posterior, prior).sum(-1)
+        return mean_where(nats.clamp(min=loss.free_nats), batch.valid)
+
+    fixed_q, fixed_p = ((x[0].detach(), x[1].detach()) for x in (q, p))
+    return [loss.kl_prior * kl(fixed_q, p), loss.kl_posterior * kl(q, fixed_p)]
+
+
+def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[Tensor]:
+    loss = model.config.loss
+    target = (batch.mc_return - model.return_mean) / model.return_std  # type: ignore[operator]
+    usable = batch.valid & batch.mc_valid
+    value = mean_where((model.value(h, z, batch.action) - target) ** 2, usable)
+    h = model.transition(h, z, batch.action)
+    z = model.gaussian(model.prior(h))[0]
+    fall = F.binary_cross_entropy_with_logits(
+        model.termination(torch.cat([h, z], -1)).squeeze(-1),
+        batch.terminal_next.float(),
+        reduction="none",
+    )
+    q = model.value(h[:, :-1], z[:, :-1], batch.action[:, 1:])
+    imagined = mean_where((q - target[:, 1:]) ** 2, usable[:, 1:] & unbroken(batch, 1))
+    return [
+        loss.value * value,
+        loss.termination * mean_where(fall, batch.valid),
+        loss.imagined_value * imagined,
+    ]
+
+
+def foresight_terms(
+    model: PlainModel,
+    states: tuple[Tensor, Tensor],
+    near: Tensor,
+    state: Tensor,
+    weight: Tensor,
+    batch: Batch,
+    generator: torch.Generator,
+) -> list[Tensor]:
+    loss, length = model.config.loss, near.shape[1]
+    ahead = [k for k in loss.foresight_ahead if k < length]
+    every = min(loss.foresight_every, length - min(ahead))
+    first = int(torch.randint(every, (), generator=generator))
+    start = torch.arange(first, length - min(ahead), every)
+    h, z = (x[:, start] for x in states)
+    seen, rows, known = [], [], []
+    for k in range(1, max(ahead) + 1):
+        start = start[start + k < length]
+        h, z = h[:, : len(start)], z[:, : len(start)]
+        h = model.transition(h, z, batch.action[:, start + k - 1])
+        z = model.gaussian(model.prior(h))[0]
+        if k in ahead:
+            seen.append(torch.cat([h, z], -1))
+            rows.append(start + k)
+            known.append(unbroken(batch, k)[:, start])
+    features, at, valid = torch.cat(seen, 1), torch.cat(rows), torch.cat(known, 1)
+    image = model.picture(features.flatten(0, 1)).view(len(near), len(at), *near.shape[2:])
+    picture = (0.5 * weight[:, at] * (image - near[:, at]) ** 2).mean((-2, -1))
+    proprioception = (0.5 * (model.decode_state(features) - state[:, at]) ** 2).mean(-1)
+    return [
+        loss.foresight_depth * mean_where(picture, valid),
+        loss.foresight_state * mean_where(proprioception, valid),
+    ]
+
+
+class PlainLearner:
+    """Model, averaged model and optimiser."""
+
+    def __init__(self, model: WorldModel, config: OptimizerConfig, seed: int) -> None:
+        self.model = PlainModel(model)
+        self.averaged = copy.deepcopy(self.model).requires_grad_(False)
+        self.config = config
+        self.optimizer = torch.optim.AdamW(
+            self.model.parameters(), lr=config.lr, weight_decay=config.weight_decay
+        )
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def update(self, batch: Batch) -> float:
+        """One gradient step; returns the loss before it."""
+        loss = plain_loss(self.model, batch, self.generator)
+        self.optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
+        self.optimizer.step()
+        with torch.no_grad():
+            for mean, value in zip(
+                self.averaged.parameters(), self.model.parameters(), strict=True
+            ):
+                mean.mul_(self.config.ema).add_(value, alpha=1 - self.config.ema)
+        return float(loss.detach())

@@ -1,0 +1,40 @@
+"""What a step frees serves the next one."""
+
+import subprocess
+import sys
+
+import pytest
+
+from egovcp_train import allocation
+
+PROGRAM = """
+import resource, sys
+import numpy as np
+from egovcp_train.allocation import keep_freed_memory
+if sys.argv[1] == "keep" and not keep_freed_memory():
+    raise SystemExit(77)
+def faults():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+np.ones(1_000_000)
+before = faults()
+for _ in range(10):
+    np.ones(1_000_000)
+print(faults() - before)
+"""
+
+
+def _faults(mode: str) -> int:
+    found = subprocess.run([sys.executable, "-c", PROGRAM, mode], capture_output=True, text=True)
+    if found.returncode == 77:
+        pytest.skip("not glibc")
+    assert found.returncode == 0, found.stderr
+    return int(found.stdout)
+
+
+def test_memory_that_was_freed_is_used_again_without_page_faults() -> None:
+    assert _faults("keep") < 100  # of 8 MB ten times, each some thousand pages
+
+
+def test_a_c_library_without_the_setting_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(allocation.ctypes, "CDLL", lambda name: object())
+    assert not allocation.keep_freed_memory()
