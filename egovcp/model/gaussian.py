@@ -8,8 +8,6 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-STD_SHIFT = 0.54  # softplus(0.54) is 1, nearly: the deviation at zero logits
-
 
 class Gaussian(NamedTuple):
     """A diagonal Gaussian: mean and standard deviation, (..., Z)."""
@@ -21,7 +19,7 @@ class Gaussian(NamedTuple):
     def from_logits(cls, logits: Tensor, min_std: float) -> Gaussian:
         """(..., 2Z) network output -> Gaussian whose deviation is 1 at zero logits."""
         mean, raw = logits.float().chunk(2, -1)
-        return cls(mean, F.softplus(raw + STD_SHIFT) + min_std)
+        return cls(mean, F.softplus(raw + 0.54) + min_std)
 
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
         """One reparametrised draw."""

@@ -17,7 +17,6 @@ from egovcp import spec
 from egovcp.model.config import LossConfig
 from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, within
 from egovcp.model.gaussian import Gaussian, kl_divergence
-from egovcp.model.recurrence import filter_embeddings, filter_steps
 from egovcp.model.world_model import PASSING_UNIT, Carry, WorldModel
 
 
@@ -65,25 +64,26 @@ def filter_sequence(
     state = model.standardise(batch.state)
     embedding = model.embed_near(near, state.flatten(0, 1)).view(size, length, -1)
     carry = model.initial(size) if carry is None else carry
-    noise = None
-    if sample:
-        shape = length, size, model.config.latent
-        noise = torch.randn(shape, generator=generator, device=state.device)
-    run = filter_embeddings if _by_hand(state) else filter_steps
-    filtered = run(model, embedding, batch.prev_action, batch.is_first, carry, noise)
+    hs: list[Tensor] = []
+    zs: list[Tensor] = []
+    posteriors: list[Gaussian] = []
+    for t in range(length):
+        h = model.advance(carry, batch.prev_action[:, t], batch.is_first[:, t])
+        posterior = model.infer(h, embedding[:, t])
+        carry = Carry(h, posterior.sample(generator) if sample else posterior.mean)
+        hs.append(carry.h)
+        zs.append(carry.z)
+        posteriors.append(posterior)
+    h_seq = torch.stack(hs, 1)
+    means, stds = (torch.stack(s, 1) for s in zip(*posteriors, strict=True))
     return Rollout(
-        filtered.carry,
-        filtered.posterior,
-        model.predict(filtered.carry.h),
+        Carry(h_seq, torch.stack(zs, 1)),
+        Gaussian(means, stds),
+        model.predict(h_seq),
         near.view(size, length, *near.shape[1:]),
         state,
         embedding,
     )
-
-
-def _by_hand(state: Tensor) -> bool:
-    """Whether there is a gradient to save work on, and nothing that casts behind its back."""
-    return torch.is_grad_enabled() and not torch.is_autocast_enabled(state.device.type)
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:

@@ -171,7 +171,9 @@ def test_free_nats_are_for_the_step_or_for_each_dimension(per: str, expected: fl
     """All KL, 4 nats, in one of four dimensions: its share is one quarter of a nat."""
     mean = torch.tensor([[[8.0**0.5, 0.0, 0.0, 0.0]]])
     one, zero = torch.ones(1, 1, 4), torch.zeros(1)
-    rollout = Rollout(Carry(zero, zero), Gaussian(mean, one), Gaussian(0 * mean, one), zero, zero)
+    rollout = Rollout(
+        Carry(zero, zero, zero), Gaussian(mean, one), Gaussian(0 * mean, one), zero, zero
+    )
     config = LossConfig(free_nats=1.0, free_nats_per=per, kl_prior=1.0)  # type: ignore[arg-type]
     losses = kl_losses(rollout, torch.ones(1, 1).bool(), config)
     assert losses["kl_prior"].item() == pytest.approx(expected)
