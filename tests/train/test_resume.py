@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from egovcp.model import Batch
 from egovcp_train import checkpoint
 from egovcp_train.checkpoint import begin_checkpoint, finish_checkpoint, load_training_state
 from egovcp_train.config import TrainConfig
-from egovcp_train.loop import Learner
+from egovcp_train.loop import Budget, Learner
 from egovcp_train.train import main
 from egovcp_train.value_fit import fit_value
 
@@ -129,7 +130,7 @@ def test_a_resumed_run_has_the_minutes_that_were_left(
     arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now = [0.0]
-    monkeypatch.setattr("egovcp_train.loop.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("egovcp_train.train.Budget", partial(Budget, clock=lambda: now[0]))
     update = Learner.update
 
     def slow(self: Learner, batch: Batch, progress: float) -> dict[str, torch.Tensor]:

@@ -148,8 +148,8 @@ class TrainConfig:
     """CPU threads; 0: all cores."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""
-    mixed_precision: Literal["auto", "no", "bf16"] = "auto"
-    """Precision of matrix products; auto: as accelerate launch was told, else no."""
+    mixed_precision: str = "auto"
+    """Precision of matrix products: no, bf16, or auto (as accelerate launch was told, else no)."""
     tensorboard: bool = True
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
     wandb: WandbConfig = field(default_factory=WandbConfig)

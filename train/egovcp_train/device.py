@@ -32,14 +32,12 @@ def choose_bf16(name: str) -> bool:
     """Whether ``--mixed_precision`` asks for bfloat16; auto: as ``accelerate launch`` was told.
 
     Raises:
-        UsageError: the launcher was told something else.
+        UsageError: it asks for something else.
     """
     said = os.environ.get("ACCELERATE_MIXED_PRECISION", "no") if name == "auto" else name
     if said not in ("no", "bf16"):
-        raise UsageError(
-            f"accelerate launch --mixed_precision={said}; expected no or bf16, or give "
-            "--mixed_precision=no to egovcp-train itself"
-        )
+        source = "accelerate launch " if name == "auto" else ""
+        raise UsageError(f"{source}--mixed_precision={said}; expected no or bf16")
     return said == "bf16"
 
 
