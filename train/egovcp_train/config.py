@@ -11,7 +11,7 @@ from egovcp.data.source import is_repo_id
 from egovcp.errors import UsageError
 from egovcp.model import WorldModelConfig
 from egovcp.plan import PlannerConfig
-from egovcp_train.passing import PassingConfig
+from egovcp_train.labels.config import PassingConfig
 from egovcp_train.value_fit import ValueFitConfig
 from egovcp_train.wandb_records import WandbConfig
 

@@ -35,7 +35,7 @@ from egovcp_train.batches import (
     whole_episodes,
 )
 from egovcp_train.config import TrainConfig
-from egovcp_train.passing import label, label_episode
+from egovcp_train.labels.passing import label, label_episode
 from egovcp_train.ranks import ALONE, Ranks
 
 EVALUATION_EPISODES = 64  # of each task
@@ -138,6 +138,11 @@ def stream_config(config: TrainConfig) -> StreamConfig:
     )
 
 
+def needs_labels(config: TrainConfig) -> bool:
+    """Whether a loss asks what is on its way."""
+    return config.policy.loss.passing > 0 or config.policy.loss.flight > 0
+
+
 def _decided(config: TrainConfig, readers: Sequence[DatasetReader], ranks: Ranks) -> TrainConfig:
     """The options with the mode that auto stands for here, so that a resumed run keeps it."""
     if config.loading.mode != "auto":
@@ -159,8 +164,9 @@ def _in_memory(
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
     set_normalisation(model, learning)
-    if config.policy.loss.passing:
-        learning, heldout = label(learning, config.passing), label(heldout, config.passing)
+    heldout = label(heldout, config.passing)
+    if needs_labels(config):
+        learning = label(learning, config.passing)
     rows = ranks.rows(sampling.batch_size)
     sampling = dataclasses.replace(sampling, batch_size=ranks.count * sampling.batch_size)
     return learning, SequenceStream(learning, sampling, mix, rows), heldout
@@ -176,12 +182,12 @@ def _on_disk(
 ) -> tuple[Learning, Stream, EpisodeStore]:
     learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
     heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.returns)
+    heldout = label(heldout, config.passing)
     facts = survey(learning, config.returns, sampling.event_quantile)
     longest = int(learning.length.max())
     fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest)
     labelling = None
-    if config.policy.loss.passing:
-        heldout = label(heldout, config.passing)
+    if needs_labels(config):
         labelling = partial(label_episode, config=config.passing)
     stream = BoundedStream(
         learning,
@@ -204,7 +210,7 @@ def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -
     def batches(first: int) -> Iterator[Batch]:
         part = index.select(chosen[first : first + EPISODES_AT_ONCE])
         store = EpisodeStore.read(part, config.returns)
-        if config.policy.loss.passing:
+        if needs_labels(config):
             store = label(store, config.passing)
         yield from whole_episodes(store, device, config.sampling.mirror)
 
