@@ -1,4 +1,8 @@
-"""Several processes with ``accelerate launch`` train as one process with the whole batch."""
+"""Several processes train as one process with the whole batch.
+
+Started with ``torchrun``, which is what ``accelerate launch`` itself starts for several GPUs; with
+``--cpu`` that one starts several processes through MPI only.
+"""
 
 import os
 import shutil
@@ -22,13 +26,12 @@ pytestmark = pytest.mark.timeout(900)
 
 type Arguments = Callable[..., list[str]]
 
-LAUNCH = [sys.executable, "-m", "accelerate.commands.launch", "--cpu", "--num_processes=2"]
-PORT = "--main_process_port=0"  # any that is free
+LAUNCH = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2"]
 PADDED = {"sampling__length": 20, "log_freq": 1, "tensorboard": "true"}  # one episode has 15 ticks
 
 
 def _start(argv: list[str]) -> subprocess.Popen[str]:
-    command = [*LAUNCH, PORT, "-m", "egovcp_train.train", *argv]
+    command = [*LAUNCH, "-m", "egovcp_train.train", *argv]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
     return subprocess.Popen(command, text=True, start_new_session=True, **pipes)
 
@@ -57,6 +60,7 @@ def test_two_processes_have_the_losses_of_one_with_the_same_global_batch(
     assert said.count("done at step 8") == 1  # one of them speaks
     assert main(arguments(tmp_path / "one", **options, batch_size=4)) == 0
     one, two = _curves(tmp_path / "one"), _curves(tmp_path / "two")
+    assert len(load_training_state(tmp_path / "two")["streams"]) == 2
     assert one.keys() == two.keys()
     assert len(one["loss/total"]) == 8
     for name, values in one.items():
