@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -37,6 +37,7 @@ from egovcp_train.batches import (
 from egovcp_train.config import TrainConfig
 from egovcp_train.labels.passing import label, label_episode
 from egovcp_train.ranks import ALONE, Ranks
+from egovcp_train.return_scale import ReturnScale, on_task_scales, task_scales
 
 EVALUATION_EPISODES = 64  # of each task
 FIT_EPISODES = 2048  # of a dataset that is not in memory: half a GB of states to fit Q to
@@ -60,6 +61,8 @@ class Material:
     """Batches of their windows."""
     heldout: EpisodeStore
     """Episodes to evaluate on."""
+    return_scales: Mapping[str, ReturnScale]
+    """Task -> the scale that its returns are on, under `returns.scale=per_task`; else empty."""
 
     def training_episodes(self, device: torch.device) -> Iterator[Batch]:
         """Whole training episodes, and their mirror images; a random part of a large dataset."""
@@ -140,7 +143,8 @@ def stream_config(config: TrainConfig) -> StreamConfig:
 
 def needs_labels(config: TrainConfig) -> bool:
     """Whether a loss asks what is on its way."""
-    return config.policy.loss.passing > 0 or config.policy.loss.flight > 0
+    loss = config.policy.loss
+    return max(loss.passing, loss.flight, loss.motion) > 0
 
 
 def _decided(config: TrainConfig, readers: Sequence[DatasetReader], ranks: Ranks) -> TrainConfig:
@@ -159,17 +163,21 @@ def _in_memory(
     mix: Mix,
     model: WorldModel,
     ranks: Ranks,
-) -> tuple[Learning, Stream, EpisodeStore]:
+) -> tuple[Learning, Stream, EpisodeStore, Mapping[str, ReturnScale]]:
     learning, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
-    set_normalisation(model, learning)
+    scales: dict[str, ReturnScale] = {}
+    if config.returns.scale == "per_task":
+        scales = task_scales(learning)
+        learning, heldout = (on_task_scales(store, scales) for store in (learning, heldout))
+    set_normalisation(model, learning, config.returns.scale != "none")
     heldout = label(heldout, config.passing)
     if needs_labels(config):
         learning = label(learning, config.passing)
     rows = ranks.rows(sampling.batch_size)
     sampling = dataclasses.replace(sampling, batch_size=ranks.count * sampling.batch_size)
-    return learning, SequenceStream(learning, sampling, mix, rows), heldout
+    return learning, SequenceStream(learning, sampling, mix, rows), heldout, scales
 
 
 def _on_disk(
@@ -179,13 +187,19 @@ def _on_disk(
     mix: Mix,
     model: WorldModel,
     ranks: Ranks,
-) -> tuple[Learning, Stream, EpisodeStore]:
+) -> tuple[Learning, Stream, EpisodeStore, Mapping[str, ReturnScale]]:
+    if config.returns.scale == "per_task":
+        raise UsageError(
+            "--returns.scale=per_task needs all episodes in memory, and these are read from the "
+            "disk; give --loading.mode=ram, or --returns.scale=dataset"
+        )
     learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
     heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.returns)
     heldout = label(heldout, config.passing)
     facts = survey(learning, config.returns, sampling.event_quantile)
     longest = int(learning.length.max())
-    fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest)
+    scaled = config.returns.scale != "none"
+    fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest, scaled)
     labelling = None
     if needs_labels(config):
         labelling = partial(label_episode, config=config.passing)
@@ -199,7 +213,7 @@ def _on_disk(
         events=facts.events,
         label=labelling,
     )
-    return learning, Ahead(stream), heldout
+    return learning, Ahead(stream), heldout, {}
 
 
 def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -> Iterator[Batch]:

@@ -319,6 +319,7 @@ def _provenance(material: Material) -> dict[str, Any]:
         "tasks": sorted({reader.task(i) for reader in readers for i in range(len(reader))}),
         "versions": versions(),
         "datasets": [{"repo_id": r.source.repo_id, "revision": r.source.commit} for r in readers],
+        "return_scales": {task: list(scale) for task, scale in material.return_scales.items()},
         "train_config": draccus.encode(material.config),
         "command": [PROG, *sys.argv[1:]],
     }
