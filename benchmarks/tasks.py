@@ -19,9 +19,9 @@ from report import parser, publish
 
 from egovcp.intervals import wilson
 from egovcp.robot.controllers import make_controller
-from egovcp.sim.config import EnvConfig
+from egovcp.sim.config import EnvConfig, eventful
 from egovcp_deploy.episodes import Group, Setup, Stage
-from egovcp_deploy.scenarios import eventful, held_out
+from egovcp_deploy.scenarios import held_out
 
 PLAYERS = ("hold", "oracle")
 BANDS = {"default": (1.16, 1.24), "low": (1.08, 1.16)}

@@ -22,7 +22,7 @@ from egovcp.log.rerun import RerunSink
 from egovcp.log.sink import Fanout, Sink
 from egovcp.log.tick import Tick
 from egovcp.rate import FixedRate, LockstepClock
-from egovcp.sim.config import EnvConfig
+from egovcp.sim.config import EnvConfig, eventful
 from egovcp.spec import PLANNER_HZ, TASKS
 from egovcp_deploy.options import (
     PLANNER,
@@ -40,7 +40,7 @@ from egovcp_deploy.options import (
 from egovcp_deploy.policy import RolloutPolicy
 from egovcp_deploy.robots import Robot
 from egovcp_deploy.runner import RolloutSummary, Runner
-from egovcp_deploy.scenarios import eventful, held_out
+from egovcp_deploy.scenarios import held_out
 
 if TYPE_CHECKING:
     from egovcp_deploy.robots.sim import SimRobot

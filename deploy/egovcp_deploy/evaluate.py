@@ -16,7 +16,7 @@ from egovcp.artefact import Artefact
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.robot.controllers import make_controller
-from egovcp.sim.config import EnvConfig
+from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.env import decided
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import TASKS
@@ -35,7 +35,7 @@ from egovcp_deploy.options import (
     write_json,
 )
 from egovcp_deploy.report import gains, summary, table
-from egovcp_deploy.scenarios import eventful, held_out
+from egovcp_deploy.scenarios import held_out
 from egovcp_deploy.scores import EpisodeScore
 
 PROG: Final = "egovcp-eval"

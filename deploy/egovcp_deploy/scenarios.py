@@ -7,11 +7,9 @@ data, nor the other's, under whatever ``--seed``.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Final
 
 from egovcp.errors import UsageError
-from egovcp.sim.config import EnvConfig
 from egovcp.sim.scenario import Scenario
 
 HELD_OUT: Final = 1_000_000_000
@@ -40,14 +38,3 @@ def _checked(seed: int) -> int:
     if not 0 <= seed < SEARCH - HELD_OUT:
         raise UsageError(f"--seed={seed}: expected a number from 0 to {SEARCH - HELD_OUT - 1}")
     return seed
-
-
-def eventful() -> EnvConfig:
-    """The simulator's defaults with an event in every episode: an empty scene tests no block."""
-    config = EnvConfig()
-    return replace(
-        config,
-        ball_episode=replace(config.ball_episode, empty_probability=0.0),
-        wall_episode=replace(config.wall_episode, empty_probability=0.0),
-        arch_episode=replace(config.arch_episode, empty_probability=0.0),
-    )

@@ -22,7 +22,7 @@ from egovcp.data.order import EpisodeOrder, Shard
 from egovcp.data.store import EpisodeStore, ReturnConfig
 from egovcp.data.stream import PLAIN, StreamConfig, require_same
 from egovcp.data.survey import EventBound
-from egovcp.data.windows import Batch, finish, gather
+from egovcp.data.windows import Batch, draw_mirrored, finish, gather
 from egovcp.errors import DataError, UsageError
 
 type Label = Callable[[NDArray[np.uint16], NDArray[np.float32]], NDArray[np.float32]]
@@ -127,7 +127,8 @@ class BoundedStream:
         if len(parts) > 1:
             batch = {key: np.concatenate([part[key] for part in parts]) for key in batch}
         self._batches += 1
-        return finish(batch, self.config.burn_in, self.config.mirror, self._rng)
+        mirrored = draw_mirrored(self.config.batch_size, self.config.mirror, self._rng)
+        return finish(batch, self.config.burn_in, mirrored)
 
     def state_dict(self) -> dict[str, Any]:
         """JSON-compatible state; a stream that loads it continues with exactly the next batch."""

@@ -19,10 +19,11 @@ from numpy.typing import NDArray
 from egovcp.data.mix import Mix, Pools, group
 from egovcp.data.store import EpisodeStore
 from egovcp.data.survey import EventBound
-from egovcp.data.windows import Batch, finish, gather
+from egovcp.data.windows import Batch, draw_mirrored, finish, gather
 from egovcp.errors import DataError, UsageError
 
 PLAIN: Final = Mix()  # no weights
+ALL_ROWS: Final = slice(None)
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,21 @@ class StreamConfig:
 class SequenceStream:
     """Iterator over batches from an `EpisodeStore`."""
 
-    def __init__(self, store: EpisodeStore, config: StreamConfig, mix: Mix = PLAIN) -> None:
+    def __init__(
+        self,
+        store: EpisodeStore,
+        config: StreamConfig,
+        mix: Mix = PLAIN,
+        rows: slice = ALL_ROWS,
+    ) -> None:
         """Find the events and seed the generator.
+
+        Args:
+            store: the episodes.
+            config: how windows are drawn.
+            mix: weights of datasets and tasks.
+            rows: which windows of each batch to make. Processes that train together draw the
+                same batch, in the same state, and make a part of it each.
 
         Raises:
             UsageError: the configuration makes no sense.
@@ -71,6 +85,7 @@ class SequenceStream:
         self.store = store
         self.config = config
         self.mix = mix
+        self._rows = rows
         self._rng = np.random.default_rng(config.seed)
         self._batches = 0
         self._episode_of = np.repeat(np.arange(len(store.length)), store.length)
@@ -87,9 +102,11 @@ class SequenceStream:
         """The next batch; keys as in `gather`, ``valid`` false where a row must not count."""
         config, rng = self.config, self._rng
         start, episode = self._draw_windows()
-        batch = gather(self.store, start, episode, config.burn_in + config.length)
+        mirrored = draw_mirrored(config.batch_size, config.mirror, rng)
+        own = self._rows
+        batch = gather(self.store, start[own], episode[own], config.burn_in + config.length)
         self._batches += 1
-        return finish(batch, config.burn_in, config.mirror, rng)
+        return finish(batch, config.burn_in, mirrored[own])
 
     def state_dict(self) -> dict[str, Any]:
         """JSON-compatible state; a stream that loads it continues with exactly the next batch."""

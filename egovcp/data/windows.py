@@ -47,10 +47,14 @@ def mirror_rows(batch: Batch, rows: NDArray[np.intp]) -> None:
     batch["passing"][rows] = mirror_passing(batch["passing"][rows])
 
 
-def finish(batch: Batch, burn_in: int, mirror: bool, rng: np.random.Generator) -> Batch:
-    """Mark the rows that only warm up, and reflect half of the windows, in place."""
-    count, span = batch["t"].shape
+def draw_mirrored(count: int, mirror: bool, rng: np.random.Generator) -> NDArray[np.bool_]:
+    """(count,) which windows to reflect: half of them; none, and no draw, unless ``mirror``."""
+    return rng.random(count) < 0.5 if mirror else np.zeros(count, dtype=np.bool_)
+
+
+def finish(batch: Batch, burn_in: int, mirrored: NDArray[np.bool_]) -> Batch:
+    """Mark the rows that only warm up, and reflect the windows ``mirrored`` (B,), in place."""
+    span = batch["t"].shape[1]
     batch["valid"] &= ~((np.arange(span) < burn_in) & (batch["t"][:, :1] > 0))
-    if mirror:
-        mirror_rows(batch, np.flatnonzero(rng.random(count) < 0.5))
+    mirror_rows(batch, np.flatnonzero(mirrored))
     return batch

@@ -143,7 +143,7 @@ def _log_static(stream: rr.RecordingStream, info: RunInfo, imagined: tuple[int, 
     pictures = [paths.DEPTH, paths.RECONSTRUCTED]
     pictures += [f"{paths.IMAGINED}/{i}" for i in range(len(imagined))]
     for path in pictures:
-        stream.log(path, _depth_style(), static=True)
+        stream.log(path, depth_style(), static=True)
     hands = rr.Points3D.from_fields(colors=[LEFT, RIGHT], radii=[0.03], show_labels=False)
     stream.log(paths.HAND_TARGETS, hands, static=True)
     stream.log(paths.CANDIDATES, rr.LineStrips3D.from_fields(radii=[0.003]), static=True)
@@ -165,7 +165,7 @@ def _pinhole(view: CameraView) -> rr.Pinhole:
     )
 
 
-def _depth_style() -> rr.DepthImage:
+def depth_style() -> rr.DepthImage:
     """What all depth pictures share: size, millimetres, one colour scale for all."""
     return rr.DepthImage.from_fields(
         format=rr.components.ImageFormat(

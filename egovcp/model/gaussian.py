@@ -8,6 +8,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from egovcp.model.shared import row_noise
+
 
 class Gaussian(NamedTuple):
     """A diagonal Gaussian: mean and standard deviation, (..., Z)."""
@@ -23,7 +25,7 @@ class Gaussian(NamedTuple):
 
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
         """One reparametrised draw."""
-        noise = torch.randn(self.mean.shape, generator=generator, device=self.mean.device)
+        noise = row_noise(self.mean.shape, generator, self.mean.device)
         return self.mean + self.std * noise
 
     def detach(self) -> Gaussian:

@@ -17,6 +17,7 @@ from egovcp import spec
 from egovcp.model.config import LossConfig
 from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, within
 from egovcp.model.gaussian import Gaussian, kl_divergence
+from egovcp.model.shared import over_all_rows
 from egovcp.model.world_model import PASSING_UNIT, Carry, WorldModel
 
 
@@ -87,9 +88,12 @@ def filter_sequence(
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
-    """Mean of x where mask; 0 where the mask is empty."""
+    """Mean of x where mask; 0 where the mask is empty.
+
+    Of a batch that processes share (`egovcp.model.shared`): this one's part of the mean.
+    """
     weight = mask.to(x.dtype)
-    return (x * weight).sum() / weight.sum().clamp_min(1.0)
+    return (x * weight).sum() / over_all_rows(weight.sum()).clamp_min(1.0)
 
 
 def depth_loss(

@@ -288,3 +288,15 @@ class EnvConfig:
         if task not in episodes:
             raise UsageError(f"unknown task {task!r}{suggest(task, episodes)}")
         return episodes[task]
+
+
+def eventful() -> EnvConfig:
+    """The defaults with an event in every episode, to evaluate with: an empty scene tests no
+    block."""
+    config = EnvConfig()
+    return replace(
+        config,
+        ball_episode=replace(config.ball_episode, empty_probability=0.0),
+        wall_episode=replace(config.wall_episode, empty_probability=0.0),
+        arch_episode=replace(config.arch_episode, empty_probability=0.0),
+    )

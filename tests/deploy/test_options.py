@@ -9,6 +9,7 @@ import pytest
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.plan import PlannerConfig
+from egovcp.sim.config import eventful
 from egovcp_deploy.options import (
     PlannerOptions,
     check_choice,
@@ -16,7 +17,7 @@ from egovcp_deploy.options import (
     make_output_dir,
     write_json,
 )
-from egovcp_deploy.scenarios import eventful, for_search, held_out
+from egovcp_deploy.scenarios import for_search, held_out
 
 
 def test_an_empty_folder_is_accepted_and_a_new_one_created(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from egovcp.model import Batch
 from egovcp_train import checkpoint
 from egovcp_train.checkpoint import begin_checkpoint, finish_checkpoint, load_training_state
 from egovcp_train.config import TrainConfig
-from egovcp_train.loop import Learner
+from egovcp_train.loop import Budget, Learner
 from egovcp_train.train import main
 from egovcp_train.value_fit import fit_value
 
@@ -38,7 +39,8 @@ def _stop_after(monkeypatch: pytest.MonkeyPatch, step: int, number: int) -> None
 
 
 def _state(output: Path) -> dict[str, Any]:
-    return load_training_state(output)
+    """What the checkpoint holds, without how long it took to get there."""
+    return {k: v for k, v in load_training_state(output).items() if k != "seconds"}
 
 
 def _equal(a: object, b: object) -> bool:
@@ -74,7 +76,7 @@ def test_a_stopped_run_that_is_resumed_equals_an_uninterrupted_one(
     handlers = [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)]
     with monkeypatch.context() as patched:
         _stop_after(patched, 4, number)
-        assert main(arguments(output)) == 0
+        assert main(arguments(output)) == 130  # as all commands that a signal ends
     said = capsys.readouterr().out
     assert "stopped early at step 4" in said
     command = next(line for line in said.splitlines() if line.startswith("continue: "))
@@ -122,6 +124,29 @@ def test_a_second_signal_is_obeyed_at_once(
 
     monkeypatch.setattr(Learner, "update", twice)
     assert main(arguments(tmp_path / "run")) == 130
+
+
+def test_a_resumed_run_has_the_minutes_that_were_left(
+    arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [0.0]
+    monkeypatch.setattr("egovcp_train.train.Budget", partial(Budget, clock=lambda: now[0]))
+    update = Learner.update
+
+    def slow(self: Learner, batch: Batch, progress: float) -> dict[str, torch.Tensor]:
+        now[0] += 60.0
+        return update(self, batch, progress)
+
+    monkeypatch.setattr(Learner, "update", slow)
+    output = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        _stop_after(patched, 2, signal.SIGTERM)
+        options = {"steps": 1000, "save_freq": 1000, "max_minutes": 5}
+        assert main(arguments(output, **options)) == 130
+    assert load_training_state(output)["seconds"] == 120.0
+    now[0] += 3600.0  # a pause is no training
+    assert main([f"--output_dir={output}", "--resume"]) == 0
+    assert _state(output)["learner"]["step"] == 5
 
 
 def test_a_finished_run_can_be_extended(finished: Path, tmp_path: Path) -> None:

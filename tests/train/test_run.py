@@ -9,14 +9,18 @@ from pathlib import Path
 import draccus
 import numpy as np
 import pytest
+import torch
 
 from egovcp import spec
 from egovcp.artefact import MANIFEST, load_artefact
 from egovcp.checks import check_artefact
 from egovcp.cli import parse_config
 from egovcp.data import DatasetWriter, Episode, Provenance
-from egovcp.model import PRESETS
+from egovcp.model import PRESETS, Batch
+from egovcp_train.checkpoint import load_training_state
 from egovcp_train.config import TrainConfig
+from egovcp_train.device import choose_bf16
+from egovcp_train.loop import Learner
 from egovcp_train.train import main, option_defaults
 
 type Arguments = Callable[..., list[str]]
@@ -200,6 +204,7 @@ def test_a_place_that_cannot_be_written_is_a_matter_of_the_surroundings(
         ({"batch_size": 0}, "--batch_size"),
         ({"save_freq": 0}, "--save_freq"),
         ({"device": "abacus"}, "--device"),
+        ({"mixed_precision": "fp8"}, "--mixed_precision=fp8; expected no or bf16"),
         ({"preset": "huge"}, "preset"),
         ({"planner__elites": 99}, "elites"),
         ({"sampling__length": 0}, "length"),
@@ -227,6 +232,81 @@ def test_a_loss_that_is_not_a_number_ends_the_run_at_once(
     last_line = capsys.readouterr().err.splitlines()[-1]
     assert re.match(r"egovcp-train: error: the loss was not finite for 3 steps", last_line)
     assert not (tmp_path / "run" / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("sick", ["mc_return", "state"])
+def test_a_fault_in_mid_run_stops_within_3_steps_and_keeps_the_last_good_checkpoint(
+    tmp_path: Path,
+    arguments: Arguments,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    sick: str,
+) -> None:
+    """From the fifth step on the loss is not finite; step 6 would be saved, were it good."""
+    update, steps = Learner.update, []
+
+    def faulty(self: Learner, batch: Batch, progress: float) -> dict[str, torch.Tensor]:
+        steps.append(self.step + 1)
+        if self.step >= 4:
+            field = getattr(batch, sick).float()
+            batch = batch._replace(**{sick: torch.full_like(field, torch.nan)})
+        return update(self, batch, progress)
+
+    monkeypatch.setattr(Learner, "update", faulty)
+    output = tmp_path / "run"
+    assert main(arguments(output, steps=100, save_freq=2)) == 3
+    assert steps[-1] == 7
+    assert "last good checkpoint" in capsys.readouterr().err.splitlines()[-1]
+    for folder in (output / "checkpoints").iterdir():
+        weights = load_artefact(str(folder / "pretrained_model")).world_model.state_dict()
+        assert all(x.isfinite().all() for x in weights.values())
+    learner = load_training_state(output)["learner"]
+    kept = [*learner["model"].values(), *learner["averaged"].values()]
+    assert all(x.isfinite().all() for x in kept)
+
+    monkeypatch.undo()
+    assert main([f"--output_dir={output}", "--resume", "--steps=9"]) == 0
+
+
+def test_weights_that_a_finite_step_has_made_infinite_are_not_saved(
+    tmp_path: Path, arguments: Arguments, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "run"
+    explosive = {"optimizer__lr": 1e38, "optimizer__warmup_steps": 0, "save_freq": 1}
+    assert main(arguments(output, **explosive)) == 3
+    assert "not finite" in capsys.readouterr().err.splitlines()[-1]
+    assert not list(output.glob("checkpoints/*"))
+
+
+def test_bfloat16_learns_about_the_same(arguments: Arguments, tmp_path: Path) -> None:
+    for precision in ("no", "bf16"):
+        assert main(arguments(tmp_path / precision, mixed_precision=precision, steps=3)) == 0
+    exact, rough = (load_training_state(tmp_path / p)["learner"] for p in ("no", "bf16"))
+    assert all(x.dtype == torch.float32 for x in rough["model"].values())
+    pairs = [(exact["model"][k], rough["model"][k]) for k in exact["model"]]
+    assert any(not torch.equal(a, b) for a, b in pairs)
+    assert all((a - b).abs().max() < 0.02 for a, b in pairs)
+
+
+def test_what_the_launcher_says_of_precision_holds_where_no_flag_does(
+    arguments: Arguments,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", "fp16")
+    _refused(arguments(tmp_path / "run"), 2, capsys, "--mixed_precision=fp16; expected no or bf16")
+    monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", "bf16")
+    assert choose_bf16("auto")
+    assert not choose_bf16("no")
+
+
+def test_the_recording_of_open_loop_prediction_lies_in_the_run(
+    arguments: Arguments, tmp_path: Path
+) -> None:
+    pytest.importorskip("rerun")
+    assert main(arguments(tmp_path / "run", steps=1)) == 0
+    assert (tmp_path / "run" / "open_loop.rrd").read_bytes()[:4] == b"RRF2"
 
 
 def test_the_controller_of_the_data_goes_into_the_artefact(

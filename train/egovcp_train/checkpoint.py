@@ -30,8 +30,7 @@ def finish_checkpoint(partial: Path, state: dict[str, Any]) -> Path:
     folder.mkdir(parents=True)
     with (folder / STATE_FILE).open("wb") as file:
         torch.save(state, file)
-        file.flush()
-        os.fsync(file.fileno())
+    _sync(partial)
     final = partial.with_suffix("")
     shutil.rmtree(final, ignore_errors=True)
     partial.rename(final)
@@ -39,7 +38,23 @@ def finish_checkpoint(partial: Path, state: dict[str, Any]) -> Path:
     link.unlink(missing_ok=True)
     link.symlink_to(final.name)
     link.replace(final.parent / "last")
+    _flush(final.parent)
     return final
+
+
+def _sync(folder: Path) -> None:
+    """Everything in the folder is on the disk, should the power fail after it gets its name."""
+    for path in (*folder.rglob("*"), folder):
+        _flush(path)
+
+
+def _flush(path: Path) -> None:
+    """Write out a file's content, or a folder's names."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 def begin_checkpoint(output_dir: Path, step: int) -> Path:

@@ -13,6 +13,7 @@ from egovcp.model import WorldModelConfig
 from egovcp.plan import PlannerConfig
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.value_fit import ValueFitConfig
+from egovcp_train.wandb_records import WandbConfig
 
 
 @dataclass(frozen=True)
@@ -126,9 +127,11 @@ class TrainConfig:
     """Gradient steps."""
     max_minutes: float = 0.0
     """Wall-clock limit in minutes after which the run ends early, its learning rate decayed on
-    the clock; 0: none. A run under a limit is not repeatable step for step."""
+    the clock; 0: none. A resumed run has what was left. A run under a limit is not repeatable
+    step for step."""
     batch_size: int = 16
-    """Windows per gradient step."""
+    """Windows per gradient step and process; under accelerate launch all processes together make
+    one step of batch_size * num_processes windows."""
     seed: int = 0
     """Seed of initialisation, batches and sampling."""
     resume: bool = False
@@ -137,14 +140,20 @@ class TrainConfig:
     """Steps between TensorBoard records."""
     eval_freq: int = 500
     """Steps between evaluations on held-out episodes; 0: only at the end."""
+    eval_closed_loop: int = 0
+    """Scenarios of each task that are played in simulation at every evaluation; 0: none."""
     save_freq: int = 1000
     """Steps between checkpoints; one is always written at the end."""
     threads: int = 0
     """CPU threads; 0: all cores."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""
+    mixed_precision: str = "auto"
+    """Precision of matrix products: no, bf16, or auto (as accelerate launch was told, else no)."""
     tensorboard: bool = True
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
+    wandb: WandbConfig = field(default_factory=WandbConfig)
+    """Weights & Biases."""
 
 
 #: What a preset says beyond the world model itself (`egovcp.model.PRESETS`). The paper knows no

@@ -25,6 +25,7 @@ from egovcp.data import (
 )
 from egovcp.data.ahead import Ahead
 from egovcp.data.memory import available_bytes
+from egovcp.data.order import Shard
 from egovcp.errors import UsageError
 from egovcp.model import Batch, WorldModel
 from egovcp_train.batches import (
@@ -35,6 +36,7 @@ from egovcp_train.batches import (
 )
 from egovcp_train.config import TrainConfig
 from egovcp_train.labels.passing import label, label_episode
+from egovcp_train.ranks import ALONE, Ranks
 from egovcp_train.return_scale import ReturnScale, on_task_scales, task_scales
 
 EVALUATION_EPISODES = 64  # of each task
@@ -69,21 +71,32 @@ class Material:
         return whole_episodes(self.learning, device, self.config.sampling.mirror)
 
 
-def prepare(config: TrainConfig, model: WorldModel) -> Material:
+def prepare(config: TrainConfig, model: WorldModel, ranks: Ranks = ALONE) -> Material:
     """Open the datasets, read all of them once, and fix the model's statistics.
+
+    The first process goes ahead: it alone downloads, refuses what is wrong, and decides.
 
     Raises:
         UsageError: the options make no sense.
         DataError: a dataset is missing, damaged, not a number, or of another specification.
         EnvironmentFailure: the Hub cannot be reached.
     """
+    if ranks.is_first:
+        material = _prepare(config, model, ranks)
+        ranks.decided(material.config.loading)
+        return material
+    loading = ranks.decided(config.loading)
+    return _prepare(dataclasses.replace(config, loading=loading), model, ranks)
+
+
+def _prepare(config: TrainConfig, model: WorldModel, ranks: Ranks) -> Material:
     mix, sampling = mix_of(config), stream_config(config)
     sampling.check()
     config.loading.shuffle.check()
     readers = open_readers(config)
-    config = _decided(config, readers)
+    config = _decided(config, readers, ranks)
     build = _in_memory if config.loading.mode == "ram" else _on_disk
-    return Material(readers, config, *build(readers, config, sampling, mix, model))
+    return Material(readers, config, *build(readers, config, sampling, mix, model, ranks))
 
 
 def open_readers(config: TrainConfig) -> tuple[DatasetReader, ...]:
@@ -134,11 +147,11 @@ def needs_labels(config: TrainConfig) -> bool:
     return max(loss.passing, loss.flight, loss.motion, loss.foresight_motion) > 0
 
 
-def _decided(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:
+def _decided(config: TrainConfig, readers: Sequence[DatasetReader], ranks: Ranks) -> TrainConfig:
     """The options with the mode that auto stands for here, so that a resumed run keeps it."""
     if config.loading.mode != "auto":
         return config
-    needed = sum(reader.num_frames for reader in readers) * FRAME_BYTES
+    needed = sum(reader.num_frames for reader in readers) * FRAME_BYTES * ranks.local
     mode: Literal["ram", "stream"] = "ram" if 2 * needed <= available_bytes() else "stream"
     return dataclasses.replace(config, loading=dataclasses.replace(config.loading, mode=mode))
 
@@ -149,6 +162,7 @@ def _in_memory(
     sampling: StreamConfig,
     mix: Mix,
     model: WorldModel,
+    ranks: Ranks,
 ) -> tuple[Learning, Stream, EpisodeStore, Mapping[str, ReturnScale]]:
     learning, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
@@ -161,7 +175,9 @@ def _in_memory(
     heldout = label(heldout, config.passing)
     if needs_labels(config):
         learning = label(learning, config.passing)
-    return learning, SequenceStream(learning, sampling, mix), heldout, scales
+    rows = ranks.rows(sampling.batch_size)
+    sampling = dataclasses.replace(sampling, batch_size=ranks.count * sampling.batch_size)
+    return learning, SequenceStream(learning, sampling, mix, rows), heldout, scales
 
 
 def _on_disk(
@@ -170,6 +186,7 @@ def _on_disk(
     sampling: StreamConfig,
     mix: Mix,
     model: WorldModel,
+    ranks: Ranks,
 ) -> tuple[Learning, Stream, EpisodeStore, Mapping[str, ReturnScale]]:
     if config.returns.scale == "per_task":
         raise UsageError(
@@ -191,6 +208,7 @@ def _on_disk(
         sampling,
         mix,
         config.loading.shuffle,
+        Shard(ranks.rank, ranks.count),
         returns=config.returns,
         events=facts.events,
         label=labelling,

@@ -12,15 +12,28 @@ from torch import Tensor
 
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel, world_model_loss
+from egovcp.model.shared import sharing
 from egovcp_train.config import OptimizerConfig
+from egovcp_train.device import precision
+from egovcp_train.ranks import ALONE, Ranks
 
 
 class Learner:
     """Model, averaged model, optimiser and the random stream of the latent noise."""
 
-    def __init__(self, model: WorldModel, config: OptimizerConfig, seed: int) -> None:
+    def __init__(
+        self,
+        model: WorldModel,
+        config: OptimizerConfig,
+        seed: int,
+        ranks: Ranks = ALONE,
+        bf16: bool = False,
+    ) -> None:
+        """All processes of ``ranks`` start from the same ``model`` and ``seed``, and stay alike."""
         self.model = model
         self.config = config
+        self.ranks = ranks
+        self.bf16 = bf16
         self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.optimizer = torch.optim.AdamW(
             model.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True
@@ -35,15 +48,18 @@ class Learner:
         self.model.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(progress)
-        loss, metrics = world_model_loss(self.model, batch, self.generator)
+        with sharing(self.ranks.share), precision(batch.state.device, self.bf16):
+            loss, metrics = world_model_loss(self.model, batch, self.generator)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
+        terms = {**metrics, "loss/total": loss.detach()}
+        terms = self.ranks.add_up(self.model.parameters(), terms)
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
-        if self._finite(norm):
+        if self._finite(norm + terms["loss/total"]):
             self.optimizer.step()
             self._average()
         self.step += 1
-        return {**metrics, "loss/total": loss.detach(), "grad_norm": norm}
+        return {**terms, "grad_norm": norm}
 
     def learning_rate(self, progress: float) -> float:
         """Linear warm-up, then cosine decay to a tenth of the peak."""
@@ -51,16 +67,26 @@ class Learner:
         cosine = 0.5 * (1 + math.cos(math.pi * min(1.0, progress)))
         return self.config.lr * warm * (0.1 + 0.9 * cosine)
 
-    def _finite(self, norm: Tensor) -> bool:
-        """Skip a step whose gradient is not finite; give up at the third in a row."""
-        if torch.isfinite(norm):
+    def require_finite(self) -> None:
+        """Raise `DataError` where a step, finite itself, has led to weights that are not."""
+        values = [*self.model.parameters(), *self.averaged.parameters()]
+        if not all(bool(x.isfinite().all()) for x in values):
+            raise DataError(
+                f"the weights are not finite after step {self.step}, so they are not saved; the "
+                "last good checkpoint, if there is one, is kept: lower --optimizer.lr"
+            )
+
+    def _finite(self, sums: Tensor) -> bool:
+        """Skip a step whose loss or gradient is not finite; give up at the third in a row."""
+        if torch.isfinite(sums):
             self._not_finite = 0
             return True
         self._not_finite += 1
         if self._not_finite >= 3:
             raise DataError(
-                f"the loss was not finite for 3 steps in a row (step {self.step}); the last good "
-                "checkpoint is kept: check the dataset, or lower --optimizer.lr"
+                f"the loss was not finite for 3 steps in a row (step {self.step + 1}); the last "
+                "good checkpoint, if there is one, is kept: check the dataset, or lower "
+                "--optimizer.lr"
             )
         return False
 
@@ -92,14 +118,24 @@ class Budget:
     """How far the run has come: by steps, or by the clock where that ends first."""
 
     def __init__(
-        self, steps: int, max_minutes: float, clock: Callable[[], float] = time.monotonic
+        self,
+        steps: int,
+        max_minutes: float,
+        clock: Callable[[], float] = time.monotonic,
+        spent: float = 0.0,
     ) -> None:
+        """``spent``: seconds that a run took before it was resumed."""
         self.steps, self.seconds, self._clock = steps, 60 * max_minutes, clock
-        self._start = clock()
+        self._start = clock() - spent
+
+    @property
+    def spent(self) -> float:
+        """Seconds since the run began, without those between a stop and a resume."""
+        return self._clock() - self._start
 
     def progress(self, step: int) -> float:
         """Fraction of the run that is done, in [0, 1]."""
         by_steps = step / self.steps
         if not self.seconds:
             return min(1.0, by_steps)
-        return min(1.0, max(by_steps, (self._clock() - self._start) / self.seconds))
+        return min(1.0, max(by_steps, self.spent / self.seconds))

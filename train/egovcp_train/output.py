@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import signal
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -74,14 +75,23 @@ def require_writable(folder: Path) -> None:
 
 
 @contextlib.contextmanager
-def stop_on_signal() -> Iterator[list[int]]:
-    """A list that fills when SIGINT or SIGTERM asks for the end; a second one is obeyed at once."""
+def stop_on_signal(echo_s: float = 0.0) -> Iterator[list[int]]:
+    """A list that fills when SIGINT or SIGTERM asks for the end; a second one is obeyed at once.
+
+    Args:
+        echo_s: seconds during which a second one is taken for the first: a launcher hands on to
+            its processes the Ctrl-C that the terminal has already sent them.
+    """
     received: list[int] = []
+    ignored_until = 0.0
 
     def note(number: int, frame: object) -> None:
-        if received:
+        nonlocal ignored_until
+        if not received:
+            received.append(number)
+            ignored_until = time.monotonic() + echo_s
+        elif time.monotonic() >= ignored_until:
             raise KeyboardInterrupt
-        received.append(number)
 
     previous = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
     try:

@@ -26,20 +26,25 @@ from egovcp_train.checkpoint import (
     finish_checkpoint,
     load_training_state,
 )
+from egovcp_train.closed_loop import ClosedLoop, require_simulator
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
 from egovcp_train.datasets import EVALUATION_EPISODES, Material, Stream, prepare
-from egovcp_train.device import choose_device
+from egovcp_train.device import choose_bf16, choose_device
 from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
-from egovcp_train.heldout.report import measure, scalars
+from egovcp_train.heldout.recording import record
+from egovcp_train.heldout.report import Report, measure, scalars
 from egovcp_train.heldout.table import table
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options, stop_on_signal
 from egovcp_train.publish import publish_trained, reserve_policy
-from egovcp_train.records import Recorder
+from egovcp_train.ranks import Ranks, join
+from egovcp_train.records import Everywhere, Recorder, Records
 from egovcp_train.value_fit import fit_value
+from egovcp_train.wandb_records import WandbRecorder, require_wandb
 
 PROG = "egovcp-train"
+LAUNCHER_ECHO_S = 5.0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -68,22 +73,33 @@ def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
 
 
 def train(config: TrainConfig) -> None:
-    """Run training to its end, or to the first SIGINT or SIGTERM, and write the artefact."""
-    output = _prepare_output(config)
+    """Run training to its end, or to the first SIGINT or SIGTERM, and write the artefact.
+
+    Raises:
+        KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
+    """
+    bf16 = choose_bf16(config.mixed_precision)
+    ranks = join(cpu=config.device == "cpu")
+    output = _prepare_output(config, ranks)
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
     device = choose_device(config.device)
     torch.manual_seed(config.seed)
     model = WorldModel(config.policy.world_model())
-    material = prepare(config, model)
+    material = prepare(config, model, ranks)
     config = material.config
-    learner = Learner(model.to(device), config.optimizer, config.seed)
-    if config.resume:
-        _restore(output, learner, material.stream)
-    reserve_policy(config.policy)
-    output.mkdir(parents=True, exist_ok=True)
-    save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
-    Run(config, output, learner, material, device, _provenance(material)).execute()
+    learner = Learner(model.to(device), config.optimizer, config.seed, ranks, bf16)
+    spent = _restore(output, learner, material.stream) if config.resume else 0.0
+    provenance = _provenance(material)
+    if ranks.is_first:
+        simulation = _simulation(config, provenance)
+        reserve_policy(config.policy)
+        output.mkdir(parents=True, exist_ok=True)
+        save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
+    else:
+        simulation = None
+    run = Run(config, output, learner, material, device, provenance, simulation, spent)
+    run.execute()
 
 
 class Run:
@@ -97,43 +113,74 @@ class Run:
         material: Material,
         device: torch.device,
         provenance: dict[str, Any],
+        simulation: ClosedLoop | None = None,
+        spent: float = 0.0,
     ) -> None:
         self.config, self.output, self.learner, self.material = config, output, learner, material
-        self.device, self.provenance = device, provenance
+        self.device, self.provenance, self.simulation = device, provenance, simulation
+        self.ranks = learner.ranks
+        self.budget = Budget(config.steps, config.max_minutes, spent=spent)
         self.metrics: dict[str, float] = {}
         self.tasks: dict[str, dict[str, Any]] = {}
-        self.recorder = Recorder(output, enabled=config.tensorboard)
+        self.played: dict[str, float] = {}
+        self.recorder = _records(config, output) if self.ranks.is_first else Everywhere([])
 
     def execute(self) -> None:
-        """Train until the budget or a signal ends it; the last state is always saved."""
-        learner = self.learner
-        budget = Budget(self.config.steps, self.config.max_minutes)
-        start = learner.step
-        with stop_on_signal() as stopped:
-            self._learn(budget, stopped)
-            finished = budget.progress(learner.step) >= 1.0
-            final = checkpoint_dir(self.output, learner.step)
-            if learner.step > start or not final.exists():
-                self.finish(fit=finished)
-        self.recorder.close()
-        print(self._last_words(final, stopped=not finished))
-        write_card(final / "pretrained_model", self.output, self.config.policy.repo_id)
-        if finished and self.config.policy.push_to_hub:
-            publish_trained(final / "pretrained_model", self.config.policy)
+        """Train until the budget or a signal ends it; the last state is always saved.
 
-    def _learn(self, budget: Budget, stopped: list[int]) -> None:
-        """Step until the budget is spent or ``stopped`` fills."""
+        Raises:
+            KeyboardInterrupt: a signal has ended it.
+        """
+        learner = self.learner
+        start = learner.step
+        with stop_on_signal(LAUNCHER_ECHO_S if self.ranks.count > 1 else 0.0) as stopped:
+            finished = self._learn(stopped)
+            final = checkpoint_dir(self.output, learner.step)
+            if learner.step > start or not self.ranks.decided(final.exists()):
+                self.finish(fit=finished)
+        if self.ranks.is_first:
+            self._conclude(final, finished)
+        self.ranks.close()
+        if not finished:
+            raise KeyboardInterrupt if self.ranks.is_first else SystemExit(130)
+
+    def _conclude(self, final: Path, finished: bool) -> None:
+        """Say where everything is, and publish what is finished."""
+        artefact = final / "pretrained_model"
+        print(self._last_words(final, stopped=not finished))
+        write_card(artefact, self.output, self.config.policy.repo_id)
+        if finished:
+            self.recorder.artefact(self.learner.step, artefact)
+        self.recorder.close()
+        if finished and self.config.policy.push_to_hub:
+            publish_trained(artefact, self.config.policy)
+
+    def _learn(self, stopped: list[int]) -> bool:
+        """Step until the budget is spent, or ``stopped`` fills here or in another process; returns
+        whether the budget is spent."""
         config, learner, start = self.config, self.learner, self.learner.step
-        frames = config.batch_size * (config.sampling.length + config.sampling.burn_in)
+        ticks = config.sampling.length + config.sampling.burn_in
+        frames = self.ranks.count * config.batch_size * ticks
         with tqdm(
-            total=config.steps, initial=start, unit="step", desc="train", mininterval=1.0
+            total=config.steps,
+            initial=start,
+            unit="step",
+            desc="train",
+            mininterval=1.0,
+            disable=not self.ranks.is_first,
         ) as bar:
-            while budget.progress(learner.step) < 1.0 and not stopped:
+            while True:
+                progress = self.budget.progress(learner.step)
+                progress, stop = self.ranks.agreed(progress, bool(stopped))
+                if progress >= 1.0 or stop:
+                    return progress >= 1.0
                 if learner.step > start and learner.step % config.save_freq == 0:
                     self.save(learner.averaged)
                 batch = to_tensors(next(self.material.stream), self.device)
-                terms = learner.update(batch, budget.progress(learner.step))
+                terms = learner.update(batch, progress)
                 bar.update()
+                if not self.ranks.is_first:
+                    continue
                 if learner.step % config.log_freq == 0:
                     self.recorder.scalars(learner.step, {k: float(v) for k, v in terms.items()})
                     bar.set_postfix(self._summary(terms, bar, frames))
@@ -141,16 +188,22 @@ class Run:
                     self.evaluate(learner.averaged)
 
     def finish(self, fit: bool) -> None:
-        """Fit Q on the states of the finished model, evaluate, and save what is shipped."""
-        shipped = copy.deepcopy(self.learner.averaged)
-        if fit:
-            episodes = self.material.training_episodes(self.device)
-            fit_value(shipped, episodes, self.config.value_fit, self.config.seed)
-        self.evaluate(shipped)
+        """Fit Q on the states of the finished model, evaluate, and save what is shipped.
+
+        A launcher leaves its processes 30 s to stop: there an unfinished model is only saved.
+        """
+        shipped = self.learner.averaged
+        if self.ranks.is_first and (fit or self.ranks.count == 1):
+            shipped = copy.deepcopy(shipped)
+            if fit:
+                episodes = self.material.training_episodes(self.device)
+                fit_value(shipped, episodes, self.config.value_fit, self.config.seed)
+            report = self.evaluate(shipped)
+            record(report, self.output, shipped.config.depth_max_m)
         self.save(shipped)
 
-    def evaluate(self, model: WorldModel) -> None:
-        """Measure a model on held-out episodes."""
+    def evaluate(self, model: WorldModel) -> Report:
+        """Measure a model on held-out episodes, and in simulation if that is asked for."""
         config, step = self.config, self.learner.step
         heldout = self.material.heldout
         episodes = recorded(heldout, self.device, EVALUATION_EPISODES)
@@ -158,18 +211,31 @@ class Run:
         self.metrics, self.tasks = report.metrics, report.tasks
         found = self.metrics | scalars(self.tasks)
         self.recorder.scalars(step, {f"heldout/{k}": v for k, v in found.items()})
-        if config.tensorboard:
+        if len(self.recorder):
             for name, picture in draw(report).items():
                 self.recorder.picture(step, f"heldout/{name}", picture)
+        if self.simulation is not None:
+            self.played = self.simulation.play(model, config.planner)
+            self.recorder.scalars(step, {f"closed_loop/{k}": v for k, v in self.played.items()})
+        return report
 
-    def save(self, model: WorldModel) -> Path:
-        """Write a checkpoint: the model as artefact, and the training state."""
+    def save(self, model: WorldModel) -> None:
+        """Write a checkpoint: the model as artefact, and the training state of all processes.
+
+        Raises:
+            DataError: the model is not finite.
+        """
+        streams = self.ranks.collected(self.material.stream.state_dict())
+        self.learner.require_finite()
+        if not self.ranks.is_first:
+            return
         partial = begin_checkpoint(self.output, self.learner.step)
-        found = {"heldout": self.metrics, "heldout_tasks": self.tasks}
+        found = {"heldout": self.metrics, "heldout_tasks": self.tasks, "closed_loop": self.played}
         provenance = self.provenance | {"step": self.learner.step, **found}
         save_artefact(partial / "pretrained_model", model, self.config.planner, provenance)
-        state = {"learner": self.learner.state_dict(), "stream": self.material.stream.state_dict()}
-        return finish_checkpoint(partial, state)
+        spent = {"seconds": self.budget.spent}
+        state = {"learner": self.learner.state_dict(), "streams": streams, **spent}
+        finish_checkpoint(partial, state)
 
     def _summary(self, terms: dict[str, Any], bar: Any, frames: int) -> dict[str, str]:
         summary = {"loss": f"{float(terms['loss/total']):.3f}"}
@@ -180,7 +246,8 @@ class Run:
         return summary
 
     def _last_words(self, final: Path, stopped: bool) -> str:
-        lines = [f"  {name:<20} {value:.4f}" for name, value in sorted(self.metrics.items())]
+        found = self.metrics | {f"closed_loop/{k}": v for k, v in self.played.items()}
+        lines = [f"  {name:<20} {value:.4f}" for name, value in sorted(found.items())]
         state = "stopped early" if stopped else "done"
         artefact = final / "pretrained_model"
         return "\n".join(
@@ -196,25 +263,49 @@ class Run:
         )
 
 
-def _prepare_output(config: TrainConfig) -> Path:
-    """Refuse a bad destination before any work starts."""
+def _prepare_output(config: TrainConfig, ranks: Ranks) -> Path:
+    """Refuse what makes no sense, or cannot be done here, before any work starts."""
     if min(config.steps, config.batch_size, config.log_freq, config.save_freq) < 1:
         raise UsageError("--steps, --batch_size, --log_freq and --save_freq must be at least 1")
-    return prepare_output(config.output_dir, config.resume)
+    if config.eval_closed_loop < 0:
+        raise UsageError(f"--eval_closed_loop={config.eval_closed_loop}: expected at least 0")
+    require_wandb(config.wandb)
+    if config.eval_closed_loop:
+        require_simulator()
+    output = Path(config.output_dir)
+    return prepare_output(config.output_dir, config.resume) if ranks.is_first else output
 
 
-def _restore(output: Path, learner: Learner, stream: Stream) -> None:
-    """Continue from the last checkpoint.
+def _simulation(config: TrainConfig, provenance: dict[str, Any]) -> ClosedLoop | None:
+    if not config.eval_closed_loop:
+        return None
+    tasks, controller = provenance["tasks"], provenance["controller_id"]
+    return ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
+
+
+def _records(config: TrainConfig, output: Path) -> Everywhere:
+    found: list[Records] = []
+    if config.tensorboard:
+        found.append(Recorder(output, enabled=True))
+    if config.wandb.enable:
+        found.append(WandbRecorder(output, config.wandb, draccus.encode(config)))
+    return Everywhere(found)
+
+
+def _restore(output: Path, learner: Learner, stream: Stream) -> float:
+    """Continue from the last checkpoint; returns the seconds that the run has taken so far.
 
     Raises:
         ArtefactError: its networks are not those of the options.
         DataError: the dataset is another one.
-        UsageError: the windows are others.
+        UsageError: the windows or the processes are others.
     """
     state = load_training_state(output)
     try:
         learner.load_state_dict(state["learner"])
-        stream.load_state_dict(state["stream"])
+        streams = state.get("streams") or [state["stream"]]
+        stream.load_state_dict(streams[min(learner.ranks.rank, len(streams) - 1)])
+        return float(state.get("seconds", 0.0))
     except (KeyError, RuntimeError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ArtefactError(
@@ -234,3 +325,7 @@ def _provenance(material: Material) -> dict[str, Any]:
         "train_config": draccus.encode(material.config),
         "command": [PROG, *sys.argv[1:]],
     }
+
+
+if __name__ == "__main__":
+    sys.exit(main())

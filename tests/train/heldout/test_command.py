@@ -45,6 +45,7 @@ def test_figures_pictures_and_a_table(
     assert content["_run"]["split"] == "all"
     assert {p.name for p in output.iterdir()} == {
         "heldout.json",
+        "open_loop.rrd",
         "open_loop_ball.png",
         "value_ball.png",
     }

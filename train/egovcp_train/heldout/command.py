@@ -19,6 +19,7 @@ from egovcp.errors import ArtefactError, UsageError
 from egovcp_train.device import choose_device
 from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
+from egovcp_train.heldout.recording import record
 from egovcp_train.heldout.report import Report, measure
 from egovcp_train.heldout.table import table
 from egovcp_train.labels.config import PassingConfig
@@ -62,7 +63,7 @@ class HeldoutConfig:
     stride: int = 4
     """Rows between the starts of open-loop predictions; 1: from each row."""
     pictures: bool = True
-    """Write open_loop_TASK.png and value_TASK.png."""
+    """Write open_loop_TASK.png, value_TASK.png and open_loop.rrd."""
     threads: int = 0
     """CPU threads; 0: all cores."""
     device: str = "auto"
@@ -91,7 +92,9 @@ def evaluate(config: HeldoutConfig) -> None:
     model = artefact.world_model.to(device)
     report = measure(model, recorded(store, device), config.stride)
     print(table(report.tasks))
-    _write(output, report, _run(config, artefact, reader), config.pictures)
+    _write(output, report, _run(config, artefact, reader))
+    if config.pictures:
+        _show(output, report, model.config.depth_max_m)
     print(f"figures: {output / RESULT}")
 
 
@@ -162,17 +165,21 @@ def _run(config: HeldoutConfig, artefact: Artefact, reader: DatasetReader) -> di
     }
 
 
-def _write(output: Path, report: Report, run: dict[str, Any], pictures: bool) -> None:
+def _write(output: Path, report: Report, run: dict[str, Any]) -> None:
     output.mkdir(parents=True, exist_ok=True)
     content = {"tasks": report.tasks, "all_tasks": report.metrics, "_run": run}
     (output / RESULT).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    if not pictures:
-        return
+
+
+def _show(output: Path, report: Report, depth_max_m: float) -> None:
+    """Draw the pictures and the recording, and say where they are."""
     from PIL import Image
 
     for name, picture in draw(report).items():
         Image.fromarray(picture).save(output / f"{name}.png", optimize=True)
         print(f"picture: {output / name}.png")
+    if recording := record(report, output, depth_max_m):
+        print(f"recording: rerun {recording}")
 
 
 if __name__ == "__main__":

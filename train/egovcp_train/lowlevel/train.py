@@ -91,7 +91,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def train(config: LowLevelTrainConfig) -> None:
-    """Run PPO to its end, or to the first SIGINT or SIGTERM, and write the controller."""
+    """Run PPO to its end, or to the first SIGINT or SIGTERM, and write the controller.
+
+    Raises:
+        KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
+    """
     if min(config.robots, config.steps, config.save_freq) < 1:
         raise UsageError("--robots, --steps and --save_freq must be at least 1")
     output = prepare_output(config.output_dir, config.resume)
@@ -180,6 +184,8 @@ class _Run:
         print(f"{PROG}: {state} after {learner.steps} steps, difficulty {self._difficulty:.2f}")
         print(f"controller: {final}")
         print(f"next: egovcp-eval-lowlevel --controller={final} --output_dir=...")
+        if state != "done":
+            raise KeyboardInterrupt
 
     @property
     def _difficulty(self) -> float:

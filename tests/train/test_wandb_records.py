@@ -1,0 +1,112 @@
+"""--wandb.enable, with a stand-in for the package."""
+
+import sys
+from collections.abc import Callable
+from importlib.machinery import ModuleSpec
+from pathlib import Path
+from types import ModuleType, SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from egovcp_train.train import main
+
+type Arguments = Callable[..., list[str]]
+
+
+class _Run:
+    def __init__(self, run_id: str) -> None:
+        self.id = run_id
+        self.logged: list[tuple[int, dict[str, Any]]] = []
+        self.artefacts: list[Any] = []
+        self.finished = False
+
+    def log(self, values: dict[str, Any], step: int) -> None:
+        self.logged.append((step, values))
+
+    def log_artifact(self, artefact: Any) -> None:
+        self.artefacts.append(artefact)
+
+    def finish(self) -> None:
+        self.finished = True
+
+
+class _Wandb(ModuleType):
+    """What egovcp uses of the package."""
+
+    class Error(Exception):
+        pass
+
+    def __init__(self) -> None:
+        super().__init__("wandb")
+        self.__spec__ = ModuleSpec("wandb", None)
+        self.runs: list[_Run] = []
+        self.asked: list[dict[str, Any]] = []
+        self.refuses = False
+
+    def init(self, **options: Any) -> _Run:
+        if self.refuses:
+            raise self.Error("api_key not configured")
+        self.asked.append(options)
+        self.runs.append(_Run(options["id"] or "abc123"))
+        return self.runs[-1]
+
+    def Image(self, pixels: Any) -> Any:  # noqa: N802
+        return SimpleNamespace(pixels=np.asarray(pixels))
+
+    def Artifact(self, name: str, type: str) -> Any:  # noqa: A002, N802
+        folders: list[str] = []
+        return SimpleNamespace(name=name, type=type, folders=folders, add_dir=folders.append)
+
+
+@pytest.fixture
+def wandb(monkeypatch: pytest.MonkeyPatch) -> _Wandb:
+    fake = _Wandb()
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    return fake
+
+
+def test_scalars_pictures_and_the_policy_go_there_and_a_resumed_run_goes_on(
+    arguments: Arguments, tmp_path: Path, wandb: _Wandb
+) -> None:
+    output = tmp_path / "run"
+    flags = ["--wandb.enable", "--wandb.project=hands", "--wandb.mode=offline"]
+    assert main(arguments(output, *flags)) == 0
+    (run,), (asked,) = wandb.runs, wandb.asked
+    assert (asked["project"], asked["mode"], asked["id"]) == ("hands", "offline", None)
+    assert asked["config"]["steps"] == 6
+    logged = {name: step for step, values in run.logged for name in values}
+    assert logged["loss/total"] == 6
+    assert logged["heldout/latent/kl"] == 6
+    assert "heldout/value_ball" in logged
+    steps = [step for step, _ in run.logged]
+    assert steps == sorted(steps)  # wandb drops what goes back in time
+    (artefact,) = run.artefacts
+    assert artefact.folders == [str(output / "checkpoints" / "000006" / "pretrained_model")]
+    assert run.finished
+
+    argv = [f"--output_dir={output}", "--resume", "--steps=8", "--wandb.disable_artifact"]
+    assert main(argv) == 0
+    assert wandb.asked[-1]["id"] == "abc123"
+    assert wandb.runs[-1].artefacts == []
+
+
+def test_without_the_package_it_is_refused_before_anything_is_written(
+    arguments: Arguments,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    assert main(arguments(tmp_path / "run", "--wandb.enable")) == 5
+    assert "pip install wandb" in capsys.readouterr().err
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_server_that_refuses_is_a_matter_of_the_surroundings(
+    arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str], wandb: _Wandb
+) -> None:
+    wandb.refuses = True
+    assert main(arguments(tmp_path / "run", "--wandb.enable")) == 5
+    assert "wandb: api_key not configured" in capsys.readouterr().err

@@ -1,0 +1,106 @@
+"""Return and success of the planner in simulation, while the model is still being trained."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from importlib.util import find_spec
+from itertools import batched
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.model import WorldModel
+from egovcp.plan import PlannerConfig
+from egovcp.plan.policy import Policy
+
+if TYPE_CHECKING:
+    from egovcp.sim.env import VectorEnv
+    from egovcp.sim.scenario import Scenario
+
+VALIDATION: Final = 3_000_000_000  # scenarios of neither a collection nor of egovcp-eval
+ROBOTS: Final = 8  # side by side
+
+type Played = tuple[NDArray[np.float64], NDArray[np.bool_]]
+
+
+def require_simulator() -> None:
+    """Raise `EnvironmentFailure` where the simulator is not installed."""
+    for package in ("mujoco", "mjlab"):
+        if find_spec(package) is None:
+            raise EnvironmentFailure(
+                f"--eval_closed_loop plays in simulation, which needs the package {package}; it is "
+                "not installed here: pip install 'egovcp[sim]', or train without the option"
+            )
+
+
+class ClosedLoop:
+    """Plays the same scenarios of each task with any model."""
+
+    def __init__(self, tasks: Sequence[str], episodes: int, seed: int, controller_id: str) -> None:
+        """Choose the controller that the data was collected with.
+
+        Args:
+            tasks: the tasks to play.
+            episodes: scenarios of each.
+            seed: which ones.
+            controller_id: of the data.
+
+        Raises:
+            UsageError: the controller is not one of those that egovcp ships.
+        """
+        self._controller = _named(controller_id)
+        self._tasks, self._episodes, self._seed = tuple(tasks), episodes, seed
+
+    def play(self, model: WorldModel, planner: PlannerConfig) -> dict[str, float]:
+        """``TASK/return``, the mean sum of rewards, and ``TASK/success``, a share."""
+        from egovcp.sim.scenario import Scenario
+
+        found: dict[str, float] = {}
+        for task in self._tasks:
+            every = [Scenario(task, VALIDATION + self._seed, i) for i in range(self._episodes)]
+            parts = [self._together(model, planner, part) for part in batched(every, ROBOTS)]
+            returns, successes = (np.concatenate(x) for x in zip(*parts, strict=True))
+            found[f"{task}/return"] = float(returns.mean())
+            found[f"{task}/success"] = float(successes.mean())
+        return found
+
+    def _together(
+        self, model: WorldModel, planner: PlannerConfig, scenarios: Sequence[Scenario]
+    ) -> Played:
+        from egovcp.sim.config import eventful
+        from egovcp.sim.env import VectorEnv
+
+        config = replace(eventful(), controller=self._controller)
+        env = VectorEnv(config, len(scenarios))
+        return _play(env, Policy(model, planner, len(scenarios), self._seed), scenarios)
+
+
+def _play(env: VectorEnv, policy: Policy, scenarios: Sequence[Scenario]) -> Played:
+    """Return and success (B,) each of one episode per row."""
+    observation = env.reset(scenarios)
+    returns = np.zeros(len(scenarios))
+    success: NDArray[np.bool_] = np.zeros(len(scenarios), dtype=np.bool_)
+    while not env.done.all():
+        live = ~env.done
+        result = env.step(policy.act(observation.depth, observation.state).action)
+        policy.advance(result.sent_action)
+        returns += np.where(live, result.reward, 0.0)
+        observation, success = result.observation, result.success
+    return returns, success
+
+
+def _named(controller_id: str) -> str:
+    """The name of the shipped controller with this id."""
+    from egovcp.robot.controllers import STANCE, WALK, make_controller
+
+    ids = {make_controller(name).id: name for name in (STANCE, WALK)}
+    if controller_id not in ids:
+        raise UsageError(
+            f"--eval_closed_loop: the data was collected with the controller {controller_id!r}, "
+            f"expected one of {', '.join(ids)}; train without the option, and evaluate with "
+            "egovcp-eval --env.controller=FILE"
+        )
+    return ids[controller_id]
