@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 
 from egovcp import spec
-from egovcp.cli import DatasetConfig
+from egovcp.cli import DatasetConfig, SelectedDatasetConfig
 from egovcp.data import (
     BoundedStream,
     DatasetReader,
@@ -21,10 +21,13 @@ from egovcp.data import (
     Mix,
     SequenceStream,
     StreamConfig,
+    sample_files,
     survey,
+    survey_sample,
 )
 from egovcp.data.ahead import Ahead
 from egovcp.data.memory import available_bytes
+from egovcp.data.source import is_local
 from egovcp.errors import UsageError
 from egovcp.model import Batch, WorldModel
 from egovcp_train.batches import (
@@ -58,16 +61,21 @@ class Material:
     """Batches of their windows."""
     heldout: EpisodeStore
     """Episodes to evaluate on."""
+    fitting: Learning
+    """Those training episodes that the final fit of Q may draw from."""
 
     def training_episodes(self, device: torch.device) -> Iterator[Batch]:
         """Whole training episodes, and their mirror images; a random part of a large dataset."""
-        if isinstance(self.learning, EpisodeIndex):
-            return _from_disk(self.learning, self.config, device)
-        return whole_episodes(self.learning, device, self.config.sampling.mirror)
+        if isinstance(self.fitting, EpisodeIndex):
+            return _from_disk(self.fitting, self.config, device)
+        return whole_episodes(self.fitting, device, self.config.sampling.mirror)
 
 
 def prepare(config: TrainConfig, model: WorldModel) -> Material:
-    """Open the datasets, read all of them once, and fix the model's statistics.
+    """Open the datasets and fix the model's statistics.
+
+    What is on disk is read and checked as a whole; of a dataset that is streamed from the Hub a
+    sample of its files.
 
     Raises:
         UsageError: the options make no sense.
@@ -77,8 +85,12 @@ def prepare(config: TrainConfig, model: WorldModel) -> Material:
     mix, sampling = mix_of(config), stream_config(config)
     sampling.check()
     config.loading.shuffle.check()
+    if config.loading.sample_files < 1:
+        raise UsageError(f"--loading.sample_files={config.loading.sample_files}: at least 1")
     readers = open_readers(config)
-    config = _decided(config, readers)
+    config = pinned(_decided(config, readers), readers)
+    if config.loading.mode == "ram" and any(reader.is_remote for reader in readers):
+        readers = open_readers(config)
     build = _in_memory if config.loading.mode == "ram" else _on_disk
     return Material(readers, config, *build(readers, config, sampling, mix, model))
 
@@ -92,10 +104,31 @@ def open_readers(config: TrainConfig) -> tuple[DatasetReader, ...]:
         EnvironmentFailure: the Hub cannot be reached.
     """
     if not config.datasets:
-        return (DatasetReader.open(config.dataset),)
-    if config.dataset != DatasetConfig():
+        return (_open(config.dataset, config),)
+    if config.dataset != SelectedDatasetConfig():
         raise UsageError("--dataset and --datasets both name data; give one of them")
-    return tuple(DatasetReader.open(dataset) for dataset in config.datasets)
+    return tuple(_open(dataset, config) for dataset in config.datasets)
+
+
+def _open(dataset: DatasetConfig, config: TrainConfig) -> DatasetReader:
+    if config.loading.mode == "ram":
+        return DatasetReader.open(dataset)
+    return DatasetReader.on_demand(dataset, config.loading.network)
+
+
+def pinned(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:
+    """The options with the commit that each dataset of the Hub is, so that a resumed run keeps
+    it, whatever is pushed meanwhile."""
+    if not config.datasets:
+        return dataclasses.replace(config, dataset=_at_commit(config.dataset, readers[0]))
+    both = zip(config.datasets, readers, strict=True)
+    return dataclasses.replace(config, datasets=tuple(_at_commit(d, r) for d, r in both))
+
+
+def _at_commit[D: DatasetConfig](config: D, reader: DatasetReader) -> D:
+    if is_local(config):
+        return config
+    return dataclasses.replace(config, revision=reader.source.commit)
 
 
 def mix_of(config: TrainConfig) -> Mix:
@@ -129,7 +162,7 @@ def _decided(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConf
     """The options with the mode that auto stands for here, so that a resumed run keeps it."""
     if config.loading.mode != "auto":
         return config
-    needed = sum(reader.num_frames for reader in readers) * FRAME_BYTES
+    needed = EpisodeIndex.of(readers).num_frames * FRAME_BYTES
     mode: Literal["ram", "stream"] = "ram" if 2 * needed <= available_bytes() else "stream"
     return dataclasses.replace(config, loading=dataclasses.replace(config.loading, mode=mode))
 
@@ -140,14 +173,14 @@ def _in_memory(
     sampling: StreamConfig,
     mix: Mix,
     model: WorldModel,
-) -> tuple[Learning, Stream, EpisodeStore]:
+) -> tuple[Learning, Stream, EpisodeStore, Learning]:
     learning, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
     set_normalisation(model, learning)
     if config.policy.loss.passing:
         learning, heldout = label(learning, config.passing), label(heldout, config.passing)
-    return learning, SequenceStream(learning, sampling, mix), heldout
+    return learning, SequenceStream(learning, sampling, mix), heldout, learning
 
 
 def _on_disk(
@@ -156,10 +189,19 @@ def _on_disk(
     sampling: StreamConfig,
     mix: Mix,
     model: WorldModel,
-) -> tuple[Learning, Stream, EpisodeStore]:
+) -> tuple[Learning, Stream, EpisodeStore, Learning]:
     learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
-    heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.returns)
-    facts = survey(learning, config.returns, sampling.event_quantile)
+    sample = learning
+    if learning.is_remote:
+        sample, unseen = sample_files(learning, unseen, config.loading.sample_files)
+        sample.bring()
+    unseen = unseen.spread(EVALUATION_EPISODES)
+    unseen.bring()
+    heldout = EpisodeStore.read(unseen, config.returns)
+    if learning.is_remote:
+        facts = survey_sample(learning, sample, config.returns, sampling.event_quantile)
+    else:
+        facts = survey(learning, config.returns, sampling.event_quantile)
     longest = int(learning.length.max())
     fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest)
     labelling = None
@@ -174,8 +216,9 @@ def _on_disk(
         returns=config.returns,
         events=facts.events,
         label=labelling,
+        checked=not learning.is_remote,
     )
-    return learning, Ahead(stream), heldout
+    return learning, Ahead(stream), heldout, sample
 
 
 def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -> Iterator[Batch]:

@@ -15,6 +15,7 @@ from tqdm import tqdm
 
 from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
+from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.model import PRESETS, WorldModel
 from egovcp_train.batches import to_tensors
@@ -225,9 +226,13 @@ def _provenance(material: Material) -> dict[str, Any]:
     readers = material.readers
     return {
         "controller_id": readers[0].controller_id,
-        "tasks": sorted({reader.task(i) for reader in readers for i in range(len(reader))}),
+        "tasks": sorted(set(EpisodeIndex.of(readers).tasks)),
         "versions": versions(),
-        "datasets": [{"repo_id": r.source.repo_id, "revision": r.source.commit} for r in readers],
+        "datasets": [
+            {"repo_id": r.source.repo_id, "revision": r.source.commit, "episodes": r.episodes}
+            for r in readers
+        ],
+        "heldout_episodes": describe_heldout(readers),
         "train_config": draccus.encode(material.config),
         "command": [PROG, *sys.argv[1:]],
     }

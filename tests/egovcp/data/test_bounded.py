@@ -137,7 +137,7 @@ def test_other_options_or_data_are_not_resumed(six: EpisodeIndex, reader: Datase
     with pytest.raises(UsageError, match="workers 1 -> 2"):
         BoundedStream(six, _config(), shuffle=FEW, shard=Shard(workers=2)).load_state_dict(state)
     with pytest.raises(DataError, match="episodes have changed"):
-        BoundedStream(six.first(5), _config(), shuffle=FEW).load_state_dict(state)
+        BoundedStream(six.select(np.arange(5)), _config(), shuffle=FEW).load_state_dict(state)
     store = EpisodeStore.load([reader])
     with pytest.raises(UsageError, match="bounded"):
         SequenceStream(store, _config()).load_state_dict(state)
