@@ -1,4 +1,4 @@
-"""egovcp-train on a dataset of the Hub, streamed: pinned, resumable, honest about a lost network."""
+"""egovcp-train on a dataset of the Hub, streamed: pinned, resumable, honest about a network."""
 
 import shutil
 from collections.abc import Callable
