@@ -91,8 +91,10 @@ COMMAND_SLICE: Final = slice(6, 16)  # velocity 3, hands 6, height 1
 COMMAND_DIM: Final = 10
 
 #: Label of a row about what is on its way: y, z (m), time left (s), whether there is something
-#: (0 or 1), and whether this is known (0 or 1).
-PASSING_DIM: Final = 5
+#: (0 or 1), and whether this is known (0 or 1); and where in the picture it is: row and column of
+#: its middle, radius (pixels; 0: nowhere), depth of its surface (m).
+PASSING_DIM: Final = 9
+IN_PICTURE: Final = slice(5, 9)
 
 STATE_NAMES: Final = (
     *(f"angular_velocity.{a}" for a in "xyz"),

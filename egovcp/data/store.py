@@ -54,8 +54,9 @@ class EpisodeStore:
     mc_valid: NDArray[np.bool_]
     """(N,)."""
     passing: NDArray[np.float32]
-    """(N, 5) what is on its way: where it will pass the plane before the robot (y, z in m) and
-    in how long (s), whether anything is, and whether that is known; zeros, not known, until
+    """(N, 9) what is on its way: where it will pass the plane before the robot (y, z in m) and
+    in how long (s), whether anything is, and whether that is known; where in the picture it is
+    (row, column and radius in pixels, depth in m; radius 0: nowhere). Zeros, not known, until
     somebody labels them."""
     start: NDArray[np.int64]
     """(E,) first frame of each episode."""

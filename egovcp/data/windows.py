@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
+from egovcp.data.mirror import mirror_action, mirror_depth, mirror_passing, mirror_state
 from egovcp.data.store import EpisodeStore
 
 type Batch = dict[str, NDArray[Any]]
@@ -44,7 +44,7 @@ def mirror_rows(batch: Batch, rows: NDArray[np.intp]) -> None:
     batch["state"][rows] = mirror_state(batch["state"][rows])
     for name in ("action", "prev_action"):
         batch[name][rows] = mirror_action(batch[name][rows])
-    batch["passing"][rows, :, 0] *= -1.0  # y
+    batch["passing"][rows] = mirror_passing(batch["passing"][rows])
 
 
 def finish(batch: Batch, burn_in: int, mirror: bool, rng: np.random.Generator) -> Batch:

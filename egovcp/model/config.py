@@ -17,8 +17,10 @@ class LossConfig:
     decode_every: int = 2
     """Reconstruct every n-th image of a window, the first one drawn at random: the decoder is
     the dearest part of a step, and neighbouring images teach it the same."""
-    moving: float = 100.0
+    moving: float = 10.0
     """Extra weight of pixels that changed since the previous frame; 0: none."""
+    flight: float = 300.0
+    """Extra weight of the pixels around a thing in flight, where labels tell; 0: none."""
     moving_threshold: float = 0.04
     """Change of nearness (fraction of the depth range) that counts as moving."""
     motion: float = 10.0
@@ -42,6 +44,14 @@ class LossConfig:
     """Also regress Q on states imagined this many steps ahead of the posterior; 0: never."""
     imagined_value: float = 1.0
     """Weight of the value loss on imagined states."""
+    foresight_depth: float = 30.0
+    """Weight of the pictures of states imagined several ticks ahead; 0: none."""
+    foresight_state: float = 1.0
+    """Weight of the proprioception of states imagined several ticks ahead; 0: none."""
+    foresight_ahead: tuple[int, ...] = (4, 8, 12)
+    """Ticks ahead at which they are compared with what was recorded."""
+    foresight_every: int = 4
+    """Imagine from every n-th row of a window only, the first one drawn at random."""
 
 
 @dataclass(frozen=True)
@@ -84,12 +94,15 @@ PAPER_LOSS = LossConfig(
     depth=float(spec.DEPTH_ROWS * spec.DEPTH_COLS),
     decode_every=1,
     moving=0.0,
+    flight=0.0,
     motion=0.0,
     passing=0.0,
     state=float(spec.STATE_DIM),
     kl_posterior=1.0,
     free_nats=0.0,
     imagined_steps=0,
+    foresight_depth=0.0,
+    foresight_state=0.0,
 )
 
 PRESETS = {

@@ -40,6 +40,16 @@ def _extreme_3x3(x: Tensor, extreme: Callable[..., Tensor]) -> Tensor:
     return x
 
 
+def lowest_3x3(x: Tensor) -> Tensor:
+    """(B, H, W) -> the smallest in each pixel's 3 x 3 neighbourhood; no gradient."""
+    return _extreme_3x3(x, torch.minimum)
+
+
+def highest_3x3(x: Tensor) -> Tensor:
+    """(B, H, W) -> the largest in each pixel's 3 x 3 neighbourhood; no gradient."""
+    return _extreme_3x3(x, torch.maximum)
+
+
 def network_image(near: Tensor) -> Tensor:
     """(B, H, W) nearness -> (B, 2, H, W): nearness and validity."""
     return torch.stack([near, (near > 0).to(near.dtype)], 1)
@@ -48,6 +58,34 @@ def network_image(near: Tensor) -> Tensor:
 def to_metres(near: Tensor, max_m: float) -> Tensor:
     """Nearness -> planar depth in metres; 0 (nothing in range) where nearness vanishes."""
     return torch.where(near > 0.01, (1.0 - near).clamp(0.0, 1.0) * max_m, 0.0)
+
+
+#: Distance in depth, m, within which a pixel belongs to a thing whose place is known.
+SLACK = 0.2
+
+
+def thing_pixels(near: Tensor, place: Tensor, max_m: float) -> Tensor:
+    """The pixels of a thing whose place in the picture is known.
+
+    Args:
+        near: (N, H, W) nearness.
+        place: (N, 4) row and column of its middle and the radius within which its pixels are,
+            in pixels, 0: it is nowhere; depth of its surface, m.
+        max_m: depth at which nearness is 0, m.
+
+    Returns:
+        (N, H, W) bool.
+    """
+    at_its_depth = ((1.0 - near) * max_m - place[:, 3, None, None]).abs() < SLACK
+    return within(near, place) & at_its_depth & (near > 0)
+
+
+def within(near: Tensor, place: Tensor) -> Tensor:
+    """(N, H, W) bool: the disc in which a thing's pixels are, see `thing_pixels`."""
+    rows = torch.arange(near.shape[-2], device=near.device)[:, None]
+    cols = torch.arange(near.shape[-1], device=near.device)
+    row, column, radius = (place[:, i, None, None] for i in range(3))
+    return (rows - row).square() + (cols - column).square() < radius.square()
 
 
 #: Nearness below which a change is noise at the end of the range, and above which it is the

@@ -1,4 +1,4 @@
-"""The training objective (paper equations 6 to 9) over a batch of sequences [B, T, ...].
+"""The terms of the training objective (paper equations 6 to 9) over sequences [B, T, ...].
 
 Alignment of a row t: the model filters o_t after a_{t-1}; Q_t judges a_t against the
 Monte Carlo return from t; D judges the state that a_t has produced, (h_{t+1}, z^_{t+1}),
@@ -13,8 +13,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from egovcp import spec
 from egovcp.model.config import LossConfig
-from egovcp.model.depth import approaching, nearness
+from egovcp.model.depth import approaching, highest_3x3, lowest_3x3, nearness, within
 from egovcp.model.gaussian import Gaussian, kl_divergence
 from egovcp.model.world_model import PASSING_UNIT, Carry, WorldModel
 
@@ -31,7 +32,7 @@ class Batch(NamedTuple):
     mc_return: Tensor  # (B, T)
     mc_valid: Tensor  # (B, T) bool
     terminal_next: Tensor  # (B, T) bool: a_t ended the episode in failure
-    passing: Tensor  # (B, T, 5), see `egovcp.data.EpisodeStore`
+    passing: Tensor  # (B, T, 9), see `egovcp.data.EpisodeStore`
 
 
 class Rollout(NamedTuple):
@@ -82,24 +83,6 @@ def filter_sequence(
     )
 
 
-def world_model_loss(
-    model: WorldModel, batch: Batch, generator: torch.Generator | None = None
-) -> tuple[Tensor, dict[str, Tensor]]:
-    """Total loss of equation 6 and its terms (scalars, detached)."""
-    config = model.config.loss
-    rollout = filter_sequence(model, batch, generator=generator)
-    terms = {
-        "depth": config.depth * depth_loss(model, rollout, batch, config, generator),
-        "motion": config.motion * motion_loss(model, rollout, batch),
-        "passing": config.passing * passing_loss(model, rollout, batch),
-        "state": config.state * state_loss(model, rollout, batch),
-        **kl_losses(rollout, batch.valid, config),
-        **value_and_termination_losses(model, rollout, batch, config),
-    }
-    total = torch.stack(list(terms.values())).sum()
-    return total, {f"loss/{name}": term.detach() for name, term in terms.items()}
-
-
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Mean of x where mask; 0 where the mask is empty."""
     weight = mask.to(x.dtype)
@@ -109,26 +92,53 @@ def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
 def depth_loss(
     model: WorldModel,
     rollout: Rollout,
-    batch: Batch,
-    config: LossConfig,
+    valid: Tensor,
+    weight: Tensor,
+    every: int = 1,
     generator: torch.Generator | None = None,
 ) -> Tensor:
-    """Gaussian negative log likelihood of the image, moving pixels weighted up."""
-    every = min(config.decode_every, batch.valid.shape[1])
-    first = int(torch.randint(every, (), generator=generator, device=batch.state.device))
+    """Gaussian negative log likelihood of every n-th image, pixels weighted.
+
+    Args:
+        model: the world model.
+        rollout: the filtered batch.
+        valid: (B, T) bool, rows that count.
+        weight: (B, T, H, W) of the pixels.
+        every: n; the first image is drawn at random.
+        generator: draws it.
+    """
+    every = min(every, valid.shape[1])
+    first = int(torch.randint(every, (), generator=generator, device=valid.device))
     rows = (slice(None), slice(first, None, every))
     image = model.decode_depth(rollout.carry.features[rows].flatten(0, 1)).float()
     error = 0.5 * (image - rollout.near[rows].flatten(0, 1)).square()
+    error = error * weight[rows].flatten(0, 1)
+    return masked_mean(error.mean((-2, -1)), valid[rows].flatten())
+
+
+def pixel_weights(near: Tensor, batch: Batch, config: LossConfig) -> Tensor:
+    """How much each pixel of (B, T, H, W) nearness counts: 1, and more where something moves.
+
+    What flies is weighted in a disc somewhat larger than itself, so that painting it beside its
+    place is no cheaper than not painting it.
+    """
+    weight = torch.ones_like(near)
     if config.moving > 0:
-        moving = moving_pixels(rollout.near, config.moving_threshold)
-        moving = moving.masked_fill(batch.is_first[..., None, None], 0.0)[rows]
-        error = error * (1.0 + config.moving * moving.flatten(0, 1))
-    return masked_mean(error.mean((-2, -1)), batch.valid[rows].flatten())
+        moving = moving_pixels(near, config.moving_threshold)
+        weight += config.moving * moving.masked_fill(batch.is_first[..., None, None], 0.0)
+    if config.flight > 0:
+        place = batch.passing[..., spec.IN_PICTURE]
+        flies = place[..., 2] > 0
+        weight[flies] += config.flight * within(near[flies], place[flies])
+    return weight
 
 
 def moving_pixels(near: Tensor, threshold: float) -> Tensor:
-    """(B, T, H, W) nearness -> 1 where a pixel differs from the previous frame, else 0."""
-    change = (near[:, 1:] - near[:, :-1]).abs() > threshold
+    """(B, T, H, W) nearness -> 1 where a pixel differs from all 3 x 3 around it in the previous
+    frame, else 0: the robot's own sway moves edges by a pixel and slides along the floor."""
+    before = near[:, :-1].flatten(0, 1)
+    low, high = (f(before).view_as(near[:, 1:]) for f in (lowest_3x3, highest_3x3))
+    change = (near[:, 1:] > high + threshold) | (near[:, 1:] < low - threshold)
     return F.pad(change, (0, 0, 0, 0, 1, 0)).to(near.dtype)
 
 
@@ -156,7 +166,7 @@ def _motion_loss_at(output: Tensor, centre: Tensor, seen: Tensor, batch: Batch, 
     """Squared error of the place ``k`` ticks ahead, and cross entropy of its being seen."""
     length = seen.shape[1]
     output, centre, seen = output[:, : length - k], centre[:, k:], seen[:, k:]
-    known = _unbroken(batch, k)
+    known = unbroken(batch, k)
     place = masked_mean((output[..., :3] - centre).square().sum(-1), known & seen)
     presence = F.binary_cross_entropy_with_logits(
         output[..., 3], seen.to(output.dtype), reduction="none"
@@ -229,7 +239,7 @@ def value_and_termination_losses(
             losses["termination"] = config.termination * masked_mean(bce, batch.valid)
         carry = Carry(carry.h[:, :-1], carry.z[:, :-1])  # (B, T - k): the rows that exist
         if config.imagined_steps and k < length:
-            same_episode = _unbroken(batch, k)
+            same_episode = unbroken(batch, k)
             q = model.standardised_value(carry, batch.action[:, k:])
             error = (q - target[:, k:]).square()
             imagined.append(masked_mean(error, usable[:, k:] & same_episode))
@@ -238,7 +248,7 @@ def value_and_termination_losses(
     return losses
 
 
-def _unbroken(batch: Batch, k: int) -> Tensor:
+def unbroken(batch: Batch, k: int) -> Tensor:
     """(B, T - k): row t and row t + k are valid and of the same episode."""
     start = batch.is_first.long().cumsum(1)
     length = start.shape[1]

@@ -97,12 +97,12 @@ def test_a_run_starts_before_the_dataset_is_here_and_stays_with_its_commit(
 def test_the_batches_and_the_state_statistics_are_those_of_a_local_copy(
     streamed: Arguments, arguments: Arguments, many_files: Path, tmp_path: Path
 ) -> None:
-    assert main(streamed(tmp_path / "hub", steps=3)) == 0
+    assert main(streamed(tmp_path / "streamed", steps=3)) == 0
     window = {"loading__mode": "stream", "loading__shuffle__episodes": 2}
     assert main(arguments(tmp_path / "disk", dataset__root=many_files, steps=3, **window)) == 0
-    streams = [load_training_state(tmp_path / name)["stream"] for name in ("hub", "disk")]
+    streams = [load_training_state(tmp_path / name)["stream"] for name in ("streamed", "disk")]
     assert streams[0] == streams[1]
-    models = [_artefact(tmp_path / name).world_model.state_dict() for name in ("hub", "disk")]
+    models = [_artefact(tmp_path / name).world_model.state_dict() for name in ("streamed", "disk")]
     for name in ("state_mean", "state_std"):
         torch.testing.assert_close(models[0][name], models[1][name])
 

@@ -12,7 +12,7 @@ from egovcp.errors import UsageError
 from egovcp.hub import Patience
 from egovcp.model import WorldModelConfig
 from egovcp.plan import PlannerConfig
-from egovcp_train.passing import PassingConfig
+from egovcp_train.labels.config import PassingConfig
 from egovcp_train.value_fit import ValueFitConfig
 
 

@@ -37,7 +37,7 @@ from egovcp_train.batches import (
     whole_episodes,
 )
 from egovcp_train.config import TrainConfig
-from egovcp_train.passing import label, label_episode
+from egovcp_train.labels.passing import label, label_episode
 
 EVALUATION_EPISODES = 64  # of each task
 FIT_EPISODES = 2048  # of a dataset that is not in memory: half a GB of states to fit Q to
@@ -158,6 +158,11 @@ def stream_config(config: TrainConfig) -> StreamConfig:
     )
 
 
+def needs_labels(config: TrainConfig) -> bool:
+    """Whether a loss asks what is on its way."""
+    return config.policy.loss.passing > 0 or config.policy.loss.flight > 0
+
+
 def _decided(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:
     """The options with the mode that auto stands for here, so that a resumed run keeps it."""
     if config.loading.mode != "auto":
@@ -178,8 +183,9 @@ def _in_memory(
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
     set_normalisation(model, learning)
-    if config.policy.loss.passing:
-        learning, heldout = label(learning, config.passing), label(heldout, config.passing)
+    heldout = label(heldout, config.passing)
+    if needs_labels(config):
+        learning = label(learning, config.passing)
     return learning, SequenceStream(learning, sampling, mix), heldout, learning
 
 
@@ -197,7 +203,7 @@ def _on_disk(
         sample.bring()
     unseen = unseen.spread(EVALUATION_EPISODES)
     unseen.bring()
-    heldout = EpisodeStore.read(unseen, config.returns)
+    heldout = label(EpisodeStore.read(unseen, config.returns), config.passing)
     if learning.is_remote:
         facts = survey_sample(learning, sample, config.returns, sampling.event_quantile)
     else:
@@ -205,8 +211,7 @@ def _on_disk(
     longest = int(learning.length.max())
     fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest)
     labelling = None
-    if config.policy.loss.passing:
-        heldout = label(heldout, config.passing)
+    if needs_labels(config):
         labelling = partial(label_episode, config=config.passing)
     stream = BoundedStream(
         learning,
@@ -229,7 +234,7 @@ def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -
     def batches(first: int) -> Iterator[Batch]:
         part = index.select(chosen[first : first + EPISODES_AT_ONCE])
         store = EpisodeStore.read(part, config.returns)
-        if config.policy.loss.passing:
+        if needs_labels(config):
             store = label(store, config.passing)
         yield from whole_episodes(store, device, config.sampling.mirror)
 

@@ -152,7 +152,7 @@ class Run:
         """Measure a model on held-out episodes."""
         config, step = self.config, self.learner.step
         heldout = self.material.heldout
-        episodes = recorded(heldout, self.device, config.passing, EVALUATION_EPISODES)
+        episodes = recorded(heldout, self.device, EVALUATION_EPISODES)
         report = measure(model, episodes)
         self.metrics, self.tasks = report.metrics, report.tasks
         found = self.metrics | scalars(self.tasks)

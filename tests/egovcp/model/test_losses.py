@@ -31,7 +31,7 @@ def _with_loss(config: LossConfig) -> WorldModel:
 
 
 #: Nothing left to chance but the noise of z: every image is reconstructed.
-EVERY_IMAGE = dataclasses.replace(PRESETS["debug"].loss, decode_every=1)
+EVERY_IMAGE = dataclasses.replace(PRESETS["debug"].loss, decode_every=1, foresight_every=1)
 
 
 def _pad(batch: Batch, rows: int, garbage: bool) -> Batch:

@@ -2,17 +2,18 @@
 
 import json
 
+import numpy as np
 import pytest
 import torch
 
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
+from egovcp.data.index import spread
 from egovcp.model import Batch
 from egovcp.testing import random_batch, toy_model
 from egovcp_train.evaluation import evaluate
-from egovcp_train.heldout.episodes import Recorded, recorded, spread
+from egovcp_train.heldout.episodes import Recorded, recorded
 from egovcp_train.heldout.report import measure, scalars
 from egovcp_train.heldout.table import table
-from egovcp_train.passing import PassingConfig
 
 
 def _group(task: str, seed: int) -> Recorded:
@@ -82,9 +83,9 @@ def test_the_table_has_a_line_for_everything_that_was_measured() -> None:
 
 
 def test_episodes_are_spread_evenly() -> None:
-    assert spread(5, None).tolist() == [0, 1, 2, 3, 4]
-    assert spread(5, 9).tolist() == [0, 1, 2, 3, 4]
-    assert spread(9, 3).tolist() == [0, 4, 8]
+    assert spread(np.arange(5), None).tolist() == [0, 1, 2, 3, 4]
+    assert spread(np.arange(5), 9).tolist() == [0, 1, 2, 3, 4]
+    assert spread(10 * np.arange(9), 3).tolist() == [0, 40, 80]
 
 
 def test_recorded_episodes_are_whole_and_padded(dataset_root) -> None:
@@ -92,11 +93,11 @@ def test_recorded_episodes_are_whole_and_padded(dataset_root) -> None:
 
     reader = DatasetReader.open(DatasetConfig(root=str(dataset_root)))
     store = EpisodeStore.load([reader], "all", ReturnConfig(steps=5))
-    (group,) = recorded(store, torch.device("cpu"), PassingConfig())
+    (group,) = recorded(store, torch.device("cpu"))
     assert group.task == "ball"
     assert sorted(group.batch.valid.sum(1).tolist()) == [15, *[24] * 7]
     assert group.batch.terminal_next.sum() == 1
     few = EpisodeStore.load([reader], "all", ReturnConfig(steps=5), per_task=3)
     assert few.identities == tuple(store.identities[i] for i in (0, 4, 7))
-    (group,) = recorded(store, torch.device("cpu"), PassingConfig(), per_task=2)
+    (group,) = recorded(store, torch.device("cpu"), per_task=2)
     assert len(group.batch.valid) == 2

@@ -21,8 +21,9 @@ from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
 from egovcp_train.heldout.report import Report, measure
 from egovcp_train.heldout.table import table
+from egovcp_train.labels.config import PassingConfig
+from egovcp_train.labels.passing import label
 from egovcp_train.output import require_writable
-from egovcp_train.passing import PassingConfig, label
 
 PROG: Final = "egovcp-eval-model"
 RESULT: Final = "heldout.json"
@@ -85,7 +86,7 @@ def evaluate(config: HeldoutConfig) -> None:
     limit = config.episodes or None
     store = label(EpisodeStore.load([reader], config.split, returns, per_task=limit), passing)
     model = artefact.world_model.to(device)
-    report = measure(model, recorded(store, device, passing), config.stride)
+    report = measure(model, recorded(store, device), config.stride)
     print(table(report.tasks))
     _write(output, report, _run(config, artefact, reader), config.pictures)
     print(f"figures: {output / RESULT}")

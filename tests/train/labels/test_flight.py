@@ -2,10 +2,14 @@
 
 import numpy as np
 import pytest
+import torch
 
 from egovcp import spec
-from egovcp_train.heldout.flight import STOP, flight_pixels, to_camera
-from egovcp_train.passing import PassingConfig, Path, to_ground
+from egovcp.model.depth import nearness, thing_pixels
+from egovcp_train.labels.camera import camera_track
+from egovcp_train.labels.config import PassingConfig
+from egovcp_train.labels.flight import STOP
+from egovcp_train.labels.passing import label_episode
 
 CONFIG = PassingConfig(camera_pitch=0.0)
 TICKS, THROW = 40, 8
@@ -28,7 +32,7 @@ def _disc(ball: np.ndarray) -> np.ndarray:
 
 def _throw(speed: float, flight: float = 0.7) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pictures (T, 48, 64) mm before a wall 4 m away, the ball's pixels, and its x (T,) m."""
-    origin = to_ground(np.zeros((TICKS, 3)), _standing(), CONFIG)[0]
+    origin = camera_track(_standing(), CONFIG).position[0]
     start = np.array([CONFIG.plane + speed * flight, 0.2, 0.3])
     velocity = np.array([-speed, -0.2, 0.5 * 9.81 * flight])
     depth = np.full((TICKS, spec.DEPTH_ROWS, spec.DEPTH_COLS), 4000, np.uint16)
@@ -42,6 +46,13 @@ def _throw(speed: float, flight: float = 0.7) -> tuple[np.ndarray, np.ndarray, n
         ball[t] = _disc(place - origin)
         depth[t][ball[t]] = round(1000 * (place[0] - origin[0] - CONFIG.radius))
     return depth, ball, x
+
+
+def flight_pixels(depth: np.ndarray, state: np.ndarray, config: PassingConfig) -> np.ndarray:
+    """(T, 48, 64), as the losses and the evaluation find them."""
+    place = torch.from_numpy(label_episode(depth, state, config)[:, spec.IN_PICTURE])
+    near = nearness(torch.from_numpy(depth.astype(np.int32)), spec.DEPTH_MAX_M)
+    return thing_pixels(near, place, spec.DEPTH_MAX_M).numpy()
 
 
 def test_the_pixels_of_a_throw_are_the_ball_s() -> None:
@@ -74,15 +85,13 @@ def test_where_nothing_flies_there_are_no_pixels(level: int) -> None:
     assert not flight_pixels(depth, _standing(), CONFIG).any()
 
 
-def test_the_camera_s_view_of_a_path_leads_back_to_the_path() -> None:
+def test_the_camera_s_view_leads_back_to_the_ground() -> None:
     """While the robot turns, leans and crouches."""
     rng = np.random.default_rng(0)
     state = _standing()
     state += 0.2 * rng.standard_normal(state.shape)
     gravity = spec.STATE_SLICES["projected_gravity"]
     state[:, gravity] /= np.linalg.norm(state[:, gravity], axis=1, keepdims=True)
-    path = Path(np.array([3.0, 0.2, 0.3]), np.array([-3.0, 0.1, 2.0]), np.array([0.0]))
-    config = PassingConfig()
-    back = to_ground(to_camera(path, state, config), state, config)
-    t = np.arange(TICKS) * spec.PLANNER_DT
-    np.testing.assert_allclose(back, [path.at(s) for s in t], atol=1e-9)
+    track = camera_track(state, PassingConfig(), age=1.0)
+    point = rng.standard_normal((TICKS, 3))
+    np.testing.assert_allclose(track.to_ground(track.to_camera(point)), point, atol=1e-9)

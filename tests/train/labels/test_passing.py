@@ -4,14 +4,17 @@ import numpy as np
 import pytest
 
 from egovcp import spec
-from egovcp.data.mirror import mirror_depth, mirror_state
+from egovcp.data.mirror import mirror_depth, mirror_passing, mirror_state
 from egovcp.robot.kinematics import LINK_NAMES, link_transforms
 from egovcp.sim.config import CameraConfig, EnvConfig, EpisodeConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.truth import Truth
-from egovcp_train.passing import PassingConfig, fit_path, label_episode, to_ground
+from egovcp_train.labels.camera import camera_track
+from egovcp_train.labels.config import PassingConfig
+from egovcp_train.labels.passing import label_episode
+from egovcp_train.labels.throw import find_throw, fit_path
 
 CONFIG = PassingConfig(camera_pitch=0.0)
 TICKS, THROW = 40, 8
@@ -27,7 +30,7 @@ def standing(ticks: int = TICKS) -> np.ndarray:
 
 def camera_origin(state: np.ndarray) -> np.ndarray:
     """Of the standing robot, in the frame of the labels."""
-    return to_ground(np.zeros((len(state), 3)), state, CONFIG)[0]
+    return camera_track(state, CONFIG).position[0]
 
 
 def photograph(ball: np.ndarray, radius: float = 0.1) -> np.ndarray:
@@ -74,9 +77,8 @@ def test_a_mirrored_throw_has_the_mirrored_label() -> None:
     depth, state = throw((0.3, 0.2)), standing()
     label = label_episode(depth, state, CONFIG)
     mirrored = label_episode(mirror_depth(depth).copy(), mirror_state(state), CONFIG)
-    expected = label.copy()
-    expected[:, 0] *= -1
-    np.testing.assert_allclose(mirrored, expected, atol=1e-3)
+    assert (label[:, 7] > 0).sum() > 8
+    np.testing.assert_allclose(mirrored, mirror_passing(label), atol=2e-3)
 
 
 def test_an_empty_scene_is_known_to_be_empty() -> None:
@@ -102,7 +104,7 @@ def test_the_robot_s_own_turning_does_not_bend_the_path() -> None:
     state = standing()
     state[:, spec.STATE_SLICES["angular_velocity"].start + 2] = 1.0  # rad/s about the vertical
     point = np.tile([2.0, 0.0, 0.0], (TICKS, 1))
-    ground = to_ground(point, state, CONFIG)
+    ground = camera_track(state, CONFIG).to_ground(point)
     angle = np.arctan2(ground[:, 1], ground[:, 0])
     np.testing.assert_allclose(angle[2:] - angle[1], np.arange(TICKS - 2) * 0.04 + 0.04, atol=1e-6)
 
@@ -120,8 +122,48 @@ def test_the_robot_s_own_sinking_does_not_bend_the_path() -> None:
     sunk = position[0, foot, 2] - upright[0, foot, 2]
     assert sunk > 0.05
     point = np.array([[2.0, 0.0, 0.0]] * 2)
-    lower = to_ground(point, state, CONFIG)[0, 2]
-    assert to_ground(point, standing(2), CONFIG)[0, 2] - lower == pytest.approx(sunk, abs=1e-6)
+    lower = camera_track(state, CONFIG).to_ground(point)[0, 2]
+    higher = camera_track(standing(2), CONFIG).to_ground(point)[0, 2]
+    assert higher - lower == pytest.approx(sunk, abs=1e-6)
+
+
+def test_a_step_of_the_robot_does_not_bend_the_path() -> None:
+    """The pelvis moves over the foot that bears it, whatever the other one does in the air."""
+    state = standing(3)
+    lifted = {"right_knee": (0.0, 0.6, 0.6), "right_hip_pitch": (0.0, -0.3, -0.6)}
+    for joint, angles in {"left_hip_pitch": (0.0, 0.0, 0.1), **lifted}.items():
+        index = spec.JOINT_NAMES.index(f"{joint}_joint")
+        state[:, spec.STATE_SLICES["joint_position"].start + index] = angles
+    position, _ = link_transforms(state[:, spec.STATE_SLICES["joint_position"]])
+    bearing = position[:, LINK_NAMES.index("left_ankle_roll_link")]
+    pelvis = camera_track(state, CONFIG).pelvis
+    assert abs(bearing[2, 0] - bearing[1, 0]) > 0.05
+    moved, slid = pelvis[2] - pelvis[1], bearing[1] - bearing[2]
+    np.testing.assert_allclose(moved[:2], slid[:2], atol=1e-3)
+
+
+@pytest.mark.parametrize("age", [0.5, 1.5])
+def test_old_pictures_of_a_swaying_robot_are_told_by_their_path(age: float) -> None:
+    """The camera nods while a ball flies: taken for young, its pictures show a wavy path."""
+    t = np.arange(TICKS)
+    nod = 0.08 * np.sin(t * 0.9)
+    state = standing()
+    state[:, spec.STATE_SLICES["projected_gravity"]] = np.stack(
+        [np.sin(nod), np.zeros(TICKS), -np.cos(nod)], -1
+    )
+    track = camera_track(state, CONFIG, age)
+    start, velocity = np.array([3.3, 0.2, 0.3]), np.array([-4.0, -0.2, 3.0])
+    depth = np.zeros((TICKS, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16)
+    for row in range(THROW, THROW + 18):
+        s = (row - THROW) * spec.PLANNER_DT
+        ball = start + velocity * s + 0.5 * GRAVITY * s * s
+        place = track.to_camera(np.tile(ball, (TICKS, 1)))[row]
+        if place[0] > spec.DEPTH_MIN_M + 0.1:
+            depth[row] = photograph(place)
+    throw = find_throw(depth, state, CONFIG)
+    assert throw.path is not None
+    assert throw.age == pytest.approx(age * spec.PLANNER_DT)
+    np.testing.assert_allclose(throw.path.at(THROW * spec.PLANNER_DT), start, atol=0.12)
 
 
 def test_flickers_are_outvoted() -> None:
@@ -142,11 +184,12 @@ def test_the_labels_assume_the_simulator_s_camera() -> None:
     assert assumed.camera_pitch == pytest.approx(np.mean(camera.pitch_range))
 
 
-def test_labels_of_simulated_throws_agree_with_the_truth() -> None:
+@pytest.mark.parametrize(("controller", "bound"), [("stance", 0.05), ("walk", 0.09)])
+def test_labels_of_simulated_throws_agree_with_the_truth(controller: str, bound: float) -> None:
     """Sway, crouches, noise, holes and delays included; the truth only judges."""
     count = 32
     throws = EpisodeConfig(ticks=34, event_ticks=(2, 4), empty_probability=0.0)
-    env = VectorEnv(EnvConfig(controller="stance", ball_episode=throws), count)
+    env = VectorEnv(EnvConfig(controller=controller, ball_episode=throws), count)
     scenarios = [Scenario("ball", 5, i) for i in range(count)]
     observation, walk = env.reset(scenarios), RandomWalk()
     walk.reset(env, scenarios)
@@ -168,8 +211,8 @@ def test_labels_of_simulated_throws_agree_with_the_truth() -> None:
     assert len(errors) > 0.9 * count
     centred = np.abs(np.array(errors) - np.median(errors, 0))
     across, up = np.median(centred, 0)
-    assert across < 0.06
-    assert up < 0.10
+    assert across < bound
+    assert up < bound
     assert (centred.max(1) < 0.25).mean() > 0.75
 
 

@@ -1,0 +1,64 @@
+"""What is foreseen is compared with the row that it stands for, and with no other."""
+
+import dataclasses
+
+import torch
+
+from egovcp import spec
+from egovcp.model import Batch, WorldModel
+from egovcp.model.foresight import foresight_losses
+from egovcp.model.losses import filter_sequence, pixel_weights
+from egovcp.testing import random_batch, toy_model
+
+
+def _model(**loss: object) -> WorldModel:
+    model = toy_model()
+    changed = dataclasses.replace(model.config.loss, foresight_every=1, **loss)
+    model.config = dataclasses.replace(model.config, loss=changed)
+    return model
+
+
+def _losses(model: WorldModel, batch: Batch) -> dict[str, torch.Tensor]:
+    rollout = filter_sequence(model, batch, sample=False)
+    weight = pixel_weights(rollout.near, batch, model.config.loss)
+    return foresight_losses(model, rollout, batch, weight)
+
+
+def test_it_is_the_error_of_the_state_imagined_so_far_ahead() -> None:
+    model, batch = _model(foresight_ahead=(3,)), random_batch(2, 6)
+    rollout = filter_sequence(model, batch, sample=False)
+    errors = []
+    for start in range(3):
+        carry = type(rollout.carry)(rollout.carry.h[:, start], rollout.carry.z[:, start])
+        for k in range(3):
+            carry = model.imagine(carry, batch.action[:, start + k])
+        wrong = model.decode_state(carry.h, carry.z) - rollout.state[:, start + 3]
+        errors.append(0.5 * wrong.square().mean(-1))
+    expected = model.config.loss.foresight_state * torch.stack(errors).mean()
+    torch.testing.assert_close(_losses(model, batch)["foresight_state"], expected)
+
+
+def test_no_window_shorter_than_the_foresight_is_judged() -> None:
+    assert _losses(_model(foresight_ahead=(8,)), random_batch(2, 6)) == {}
+
+
+def test_nothing_is_foreseen_across_the_start_of_an_episode() -> None:
+    model, batch = _model(foresight_ahead=(2,)), random_batch(2, 6)
+    batch.is_first[:, 4] = True
+    other = batch._replace(state=batch.state.clone())
+    other.state[:, 4:] += 5.0  # rows 4 and 5 could only be reached from the other episode
+    torch.testing.assert_close(
+        _losses(model, batch)["foresight_state"], _losses(model, other)["foresight_state"]
+    )
+
+
+def test_what_flies_weighs_more_in_a_disc_around_its_place() -> None:
+    model, batch = _model(moving=0.0, flight=7.0), random_batch(1, 3)
+    batch.passing.zero_()
+    batch.passing[0, 1, spec.IN_PICTURE] = torch.tensor([20.0, 30.0, 2.0, 1.5])
+    near = torch.zeros((1, 3, spec.DEPTH_ROWS, spec.DEPTH_COLS))
+    weight = pixel_weights(near, batch, model.config.loss)
+    assert weight[0, 1, 20, 30] == 8.0
+    assert weight[0, 1, 20, 31] == 8.0
+    assert weight[0, 1, 20, 33] == 1.0
+    assert (weight[0, [0, 2]] == 1.0).all()
