@@ -43,7 +43,6 @@ EVALUATION_EPISODES = 64  # of each task
 FIT_EPISODES = 2048  # of a dataset that is not in memory: half a GB of states to fit Q to
 FRAME_BYTES = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (spec.STATE_DIM + 2 * spec.ACTION_DIM + 8)
 
-type Stream = SequenceStream | Ahead
 type Learning = EpisodeStore | EpisodeIndex
 
 
@@ -57,7 +56,7 @@ class Material:
     """The options, ``loading.mode`` no longer auto."""
     learning: Learning
     """Episodes to train on."""
-    stream: Stream
+    stream: Ahead
     """Batches of their windows."""
     heldout: EpisodeStore
     """Episodes to evaluate on."""
@@ -178,7 +177,7 @@ def _in_memory(
     sampling: StreamConfig,
     mix: Mix,
     model: WorldModel,
-) -> tuple[Learning, Stream, EpisodeStore, Learning]:
+) -> tuple[Learning, Ahead, EpisodeStore, Learning]:
     learning, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
@@ -186,7 +185,7 @@ def _in_memory(
     heldout = label(heldout, config.passing)
     if needs_labels(config):
         learning = label(learning, config.passing)
-    return learning, SequenceStream(learning, sampling, mix), heldout, learning
+    return learning, Ahead(SequenceStream(learning, sampling, mix)), heldout, learning
 
 
 def _on_disk(
@@ -195,15 +194,15 @@ def _on_disk(
     sampling: StreamConfig,
     mix: Mix,
     model: WorldModel,
-) -> tuple[Learning, Stream, EpisodeStore, Learning]:
+) -> tuple[Learning, Ahead, EpisodeStore, Learning]:
     learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
     sample = learning
     if learning.is_remote:
         sample, unseen = sample_files(learning, unseen, config.loading.sample_files)
-        sample.bring()
-    unseen = unseen.spread(EVALUATION_EPISODES)
-    unseen.bring()
-    heldout = label(EpisodeStore.read(unseen, config.returns), config.passing)
+        for part in (sample, unseen):
+            part.bring()
+    heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.returns)
+    heldout = label(heldout, config.passing)
     if learning.is_remote:
         facts = survey_sample(learning, sample, config.returns, sampling.event_quantile)
     else:

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
+from egovcp.data.ahead import Ahead
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.model import PRESETS, WorldModel
 from egovcp_train.batches import to_tensors
@@ -27,7 +28,7 @@ from egovcp_train.checkpoint import (
     load_training_state,
 )
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
-from egovcp_train.datasets import EVALUATION_EPISODES, Material, Stream, prepare
+from egovcp_train.datasets import EVALUATION_EPISODES, Material, prepare
 from egovcp_train.device import choose_device
 from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
@@ -202,7 +203,7 @@ def _prepare_output(config: TrainConfig) -> Path:
     return prepare_output(config.output_dir, config.resume)
 
 
-def _restore(output: Path, learner: Learner, stream: Stream) -> None:
+def _restore(output: Path, learner: Learner, stream: Ahead) -> None:
     """Continue from the last checkpoint.
 
     Raises:
