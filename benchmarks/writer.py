@@ -16,6 +16,7 @@ import statistics
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from egovcp.data import DatasetWriter, Episode, Provenance
 from egovcp.data.committer import committing
 from egovcp.data.encoded import encode
 from egovcp.data.spool import SealedEpisode
+from egovcp.testing import random_episode
 
 PROVENANCE = Provenance("benchmark")
 
@@ -39,19 +41,7 @@ def make_episode(number: int, ticks: int) -> Episode:
     ramp = np.linspace(4500, 900, spec.DEPTH_ROWS)[:, None]
     depth = (ramp + rng.normal(0, 20, pixels)).clip(280, 5000).astype(np.uint16)
     depth[rng.random(pixels) < 0.3] = 0
-    last = np.arange(ticks) == ticks - 1
-    return Episode(
-        depth=depth,
-        state=rng.normal(size=(ticks, spec.STATE_DIM)).astype(np.float32),
-        action=rng.uniform(-1, 1, (ticks, spec.ACTION_DIM)).astype(np.float32),
-        reward=rng.normal(size=ticks).astype(np.float32),
-        done=last,
-        success=np.zeros(ticks, dtype=np.bool_),
-        truncated=last,
-        task="ball",
-        time_limit=ticks,
-        metadata={"seed": 0, "episode": number},
-    )
+    return replace(random_episode(number, ticks), depth=depth)
 
 
 def lerobot(root: Path, episodes: Sequence[Episode]) -> None:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from egovcp.data.encoded import EncodedEpisode
+from egovcp.data import Episode
+from egovcp.data.encoded import EncodedEpisode, encode
 from egovcp.data.spool import SealedEpisode
+from egovcp.errors import DataError
 from egovcp.sim.scenario import Scenario
 
 
@@ -92,3 +96,25 @@ class Backend(Protocol):
     def close(self) -> None:
         """Free what the backend itself holds."""
         ...
+
+
+def encode_numbered(number: int, episode: Episode) -> EncodedEpisode:
+    """Validate and encode an episode of the run.
+
+    Raises:
+        DataError: it is not valid; the error's ``episode`` is ``number``.
+    """
+    try:
+        return encode(episode, f"episode {number}")
+    except DataError as error:
+        error.episode = number
+        raise
+
+
+def portable(error: Exception) -> Exception:
+    """The error, or what it says if it cannot travel between processes."""
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes, made one call before
+    except Exception:  # noqa: BLE001 - an exception class may fail in any way here
+        return RuntimeError("".join(traceback.format_exception_only(error)).strip())
+    return error

@@ -7,19 +7,19 @@ Every node needs this package, and nothing of this machine's disk.
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 from collections.abc import Sequence
 from typing import Any, Final
 
-from egovcp.data.encoded import encode
 from egovcp.data.spool import SealedEpisode
 from egovcp.errors import EnvironmentFailure
 from egovcp.sim.scenario import Scenario
-from egovcp_collect.backend import Brief, Report
+from egovcp_collect.backend import Brief, Report, encode_numbered, portable
 from egovcp_collect.config import CollectConfig
-from egovcp_collect.local import portable
 from egovcp_collect.simulation import Simulation
 
+_LOG = logging.getLogger(__name__)
 _REPORT_EVERY: Final = 1.0  # s; each report is a round trip
 
 
@@ -44,7 +44,7 @@ class RemoteSimulation:
         try:
             self._simulation.add(scenarios)
             progress = self._simulation.advance(_REPORT_EVERY)
-            encoded = [(n, encode(e, f"episode {n}")) for n, e in progress.episodes]
+            encoded = [(n, encode_numbered(n, e)) for n, e in progress.episodes]
         except Exception as error:  # noqa: BLE001 - whatever it is, the collection must hear of it
             return Report(0, failure=portable(error))
         briefs = tuple(Brief.of(number, episode) for number, episode in encoded)
@@ -94,9 +94,15 @@ class RayWorker:
         return not self._dead
 
     def kill(self) -> None:
-        """End the actor."""
-        _ray().kill(self._actor)
+        """End the actor; one that cannot be reached any more is as good as ended.
+
+        Work goes on, or ends for another reason, which must not be hidden by this.
+        """
         self.call = None
+        try:
+            _ray().kill(self._actor)
+        except (_ray().exceptions.RayError, ConnectionError, RuntimeError, ValueError) as error:
+            _LOG.warning("a Ray actor could not be ended: %s", error)
 
 
 class RayBackend:

@@ -19,11 +19,13 @@ from egovcp.data.committer import Committer, committing
 from egovcp.data.source import local_root
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.env import decided
+from egovcp.sim.scenario import Scenario
 from egovcp_collect.backend import Backend
 from egovcp_collect.config import SHAPING, CollectConfig
 from egovcp_collect.crew import Crew
 from egovcp_collect.progress import Progress
 from egovcp_collect.resume import require_same
+from egovcp_collect.room import require_room
 from egovcp_collect.versions import installed_versions
 
 PROG: Final = "egovcp-collect"
@@ -51,7 +53,8 @@ def collect(config: CollectConfig, command: str = "") -> None:
     Raises:
         UsageError: an option makes no sense, or something is there already.
         DataError: what is there is damaged, or simulation went wrong.
-        EnvironmentFailure: another process writes the dataset; workers cannot be kept alive.
+        EnvironmentFailure: another process writes the dataset; there is not enough room for it;
+            workers cannot be kept alive.
         OSError: the disk is full.
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
@@ -61,21 +64,41 @@ def collect(config: CollectConfig, command: str = "") -> None:
     agree = partial(require_same, provenance) if config.resume else None
     root = local_root(config.dataset)
     with committing(root, provenance, config.shard_episodes, agree) as committer:
+        missing = _missing(config, committer)
+        require_room(root.parent, missing, config.env, config.shard_episodes)
         already = committer.committed + committer.sealed
         with Progress(config.episodes, already, lambda: _disk_bytes(committer)) as progress:
             try:
-                _collect(config, committer, progress)
-            finally:
-                committer.commit()
+                _collect(config, missing, committer, progress)
+            except BaseException as error:
+                _commit_after(error, committer)
+                raise
+            committer.commit()
         print(_summary(committer, progress))
         if committer.committed < config.episodes:
             raise KeyboardInterrupt
 
 
-def _collect(config: CollectConfig, committer: Committer, progress: Progress) -> None:
+def _commit_after(error: BaseException, committer: Committer) -> None:
+    """Commit what is sealed; should that fail, too, the user still hears of ``error``."""
+    try:
+        committer.commit()
+    except Exception as second:  # noqa: BLE001 - whatever it is, it came after, and from, the first
+        words = f"what is sealed could not be committed, --resume will do it: {second}"
+        error.add_note(words)
+        print(f"{PROG}: warning: {words}", file=sys.stderr)
+
+
+def _missing(config: CollectConfig, committer: Committer) -> list[Scenario]:
+    """The episodes that are neither committed nor sealed."""
+    numbers = set(committer.missing(config.episodes))
+    return [scenario for scenario in config.scenarios() if scenario.episode in numbers]
+
+
+def _collect(
+    config: CollectConfig, scenarios: Sequence[Scenario], committer: Committer, progress: Progress
+) -> None:
     """Until every episode is sealed, or a signal asks to stop."""
-    missing = set(committer.missing(config.episodes))
-    scenarios = [s for s in config.scenarios() if s.episode in missing]
     if not scenarios:
         return
     backend = _backend(config, committer)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import time
 from collections import Counter, deque
 from collections.abc import Iterable
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from types import TracebackType
 from typing import Final, Self
@@ -58,6 +59,7 @@ class Crew:
         self._count = max(1, min(workers, -(-len(self._waiting) // robots)))
         self._posts: list[_Post] = []
         self._lost: Counter[int] = Counter()
+        self._invalid: Counter[int] = Counter()
         self.replaced = 0
         """Workers that died or hung."""
 
@@ -77,9 +79,10 @@ class Crew:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        for post in self._posts:
-            post.worker.kill()
-        self._backend.close()
+        with ExitStack() as stack:  # one that fails to end does not keep the others
+            stack.callback(self._backend.close)
+            for post in self._posts:
+                stack.callback(post.worker.kill)
 
     def poll(self) -> list[Report]:
         """Wait a moment for reports, replace whom it takes, and hand out work.
@@ -117,17 +120,28 @@ class Crew:
         self._posts.remove(post)
         if cause is not None and not isinstance(cause, DataError | TimeoutError):
             raise cause
-        self._lost.update(post.todo.keys())
-        self._give_up(post, cause)
+        if isinstance(cause, DataError):
+            self._count_invalid(post, cause)
+        else:
+            self._count_lost(post, cause)
         self.replaced += 1
         self._waiting.extendleft(reversed(post.todo.values()))
         self._hire()
 
-    def _give_up(self, post: _Post, cause: Exception | None) -> None:
-        """Raise if the episodes of this post have met the same fate too often."""
-        attempts = max((self._lost[number] for number in post.todo), default=0)
-        if isinstance(cause, DataError) and attempts > 1:
+    def _count_invalid(self, post: _Post, cause: DataError) -> None:
+        """Raise if the episode at fault came out invalid before; the worker's others are blameless.
+
+        If it is not known which one it was, any of them may have been.
+        """
+        suspects = [n for n in post.todo if cause.episode in (None, n)]
+        self._invalid.update(suspects)
+        if not suspects or max(self._invalid[number] for number in suspects) > 1:
             raise cause
+
+    def _count_lost(self, post: _Post, cause: Exception | None) -> None:
+        """Raise if the episodes of this post have met the same fate too often."""
+        self._lost.update(post.todo.keys())
+        attempts = max((self._lost[number] for number in post.todo), default=0)
         if attempts >= ATTEMPTS:
             first, last = min(post.todo), max(post.todo)
             reason = str(cause) if cause else "was killed (out of memory? try fewer --num_workers)"

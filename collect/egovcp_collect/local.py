@@ -14,11 +14,10 @@ from pathlib import Path
 from typing import Final
 
 from egovcp.data import Episode
-from egovcp.data.encoded import encode
 from egovcp.data.spool import SealedEpisode, Spool
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
-from egovcp_collect.backend import Brief, Report
+from egovcp_collect.backend import Brief, Report, encode_numbered, portable
 from egovcp_collect.config import CollectConfig
 from egovcp_collect.simulation import Simulation
 
@@ -132,7 +131,7 @@ class _Sealer:
         self._pending.append(self._pool.submit(self._put, number, episode))
 
     def _put(self, number: int, episode: Episode) -> Brief:
-        encoded = encode(episode, f"episode {number}")
+        encoded = encode_numbered(number, episode)
         self._spool.put(SealedEpisode.of(number, encoded))
         return Brief.of(number, encoded)
 
@@ -148,12 +147,3 @@ class _Sealer:
         while self._pending and (wait or len(self._pending) > _UNSEALED or self._pending[0].done()):
             out.append(self._pending.popleft().result())
         return tuple(out)
-
-
-def portable(error: Exception) -> Exception:
-    """The error, or what it says if it cannot travel between processes."""
-    try:
-        pickle.loads(pickle.dumps(error))  # noqa: S301 - our own bytes, made one call before
-    except Exception:  # noqa: BLE001 - an exception class may fail in any way here
-        return RuntimeError("".join(traceback.format_exception_only(error)).strip())
-    return error

@@ -13,6 +13,8 @@ from typing import Any, Final
 from egovcp.artefact import Artefact, load_artefact
 from egovcp.errors import EnvironmentFailure, UsageError, suggest
 from egovcp.plan import PlannerConfig
+from egovcp.plan.cem import TerminationRule
+from egovcp.plan.choices import Ensemble, Latent
 
 PLANNER: Final = "planner"
 REFERENCES: Final = ("hold", "random", "oracle")
@@ -46,6 +48,13 @@ class PlannerOptions:
     """Rounds of the cross-entropy method."""
     elites: int | None = None
     """Best candidates that the next round is fitted to."""
+    termination_rule: TerminationRule | None = None
+    """What a failed plan's later values are: paper (0), shift (the data's worst return), survival
+    (weighted with the probability of being alive)."""
+    latent: Latent | None = None
+    """z of imagined states: mean of the prior, or a sample."""
+    ensemble: Ensemble | None = None
+    """Several heads of Q: mean, or min."""
 
     def apply(self, planner: PlannerConfig) -> PlannerConfig:
         """``planner`` with these changes.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from egovcp.data.episode import Episode
 from egovcp.data.index import EpisodeIndex, fingerprint
 from egovcp.data.reader import DatasetReader
 from egovcp.data.split import HELDOUT_FRACTION
+
+ReturnScaling = Literal["dataset", "none", "per_task"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,9 @@ class ReturnConfig:
     """Horizon K, planner ticks."""
     keep_truncated: bool = False
     """Train on returns that the time limit cuts short, too (the paper's choice)."""
+    scale: ReturnScaling = "dataset"
+    """What Q is fitted to. dataset: returns in deviations from their mean over all tasks; none:
+    returns as they are; per_task: an ablation, in deviations from the mean of the own task."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ Hugging Face's library to the same limits and errors. Datasets and models alike.
 
 from egovcp.hub.failures import LostUpdate, RepoType, explained, token
 from egovcp.hub.fetch import fetch, resolve, snapshot
+from egovcp.hub.options import PublishConfig
 from egovcp.hub.patience import HubUnreachable, Patience, patient
 from egovcp.hub.publish import Content, Publication, Published, publish, reserve
 from egovcp.hub.shelf import Shelf
@@ -17,6 +18,7 @@ __all__ = [
     "LostUpdate",
     "Patience",
     "Publication",
+    "PublishConfig",
     "Published",
     "RepoType",
     "Shelf",

@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from egovcp import spec
 from egovcp.errors import UsageError
+
+ValueLoss = Literal["mse", "two_hot"]
+FreeNatsPer = Literal["step", "dimension"]
 
 
 @dataclass(frozen=True)
@@ -23,8 +27,13 @@ class LossConfig:
     """Extra weight of the pixels around a thing in flight, where labels tell; 0: none."""
     moving_threshold: float = 0.04
     """Change of nearness (fraction of the depth range) that counts as moving."""
+    near: float = 0.0
+    """Extra weight of near pixels; 0: none."""
+    near_threshold: float = 0.7
+    """Nearness (1 at the camera, 0 at the end of the depth range) beyond which a pixel is near."""
     motion: float = 10.0
-    """Weight of the place of what approaches, mean squared error in half images; 0: none."""
+    """Weight of the place in the picture of what flies, where labels tell, Huber loss in half
+    pictures; 0: none."""
     passing: float = 3.0
     """Weight of where and when something thrown will pass, Huber loss in units of
     `PASSING_UNIT`; 0: none."""
@@ -36,10 +45,14 @@ class LossConfig:
     """Weight of KL(q || sg p), which pulls the posterior to the prior."""
     free_nats: float = 1.0
     """KL below this many nats per step costs nothing."""
+    free_nats_per: FreeNatsPer = "step"
+    """step: the free nats are for the sum over z, however it is spread; dimension: each dimension
+    of z has an equal share of them to itself."""
     termination: float = 1.0
     """Weight of the termination cross entropy."""
     value: float = 1.0
-    """Weight of (Q - Monte Carlo return)^2, in units of the return's standard deviation."""
+    """Weight of (Q - Monte Carlo return)^2, in units of the return's standard deviation (see
+    `value_loss`)."""
     imagined_steps: int = 1
     """Also regress Q on states imagined this many steps ahead of the posterior; 0: never."""
     imagined_value: float = 1.0
@@ -52,6 +65,9 @@ class LossConfig:
     """Ticks ahead at which they are compared with what was recorded."""
     foresight_every: int = 4
     """Imagine from every n-th row of a window only, the first one drawn at random."""
+    reward: float = 0.0
+    """Weight of the reward predicted from (h, z, a), mean squared error in units of the return's
+    standard deviation, on the states that Q is trained on; 0: there is no such head."""
 
 
 @dataclass(frozen=True)
@@ -67,11 +83,20 @@ class WorldModelConfig:
     channels: tuple[int, int, int] = (32, 64, 64)
     """Channels of the three layers of the depth CNN; the decoder uses the last."""
     motion_ahead: tuple[int, ...] = (0, 3, 6, 9)
-    """Ticks ahead at which the place of what approaches is predicted straight from the state."""
+    """Ticks ahead at which the place of what flies is predicted straight from the state; the first
+    is 0, now."""
+    paint_flight: bool = True
+    """What flies is painted as a disc where the state says that it is (`loss.motion` teaches it),
+    over the picture that the decoder paints."""
     value_state: int = 8
     """Numbers to which (h, z) is reduced for Q; 0: Q reads all of it."""
     value_of_passing: bool = True
     """Q is told what is on its way (`loss.passing` teaches it) by a head of its own."""
+    value_loss: ValueLoss = "mse"
+    """mse: Q is a number, fitted by its squared error; two_hot: a distribution over bins of
+    symlog returns, fitted by cross entropy, whose mean is the number."""
+    q_heads: int = 1
+    """Heads of Q that differ in their start; Q is their mean unless the planner wants the least."""
     min_std: float = 0.1
     """Floor of the latent standard deviation."""
     update_bias: float = -1.0
@@ -86,6 +111,18 @@ class WorldModelConfig:
             raise UsageError(
                 "value_of_passing needs loss.passing above 0: nothing else teaches Q what is on "
                 "its way; set --policy.value_of_passing=false, or a weight"
+            )
+        if self.q_heads < 1:
+            raise UsageError(f"q_heads is {self.q_heads}; expected at least 1")
+        if self.paint_flight and self.loss.motion <= 0:
+            raise UsageError(
+                "paint_flight needs loss.motion above 0: nothing else teaches the place of what "
+                "flies; set --policy.paint_flight=false, or a weight"
+            )
+        if self.paint_flight and self.motion_ahead[:1] != (0,):
+            raise UsageError(
+                f"motion_ahead {list(self.motion_ahead)}: with paint_flight the first must be 0, "
+                "the place that is painted; put it there, or set --policy.paint_flight=false"
             )
 
 
@@ -107,6 +144,8 @@ PAPER_LOSS = LossConfig(
 
 PRESETS = {
     "default": WorldModelConfig(),
-    "paper": WorldModelConfig(value_state=0, value_of_passing=False, loss=PAPER_LOSS),
+    "paper": WorldModelConfig(
+        value_state=0, value_of_passing=False, paint_flight=False, loss=PAPER_LOSS
+    ),
     "debug": WorldModelConfig(hidden=32, latent=8, units=32, channels=(4, 8, 8)),
 }

@@ -88,6 +88,40 @@ def within(near: Tensor, place: Tensor) -> Tensor:
     return (rows - row).square() + (cols - column).square() < radius.square()
 
 
+DISC = 5.0  #: pixels times metres, the radius of a thing 0.12 m in radius
+PAINTED = 0.02  # probability below which nothing is painted
+
+
+def paint_disc(image: Tensor, place: Tensor, shape: Tensor, max_m: float) -> Tensor:
+    """Paint a thing over a picture.
+
+    Args:
+        image: (N, H, W) nearness.
+        place: (N, 4) column and row of its middle in half pictures from the middle, nearness,
+            log-odds that it is there.
+        shape: (N, 2) logarithm of its size relative to `DISC`, and softness of its edge: a state
+            that is unsure of the place blurs it.
+        max_m: depth at which nearness is 0, m.
+    """
+    there = torch.sigmoid(place[:, 3])
+    painted = torch.nonzero(there > PAINTED)[:, 0]
+    place, shape, image_there = (
+        place[painted, :, None, None],
+        shape[painted, :, None, None],
+        image[painted],
+    )
+    height, width = image.shape[-2:]
+    rows = torch.linspace(-1, 1, height, device=image.device)[:, None]
+    cols = torch.linspace(-1, 1, width, device=image.device)
+    down, right = (rows - place[:, 1]) * (height - 1) / 2, (cols - place[:, 0]) * (width - 1) / 2
+    away = (down.square() + right.square() + 1e-4).sqrt()
+    near = place[:, 2].clamp(0.0, 0.95)
+    radius = DISC * shape[:, 0].clamp(-1.0, 1.0).exp() / ((1 - near) * max_m)
+    edge = 0.3 + F.softplus(shape[:, 1])
+    cover = there[painted, None, None] * torch.sigmoid((radius - away) / edge)
+    return image.index_copy(0, painted, torch.lerp(image_there, near.expand_as(cover), cover))
+
+
 #: Nearness below which a change is noise at the end of the range, and above which it is the
 #: robot's own arm: 4 m and 0.9 m of a range of 5 m.
 OBJECT_NEARNESS = (0.2, 0.82)

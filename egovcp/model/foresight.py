@@ -66,7 +66,7 @@ def _compare(
     """Errors of imagined states (B, S, ...) against the rows (S,) that they stand for."""
     config = model.config.loss
     near = rollout.near[:, rows]
-    image = model.decode_depth(seen.features.flatten(0, 1)).float().view_as(near)
+    image = model.picture(seen.flat()).view_as(near)
     picture = (0.5 * weight[:, rows] * (image - near).square()).mean((-2, -1))
     state = 0.5 * (model.decode_state(*seen).float() - rollout.state[:, rows]).square().mean(-1)
     return {

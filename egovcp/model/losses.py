@@ -15,7 +15,7 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.model.config import LossConfig
-from egovcp.model.depth import approaching, highest_3x3, lowest_3x3, nearness, within
+from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, within
 from egovcp.model.gaussian import Gaussian, kl_divergence
 from egovcp.model.world_model import PASSING_UNIT, Carry, WorldModel
 
@@ -33,6 +33,7 @@ class Batch(NamedTuple):
     mc_valid: Tensor  # (B, T) bool
     terminal_next: Tensor  # (B, T) bool: a_t ended the episode in failure
     passing: Tensor  # (B, T, 9), see `egovcp.data.EpisodeStore`
+    reward: Tensor  # (B, T), after a_t
 
 
 class Rollout(NamedTuple):
@@ -43,6 +44,7 @@ class Rollout(NamedTuple):
     prior: Gaussian
     near: Tensor  # (B, T, 48, 64)
     state: Tensor  # (B, T, 74) standardised
+    embedding: Tensor  # (B, T, units) of the observation alone
 
 
 def filter_sequence(
@@ -80,6 +82,7 @@ def filter_sequence(
         model.predict(h_seq),
         near.view(size, length, *near.shape[1:]),
         state,
+        embedding,
     )
 
 
@@ -110,7 +113,7 @@ def depth_loss(
     every = min(every, valid.shape[1])
     first = int(torch.randint(every, (), generator=generator, device=valid.device))
     rows = (slice(None), slice(first, None, every))
-    image = model.decode_depth(rollout.carry.features[rows].flatten(0, 1)).float()
+    image = model.picture(rollout.carry.rows(rows).flat())
     error = 0.5 * (image - rollout.near[rows].flatten(0, 1)).square()
     error = error * weight[rows].flatten(0, 1)
     return masked_mean(error.mean((-2, -1)), valid[rows].flatten())
@@ -126,6 +129,8 @@ def pixel_weights(near: Tensor, batch: Batch, config: LossConfig) -> Tensor:
     if config.moving > 0:
         moving = moving_pixels(near, config.moving_threshold)
         weight += config.moving * moving.masked_fill(batch.is_first[..., None, None], 0.0)
+    if config.near > 0:
+        weight += config.near * (near > config.near_threshold)
     if config.flight > 0:
         place = batch.passing[..., spec.IN_PICTURE]
         flies = place[..., 2] > 0
@@ -143,38 +148,47 @@ def moving_pixels(near: Tensor, threshold: float) -> Tensor:
 
 
 def motion_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
-    """Where something approaches, now and some ticks ahead, and whether it is seen at all.
+    """Where in the picture something flies, now and some ticks ahead, and whether anything does.
 
-    A summary of the image that a ball dominates: in the image itself a distant ball is 10
-    of 3072 pixels, here it is the whole target. Asked for the future too, the state must
-    hold the path, not only the place, and keep it while the ball is out of the picture.
+    In the image itself a distant ball is 10 of 3072 pixels, here it is the whole target. Asked
+    for the future too, the state must hold the path, not only the place, and keep it while
+    the ball is out of the picture. The encoder is asked as well: through a state that is not
+    yet worth reading it would learn late where to look.
     """
-    centre, seen = approaching(rollout.near)
-    seen = seen & ~batch.is_first  # the image before belongs to another episode
-    ahead = model.config.motion_ahead
-    output = model.decode_motion(rollout.carry.h, rollout.carry.z).float()
-    predictions = output.unflatten(-1, (len(ahead), 4)).unbind(-2)
+    row, column, radius, depth = batch.passing[..., spec.IN_PICTURE].unbind(-1)
+    middle = [(size - 1) / 2 for size in rollout.near.shape[-2:]]
+    place = [column / middle[1] - 1, row / middle[0] - 1, 1 - depth / model.config.depth_max_m]
+    known = batch.valid & (batch.passing[..., 4] > 0)
+    target = torch.stack([*place, radius > 0, known], -1)
+    sight = _motion_loss_at(model.sight(rollout.embedding), target, batch, 0)
     losses = [
-        _motion_loss_at(prediction, centre, seen, batch, k)
-        for prediction, k in zip(predictions, ahead, strict=True)
-        if k < seen.shape[1]
+        _motion_loss_at(prediction, target, batch, k)
+        for prediction, k in zip(
+            model.motion(rollout.carry).unbind(-2), model.config.motion_ahead, strict=True
+        )
+        if k < target.shape[1]
     ]
-    return torch.stack([output.new_zeros(()), *losses]).sum()
+    return torch.stack([sight, *losses]).sum()
 
 
-def _motion_loss_at(output: Tensor, centre: Tensor, seen: Tensor, batch: Batch, k: int) -> Tensor:
-    """Squared error of the place ``k`` ticks ahead, and cross entropy of its being seen."""
-    length = seen.shape[1]
-    output, centre, seen = output[:, : length - k], centre[:, k:], seen[:, k:]
-    known = unbroken(batch, k)
-    place = masked_mean((output[..., :3] - centre).square().sum(-1), known & seen)
-    presence = F.binary_cross_entropy_with_logits(
-        output[..., 3], seen.to(output.dtype), reduction="none"
+def _motion_loss_at(output: Tensor, target: Tensor, batch: Batch, k: int) -> Tensor:
+    """Error of the place ``k`` ticks ahead, and cross entropy of there being any.
+
+    Args:
+        output: (B, T, 4).
+        target: (B, T, 5) column and row in half pictures, nearness, whether, whether known.
+        batch: what was recorded.
+        k: ticks.
+    """
+    output, target = output[:, : target.shape[1] - k], target[:, k:]
+    flies = target[..., 3]
+    known = unbroken(batch, k) & (target[..., 4] > 0)
+    # Linear beyond a few pixels: else what is far off says everything and a pixel nothing.
+    place = (
+        F.huber_loss(output[..., :3], target[..., :3], reduction="none", delta=0.1).sum(-1) / 0.1
     )
-    judged = known & ~batch.is_first[:, k:]
-    if k == 0:
-        judged[:, 0] = False  # no previous image in the window
-    return place + 0.1 * masked_mean(presence, judged)
+    presence = F.binary_cross_entropy_with_logits(output[..., 3], flies, reduction="none")
+    return masked_mean(place, known & (flies > 0)) + 0.1 * masked_mean(presence, known)
 
 
 def passing_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
@@ -202,12 +216,19 @@ def state_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
 def kl_losses(rollout: Rollout, valid: Tensor, config: LossConfig) -> dict[str, Tensor]:
     """The two terms of equation 8, each clipped below at the free nats."""
     q, p = rollout.posterior, rollout.prior
-    to_prior = kl_divergence(q.detach(), p).sum(-1).clamp_min(config.free_nats)
-    to_posterior = kl_divergence(q, p.detach()).sum(-1).clamp_min(config.free_nats)
+    to_prior = _beyond_free(kl_divergence(q.detach(), p), config)
+    to_posterior = _beyond_free(kl_divergence(q, p.detach()), config)
     return {
         "kl_prior": config.kl_prior * masked_mean(to_prior, valid),
         "kl_posterior": config.kl_posterior * masked_mean(to_posterior, valid),
     }
+
+
+def _beyond_free(kl: Tensor, config: LossConfig) -> Tensor:
+    """(..., Z) nats -> (...,), not below the free nats."""
+    if config.free_nats_per == "dimension":
+        return kl.clamp_min(config.free_nats / kl.shape[-1]).sum(-1)
+    return kl.sum(-1).clamp_min(config.free_nats)
 
 
 def value_and_termination_losses(
@@ -217,12 +238,17 @@ def value_and_termination_losses(
 
     The planner asks Q about imagined states, so Q learns on them as well: k steps after
     row t the model has imagined (h_{t+k}, z^_{t+k}) from the recorded actions, and its
-    value is regressed on the return of row t + k.
+    value is regressed on the return of row t + k. The reward, if it is predicted at all,
+    is asked of the same states.
     """
     target = (batch.mc_return - model.return_mean) / model.return_std
     usable = batch.valid & batch.mc_valid
-    error = (model.standardised_value(rollout.carry, batch.action) - target).square()
+    error = model.value_error(rollout.carry, batch.action, target)
     losses = {"value": config.value * masked_mean(error, usable)}
+    predicts_reward = model.reward_head is not None
+    rewards: list[Tensor] = []
+    if predicts_reward:
+        rewards.append(_reward_error(model, rollout.carry, batch, batch.valid))
 
     carry = rollout.carry
     length = batch.valid.shape[1]
@@ -240,12 +266,22 @@ def value_and_termination_losses(
         carry = Carry(carry.h[:, :-1], carry.z[:, :-1])  # (B, T - k): the rows that exist
         if config.imagined_steps and k < length:
             same_episode = unbroken(batch, k)
-            q = model.standardised_value(carry, batch.action[:, k:])
-            error = (q - target[:, k:]).square()
+            error = model.value_error(carry, batch.action[:, k:], target[:, k:])
             imagined.append(masked_mean(error, usable[:, k:] & same_episode))
+            if predicts_reward:
+                rewards.append(_reward_error(model, carry, batch, same_episode))
     if imagined:
         losses["imagined_value"] = config.imagined_value * torch.stack(imagined).mean()
+    if rewards:
+        losses["reward"] = config.reward * torch.stack(rewards).mean()
     return losses
+
+
+def _reward_error(model: WorldModel, carry: Carry, batch: Batch, mask: Tensor) -> Tensor:
+    """Mean squared error of the reward at the last rows of a window, as many as ``mask`` has."""
+    rows = slice(batch.valid.shape[1] - mask.shape[1], None)
+    target = batch.reward[:, rows] / model.return_std
+    return masked_mean((model.scaled_reward(carry, batch.action[:, rows]) - target).square(), mask)
 
 
 def unbroken(batch: Batch, k: int) -> Tensor:

@@ -84,11 +84,11 @@ class ValueHead(nn.Module):
     has learned by heart it takes for an effect of the action.
     """
 
-    def __init__(self, state: Sequence[int], width: int, units: int) -> None:
+    def __init__(self, state: Sequence[int], width: int, units: int, outputs: int = 1) -> None:
         super().__init__()
         self.reduce = SplitLinear(state, width) if width else None
         inputs = (width,) if width else state
-        self.mlp = SplitMlp((*inputs, spec.ACTION_DIM), units, 1, hidden_layers=2)
+        self.mlp = SplitMlp((*inputs, spec.ACTION_DIM), units, outputs, hidden_layers=2)
 
     def restart(self) -> None:
         """Forget everything and answer zero."""
@@ -101,7 +101,7 @@ class ValueHead(nn.Module):
         self.mlp.start_at_zero()
 
     def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
-        """(..., hidden), (..., latent), (..., 7) -> (..., 1)."""
+        """(..., hidden), (..., latent), (..., 7) -> (..., outputs)."""
         state = (h, z) if self.reduce is None else (self.reduce(h, z),)
         q: Tensor = self.mlp(*state, action)
         return q

@@ -17,6 +17,7 @@ def set_statistics(
     state_mean: NDArray[np.floating],
     state_std: NDArray[np.floating],
     returns: NDArray[np.floating],
+    scaled: bool = True,
 ) -> None:
     """Fix the model's normalisation.
 
@@ -24,12 +25,13 @@ def set_statistics(
         state_mean: (74,) of the proprioceptive state.
         state_std: (74,) its deviation.
         returns: (n,) the complete Monte Carlo returns, at least one.
+        scaled: Q is fitted in deviations of these returns from their mean; else in units of return.
     """
     values = {
         "state_mean": state_mean,
         "state_std": np.maximum(state_std, STD_FLOOR),
-        "return_mean": returns.mean(dtype=np.float64),
-        "return_std": max(float(returns.std(dtype=np.float64)), 1e-6),
+        "return_mean": returns.mean(dtype=np.float64) if scaled else 0.0,
+        "return_std": max(float(returns.std(dtype=np.float64)), 1e-6) if scaled else 1.0,
         "return_floor": np.quantile(returns, WORST_RETURN_QUANTILE),
     }
     for name, value in values.items():

@@ -22,8 +22,10 @@ import torch
 from torch import Tensor, nn
 
 from egovcp import spec
+from egovcp.errors import UsageError
+from egovcp.model import value
 from egovcp.model.config import WorldModelConfig
-from egovcp.model.depth import nearness, network_image, to_metres
+from egovcp.model.depth import nearness, network_image, paint_disc, to_metres
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.nets import (
     DepthDecoder,
@@ -48,6 +50,14 @@ class Carry(NamedTuple):
     def features(self) -> Tensor:
         return torch.cat([self.h, self.z], -1)
 
+    def rows(self, rows: tuple[slice, ...]) -> Carry:
+        """Some of the states, of all leading dimensions."""
+        return Carry(self.h[rows], self.z[rows])
+
+    def flat(self) -> Carry:
+        """(B, T, ...) -> (B T, ...)."""
+        return Carry(self.h.flatten(0, 1), self.z.flatten(0, 1))
+
 
 class PosteriorHead(nn.Module):
     """One hidden layer on [h, o]; the part of o arrives ready-made (`embed_observation`)."""
@@ -60,6 +70,15 @@ class PosteriorHead(nn.Module):
     def forward(self, h: Tensor, embedding: Tensor) -> Tensor:
         logits: Tensor = self.rest(self.project_h(h) + embedding)
         return logits
+
+
+class QHead(NamedTuple):
+    """The parts of one head of Q, whose outputs add up."""
+
+    state: ValueHead
+    """Reads (h, z) and the action."""
+    passing: SplitMlp | None
+    """Reads what is on its way and the action."""
 
 
 class WorldModel(nn.Module):
@@ -85,15 +104,19 @@ class WorldModel(nn.Module):
         self.prior = SplitMlp((c.hidden,), c.units, 2 * c.latent)
         self.decode_depth = DepthDecoder(sum(state), c.channels[-1])
         self.decode_state = SplitMlp(state, c.units, spec.STATE_DIM)
-        self.decode_motion = SplitMlp(state, c.units, 4 * len(c.motion_ahead))
+        self.decode_motion = SplitMlp(state, c.units, 4 * len(c.motion_ahead) + 2)
+        self.decode_sight = nn.Sequential(nn.LayerNorm(c.units), nn.SiLU(), nn.Linear(c.units, 4))
         self.decode_passing = SplitMlp(state, c.units, 4)
         self.termination_head = SplitMlp(state, c.units, 1)
-        self.value_head = ValueHead(state, c.value_state, c.units)
-        self.passing_value_head = (
-            SplitMlp((4, spec.ACTION_DIM), c.units // 2, 1, hidden_layers=2)
-            if c.value_of_passing
-            else None
-        )
+        self.value_head = self._new_value_head()
+        self.passing_value_head = self._new_passing_value_head() if c.value_of_passing else None
+        self.more_value_heads = nn.ModuleList()
+        self.more_passing_value_heads = nn.ModuleList()
+        for _ in range(c.q_heads - 1):
+            self.more_value_heads.append(self._new_value_head())
+            if c.value_of_passing:
+                self.more_passing_value_heads.append(self._new_passing_value_head())
+        self.reward_head = ValueHead(state, c.value_state, c.units) if c.loss.reward > 0 else None
         self._start_at_zero()
         self.register_buffer("state_mean", torch.zeros(spec.STATE_DIM))
         self.register_buffer("state_std", torch.ones(spec.STATE_DIM))
@@ -101,9 +124,19 @@ class WorldModel(nn.Module):
         self.register_buffer("return_std", torch.ones(()))
         self.register_buffer("return_floor", torch.zeros(()))
 
+    def _new_value_head(self) -> ValueHead:
+        c = self.config
+        outputs = value.width(c.value_loss)
+        return ValueHead((c.hidden, c.latent), c.value_state, c.units, outputs)
+
+    def _new_passing_value_head(self) -> SplitMlp:
+        units, outputs = self.config.units // 2, value.width(self.config.value_loss)
+        return SplitMlp((4, spec.ACTION_DIM), units, outputs, hidden_layers=2)
+
     def _start_at_zero(self) -> None:
         """Value and termination start as constants, so that early plans are not random."""
-        for head in (self.value_head, self.passing_value_head, self.termination_head):
+        self.termination_head.start_at_zero()
+        for head in (*(part for q in self.q_heads for part in q), self.reward_head):
             if head is not None:
                 head.start_at_zero()
 
@@ -176,6 +209,17 @@ class WorldModel(nn.Module):
         h = self.transition(carry, action)
         return Carry(h, self.predict(h).mean)
 
+    def imagine_sample(
+        self, carry: Carry, action: Tensor, generator: torch.Generator | None = None
+    ) -> Carry:
+        """The same, but z is drawn from the prior, with one noise (latent,) for all rows: what
+        differs between two candidates is what they do, not their luck."""
+        h = self.transition(carry, action)
+        prior = self.predict(h)
+        size = (self.config.latent,)
+        noise = torch.randn(size, generator=generator, device=prior.mean.device)
+        return Carry(h, prior.mean + prior.std * noise)
+
     @staticmethod
     def spread(carry: Carry) -> Carry:
         """(E, ...) -> (E, 1, ...): one state that broadcasts over candidate actions."""
@@ -193,10 +237,60 @@ class WorldModel(nn.Module):
         of the state adds. The first part sees little else than the action: a regression on
         the whole state predicts the return better and ranks actions worse (`docs/log.md`).
         """
-        q: Tensor = self.value_head(carry.h, carry.z, action)
-        if self.passing_value_head is not None:
-            q = q + self.passing_value_head(self.passing(carry), action)
-        return q.squeeze(-1).float()
+        return self._all_values(carry, action).mean(0)
+
+    def lowest_value(self, carry: Carry, action: Tensor) -> Tensor:
+        """What the most doubtful of the heads of Q says, in units of return, (...,)."""
+        q = self._all_values(carry, action).amin(0)
+        return q * self.return_std + self.return_mean
+
+    def value_error(self, carry: Carry, action: Tensor, target: Tensor) -> Tensor:
+        """Loss of Q beside the standardised return (...,), mean over the heads, (...,)."""
+        kind = self.config.value_loss
+        outputs = self._value_outputs(carry, action)
+        return torch.stack([value.error(q, target, kind) for q in outputs]).mean(0)
+
+    @property
+    def q_heads(self) -> list[QHead]:
+        """The heads of Q; the first one alone unless `q_heads` asks for more."""
+        state = (self.value_head, *self.more_value_heads)
+        passing = (self.passing_value_head, *self.more_passing_value_heads)
+        if self.passing_value_head is None:
+            passing = (None,) * len(state)
+        return [QHead(*parts) for parts in zip(state, passing, strict=True)]
+
+    def _all_values(self, carry: Carry, action: Tensor) -> Tensor:
+        """Of each head, in units of the return's deviation from its mean, (heads, ...)."""
+        outputs = self._value_outputs(carry, action)
+        return torch.stack([value.read(q, self.config.value_loss) for q in outputs])
+
+    def _value_outputs(self, carry: Carry, action: Tensor) -> list[Tensor]:
+        """Of each head, (..., width of `egovcp.model.value`)."""
+        told = None if self.passing_value_head is None else self.passing(carry)
+        outputs = []
+        for head in self.q_heads:
+            q: Tensor = head.state(carry.h, carry.z, action)
+            if head.passing is not None:
+                q = q + head.passing(told, action)
+            outputs.append(q)
+        return outputs
+
+    def reward(self, carry: Carry, action: Tensor) -> Tensor:
+        """The reward that a (..., 7) earns at this state, in units of reward, (...,).
+
+        Raises:
+            UsageError: the model was trained without ``loss.reward``.
+        """
+        return self.scaled_reward(carry, action) * self.return_std
+
+    def scaled_reward(self, carry: Carry, action: Tensor) -> Tensor:
+        """The same in units of the return's deviation; zero stays zero."""
+        if self.reward_head is None:
+            raise UsageError(
+                "this world model predicts no rewards; train it with --policy.loss.reward=1"
+            )
+        r: Tensor = self.reward_head(carry.h, carry.z, action)
+        return r.squeeze(-1).float()
 
     def passing(self, carry: Carry) -> Tensor:
         """Is something on its way, and if so where and when will it pass, (..., 4).
@@ -218,7 +312,30 @@ class WorldModel(nn.Module):
         """Probability that the episode has failed at this state, (...,)."""
         return torch.sigmoid(self.termination_logit(carry))
 
+    def motion(self, carry: Carry) -> Tensor:
+        """Where in the picture something flies, ``motion_ahead`` ticks ahead, (..., A, 4): column
+        and row of its middle in half pictures from the middle, nearness, log-odds that it does."""
+        out: Tensor = self.decode_motion(carry.h, carry.z).float()[..., :-2].contiguous()
+        return out.view(*out.shape[:-1], len(self.config.motion_ahead), 4)
+
+    def sight(self, embedding: Tensor) -> Tensor:
+        """What `motion` says of now, (..., 4), from one observation's embedding (..., units)."""
+        out: Tensor = self.decode_sight(embedding).float()
+        return out
+
+    def picture(self, carry: Carry) -> Tensor:
+        """Nearness (B, 48, 64) of the picture at a state (B, ...); not clamped.
+
+        What flies is painted where `motion` says that it is: a network that paints every
+        pixel by itself learns late, and never sharply, to move ten of them.
+        """
+        image: Tensor = self.decode_depth(carry.features).float()
+        if not self.config.paint_flight:
+            return image
+        out = self.decode_motion(carry.h, carry.z).float()
+        return paint_disc(image, out[..., :4], out[..., -2:], self.config.depth_max_m)
+
     def decode(self, carry: Carry) -> tuple[Tensor, Tensor]:
         """Carry (B, ...) -> depth (B, 48, 64) in metres, 0 = nothing in range; state (B, 74)."""
-        depth = to_metres(self.decode_depth(carry.features).float(), self.config.depth_max_m)
+        depth = to_metres(self.picture(carry), self.config.depth_max_m)
         return depth, self.decode_state(carry.h, carry.z).float() * self.state_std + self.state_mean

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.errors import UsageError
+from egovcp.plan.choices import Ensemble, Latent, judge_of, step_of
 
 TerminationRule = Literal["paper", "shift", "survival"]
 
@@ -67,6 +68,11 @@ class PlannerConfig:
     termination_rule: TerminationRule = "shift"
     """paper: later values are 0; shift: they are the data's worst return; survival: each
     value above the worst return is weighted with the probability of being alive."""
+    latent: Latent = "mean"
+    """z of imagined states. mean: the prior's; sample: drawn from the prior, anew in each
+    iteration, with the same noise for all candidates."""
+    ensemble: Ensemble = "mean"
+    """What several heads of Q are worth together (`q_heads`): their mean, or the least of them."""
 
     def __post_init__(self) -> None:
         if min(self.samples, self.horizon, self.iterations, self.elites) < 1:
@@ -104,8 +110,20 @@ def walk(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
     return torch.stack(actions, -2)
 
 
-def evaluate[L](model: Dynamics[L], carry: L, actions: Tensor, config: PlannerConfig) -> Tensor:
-    """J (E, M) of plans (E, M, N, 7) from the robots' carry (E, ...)."""
+def evaluate[L](
+    model: Dynamics[L],
+    carry: L,
+    actions: Tensor,
+    config: PlannerConfig,
+    generator: torch.Generator | None = None,
+) -> Tensor:
+    """J (E, M) of plans (E, M, N, 7) from the robots' carry (E, ...).
+
+    Args:
+        generator: of the noise under ``latent=sample``; None: torch's own.
+    """
+    imagine = step_of(model, model.imagine, config.latent, generator)
+    judge = judge_of(model, model.value, config.ensemble)
     horizon = actions.shape[-2]
     floor = 0.0 if config.termination_rule == "paper" else model.return_floor
     total = torch.zeros_like(actions[..., 0, 0])
@@ -113,8 +131,8 @@ def evaluate[L](model: Dynamics[L], carry: L, actions: Tensor, config: PlannerCo
     carry = model.spread(carry)
     for k in range(horizon):
         if k > 0:
-            carry = model.imagine(carry, actions[..., k - 1, :])
-        total = total + alive * (model.value(carry, actions[..., k, :]) - floor)
+            carry = imagine(carry, actions[..., k - 1, :])
+        total = total + alive * (judge(carry, actions[..., k, :]) - floor)
         if k == 0 or k == horizon - 1:
             continue  # o_t was seen alive; and nothing follows the last step
         dead = model.termination(carry)
@@ -147,7 +165,7 @@ def plan_cem[L](
     start = executed[:, None]  # (E, 1, 7)
     for _ in range(config.iterations):
         deltas = _sample(mean, std, config, generator)  # (E, M, N, 7)
-        values = evaluate(model, carry, walk(start, deltas, config.eta), config)
+        values = evaluate(model, carry, walk(start, deltas, config.eta), config, generator)
         values = values.masked_fill(~values.isfinite(), -torch.inf)
         top, index = values.topk(config.elites, dim=1)
         elites = deltas.take_along_dim(index[:, :, None, None], 1)

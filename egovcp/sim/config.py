@@ -95,8 +95,8 @@ class WallConfig:
     push_time: float = 0.02
     """Time over which a push acts, s."""
     disturbed_time: float = 6.0
-    """Time after a push in which bracing is rewarded, s; the stance cannot step back from a
-    wall that it leans on, so by default this is the rest of the episode."""
+    """Time after a push in which bracing is rewarded, s; by default the rest of the episode, since
+    a controller that does not step leans on the wall for so long."""
     brace_reward: float = 0.03
     """Per tick upright with a hand and nothing else on the wall while disturbed."""
     upright_reward: float = 0.02

@@ -77,12 +77,19 @@ def decided(config: EnvConfig) -> EnvConfig:
 class VectorEnv:
     """B robots, each in an episode of its own.
 
+    Args:
+        pictures: false: depth stays empty, which saves the rays; all else is as with them.
+
     Raises:
         UsageError: unknown task, wrong shapes, or actions that are not numbers.
     """
 
     def __init__(
-        self, config: EnvConfig, num_envs: int, controller: LowLevelController | None = None
+        self,
+        config: EnvConfig,
+        num_envs: int,
+        controller: LowLevelController | None = None,
+        pictures: bool = True,
     ) -> None:
         if num_envs < 1 or config.threads < 1:
             raise UsageError(
@@ -93,6 +100,7 @@ class VectorEnv:
         self.config = config = config.for_controller(self.controller.walks)
         self.lanes: list[Lane] = []
         self._camera = DepthCamera(config.camera)
+        self._pictures = pictures
         self._standing = settle(build_scene("ball", config.feet), self.controller)
         self._pool = ThreadPoolExecutor(config.threads) if config.threads > 1 else None
         self._controller_state = np.zeros((num_envs, STATE_DIM))
@@ -130,7 +138,7 @@ class VectorEnv:
         if len(scenarios) != self.num_envs:
             raise UsageError(f"expected {self.num_envs} scenarios, found {len(scenarios)}")
         if not self.lanes:
-            self.lanes = [Lane(self.config, self._camera, self._standing, s) for s in scenarios]
+            self.lanes = [self._lane(scenario) for scenario in scenarios]
             return self._begin(np.arange(self.num_envs), None)
         self._start_lanes(range(self.num_envs), scenarios)
         return self._begin(np.arange(self.num_envs), None)
@@ -144,6 +152,9 @@ class VectorEnv:
         self._start_lanes(rows, scenarios)
         which = np.asarray(rows, dtype=np.intp)
         return self._begin(which, which)
+
+    def _lane(self, scenario: Scenario) -> Lane:
+        return Lane(self.config, self._camera, self._standing, scenario, self._pictures)
 
     def _start_lanes(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
         for row, scenario in zip(rows, scenarios, strict=True):

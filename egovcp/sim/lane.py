@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import asdict
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,24 +22,35 @@ from egovcp.sim.tasks import make_task
 from egovcp.spec import (
     CONTROLLER_HZ,
     CONTROLLER_TICKS_PER_PLAN,
+    DEPTH_COLS,
+    DEPTH_ROWS,
     PHYSICS_STEPS_PER_CONTROLLER_TICK,
     STATE_DIM,
 )
 
 Array = NDArray[np.float64]
 
+_EMPTY: Final = np.zeros((DEPTH_ROWS, DEPTH_COLS), dtype=np.uint16)
+
 
 class Lane:
     """Runs one episode. Everything random in it comes from the scenario.
 
     A picture of age k controller ticks is taken k controller ticks before the planner tick
-    that sees it; one picture is rendered per planner tick, whatever its age.
+    that sees it; one picture is rendered per planner tick, whatever its age. Without
+    ``pictures`` all of them are empty; nothing else changes.
     """
 
     def __init__(
-        self, config: EnvConfig, camera: DepthCamera, standing: Standing, scenario: Scenario
+        self,
+        config: EnvConfig,
+        camera: DepthCamera,
+        standing: Standing,
+        scenario: Scenario,
+        pictures: bool = True,
     ) -> None:
         self._config = config
+        self._sees = pictures
         self._camera = camera
         self._standing = standing
         self._robots: dict[str, SimulatedRobot] = {}
@@ -134,6 +146,8 @@ class Lane:
             self._pictures.append(self._take_picture())
 
     def _take_picture(self) -> NDArray[np.uint16]:
+        if not self._sees:
+            return _EMPTY
         depth = self._camera.render(self._view, self.robot.data, self.camera_pitch)
         return self._noise.apply(depth)
 

@@ -30,6 +30,7 @@ def random_batch(size: int = 4, length: int = 8, seed: int = 0) -> Batch:
         mc_valid=torch.ones(shape, dtype=torch.bool),
         terminal_next=torch.zeros(shape, dtype=torch.bool),
         passing=torch.rand((*shape, spec.PASSING_DIM), generator=rng).round(),
+        reward=torch.randn(shape, generator=rng),
     )
 
 

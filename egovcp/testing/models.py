@@ -6,19 +6,21 @@ import torch
 from torch import Tensor, nn
 
 from egovcp import spec
-from egovcp.model import PRESETS, Carry, WorldModel
+from egovcp.model import PRESETS, Carry, WorldModel, WorldModelConfig
 from egovcp.model.nets import ValueHead
 
 
-def toy_model(preset: str = "debug", seed: int = 0) -> WorldModel:
-    """An untrained world model whose heads answer differently to different questions.
+def toy_model(preset: str | WorldModelConfig = "debug", seed: int = 0) -> WorldModel:
+    """An untrained world model, of a preset or a configuration, whose heads answer differently to
+    different questions.
 
     A new `WorldModel` predicts constants for value and termination, which hides mistakes.
     """
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = WorldModel(PRESETS[preset])
-        for head in (model.value_head, model.passing_value_head, model.termination_head):
+        model = WorldModel(PRESETS[preset] if isinstance(preset, str) else preset)
+        values = [part for head in model.q_heads for part in head]
+        for head in (*values, model.termination_head, model.reward_head):
             if head is None:
                 continue
             last = (head.mlp if isinstance(head, ValueHead) else head).rest[-1]

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from egovcp_collect.cluster import RayWorker
 from egovcp_collect.collect import main
 
-pytest.importorskip("ray")
+ray = pytest.importorskip("ray")
 
 _SHORT = (
     "--task=ball",
@@ -24,6 +25,20 @@ def test_ray_gives_the_same_data(tmp_path: Path) -> None:
     assert main([*_SHORT, f"--dataset.root={there}", *ray]) == 0
     for path in here.rglob("*.parquet"):
         assert (there / path.relative_to(here)).read_bytes() == path.read_bytes()
+
+
+def test_an_actor_that_cannot_be_ended_hides_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ray raises when its own connection is gone."""
+
+    def refuse(actor: object) -> None:
+        raise ray.exceptions.RaySystemError("the connection is gone")
+
+    worker = object.__new__(RayWorker)
+    monkeypatch.setattr(worker, "_actor", None, raising=False)
+    monkeypatch.setattr(ray, "kill", refuse)
+    worker.call = object()
+    worker.kill()
+    assert worker.call is None
 
 
 def test_a_cluster_that_is_not_there(

@@ -1,4 +1,6 @@
+import errno
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -6,8 +8,11 @@ import pytest
 
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader
+from egovcp.data.committer import Committer
+from egovcp.errors import DataError
 from egovcp_collect.collect import main
 from egovcp_collect.config import CollectConfig, MixConfig
+from egovcp_collect.crew import Crew
 
 _SHORT = ["--env.ball_episode.ticks=6", "--env.ball_episode.event_ticks=[0,1]"]
 
@@ -111,6 +116,26 @@ def test_a_place_that_cannot_be_written_is_refused(
     (tmp_path / "file").write_text("mine")
     assert _collect(tmp_path / "file" / "new", "--episodes=1") == 2
     assert "below a file" in capsys.readouterr().err
+
+
+def test_an_error_is_not_hidden_by_the_commit_that_follows_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The simulation fails, and then the disk, when what was sealed is to be committed."""
+
+    def fail(self: Crew) -> None:
+        raise DataError("the robot has left the earth")
+
+    def full(self: Committer) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(Crew, "poll", fail)
+    monkeypatch.setattr(Committer, "commit", full)
+    assert _collect(tmp_path / "new", "--episodes=1", "--num_workers=1") == 3
+    *_, warning, last = capsys.readouterr().err.strip().splitlines()
+    assert last == "egovcp-collect: error: the robot has left the earth"
+    assert "warning" in warning
+    assert "No space left" in warning
 
 
 def test_no_destination_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,13 +1,16 @@
 """Workers that die, hang and fail: the crew must get every episode all the same."""
 
+import copy
 import time
 from collections.abc import Callable, Sequence
 
+import numpy as np
 import pytest
 
 from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.sim.scenario import Scenario
-from egovcp_collect.backend import Brief, Report
+from egovcp.testing import random_episode
+from egovcp_collect.backend import Brief, Report, encode_numbered, portable
 from egovcp_collect.crew import ATTEMPTS, Crew
 
 _ROBOTS = 2
@@ -153,6 +156,55 @@ def test_an_episode_that_stays_invalid_ends_the_run() -> None:
 
     with pytest.raises(DataError, match="episode 7, frame 3"):
         _play(deed)
+
+
+def _invalid(number: int) -> DataError:
+    error = DataError(f"episode {number}, frame 3: state is not finite")
+    error.episode = number
+    return error
+
+
+def test_an_invalid_episode_is_not_held_against_those_beside_it() -> None:
+    """Two of one worker's episodes are invalid once each: neither stayed so."""
+    failed: list[int] = []
+
+    def deed(worker: _Worker, number: int) -> Report | None:
+        if number not in (6, 7) or number in failed:
+            return None
+        failed.append(number)
+        return Report(0, failure=_invalid(number))
+
+    numbers, crew, _ = _play(deed, workers=1)
+    assert sorted(numbers) == list(range(20))
+    assert crew.replaced == 2
+
+
+def test_an_invalid_episode_is_found_among_lost_workers() -> None:
+    """A worker that died on the same episodes before is no reason to give up one that is new."""
+    mishaps: list[str] = []
+
+    def deed(worker: _Worker, number: int) -> Report | None:
+        if number != 7 or len(mishaps) == 2:
+            return None
+        mishaps.append("death" if not mishaps else "invalid")
+        if len(mishaps) == 2:
+            return Report(0, failure=_invalid(7))
+        worker.alive = False
+        return None
+
+    numbers, crew, _ = _play(deed)
+    assert sorted(numbers) == list(range(20))
+    assert crew.replaced == 2
+
+
+def test_the_number_of_an_invalid_episode_travels_with_the_error() -> None:
+    episode = random_episode(7)
+    episode.state[3, 0] = np.nan
+    with pytest.raises(DataError, match="episode 7, frame 3") as caught:
+        encode_numbered(7, episode)
+    arrived = copy.copy(portable(caught.value))  # goes the way of pickle
+    assert isinstance(arrived, DataError)
+    assert (arrived.episode, str(arrived)) == (7, str(caught.value))
 
 
 @pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), RuntimeError("bug")])

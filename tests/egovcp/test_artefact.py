@@ -110,6 +110,36 @@ def test_another_planner_can_be_asked_for(original: Path) -> None:
     assert load_artefact(str(original)).make_policy(planner=other).config == other
 
 
+def test_an_artefact_without_the_younger_options_loads_as_what_it_was(folder: Path) -> None:
+    """They are absent in files of an earlier version; their defaults change nothing."""
+    expected = load_artefact(str(folder))
+
+    def forget(config: Json) -> None:
+        for name in ("value_loss", "q_heads"):
+            del config["world_model"][name]
+        for name in ("near", "near_threshold", "free_nats_per", "reward"):
+            del config["world_model"]["loss"][name]
+        for name in ("latent", "ensemble"):
+            del config["planner"][name]
+
+    _edit(folder / CONFIG, forget)
+    _sign(folder)
+    found = load_artefact(str(folder))
+    assert (found.world_model.config, found.planner) == (
+        expected.world_model.config,
+        expected.planner,
+    )
+
+
+def test_options_that_the_weights_contradict_are_refused(folder: Path) -> None:
+    _edit(folder / CONFIG, lambda config: config["world_model"].update(q_heads=2))
+    _sign(folder)
+    with pytest.raises(
+        ArtefactError, match=r"weights and configuration disagree.*more_value_heads"
+    ):
+        load_artefact(str(folder))
+
+
 # --- refusals --------------------------------------------------------------------------
 @pytest.mark.parametrize("name", sorted(FILES))
 def test_a_missing_file_is_named(folder: Path, name: str) -> None:

@@ -1,4 +1,4 @@
-"""``lerobot-train`` and ``lerobot-eval`` find the plugins, train a policy and play it."""
+"""``lerobot-train`` and ``lerobot-eval`` find the plugins, train, publish and play a policy."""
 
 import json
 import os
@@ -6,19 +6,32 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from egovcp.artefact import load_artefact
 from egovcp.checks import check_artefact
+from egovcp.processors import PROCESSORS
+from egovcp.testing.hub import FakeHub, environment, in_this_process
 from lerobot_policy_egovcp import EgovcpPolicy
 
 PLUGINS = sorted((Path(__file__).resolve().parents[2] / "plugins").iterdir())
+POLICY = "me/policy"
+TOKEN = "hf_right"
 
 
 @pytest.fixture(scope="module")
-def surroundings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
-    """An environment in which the plugins' distributions are installed, without a network."""
+def hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[FakeHub]:
+    """A Hub that knows one user."""
+    with FakeHub(tmp_path_factory.mktemp("hub"), token=TOKEN) as hub:
+        yield hub
+
+
+@pytest.fixture(scope="module")
+def surroundings(hub: FakeHub, tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """An environment in which the plugins' distributions are installed, with a Hub of its own."""
     place = tmp_path_factory.mktemp("site")
     for plugin in PLUGINS:
         project = tomllib.loads((plugin / "pyproject.toml").read_text())["project"]
@@ -27,16 +40,18 @@ def surroundings(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         note.parent.mkdir()
         note.write_text(f"Metadata-Version: 2.3\nName: {name}\nVersion: {version}\n")
     paths = [str(place), *map(str, PLUGINS), os.environ.get("PYTHONPATH", "")]
-    return os.environ | {
-        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
-        "HF_HUB_OFFLINE": "1",
-        "HF_HOME": str(place / "hub"),
-    }
+    own = {"PYTHONPATH": os.pathsep.join(filter(None, paths)), "HF_TOKEN": TOKEN}
+    return os.environ | environment(hub.endpoint, place) | own
 
 
 def _run(surroundings: dict[str, str], program: str, *options: str) -> str:
     """The log of ``lerobot-train`` or ``lerobot-eval`` with these options."""
-    start = f"from lerobot.scripts.lerobot_{program} import main; main()"
+    start = (
+        "from huggingface_hub import RepoCard\n"
+        "RepoCard.validate = lambda self, repo_type=None: None\n"  # it asks the real Hub
+        f"from lerobot.scripts.lerobot_{program} import main\n"
+        "main()"
+    )
     command = [sys.executable, "-c", start, *options]
     done = subprocess.run(
         command, env=surroundings, capture_output=True, text=True, timeout=280, check=False
@@ -53,7 +68,7 @@ def _checkpoint(output: Path, step: int) -> Path:
 def run(
     surroundings: dict[str, str], dataset_root: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, str]:
-    """Two steps from scratch: the output folder, and the log."""
+    """Two steps from scratch, published: the output folder, and the log."""
     output = tmp_path_factory.mktemp("lerobot-train") / "run"
     small = {"hidden": 32, "latent": 8, "units": 32, "channels": "[4,8,8]"}
     log = _run(
@@ -61,7 +76,9 @@ def run(
         "train",
         "--policy.type=egovcp",
         "--policy.device=cpu",
-        "--policy.push_to_hub=false",
+        "--policy.push_to_hub=true",
+        f"--policy.repo_id={POLICY}",
+        "--policy.private=true",
         "--policy.sequence_length=6",
         "--policy.returns.steps=4",
         "--policy.planner.samples=16",
@@ -89,6 +106,24 @@ def test_it_trains_a_policy_that_egovcp_and_lerobot_load(run: tuple[Path, str]) 
     assert policy.config.planner.samples == 16
 
 
+def test_what_it_publishes_is_the_artefact(
+    hub: FakeHub, run: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """LeRobot adds its options and the processors, which the manifest does not seal."""
+    output, log = run
+    assert re.search(rf"Model pushed to {hub.endpoint}/\S*{POLICY}", log)
+    assert hub.store.refs(f"models/{POLICY}").private
+    monkeypatch.setenv("HF_TOKEN", TOKEN)
+    with in_this_process(hub.endpoint, tmp_path):
+        published = check_artefact(POLICY)
+        policy = EgovcpPolicy.from_pretrained(POLICY)
+    assert {"train_config.json", *PROCESSORS} <= {
+        path.name for path in published.path.iterdir()
+    }
+    for name, value in load_artefact(str(_checkpoint(output, 2))).world_model.state_dict().items():
+        assert policy.world_model.state_dict()[name].equal(value), name
+
+
 @pytest.mark.slow
 def test_a_run_is_resumed(surroundings: dict[str, str], run: tuple[Path, str]) -> None:
     output, _ = run
@@ -103,13 +138,12 @@ def test_a_run_is_resumed(surroundings: dict[str, str], run: tuple[Path, str]) -
 
 
 @pytest.mark.slow
-def test_lerobot_eval_plays_it(
-    surroundings: dict[str, str], run: tuple[Path, str], tmp_path: Path
-) -> None:
+@pytest.mark.usefixtures("run")
+def test_lerobot_eval_plays_it_from_the_hub(surroundings: dict[str, str], tmp_path: Path) -> None:
     _run(
         surroundings,
         "eval",
-        f"--policy.path={_checkpoint(run[0], 2)}",
+        f"--policy.path={POLICY}",
         "--policy.device=cpu",
         "--env.type=egovcp",
         "--env.task=ball",

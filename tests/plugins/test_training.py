@@ -14,11 +14,17 @@ from torch import Tensor
 from egovcp.artefact import load_artefact
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.data.stream import gather
+from egovcp.data.windows import mirror_rows
 from egovcp.errors import ArtefactError, DataError, UsageError
 from egovcp.model import Batch
 from egovcp_train.batches import set_normalisation
-from lerobot_policy_egovcp import EgovcpConfig, EgovcpPolicy, make_egovcp_pre_post_processors
-from lerobot_policy_egovcp.training_rows import Targets, open_reader, to_batch
+from lerobot_policy_egovcp import (
+    EgovcpConfig,
+    EgovcpPolicy,
+    make_egovcp_pre_post_processors,
+    modeling_egovcp,
+)
+from lerobot_policy_egovcp.training_rows import Targets, mirrored, open_reader, to_batch
 
 ROWS = [0, 1, 5, 11, 12, 26, 32, 33, 92]  # first, middle and last rows; 24 to 32 end in a fall
 
@@ -69,6 +75,45 @@ def test_a_window_of_lerobot_is_a_window_of_the_stream(
         np.testing.assert_array_equal(getattr(found, flag), expected[flag], err_msg=flag)
     assert found.terminal_next.any()
     assert 0 < found.is_first.sum() < len(ROWS)
+
+
+def test_a_mirrored_window_of_lerobot_is_a_mirrored_window_of_the_stream(
+    policy: EgovcpPolicy, config: EgovcpConfig, meta: LeRobotDatasetMetadata
+) -> None:
+    store = _store(meta, config.returns)
+    episode = np.searchsorted(store.start + store.length, ROWS, side="right")
+    expected = gather(store, np.array(ROWS), episode, config.sequence_length)
+    which = np.arange(len(ROWS)) % 2 == 0
+    mirror_rows(expected, np.flatnonzero(which))
+    plain = to_batch(_windows(config, meta, ROWS), Targets.of(_reader(meta), config.returns))
+    found = mirrored(plain, torch.from_numpy(which))
+    valid = expected["valid"]
+    for name in Batch._fields:
+        value = getattr(found, name).numpy()
+        np.testing.assert_array_equal(value[valid], expected[name][valid], err_msg=name)
+
+
+def test_mirrored_windows_are_for_learning_alone(
+    policy: EgovcpPolicy,
+    config: EgovcpConfig,
+    meta: LeRobotDatasetMetadata,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked: list[int] = []
+
+    def count(rows: Batch, which: Tensor) -> Batch:
+        asked.append(len(which))
+        return rows
+
+    monkeypatch.setattr(modeling_egovcp, "mirrored", count)
+    batch = _windows(config, meta, ROWS)
+    policy.eval().forward(batch)
+    assert asked == []
+    policy.train().forward(batch)
+    assert asked == [len(ROWS)]
+    config.mirror = False
+    policy.forward(batch)
+    assert asked == [len(ROWS)]
 
 
 def test_a_new_policy_has_the_statistics_of_the_dataset(

@@ -1,5 +1,6 @@
 """egovcp-export: the networks say what the world model says, in another runtime."""
 
+import dataclasses
 import hashlib
 import json
 from collections.abc import Callable
@@ -225,3 +226,31 @@ def test_without_the_packages_it_says_what_to_install(
     monkeypatch.setattr(module, "find_spec", lambda name: None if name == "onnx" else object())
     assert main([f"--policy.path={artefact}", f"--output_dir={tmp_path / 'onnx'}"]) == 5
     assert "this needs onnx, not installed here" in capsys.readouterr().err
+
+
+# --- options ----------------------------------------------------------------------------
+def test_a_q_of_bins_and_heads_and_a_reward_are_exported(tmp_path: Path) -> None:
+    config = PRESETS["debug"]
+    loss = dataclasses.replace(config.loss, reward=1.0)
+    config = dataclasses.replace(config, value_loss="two_hot", q_heads=2, loss=loss)
+    torch.manual_seed(0)
+    model = _lively(WorldModel(config))
+    save_artefact(tmp_path / "policy", model, PlannerConfig(), {"controller_id": "s-1"})
+    argv = [f"--policy.path={tmp_path / 'policy'}", f"--output_dir={tmp_path / 'onnx'}"]
+    assert main(argv) == 0
+    errors = verify(tmp_path / "onnx")
+    assert errors.keys() == {*NETWORKS, "reward"}
+    assert json.loads((tmp_path / "onnx" / REPORT).read_text())["networks"].keys() == errors.keys()
+
+
+@pytest.mark.parametrize("planner", [{"latent": "sample"}, {"ensemble": "min"}])
+def test_a_planner_that_asks_for_more_than_means_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], planner: dict[str, Any]
+) -> None:
+    model = WorldModel(PRESETS["debug"])
+    provenance = {"controller_id": "s-1"}
+    save_artefact(tmp_path / "policy", model, PlannerConfig(**planner), provenance)
+    argv = [f"--policy.path={tmp_path / 'policy'}", f"--output_dir={tmp_path / 'onnx'}"]
+    assert main(argv) == 4
+    assert "--planner.latent=mean" in capsys.readouterr().err
+    assert not (tmp_path / "onnx").exists()

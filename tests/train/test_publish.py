@@ -14,6 +14,7 @@ from egovcp.artefact import load_artefact, save_artefact
 from egovcp.checks import check_artefact
 from egovcp.hub import Patience
 from egovcp.plan import PlannerConfig
+from egovcp.processors import PROCESSORS
 from egovcp.testing import toy_model
 from egovcp.testing.hub import FakeHub, in_this_process
 from egovcp_train import publish as publishing
@@ -59,7 +60,7 @@ def test_a_run_is_published_in_one_commit_and_plans_from_there(
     assert hub.requests["commit"] == 1
     assert f"me/policy@main is now {head.sha}" in capsys.readouterr().out
     published = {path for path in head.files if path != ".gitattributes"}
-    data = {"config.json", "model.safetensors", "manifest.json"}
+    data = {"config.json", "model.safetensors", "manifest.json", *PROCESSORS}
     assert published == {*data, "README.md", "assets/training.png"}
     artefact = check_artefact("me/policy", head.sha)
     assert artefact.manifest == load_artefact(str(_last(run))).manifest

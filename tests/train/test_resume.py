@@ -192,6 +192,15 @@ def test_resuming_with_what_does_not_fit_is_refused(
     assert _equal(_state(output), _state(finished))
 
 
+def test_resuming_with_a_config_file_is_refused(
+    finished: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Which of the two would win? Even the run's own file may lie in another folder by now."""
+    file = f"--config_path={finished / 'train_config.yaml'}"
+    _refused([f"--output_dir={finished}", "--resume", file], 2, capsys, "drop it")
+    _refused([file, "--resume=true"], 2, capsys, "--output_dir")
+
+
 # --- killed while a checkpoint is written -----------------------------------------------------
 class _Killed(BaseException):
     """The process is gone: nothing after it runs."""

@@ -117,7 +117,8 @@ def test_what_an_action_earns_is_not_credited_to_the_state_that_goes_with_it() -
     with torch.no_grad():
         place = model.passing(Carry(h, z))[:, 1]
     target = -((action[:, 0] - place) ** 2)
-    rows = Rows(h, z, action, (target - target.mean()) / target.std())
+    standardised = (target - target.mean()) / target.std()
+    rows = Rows(h, z, action, standardised, torch.zeros(count))
     _fit_heads(model, rows, ValueFitConfig(steps=300, rows=512, lr=3e-3), rng)
     with torch.no_grad():
         good, bad = action.clone(), action.clone()

@@ -47,15 +47,18 @@ def whole_episodes(
             yield to_tensors(arrays, device)
 
 
-def set_normalisation(model: WorldModel, store: EpisodeStore) -> None:
+def set_normalisation(model: WorldModel, store: EpisodeStore, scaled: bool = True) -> None:
     """Fix the model's statistics from the training episodes: state, return, worst return.
+
+    Args:
+        scaled: see `egovcp.model.statistics.set_statistics`.
 
     Raises:
         DataError: no return is usable, because the episodes are too short.
     """
     state = store.state.astype(np.float64)
     returns = store.mc_return[store.mc_valid]
-    fix_normalisation(model, state.mean(0), state.std(0), returns, int(store.length.max()))
+    fix_normalisation(model, state.mean(0), state.std(0), returns, int(store.length.max()), scaled)
 
 
 def fix_normalisation(
@@ -64,6 +67,7 @@ def fix_normalisation(
     state_std: NDArray[np.float64],
     returns: NDArray[np.float32],
     longest: int,
+    scaled: bool = True,
 ) -> None:
     """Fix the model's statistics: state (74,) each, complete returns (N,), longest episode.
 
@@ -75,4 +79,4 @@ def fix_normalisation(
             f"no row has a complete Monte Carlo return: the episodes (at most {longest} ticks) "
             "are not longer than --returns.steps; lower it, or collect longer episodes"
         )
-    set_statistics(model, state_mean, state_std, returns)
+    set_statistics(model, state_mean, state_std, returns, scaled)

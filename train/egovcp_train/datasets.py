@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -38,12 +38,14 @@ from egovcp_train.batches import (
 )
 from egovcp_train.config import TrainConfig
 from egovcp_train.labels.passing import label, label_episode
+from egovcp_train.return_scale import ReturnScale, on_task_scales, task_scales
 
 EVALUATION_EPISODES = 64  # of each task
 FIT_EPISODES = 2048  # of a dataset that is not in memory: half a GB of states to fit Q to
 FRAME_BYTES = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (spec.STATE_DIM + 2 * spec.ACTION_DIM + 8)
 
 type Learning = EpisodeStore | EpisodeIndex
+type Built = tuple[Learning, Ahead, EpisodeStore, Learning, Mapping[str, ReturnScale]]
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,8 @@ class Material:
     """Episodes to evaluate on."""
     fitting: Learning
     """Those training episodes that the final fit of Q may draw from."""
+    return_scales: Mapping[str, ReturnScale]
+    """Task -> the scale that its returns are on, under `returns.scale=per_task`; else empty."""
 
     def training_episodes(self, device: torch.device) -> Iterator[Batch]:
         """Whole training episodes, and their mirror images; a random part of a large dataset."""
@@ -159,7 +163,8 @@ def stream_config(config: TrainConfig) -> StreamConfig:
 
 def needs_labels(config: TrainConfig) -> bool:
     """Whether a loss asks what is on its way."""
-    return config.policy.loss.passing > 0 or config.policy.loss.flight > 0
+    loss = config.policy.loss
+    return max(loss.passing, loss.flight, loss.motion) > 0
 
 
 def _decided(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:
@@ -177,15 +182,19 @@ def _in_memory(
     sampling: StreamConfig,
     mix: Mix,
     model: WorldModel,
-) -> tuple[Learning, Ahead, EpisodeStore, Learning]:
+) -> Built:
     learning, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
-    set_normalisation(model, learning)
+    scales: dict[str, ReturnScale] = {}
+    if config.returns.scale == "per_task":
+        scales = task_scales(learning)
+        learning, heldout = (on_task_scales(store, scales) for store in (learning, heldout))
+    set_normalisation(model, learning, config.returns.scale != "none")
     heldout = label(heldout, config.passing)
     if needs_labels(config):
         learning = label(learning, config.passing)
-    return learning, Ahead(SequenceStream(learning, sampling, mix)), heldout, learning
+    return learning, Ahead(SequenceStream(learning, sampling, mix)), heldout, learning, scales
 
 
 def _on_disk(
@@ -194,7 +203,12 @@ def _on_disk(
     sampling: StreamConfig,
     mix: Mix,
     model: WorldModel,
-) -> tuple[Learning, Ahead, EpisodeStore, Learning]:
+) -> Built:
+    if config.returns.scale == "per_task":
+        raise UsageError(
+            "--returns.scale=per_task needs all episodes in memory, and these are read from the "
+            "disk; give --loading.mode=ram, or --returns.scale=dataset"
+        )
     learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
     sample = learning
     if learning.is_remote:
@@ -208,7 +222,8 @@ def _on_disk(
     else:
         facts = survey(learning, config.returns, sampling.event_quantile)
     longest = int(learning.length.max())
-    fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest)
+    scaled = config.returns.scale != "none"
+    fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest, scaled)
     labelling = None
     if needs_labels(config):
         labelling = partial(label_episode, config=config.passing)
@@ -222,7 +237,7 @@ def _on_disk(
         label=labelling,
         checked=not learning.is_remote,
     )
-    return learning, Ahead(stream), heldout, sample
+    return learning, Ahead(stream), heldout, sample, {}
 
 
 def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -> Iterator[Batch]:

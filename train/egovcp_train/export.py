@@ -28,8 +28,10 @@ from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
 from egovcp_train.onnx_networks import (
     NETWORKS,
     OPSET,
+    REWARD,
     Network,
     golden_inputs,
+    networks_of,
     reference,
     write_graph,
 )
@@ -104,10 +106,12 @@ def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:
     """Write everything to the existing ``folder``; network -> its largest error.
 
     Raises:
-        ArtefactError: a network does not say what the original says.
+        ArtefactError: a network does not say what the original says, or the planner would ask for
+            more than they say.
     """
     model = artefact.world_model
-    for name, network in NETWORKS.items():
+    _require_exportable(artefact)
+    for name, network in networks_of(model).items():
         write_graph(network(model), golden_inputs(model, _TRACED_ROWS, 1), folder / f"{name}.onnx")
     inputs = golden_inputs(model, _ROWS)
     golden = {f"inputs/{name}": tensor for name, tensor in inputs.items()}
@@ -119,6 +123,17 @@ def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:
     text = json.dumps(report, indent=2, allow_nan=False) + "\n"
     (folder / REPORT).write_text(text, encoding="utf-8")
     return errors
+
+
+def _require_exportable(artefact: Artefact) -> None:
+    """Raise `ArtefactError` for a planner that asks what the networks do not answer."""
+    planner = artefact.planner
+    if (planner.latent, planner.ensemble) != ("mean", "mean"):
+        raise ArtefactError(
+            f"{artefact.path}: its planner has latent={planner.latent} and "
+            f"ensemble={planner.ensemble}; the networks written here give the mean of each, and "
+            "another plan: train with --planner.latent=mean --planner.ensemble=mean"
+        )
 
 
 def verify(folder: Path) -> dict[str, float]:
@@ -133,7 +148,8 @@ def verify(folder: Path) -> dict[str, float]:
     _require_packages()
     golden = load_file(folder / GOLDEN)
     errors: dict[str, float] = {}
-    for name, network in NETWORKS.items():
+    present = REWARD if (folder / "reward.onnx").exists() else {}
+    for name, network in {**NETWORKS, **present}.items():
         inputs = {key: golden[f"inputs/{key}"].numpy() for key in network.inputs}
         expected = [golden[f"outputs/{name}/{key}"].numpy() for key in network.outputs]
         errors[name] = _largest_error(folder / f"{name}.onnx", network, inputs, expected)
@@ -186,7 +202,7 @@ def _report(artefact: Artefact, folder: Path, golden: dict[str, torch.Tensor]) -
                 "inputs": {key: described(f"inputs/{key}") for key in network.inputs},
                 "outputs": {key: described(f"outputs/{name}/{key}") for key in network.outputs},
             }
-            for name, network in NETWORKS.items()
+            for name, network in networks_of(artefact.world_model).items()
         },
         "golden": {"file": GOLDEN, "sha256": _sha256(folder / GOLDEN), "tolerance": TOLERANCE},
         "return_floor": float(artefact.world_model.return_floor),

@@ -4,6 +4,7 @@
     imagine      h, z, action                          ->  h_next, z_next
     value        h, z, action                          ->  value
     termination  h, z                                  ->  termination
+    reward       h, z, action                          ->  reward         if it is predicted
 
 Normalisation is inside: depth comes in millimetres, proprioception in SI units, and values go out
 in units of return. A planner repeats the row of a robot for each of its candidates.
@@ -87,12 +88,28 @@ class Termination(Network):
         return self.model.termination(Carry(h, z))
 
 
+class Reward(Network):
+    """`WorldModel.reward`, (B,)."""
+
+    inputs = ("h", "z", "action")
+    outputs = ("reward",)
+
+    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
+        return self.model.reward(Carry(h, z), action)
+
+
 NETWORKS: Final[Mapping[str, type[Network]]] = {
     "observe": Observe,
     "imagine": Imagine,
     "value": Value,
     "termination": Termination,
 }
+REWARD: Final[Mapping[str, type[Network]]] = {"reward": Reward}
+
+
+def networks_of(model: WorldModel) -> Mapping[str, type[Network]]:
+    """What there is of this model, by name."""
+    return NETWORKS if model.reward_head is None else {**NETWORKS, **REWARD}
 
 
 def pooled_nearness(depth_mm: Tensor, max_m: float) -> Tensor:
@@ -134,12 +151,15 @@ def reference(model: WorldModel, inputs: Tensors) -> dict[str, Tensors]:
     action, state, is_first = inputs["action"], inputs["state"], inputs["is_first"]
     observed = model.observe(carry, action, depth, state, is_first)
     imagined = model.imagine(carry, action)
-    return {
+    answers = {
         "observe": {"h_next": observed.h, "z_next": observed.z},
         "imagine": {"h_next": imagined.h, "z_next": imagined.z},
         "value": {"value": model.value(carry, action)},
         "termination": {"termination": model.termination(carry)},
     }
+    if model.reward_head is not None:
+        answers["reward"] = {"reward": model.reward(carry, action)}
+    return answers
 
 
 def write_graph(network: Network, inputs: Tensors, path: Path) -> None:

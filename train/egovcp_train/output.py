@@ -18,10 +18,20 @@ CONFIG_FILE = "train_config.yaml"
 
 
 def resumed_options(argv: Sequence[str]) -> dict[str, Any]:
-    """What stands where no flag says otherwise: the options of the run that is resumed."""
+    """What stands where no flag says otherwise: the options of the run that is resumed.
+
+    Raises:
+        UsageError: a config file, which says everything itself, would hide them.
+    """
     given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
     saved = Path(given.get("output_dir", "")) / CONFIG_FILE
     resume = "--resume" in argv or given.get("resume", "").lower() == "true"
+    if resume and "config_path" in given:
+        raise UsageError(
+            f"--resume goes on with the options that the run has kept in its --output_dir, and "
+            f"--config_path={given['config_path']} says others; drop it, and give what is to "
+            "change as flags of their own"
+        )
     if not (resume and saved.is_file()):
         return {}
     options: dict[str, Any] = cfgparsing.load_config(saved.read_text("utf-8"), file=saved)

@@ -11,7 +11,7 @@ from egovcp.artefact import load_artefact
 from egovcp.cli import run_command
 from egovcp.data.source import is_repo_id
 from egovcp.errors import UsageError
-from egovcp.hub import Patience, publish
+from egovcp.hub import PublishConfig, publish
 from egovcp_train.publish import publication, report
 
 PROG = "egovcp-push"
@@ -26,7 +26,7 @@ class FolderConfig:
 
 
 @dataclass(frozen=True)
-class PushConfig:
+class PushConfig(PublishConfig):
     """Publish a policy artefact and its card on the Hub in one commit.
 
     The artefact is checked first. A push that failed can be repeated: it completes what is
@@ -35,20 +35,8 @@ class PushConfig:
 
     policy: FolderConfig = field(default_factory=FolderConfig)
     """The artefact."""
-    repo_id: str = ""
-    """Where to publish it, `user/name`."""
-    private: bool = False
-    """A new repository is private."""
-    branch: str = "main"
-    """Branch; made if need be."""
-    tag: str = ""
-    """A tag for this version; empty: none. It cannot be moved later."""
     message: str = ""
     """Title of the commit; empty: how long it was trained."""
-    network: Patience = field(default_factory=Patience)
-    """How long to try."""
-    json: str = ""
-    """File for {"repo_id", "branch", "tag", "commit", "new"}; empty: none."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:

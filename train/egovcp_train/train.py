@@ -234,6 +234,7 @@ def _provenance(material: Material) -> dict[str, Any]:
             for r in readers
         ],
         "heldout_episodes": describe_heldout(readers),
+        "return_scales": {task: list(scale) for task, scale in material.return_scales.items()},
         "train_config": draccus.encode(material.config),
         "command": [PROG, *sys.argv[1:]],
     }

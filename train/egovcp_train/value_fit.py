@@ -14,11 +14,12 @@ from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 
-from egovcp.model import Batch, Carry, WorldModel
+from egovcp.model import Batch, Carry, WorldModel, value
 from egovcp.model.losses import filter_sequence
 from egovcp.model.nets import SplitMlp, ValueHead
+from egovcp.model.world_model import QHead
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,7 @@ class Rows(NamedTuple):
     z: Tensor  # (R, latent)
     action: Tensor  # (R, 7)
     target: Tensor  # (R,) standardised return
+    reward: Tensor  # (R,) in deviations of the return
 
 
 def fit_value(
@@ -77,51 +79,80 @@ def fit_value(
 def _fit_heads(
     model: WorldModel, rows: Rows, config: ValueFitConfig, generator: torch.Generator
 ) -> None:
-    device = model.state_mean.device
-    if (head := model.passing_value_head) is not None:
+    """Each head of Q, and that of the reward if there is one."""
+    for head in model.q_heads:
+        _fit_q(model, head, rows, config, generator)
+    if (reward := model.reward_head) is not None:
+
+        def earned(x: Rows, known: Tensor | None) -> Tensor:
+            r: Tensor = reward(*_hidden(x, config), x.action)
+            return (r.squeeze(-1) - x.reward).square().mean()
+
+        _descend(reward, earned, rows, None, config, generator)
+
+
+def _fit_q(
+    model: WorldModel,
+    head: QHead,
+    rows: Rows,
+    config: ValueFitConfig,
+    generator: torch.Generator,
+) -> None:
+    kind, known = model.config.value_loss, None
+    if (passing := head.passing) is not None:
 
         def told(x: Rows) -> Tensor:
-            q: Tensor = head(model.passing(Carry(x.h, x.z)), x.action)
-            return q.squeeze(-1)
+            q: Tensor = passing(model.passing(Carry(x.h, x.z)), x.action)
+            return q
 
-        _descend(head, _squared(told), rows, config, generator, device)
+        def told_error(x: Rows, known: Tensor | None) -> Tensor:
+            return value.error(told(x), x.target, kind).mean()
+
+        _descend(passing, told_error, rows, None, config, generator)
         with torch.no_grad():
             chunks = torch.split(torch.arange(len(rows.target)), 65536)
-            explained = [told(_pick(rows, some, device)).cpu() for some in chunks]
-        rows = rows._replace(target=rows.target - torch.cat(explained))
+            known = torch.cat([told(_pick(rows, some, _device(passing))).cpu() for some in chunks])
 
-    def judged(x: Rows) -> Tensor:
-        h, z = (F.dropout(s, config.dropout) for s in (x.h, x.z))
-        q: Tensor = model.value_head(h, z, x.action)
-        return q.squeeze(-1)
+    def judged(x: Rows, known: Tensor | None) -> Tensor:
+        q: Tensor = head.state(*_hidden(x, config), x.action)
+        if known is None:
+            return value.error(q, x.target, kind).mean()
+        return value.error_beyond(q, known, x.target, kind).mean()
 
-    _descend(model.value_head, _squared(judged), rows, config, generator, device)
+    _descend(head.state, judged, rows, known, config, generator)
+
+
+def _hidden(x: Rows, config: ValueFitConfig) -> tuple[Tensor, Tensor]:
+    """h and z, some of them hidden."""
+    return F.dropout(x.h, config.dropout), F.dropout(x.z, config.dropout)
 
 
 def _descend(
     head: SplitMlp | ValueHead,
-    loss: Callable[[Rows], Tensor],
+    loss: Callable[[Rows, Tensor | None], Tensor],
     rows: Rows,
+    known: Tensor | None,
     config: ValueFitConfig,
     generator: torch.Generator,
-    device: torch.device,
 ) -> None:
-    """Fit ``head`` from scratch to a small ``loss``."""
+    """Fit ``head`` from scratch to a small ``loss`` of rows and of what is ``known`` of them."""
     head.restart()
     head.requires_grad_(True)
+    device = _device(head)
     optimizer = torch.optim.AdamW(head.parameters(), lr=config.lr, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=config.steps)
     for _ in range(config.steps):
         pick = torch.randint(len(rows.target), (config.rows,), generator=generator)
         optimizer.zero_grad(set_to_none=True)
-        loss(_pick(rows, pick, device)).backward()  # type: ignore[no-untyped-call]
+        beyond = None if known is None else known[pick].to(device)
+        loss(_pick(rows, pick, device), beyond).backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         schedule.step()
     head.requires_grad_(False)
 
 
-def _squared(predict: Callable[[Rows], Tensor]) -> Callable[[Rows], Tensor]:
-    return lambda x: (predict(x) - x.target).square().mean()
+def _device(head: nn.Module) -> torch.device:
+    return next(head.parameters()).device
 
 
 def _pick(rows: Rows, which: Tensor, device: torch.device) -> Rows:
@@ -150,6 +181,7 @@ def _rows_of(
     """States of one batch of episodes, each imagined a random number of steps ahead."""
     carry = filter_sequence(model, batch, sample=False).carry
     target = (batch.mc_return - model.return_mean) / model.return_std
+    reward = batch.reward / model.return_std
     usable = batch.valid & batch.mc_valid
     length = batch.valid.shape[1]
     depth = min(imagined_steps, length - 1)
@@ -160,6 +192,7 @@ def _rows_of(
             carry = Carry(carry.h[:, : length - k], carry.z[:, : length - k])
             carry = model.imagine(carry, batch.action[:, k - 1 : length - 1])
         mask = usable[:, k:] & (steps[:, k:] == k)
-        found.append((carry.h[mask], carry.z[mask], batch.action[:, k:][mask], target[:, k:][mask]))
-    h, z, action, value = (torch.cat(column).cpu() for column in zip(*found, strict=True))
-    return Rows(h.half(), z.half(), action.half(), value)
+        ahead = (x[:, k:][mask] for x in (batch.action, target, reward))
+        found.append((carry.h[mask], carry.z[mask], *ahead))
+    h, z, action, *targets = (torch.cat(column).cpu() for column in zip(*found, strict=True))
+    return Rows(h.half(), z.half(), action.half(), *targets)

@@ -15,7 +15,7 @@ from egovcp.data import DatasetConfig, DatasetReader, schema
 from egovcp.data.committer import work_folder
 from egovcp.data.source import is_repo_id
 from egovcp.errors import DataError, UsageError
-from egovcp.hub import Content, Patience, Publication, Published, publish
+from egovcp.hub import Content, Publication, PublishConfig, Published, publish
 from egovcp_collect.dataset.card import ASSETS, CARD, card_text
 from egovcp_collect.dataset.replace import write_report
 
@@ -24,7 +24,7 @@ _OWNED: Final = ("data", "meta", "videos", "images", ASSETS)
 
 
 @dataclass(frozen=True)
-class PushConfig:
+class PushConfig(PublishConfig):
     """Publish a dataset and its card on the Hub in one commit, and tag it for LeRobot.
 
     The dataset is checked first. A push that failed can be repeated: it completes what is
@@ -33,20 +33,10 @@ class PushConfig:
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder on disk."""
-    repo_id: str = ""
-    """Where to publish it, `user/name`."""
-    private: bool = False
-    """A new repository is private."""
     branch: str = "main"
     """Branch; made if need be. LeRobot's version tag follows `main` alone."""
-    tag: str = ""
-    """A tag for this version; empty: none. It cannot be moved later."""
     message: str = ""
     """Title of the commit; empty: what the dataset holds."""
-    network: Patience = field(default_factory=Patience)
-    """How long to try."""
-    json: str = ""
-    """File for {"repo_id", "branch", "commit", "new", "tag"}; empty: none."""
 
 
 CONFIG = PushConfig

@@ -22,7 +22,8 @@ FEATURE_SHAPES = {
 
 def _world_model() -> WorldModelConfig:
     """The default without the labels of what is on its way, which take whole episodes to find."""
-    return WorldModelConfig(value_of_passing=False, loss=LossConfig(passing=0.0))
+    loss = LossConfig(passing=0.0, motion=0.0, flight=0.0)
+    return WorldModelConfig(value_of_passing=False, paint_flight=False, loss=loss)
 
 
 def _no_normalisation() -> dict[str, NormalizationMode]:
@@ -32,7 +33,12 @@ def _no_normalisation() -> dict[str, NormalizationMode]:
 @PreTrainedConfig.register_subclass("egovcp")
 @dataclass
 class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
-    """World model, planner and training of an egovcp policy; the first two are the artefact's."""
+    """World model, planner and training of an egovcp policy; the first two are the artefact's.
+
+    ``lerobot-train`` gives a plainer policy than ``egovcp-train``: no labels of what is on its
+    way, no averaged weights, no final fit of Q. They need whole episodes, or a place in the
+    training loop that LeRobot does not have.
+    """
 
     world_model: WorldModelConfig = field(default_factory=_world_model)
     """World model and losses."""
@@ -44,6 +50,8 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
     """Monte Carlo target of Q."""
     sequence_length: int = 20
     """Ticks per training window, which begins at the row that LeRobot draws."""
+    mirror: bool = True
+    """Left-right mirror half of the windows (the robot is symmetric)."""
     drop_n_last_frames: int = 0
     """Rows at the end of an episode at which no window begins; windows past the end are padded."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_no_normalisation)
@@ -65,6 +73,11 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
             raise UsageError(
                 f"--policy.sequence_length={self.sequence_length} and --policy.drop_n_last_frames="
                 f"{self.drop_n_last_frames}; expected at least 2 and 0"
+            )
+        if self.returns.scale == "per_task":
+            raise UsageError(
+                "--policy.returns.scale=per_task is an ablation of egovcp-train; choose dataset or "
+                "none"
             )
         if any(mode is not NormalizationMode.IDENTITY for mode in self._modes()):
             raise UsageError(

@@ -23,7 +23,13 @@ from egovcp.model import WorldModel, world_model_loss
 from egovcp.model.statistics import set_statistics
 from egovcp.plan import Policy
 from lerobot_policy_egovcp.configuration_egovcp import EgovcpConfig
-from lerobot_policy_egovcp.training_rows import Targets, open_reader, to_batch, to_millimetres
+from lerobot_policy_egovcp.training_rows import (
+    Targets,
+    mirrored,
+    open_reader,
+    to_batch,
+    to_millimetres,
+)
 
 type Stats = Mapping[str, Mapping[str, Any]]
 
@@ -67,7 +73,11 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
             state = dataset_stats[spec.STATE_KEY]
             returns = self._dataset_targets().usable.numpy()
             set_statistics(
-                self.world_model, np.asarray(state["mean"]), np.asarray(state["std"]), returns
+                self.world_model,
+                np.asarray(state["mean"]),
+                np.asarray(state["std"]),
+                returns,
+                scaled=config.returns.scale != "none",
             )
 
     @classmethod
@@ -166,6 +176,8 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
             DataError: the dataset is damaged.
         """
         rows = to_batch(batch, self._dataset_targets())
+        if self.training and self.config.mirror:
+            rows = mirrored(rows, torch.rand(len(rows.state), device=rows.state.device) < 0.5)
         loss, terms = world_model_loss(self.world_model, rows)
         return loss, {name.removeprefix("loss/"): float(value) for name, value in terms.items()}
 

@@ -9,10 +9,11 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid
+from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid, mirror
 from egovcp.data.source import recorded
 from egovcp.errors import DataError
 from egovcp.model import Batch
@@ -22,7 +23,7 @@ _COLUMNS = (spec.REWARD_KEY, spec.DONE_KEY, spec.TRUNCATED_KEY)
 
 @dataclass(frozen=True)
 class Targets:
-    """Return and termination targets of every row of a dataset, by LeRobot's row ``index``.
+    """Reward, return and termination of every row of a dataset, by LeRobot's row ``index``.
 
     LeRobot reads no windows of scalar columns, and a return reaches farther than a window;
     so the targets are computed once, from the whole columns of reward and done.
@@ -31,6 +32,7 @@ class Targets:
     mc_return: Tensor  # (N,)
     mc_valid: Tensor  # (N,) bool
     terminal_next: Tensor  # (N,) bool
+    reward: Tensor  # (N,)
 
     @classmethod
     def of(cls, reader: DatasetReader, config: ReturnConfig) -> Self:
@@ -74,6 +76,7 @@ def _episode_targets(reader: DatasetReader, index: int, config: ReturnConfig) ->
         mc_return(reward, config.gamma, config.steps),
         mc_valid(len(reward), limit, config.steps, config.keep_truncated),
         is_terminal(done, truncated),
+        reward,
     )
 
 
@@ -113,6 +116,26 @@ def to_batch(batch: Mapping[str, Tensor], targets: Targets) -> Batch:
         mc_valid=rows["mc_valid"] & valid,
         terminal_next=rows["terminal_next"] & valid,
         passing=state.new_zeros(size, length, spec.PASSING_DIM),
+        reward=rows["reward"],
+    )
+
+
+def mirrored(rows: Batch, which: Tensor) -> Batch:
+    """The batch with the windows ``which`` (B,) bool as the robot would live them in a mirror.
+
+    ``passing`` stays as it is: it holds no labels here (see `to_batch`).
+    """
+
+    def swap(value: Tensor, source: NDArray[np.intp], sign: NDArray[np.float32]) -> Tensor:
+        other = value[..., torch.from_numpy(source).to(value.device)]
+        other = other * torch.from_numpy(sign).to(value)
+        return torch.where(which[:, None, None], other, value)
+
+    return rows._replace(
+        depth=torch.where(which[:, None, None, None], rows.depth.flip(-1), rows.depth),
+        state=swap(rows.state, mirror.STATE_SOURCE, mirror.STATE_SIGN),
+        action=swap(rows.action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),
+        prev_action=swap(rows.prev_action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),
     )
 
 

@@ -6,21 +6,18 @@
 import sys
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from conftest import _make_episode
-
 from egovcp.data import Provenance
 from egovcp.data.committer import committing
 from egovcp.data.encoded import encode
 from egovcp.data.spool import SealedEpisode
+from egovcp.testing import random_episode
 
 
 def main(root: Path) -> None:
     sealed: set[int] = set()
     with committing(root, Provenance("stance-1"), 3, lambda provenance: None) as committer:
         for number in committer.missing(100_000):
-            episode = _make_episode(number, length=4)
+            episode = random_episode(number, length=4)
             committer.spool.put(SealedEpisode.of(number, encode(episode)))
             committer.note(number)
             sealed.add(number)

@@ -7,10 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
-from egovcp import spec
 from egovcp.data import (
     DatasetConfig,
     DatasetReader,
@@ -19,37 +17,14 @@ from egovcp.data import (
     Provenance,
     files,
 )
+from egovcp.testing import random_episode
 
 type MakeEpisode = Callable[..., Episode]
 
 
-def _make_episode(
-    number: int, length: int = 12, time_limit: int | None = None, task: str = "ball", seed: int = 0
-) -> Episode:
-    """A random episode; it falls if ``length`` is less than ``time_limit``."""
-    rng = np.random.default_rng((seed, number))
-    limit = time_limit or length
-    last = np.arange(length) == length - 1
-    pixels = (length, spec.DEPTH_ROWS, spec.DEPTH_COLS)
-    depth = rng.integers(280, 5000, pixels).astype(np.uint16)
-    depth[rng.random(pixels) < 0.1] = 0
-    return Episode(
-        depth=depth,
-        state=rng.normal(size=(length, spec.STATE_DIM)).astype(np.float32),
-        action=rng.uniform(-1, 1, (length, spec.ACTION_DIM)).astype(np.float32),
-        reward=rng.normal(size=length).astype(np.float32),
-        done=last,
-        success=rng.random(length) < 0.1,
-        truncated=last & (length == limit),
-        task=task,
-        time_limit=limit,
-        metadata={"seed": seed, "episode": number, "ball": {"radius": 0.1}},
-    )
-
-
 @pytest.fixture(scope="session")
 def make_episode() -> MakeEpisode:
-    return _make_episode
+    return random_episode
 
 
 @pytest.fixture(scope="session")
@@ -58,7 +33,7 @@ def episodes() -> list[Episode]:
     shapes = [(12, 12), (7, 12), (12, 12), (1, 12), (20, 20), (12, 12)]
     tasks = ["ball", "wall"]
     return [
-        _make_episode(i, length, limit, tasks[i % 2]) for i, (length, limit) in enumerate(shapes)
+        random_episode(i, length, limit, tasks[i % 2]) for i, (length, limit) in enumerate(shapes)
     ]
 
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from egovcp import spec
 from egovcp.model import PRESETS, Batch, Carry, LossConfig, WorldModel, world_model_loss
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.losses import (
@@ -130,9 +131,9 @@ class _Recorder(CountingModel):
         self.values: list[tuple[Carry, Tensor]] = []
         self.terminations: list[Carry] = []
 
-    def standardised_value(self, carry: Carry, action: Tensor) -> Tensor:
+    def value_error(self, carry: Carry, action: Tensor, target: Tensor) -> Tensor:
         self.values.append((carry, action))
-        return carry.h[..., 0]
+        return (carry.h[..., 0] - target).square()
 
     def termination_logit(self, carry: Carry) -> Tensor:
         self.terminations.append(carry)
@@ -147,7 +148,7 @@ def _counted(batch: Batch) -> Rollout:
     h[..., CountingModel.COUNT] = torch.arange(length)
     z = torch.zeros(size, length, model.config.latent)
     flat = Gaussian(z, torch.ones_like(z))
-    return Rollout(Carry(h, z), flat, flat, torch.zeros(1), batch.state)
+    return Rollout(Carry(h, z), flat, flat, torch.zeros(1), batch.state, torch.zeros(1))
 
 
 def test_termination_judges_the_state_that_the_action_has_produced() -> None:
@@ -182,7 +183,7 @@ def test_a_fall_after_row_t_pulls_only_the_state_imagined_from_row_t(t: int) -> 
     h = torch.randn(1, 5, model.config.hidden, requires_grad=True)
     z = torch.randn(1, 5, model.config.latent)
     flat = Gaussian(z, torch.ones_like(z))
-    rollout = Rollout(Carry(h, z), flat, flat, torch.zeros(1), batch.state)
+    rollout = Rollout(Carry(h, z), flat, flat, torch.zeros(1), batch.state, torch.zeros(1))
     fall = batch.terminal_next.clone()
     fall[0, t] = True
 
@@ -253,11 +254,31 @@ def test_a_window_of_one_row_is_trainable(model: WorldModel) -> None:
 @pytest.mark.parametrize("ahead", [(), (0,), (2, 9), (9,)])
 def test_motion_may_be_foretold_for_any_ticks_ahead_or_none(ahead: tuple[int, ...]) -> None:
     """Ticks beyond the window ask for nothing."""
-    torch.manual_seed(0)
-    model = WorldModel(dataclasses.replace(PRESETS["debug"], motion_ahead=ahead))
+
+    def motion(ahead: tuple[int, ...]) -> float:
+        torch.manual_seed(0)
+        config = dataclasses.replace(PRESETS["debug"], motion_ahead=ahead, paint_flight=False)
+        model = WorldModel(config)
+        for parameter in model.decode_sight.parameters():
+            torch.nn.init.zeros_(parameter)
+        return _loss(model, random_batch(2, 4))["loss/motion"]
+
+    assert (motion(ahead) > motion(())) == any(k < 4 for k in ahead)
+
+
+def test_a_place_is_asked_for_only_where_something_is_known_to_fly() -> None:
     batch = random_batch(2, 4)
-    motion = _loss(model, batch)["loss/motion"]
-    assert (motion > 0) == any(k < 4 for k in ahead)
+    batch.passing[..., 4] = 1.0
+    batch.passing[..., spec.IN_PICTURE] = torch.tensor([20.0, 30.0, 0.0, 2.0])
+    nowhere = _loss(toy_model(), batch)["loss/motion"]
+    batch.passing[..., 5] = 40.0  # another row
+    assert _loss(toy_model(), batch)["loss/motion"] == nowhere
+    batch.passing[:, 1, 7] = 3.0
+    somewhere = _loss(toy_model(), batch)["loss/motion"]
+    assert somewhere > nowhere
+    batch.passing[:, 1, 4] = 0.0
+    unknown = _loss(toy_model(), batch)["loss/motion"]
+    assert unknown < somewhere
 
 
 def _leaves(seed: int) -> Gaussian:
@@ -271,7 +292,7 @@ def _leaves(seed: int) -> Gaussian:
 def test_each_kl_term_moves_one_side(term: str, moved: str) -> None:
     q, p = _leaves(0), _leaves(1)
     empty = torch.zeros(1)
-    rollout = Rollout(Carry(empty, empty), q, p, empty, empty)
+    rollout = Rollout(Carry(empty, empty), q, p, empty, empty, empty)
     losses = kl_losses(rollout, torch.ones(2, 3).bool(), LossConfig(free_nats=0.0))
     sides = {"posterior": q.mean, "prior": p.mean}
     gradients = torch.autograd.grad(losses[term], tuple(sides.values()), allow_unused=True)
@@ -283,7 +304,7 @@ def test_kl_below_the_free_nats_costs_its_floor_and_moves_nothing() -> None:
     q = _leaves(0)
     p = Gaussian((q.mean.detach() + 0.01).requires_grad_(), q.std.detach())
     empty = torch.zeros(1)
-    rollout = Rollout(Carry(empty, empty), q, p, empty, empty)
+    rollout = Rollout(Carry(empty, empty), q, p, empty, empty, empty)
     losses = kl_losses(rollout, torch.ones(2, 3).bool(), LossConfig(free_nats=1.0, kl_prior=1.0))
     assert losses["kl_prior"].item() == 1.0
     (gradient,) = torch.autograd.grad(losses["kl_prior"], p.mean)

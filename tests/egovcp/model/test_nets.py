@@ -31,6 +31,18 @@ def test_a_value_told_of_what_nothing_teaches_is_refused():
         WorldModelConfig(loss=LossConfig(passing=0.0))
 
 
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"loss": LossConfig(motion=0.0)}, r"paint_flight.*loss\.motion"),
+        ({"motion_ahead": (3,)}, r"motion_ahead \[3\].*first must be 0"),
+    ],
+)
+def test_nothing_is_painted_where_nothing_teaches_the_place(config, message):
+    with pytest.raises(UsageError, match=message):
+        WorldModelConfig(**config)
+
+
 @pytest.mark.parametrize("told", [False, True])
 def test_q_has_a_part_for_what_is_on_its_way_only_if_told(told):
     model = WorldModel(WorldModelConfig(value_of_passing=told))

@@ -1,5 +1,6 @@
 """Errors of models whose prediction is known."""
 
+import dataclasses
 from typing import Any
 
 import pytest
@@ -25,7 +26,7 @@ class _Clairvoyant(WorldModel):
     """
 
     def __init__(self, batch: Batch, repeats: bool) -> None:
-        super().__init__(PRESETS["debug"])
+        super().__init__(dataclasses.replace(PRESETS["debug"], paint_flight=False))
         self.near = nearness(batch.depth.flatten(0, 1), self.config.depth_max_m)
         self.near = self.near.view(*batch.depth.shape)
         self.known = self.standardise(batch.state)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from egovcp import spec
-from egovcp.model import Batch
+from egovcp.model import Batch, Carry
 from egovcp.model.losses import filter_sequence
 from egovcp.testing import random_batch, toy_model
 from egovcp_train.heldout.episodes import Recorded
@@ -54,12 +54,11 @@ def test_the_first_picture_is_filtered_and_the_others_are_imagined() -> None:
         rollout = filter_sequence(model, batch, sample=False)
         (found,) = _strips(batch)
         s = found.start
-        filtered = model.decode_depth(rollout.carry.features[:, s])[0].clamp(0, 1)
-        carry = model.imagine(
-            type(rollout.carry)(rollout.carry.h[:, s], rollout.carry.z[:, s]), batch.action[:, s]
-        )
+        carry = Carry(rollout.carry.h[:, s], rollout.carry.z[:, s])
+        filtered = model.picture(carry)[0].clamp(0, 1)
+        carry = model.imagine(carry, batch.action[:, s])
         carry = model.imagine(carry, batch.action[:, s + 1])
-        ahead = model.decode_depth(carry.features)[0].clamp(0, 1)
+        ahead = model.picture(carry)[0].clamp(0, 1)
     torch.testing.assert_close(torch.from_numpy(found.foreseen[0]), filtered)
     torch.testing.assert_close(torch.from_numpy(found.foreseen[1]), ahead)
 

@@ -24,6 +24,7 @@ from egovcp_train.heldout.table import table
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.labels.passing import label
 from egovcp_train.output import require_writable
+from egovcp_train.return_scale import ReturnScale, on_task_scales
 
 PROG: Final = "egovcp-eval-model"
 RESULT: Final = "heldout.json"
@@ -80,11 +81,13 @@ def evaluate(config: HeldoutConfig) -> None:
     device = choose_device(config.device)
     artefact = load_artefact(config.policy.path, config.policy.revision)
     reader = DatasetReader.open(config.dataset)
-    _require_same_controller(artefact, reader)
-    passing = _trained_with(artefact, "passing", PassingConfig)
-    returns = _trained_with(artefact, "returns", ReturnConfig)
+    require_same_controller(artefact, reader)
+    passing = trained_with(artefact, "passing", PassingConfig)
+    returns = trained_with(artefact, "returns", ReturnConfig)
     limit = config.episodes or None
     store = label(EpisodeStore.load([reader], config.split, returns, per_task=limit), passing)
+    if returns.scale == "per_task":
+        store = on_task_scales(store, _return_scales(artefact))
     model = artefact.world_model.to(device)
     report = measure(model, recorded(store, device), config.stride)
     print(table(report.tasks))
@@ -105,7 +108,7 @@ def _check(config: HeldoutConfig) -> Path:
     return output
 
 
-def _require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
+def require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
     """Raise `ArtefactError` where the data's actions were given to another controller."""
     if artefact.controller_id != reader.controller_id:
         raise ArtefactError(
@@ -116,7 +119,7 @@ def _require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
         )
 
 
-def _trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
+def trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
     """The options of the training under ``name``; the defaults where the manifest has none.
 
     Raises:
@@ -131,6 +134,21 @@ def _trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
             f"({' '.join(str(error).split())}); train again with this version"
         ) from error
     return found
+
+
+def _return_scales(artefact: Artefact) -> dict[str, ReturnScale]:
+    """The scales of the training.
+
+    Raises:
+        ArtefactError: they cannot be read.
+    """
+    try:
+        return {k: ReturnScale(*v) for k, v in artefact.manifest["return_scales"].items()}
+    except (AttributeError, KeyError, TypeError) as error:
+        raise ArtefactError(
+            f"{artefact.path}: its manifest does not say on which scale each task's returns were "
+            "(return_scales); train again with this version"
+        ) from error
 
 
 def _run(config: HeldoutConfig, artefact: Artefact, reader: DatasetReader) -> dict[str, Any]:

@@ -89,10 +89,9 @@ class OpenLoop:
         self._state[k] += errors.double().cpu()
         self._rows[k] += len(b)
         watched = starts.watched[b, i]
-        features = torch.cat([h, z], -1)
         for some in torch.split(torch.arange(len(b), device=b.device), _IMAGES_AT_ONCE):
             bs, ts = b[some], then[some]
-            image = model.decode_depth(features[some]).float().clamp(0.0, 1.0)
+            image = model.picture(Carry(h[some], z[some])).clamp(0.0, 1.0)
             truth = rollout.near[bs, ts]
             wrong = (image - truth).abs()
             still = (rollout.near[bs, ts - k] - truth).abs()

@@ -78,7 +78,7 @@ def _strip(
     states = [carry]
     for k in range(max(HORIZONS)):
         states.append(model.imagine(states[-1], episodes.batch.action[b, s + k][None]))
-    features = torch.cat([states[k].features for k in STRIP])
-    foreseen = model.decode_depth(features).float().clamp(0.0, 1.0)
+    shown = Carry(*(torch.cat(parts) for parts in zip(*(states[k] for k in STRIP), strict=True)))
+    foreseen = model.picture(shown).clamp(0.0, 1.0)
     seen = rollout.near[b, [s + k for k in STRIP]]
     return Strip(interest, s, seen.cpu().numpy(), foreseen.cpu().numpy())

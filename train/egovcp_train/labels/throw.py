@@ -8,7 +8,7 @@ into a frame that stays put; those of one throw are fitted by a ballistic path
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -16,11 +16,14 @@ import torch
 from numpy.typing import NDArray
 
 from egovcp import spec
-from egovcp.model.depth import approaching, nearness
+from egovcp.model.depth import MIN_PIXELS, approaching, nearness
 from egovcp_train.labels.camera import Array, CameraTrack, camera_track
 from egovcp_train.labels.config import PassingConfig
 
 _GRAVITY: Final = np.array([0.0, 0.0, -9.81])  # m/s^2
+_LOOKS: Final = 3  # a path that leads half way at first leads all the way at last
+_SEARCH: Final = 0.35  # m, around the place where a thing may be
+_HANDS: Final = 0.9  # m before the camera, where hands begin
 
 
 class Path(NamedTuple):
@@ -72,7 +75,48 @@ def find_throw(
         track = camera_track(state, config, age)
         path = fit_path(t, track.to_ground(point)[rows], config)
         throws.append(Throw(rows, track, age * spec.PLANNER_DT, path))
-    return max(throws, key=_support)
+    found = max(throws, key=_support)
+    for _ in range(_LOOKS):
+        found = _look_again(found, depth, config)
+    return found
+
+
+def _look_again(throw: Throw, depth: NDArray[np.uint16], config: PassingConfig) -> Throw:
+    """The same throw, its path fitted to what is seen around it in every picture of its flight.
+
+    Sightings at first glance are few: a thing that flies straight at the camera hardly moves
+    in the picture. Once its path is roughly known, it is known where to look.
+    """
+    if throw.path is None:
+        return throw
+    t = np.arange(len(depth), dtype=np.float64) * spec.PLANNER_DT
+    expected = throw.track.to_camera(throw.path.at(t))
+    flies = (t > throw.path.seen[0] - 0.1) & (expected[:, 0] > _HANDS)
+    rows = np.flatnonzero(flies & (t < throw.path.time_at(config.plane)))
+    point = np.zeros((len(depth), 3))
+    point[rows], seen = _around(depth[rows], expected[rows], config)
+    rows = rows[seen]
+    path = fit_path(t[rows], throw.track.to_ground(point)[rows], config)
+    better = path is not None and len(path.seen) >= len(throw.path.seen)
+    return replace(throw, path=path) if better else throw
+
+
+def _around(
+    depth: NDArray[np.uint16], expected: Array, config: PassingConfig
+) -> tuple[Array, NDArray[np.bool_]]:
+    """(n, 48, 64) mm and where a thing may be, (n, 3) m, camera frame -> where it is, (n, 3) m;
+    (n,) whether it is seen."""
+    near = nearness(torch.from_numpy(depth.astype(np.int32)), spec.DEPTH_MAX_M)
+    x, left, up = (torch.from_numpy(expected[:, i, None, None]) for i in range(3))
+    z = (1 - near) * spec.DEPTH_MAX_M + config.radius
+    row = (torch.arange(spec.DEPTH_ROWS)[:, None] - (spec.DEPTH_ROWS - 1) / 2) / config.focal
+    col = (torch.arange(spec.DEPTH_COLS) - (spec.DEPTH_COLS - 1) / 2) / config.focal
+    away = torch.hypot(col * x + left, row * x + up)
+    weight = ((near > 0) & ((z - x).abs() < _SEARCH) & (away < _SEARCH)).double()
+    n = weight.sum((1, 2))
+    mean = [(weight * v).sum((1, 2)) / n.clamp_min(1) for v in (z, -z * col, -z * row)]
+    cut = weight[:, [0, -1]].sum((1, 2)) + weight[:, :, [0, -1]].sum((1, 2))  # its middle is lost
+    return torch.stack(mean, -1).numpy(), ((n >= MIN_PIXELS) & (cut == 0)).numpy()
 
 
 def _support(throw: Throw) -> tuple[int, float]:
