@@ -43,7 +43,16 @@ class DatasetConfig:
 
 
 @dataclass(frozen=True)
-class WeightedDatasetConfig(DatasetConfig):
+class SelectedDatasetConfig(DatasetConfig):
+    """Some episodes of a dataset."""
+
+    episodes: str = ""
+    """Only these episodes: numbers, `[0, 5, 7]`, a range whose end is excluded, `0:1334`, or both,
+    `[0:100, 250]`; empty: all."""
+
+
+@dataclass(frozen=True)
+class WeightedDatasetConfig(SelectedDatasetConfig):
     """One of several datasets to mix."""
 
     weight: float | None = None

@@ -9,14 +9,16 @@ from egovcp.cli import DatasetConfig
 from egovcp.data.arrays import load_arrays, open_dataset
 from egovcp.data.bounded import BoundedStream, ShuffleConfig
 from egovcp.data.episode import Episode
+from egovcp.data.heldout import describe_heldout
 from egovcp.data.index import EpisodeIndex
 from egovcp.data.mix import Mix
 from egovcp.data.order import Shard
 from egovcp.data.provenance import Provenance
 from egovcp.data.reader import DatasetReader
+from egovcp.data.sample import sample_files
 from egovcp.data.store import EpisodeStore, ReturnConfig
 from egovcp.data.stream import SequenceStream, StreamConfig
-from egovcp.data.survey import Survey, survey
+from egovcp.data.survey import Survey, survey, survey_sample
 from egovcp.data.targets import is_terminal, mc_return, mc_valid
 from egovcp.data.windows import Batch
 from egovcp.data.writer import DatasetWriter
@@ -38,10 +40,13 @@ __all__ = [
     "ShuffleConfig",
     "StreamConfig",
     "Survey",
+    "describe_heldout",
     "is_terminal",
     "load_arrays",
     "mc_return",
     "mc_valid",
     "open_dataset",
+    "sample_files",
     "survey",
+    "survey_sample",
 ]

@@ -62,6 +62,7 @@ class BoundedStream:
         returns: ReturnConfig | None = None,
         events: Mapping[str, EventBound] | None = None,
         label: Label | None = None,
+        checked: bool = True,
     ) -> None:
         """Make room; nothing is read before the first batch.
 
@@ -74,6 +75,7 @@ class BoundedStream:
             returns: the Monte Carlo target.
             events: task -> which rewards are events; needed where they are drawn more often.
             label: what makes ``passing`` (T, 5) of an episode's depth and state; None: zeros.
+            checked: all episodes have been validated; if not, each is when it is first read.
 
         Raises:
             UsageError: the configuration makes no sense.
@@ -86,6 +88,7 @@ class BoundedStream:
         self.index, self.config, self.mix, self.shard = index, config, mix, shard
         self._returns, self._events, self._label = returns or ReturnConfig(), events, label
         self._labels: dict[int, NDArray[np.float32]] = {}
+        self._checked = np.full(len(index), checked)
         groups = group(mix, index.dataset, index.tasks, index.length)
         self._group = groups.of
         self._order = EpisodeOrder(index, groups, shard, config.seed)
@@ -113,6 +116,7 @@ class BoundedStream:
 
         Raises:
             DataError: a file is damaged.
+            EnvironmentFailure: the Hub, from which it comes, cannot be reached.
         """
         parts: list[Batch] = []
         wanted = self.config.batch_size
@@ -176,9 +180,13 @@ class BoundedStream:
                 windows = self.index.length[episode] * self._shuffle.reuse / self.config.length
                 self._left[slot] = int(windows + self._rng.random())  # on average exactly so many
             self._read(slot, episode)
+            if self.index.is_remote:
+                self.index.expect(self._order.upcoming())
 
     def _read(self, slot: int, number: int) -> None:
-        episode, store = self.index.read_again(number), self._slots
+        read = self.index.read_again if self._checked[number] else self.index.read
+        episode, store = read(number), self._slots
+        self._checked[number] = True
         store.fill(slot, episode, self._returns)
         store.length[slot] = len(episode)
         self._held[slot] = number

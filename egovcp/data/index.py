@@ -12,6 +12,7 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from egovcp.data.columns import EPISODE_FEATURES
 from egovcp.data.episode import Episode
@@ -38,14 +39,14 @@ class EpisodeIndex:
         split: str = "all",
         heldout_fraction: float = HELDOUT_FRACTION,
     ) -> Self:
-        """The episodes of a split.
+        """The episodes of a split, of those that are asked for.
 
         Raises:
             DataError: the datasets cannot be mixed, or the split is empty.
             UsageError: there is no such split.
         """
         require_mixable(readers)
-        places = [(d, i) for d, reader in enumerate(readers) for i in range(len(reader))]
+        places = [(d, i) for d, reader in enumerate(readers) for i in reader.chosen.tolist()]
         identities = [readers[d].identity(i) for d, i in places]
         chosen = list(compress(places, in_split(identities, split, heldout_fraction)))
         if not chosen:
@@ -98,6 +99,30 @@ class EpisodeIndex:
     def fingerprint(self) -> str:
         """Hash of which episodes these are, in order."""
         return fingerprint(self.identities, self.length)
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether some of the episodes come from the Hub as they are read."""
+        return any(reader.is_remote for reader in self.readers)
+
+    def bring(self) -> None:
+        """Have the files of all its episodes here.
+
+        Raises:
+            DataError: a dataset on the Hub is incomplete.
+            EnvironmentFailure: the Hub cannot be reached, or refuses.
+        """
+        one_of_each = dict(zip(self.files, range(len(self)), strict=True)).values()
+        for episode in tqdm(one_of_each, unit="file", desc="fetch", leave=False):
+            reader, number = self._place(episode)
+            reader.bring(number)
+
+    def expect(self, episodes: Sequence[int]) -> None:
+        """Say which episodes are read next, so that their files come meanwhile."""
+        for reader in self.readers:
+            if reader.is_remote:
+                places = map(self._place, episodes)
+                reader.expect([number for other, number in places if other is reader])
 
     def read(self, episode: int) -> Episode:
         """Read one episode and validate it.

@@ -177,6 +177,26 @@ def _check_episodes(
         )
 
 
+def load_episode_stats(
+    root: Path, feature: str, count: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mean and deviation of a feature in each of ``count`` episodes, (E, n) each.
+
+    Raises:
+        DataError: the table of episodes does not have them, or not for all.
+    """
+    folder = root / "meta" / "episodes"
+    names = [f"stats/{feature}/{statistic}" for statistic in ("mean", "std")]
+    with damaged(folder):
+        paths = sorted(folder.glob("*/*.parquet"))
+        tables = [pq.ParquetFile(path).read(columns=names) for path in paths]
+        table = pa.concat_tables(tables)
+        mean, std = (np.array(table[name].to_pylist(), dtype=np.float64) for name in names)
+    if len(mean) != count or not (np.isfinite(mean).all() and np.isfinite(std).all()):
+        raise DataError.at(folder, f"the statistics of {feature} are not complete")
+    return mean, std
+
+
 def load_tasks(root: Path) -> dict[int, str]:
     """``meta/tasks.parquet``: task index -> task name."""
     path = root / schema.TASKS_PATH

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import groupby
-from typing import Any, Final
+from itertools import chain, groupby
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,6 +52,16 @@ class Shard:
         return self.ranks * self.workers
 
 
+class _Epoch(NamedTuple):
+    """All episodes of a group once, block by block of files."""
+
+    episodes: Numbers
+    ends: Numbers
+    """(blocks,) where each block ends."""
+    files: list[list[int]]
+    """For each block, an episode of each of its files."""
+
+
 class EpisodeOrder:
     """Endless epochs over the episodes of each group in one shard."""
 
@@ -67,7 +77,7 @@ class EpisodeOrder:
         self._files = [_dealt(_files(index, groups.of == g), shard) for g in drawn]
         self._epoch = [0] * len(drawn)
         self._cursor = [0] * len(drawn)
-        self._shuffled: list[Numbers] = [self._shuffle(g) for g in range(len(drawn))]
+        self._epochs = [self._shuffle(g) for g in range(len(drawn))]
         # An episode yields windows in proportion to its length: groups of long ones come less often
         mean = np.array([index.length[np.concatenate(files)].mean() for files in self._files])
         rate = groups.share[drawn] / mean
@@ -81,12 +91,20 @@ class EpisodeOrder:
     def draw(self, rng: np.random.Generator) -> int:
         """The next episode of a group that ``rng`` chooses."""
         group = int(rng.choice(len(self._rate), p=self._rate)) if len(self._rate) > 1 else 0
-        if self._cursor[group] == len(self._shuffled[group]):
+        if self._cursor[group] == len(self._epochs[group].episodes):
             self._epoch[group] += 1
             self._cursor[group] = 0
-            self._shuffled[group] = self._shuffle(group)
+            self._epochs[group] = self._shuffle(group)
         self._cursor[group] += 1
-        return int(self._shuffled[group][self._cursor[group] - 1])
+        return int(self._epochs[group].episodes[self._cursor[group] - 1])
+
+    def upcoming(self) -> list[int]:
+        """An episode of each file that is read from now on, for a few files of each group."""
+        found: list[int] = []
+        for cursor, epoch in zip(self._cursor, self._epochs, strict=True):
+            block = int(np.searchsorted(epoch.ends, cursor, side="right"))
+            found += chain.from_iterable(epoch.files[block : block + 2])
+        return found
 
     def state_dict(self) -> dict[str, Any]:
         """JSON-compatible."""
@@ -95,16 +113,18 @@ class EpisodeOrder:
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on where another order over the same episodes stood."""
         self._epoch, self._cursor = list(state["epoch"]), list(state["cursor"])
-        self._shuffled = [self._shuffle(g) for g in range(len(self._files))]
+        self._epochs = [self._shuffle(g) for g in range(len(self._files))]
 
-    def _shuffle(self, group: int) -> Numbers:
+    def _shuffle(self, group: int) -> _Epoch:
         """The episodes of a group in the order of its epoch: a few files at a time."""
         rng = np.random.default_rng((*self._seed, group, self._epoch[group]))
         files = self._files[group]
         order = rng.permutation(len(files))
         blocks = [order[i : i + FILES_AT_ONCE] for i in range(0, len(order), FILES_AT_ONCE)]
         together = (np.concatenate([files[f] for f in block]) for block in blocks)
-        return np.concatenate([rng.permutation(episodes) for episodes in together])
+        parts = [rng.permutation(episodes) for episodes in together]
+        some = [[int(files[f][0]) for f in block] for block in blocks]
+        return _Epoch(np.concatenate(parts), np.cumsum([len(part) for part in parts]), some)
 
 
 def _files(index: EpisodeIndex, chosen: NDArray[np.bool_]) -> list[Numbers]:

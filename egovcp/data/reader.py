@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from functools import lru_cache, partial
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,25 +13,34 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from egovcp.cli import DatasetConfig
+from egovcp.cli import DatasetConfig, SelectedDatasetConfig
 from egovcp.data import metadata, schema
 from egovcp.data.columns import EPISODE_FEATURES, Columns, open_data_file, to_numpy
 from egovcp.data.episode import Episode
 from egovcp.data.paths import require_file
-from egovcp.data.source import Source, locate
+from egovcp.data.selection import select_episodes
+from egovcp.data.source import Source, is_local, locate, shelve
 from egovcp.errors import DataError, suggest
+from egovcp.hub import Patience, Shelf
 
 _OPEN_FILES = 8
+_PATIENCE = Patience()
 _TIMESTAMP_SLACK = 1e-3  # s; float32 timestamps
 
 
 class DatasetReader:
     """A validated dataset; the arrays themselves are read, and checked, on demand."""
 
-    def __init__(self, source: Source) -> None:
+    def __init__(self, source: Source, shelf: Shelf | None = None, episodes: str = "") -> None:
         """Check the `meta` folder of a dataset that lies on disk; `open` looks for its files, too.
 
+        Args:
+            source: where it lies.
+            shelf: what brings its data files when they are read; None: they are there.
+            episodes: those of them that are asked for (see `select_episodes`); empty: all.
+
         Raises:
+            UsageError: the episodes asked for are not there.
             DataError: it is damaged, incomplete, or of another specification.
         """
         self.source = source
@@ -40,7 +49,10 @@ class DatasetReader:
         self._collection = metadata.load_collection(source.root, self.lengths)
         self._task_names = metadata.load_tasks(source.root)
         self._file_start = _file_starts(self._table)
-        self._open_file = lru_cache(maxsize=_OPEN_FILES)(partial(open_data_file, source.root))
+        self._shelf, self._episodes = shelf, episodes
+        self.chosen = select_episodes(episodes, len(self))
+        """The numbers of the episodes that are asked for, ascending."""
+        self._open_file = lru_cache(maxsize=_OPEN_FILES)(self._opened)
 
     @classmethod
     def open(cls, config: DatasetConfig) -> Self:
@@ -54,10 +66,26 @@ class DatasetReader:
             DataError: there is none, or not one of this specification.
             EnvironmentFailure: the Hub cannot be reached.
         """
-        reader = cls(locate(config))
+        reader = cls(locate(config), episodes=_asked_for(config))
         for path in reader.frames_per_file:
             require_file(reader.root, path)
         return reader
+
+    @classmethod
+    def on_demand(cls, config: DatasetConfig, patience: Patience = _PATIENCE) -> Self:
+        """Open a dataset to stream from: what is only on the Hub comes file by file, when it is
+        read, at the commit that the revision is now.
+
+        Raises:
+            UsageError: the configuration names no dataset.
+            DataError: there is none, or not one of this specification.
+            EnvironmentFailure: the Hub cannot be reached.
+        """
+        if is_local(config):
+            return cls.open(config)
+        shelf = shelve(config, patience)
+        source = Source(shelf.folder, shelf.repo_id, shelf.commit)
+        return cls(source, shelf, _asked_for(config))
 
     def __len__(self) -> int:
         return len(self._table.length)
@@ -65,6 +93,16 @@ class DatasetReader:
     def __iter__(self) -> Iterator[Episode]:
         """The episodes in order, each read when its turn comes (see `read`)."""
         return (self.read(index) for index in range(len(self)))
+
+    @property
+    def is_remote(self) -> bool:
+        """Whether its data files come from the Hub as they are read."""
+        return self._shelf is not None
+
+    @property
+    def episodes(self) -> str:
+        """Which episodes were asked for, in the words of `select_episodes`; empty: all."""
+        return self._episodes
 
     @property
     def root(self) -> Path:
@@ -211,6 +249,37 @@ class DatasetReader:
         except DataError as error:
             raise DataError.at(path, error.problem or str(error), index, error.frame) from error
 
+    def bring(self, index: int) -> None:
+        """Have the file of an episode here, which may mean to wait for it.
+
+        Raises:
+            DataError: the dataset on the Hub lacks it.
+            EnvironmentFailure: the Hub cannot be reached, or refuses.
+        """
+        if self._shelf is not None:
+            self._shelf.bring(self._name(index))
+
+    def expect(self, indices: Sequence[int]) -> None:
+        """Say which episodes are read next, so that their files come meanwhile."""
+        if self._shelf is not None:
+            self._shelf.expect(map(self._name, indices))
+
+    def episode_stats(self, feature: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Mean and deviation of a feature in each episode, (E, n) each, from `meta/episodes`.
+
+        Raises:
+            DataError: they are not there.
+        """
+        return metadata.load_episode_stats(self.root, feature, len(self))
+
+    def _name(self, index: int) -> str:
+        return self.data_path(index).relative_to(self.root).as_posix()
+
+    def _opened(self, path: Path) -> pq.ParquetFile:
+        if self._shelf is not None:
+            self._shelf.bring(path.relative_to(self.root).as_posix())
+        return open_data_file(self.root, path)
+
     def data_path(self, index: int) -> Path:
         """The file that holds an episode."""
         name = str(self._info["data_path"]).format(
@@ -255,6 +324,10 @@ class DatasetReader:
             at = int(np.argmax(other))
             found = self._task_names.get(int(columns["task_index"][at]), "unknown")
             yield at, f"its task is {found}, but {schema.COLLECTION_PATH} says {self.task(index)}"
+
+
+def _asked_for(config: DatasetConfig) -> str:
+    return config.episodes if isinstance(config, SelectedDatasetConfig) else ""
 
 
 def _file_starts(table: metadata.EpisodeTable) -> NDArray[np.int64]:

@@ -12,7 +12,7 @@ from egovcp.cli import DatasetConfig
 from egovcp.data import schema
 from egovcp.data.files import write_json
 from egovcp.errors import DataError, UsageError
-from egovcp.hub import Patience, snapshot
+from egovcp.hub import Patience, Shelf, snapshot
 
 _PATIENCE = Patience()
 _REPO_ID = re.compile(r"\w[\w.-]*/\w[\w.-]*", re.ASCII)
@@ -71,6 +71,30 @@ def locate(config: DatasetConfig, patience: Patience = _PATIENCE) -> Source:
     return _download(config, patience)
 
 
+def is_local(config: DatasetConfig) -> bool:
+    """Whether the dataset is a folder: the root, or LeRobot's, unless a revision is asked for.
+
+    Raises:
+        UsageError: neither root nor a well-formed repo id is given.
+    """
+    there = (local_root(config) / schema.INFO_PATH).is_file()
+    return bool(config.root) or (there and not config.revision)
+
+
+def shelve(config: DatasetConfig, patience: Patience = _PATIENCE) -> Shelf:
+    """A dataset of the Hub with its `meta` folder; the other files can be brought from there.
+
+    If the Hub cannot be reached, a complete `meta` folder of an earlier download serves.
+
+    Raises:
+        UsageError: bad or missing id.
+        DataError: the Hub has no such dataset or revision.
+        EnvironmentFailure: the Hub cannot be reached, or refuses.
+    """
+    _require_repo_id(config.repo_id)
+    return Shelf.open(config.repo_id, config.revision, patience, _hub_cache(), ["meta/*"])
+
+
 def record(source: Source) -> None:
     """Note in a downloaded folder which commit it is."""
     content = {"repo_id": source.repo_id, "commit": source.commit}
@@ -107,6 +131,10 @@ def _require_repo_id(repo_id: str) -> None:
 
 
 def _download(config: DatasetConfig, patience: Patience) -> Source:
-    repo_id, cache = config.repo_id, lerobot_home() / "hub"
-    folder = snapshot(repo_id, config.revision, patience, cache_dir=cache)
-    return Source(folder, repo_id, commit=folder.name)
+    folder = snapshot(config.repo_id, config.revision, patience, cache_dir=_hub_cache())
+    return Source(folder, config.repo_id, commit=folder.name)
+
+
+def _hub_cache() -> Path:
+    """Where LeRobot, too, keeps what it has downloaded."""
+    return lerobot_home() / "hub"

@@ -88,6 +88,7 @@ class SequenceStream:
         self._rows = rows
         self._rng = np.random.default_rng(config.seed)
         self._batches = 0
+        self._fingerprint = store.fingerprint
         self._episode_of = np.repeat(np.arange(len(store.length)), store.length)
         self._events = event_rows(store, config.event_quantile)
         self._groups = group(mix, store.dataset, store.tasks, store.length)
@@ -115,7 +116,7 @@ class SequenceStream:
             "batches": self._batches,
             "config": vars(self.config).copy(),
             "mix": self.mix.as_dict(),
-            "fingerprint": self.store.fingerprint,
+            "fingerprint": self._fingerprint,
         }
 
     def load_state_dict(self, state: Mapping[str, Any]) -> Self:
@@ -125,7 +126,7 @@ class SequenceStream:
             DataError: the episodes differ.
             UsageError: the configuration differs.
         """
-        if state["fingerprint"] != self.store.fingerprint:
+        if state["fingerprint"] != self._fingerprint:
             raise DataError("cannot resume the data stream: the dataset's episodes have changed")
         if "held" in state:
             raise UsageError("cannot resume in memory as a whole what was a bounded stream")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
@@ -58,6 +58,31 @@ class Survey:
     """Monte Carlo returns of the rows that have a complete one."""
     events: Mapping[str, EventBound]
     """Task -> which rewards are events."""
+
+
+def survey_sample(
+    index: EpisodeIndex,
+    sample: EpisodeIndex,
+    returns: ReturnConfig | None = None,
+    event_quantile: float = 0.98,
+) -> Survey:
+    """What `survey` says of ``index``, while only ``sample``, a part of it, is read.
+
+    Mean and deviation of the state are those of all its episodes, from the statistics that
+    `meta/episodes` keeps of each. Returns and events are those of the sample.
+
+    Raises:
+        DataError: a dataset is damaged, or lacks these statistics.
+        EnvironmentFailure: the Hub, from which it comes, cannot be reached.
+    """
+    found = survey(sample, returns, event_quantile)
+    stats = [reader.episode_stats(spec.STATE_KEY) for reader in index.readers]
+    places = list(zip(index.dataset.tolist(), index.number.tolist(), strict=True))
+    mean, std = (np.stack([stats[d][k][i] for d, i in places]) for k in (0, 1))
+    weight = (index.length / index.num_frames)[:, None]
+    total = (weight * mean).sum(0)
+    variance = (weight * (std**2 + (mean - total) ** 2)).sum(0)
+    return replace(found, state_mean=total, state_std=np.sqrt(variance))
 
 
 def survey(

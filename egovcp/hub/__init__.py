@@ -1,8 +1,8 @@
 """The Hugging Face Hub over a network that fails: bounded requests, whole versions, clear errors.
 
 `publish` puts files there in one commit, `fetch` brings a commit to a folder, `snapshot` to the
-cache; `patient` and `explained` hold every other call of Hugging Face's library to the same limits
-and errors. Datasets and models alike.
+cache, `Shelf` file by file as they are needed; `patient` and `explained` hold every other call of
+Hugging Face's library to the same limits and errors. Datasets and models alike.
 """
 
 from egovcp.hub.failures import LostUpdate, RepoType, explained, token
@@ -10,6 +10,7 @@ from egovcp.hub.fetch import fetch, resolve, snapshot
 from egovcp.hub.options import PublishConfig
 from egovcp.hub.patience import HubUnreachable, Patience, patient
 from egovcp.hub.publish import Content, Publication, Published, publish, reserve
+from egovcp.hub.shelf import Shelf
 
 __all__ = [
     "Content",
@@ -20,6 +21,7 @@ __all__ = [
     "PublishConfig",
     "Published",
     "RepoType",
+    "Shelf",
     "explained",
     "fetch",
     "patient",

@@ -25,6 +25,7 @@ _LOG = logging.getLogger(__name__)
 _TRANSIENT = {408, 429, 500, 502, 503, 504}
 _OPTIONAL_S = 5.0  # what the library itself would wait less long for, it can do without
 _PROGRESS_BYTES = 1 << 20  # a broken download that brought this much was worth its try
+_ONE_AT_A_TIME = threading.RLock()  # the library has one client, whose factory is exchanged
 
 
 class HubUnreachable(EnvironmentFailure):
@@ -53,26 +54,29 @@ class Patience:
 def patient(patience: Patience) -> Iterator[None]:
     """Hold every request of `huggingface_hub` in this process to ``patience``.
 
+    Another thread that enters waits until this one has left.
+
     Raises from those requests, once the tries are used up:
         HubUnreachable: names the request and what came of it.
     """
     import huggingface_hub
     from huggingface_hub.utils import _http
 
-    # The library lets one set the factory of its client, but not ask for the present one,
-    # which may carry a user's proxy or certificates.
-    before = _http._GLOBAL_CLIENT_FACTORY
+    with _ONE_AT_A_TIME:
+        # The library lets one set the factory of its client, but not ask for the present one,
+        # which may carry a user's proxy or certificates.
+        before = _http._GLOBAL_CLIENT_FACTORY
 
-    def factory() -> httpx.Client:
-        client = before()
-        client.send = _Sender(client.send, patience)  # type: ignore[method-assign]
-        return client
+        def factory() -> httpx.Client:
+            client = before()
+            client.send = _Sender(client.send, patience)  # type: ignore[method-assign]
+            return client
 
-    huggingface_hub.set_client_factory(factory)
-    try:
-        yield
-    finally:
-        huggingface_hub.set_client_factory(before)
+        huggingface_hub.set_client_factory(factory)
+        try:
+            yield
+        finally:
+            huggingface_hub.set_client_factory(before)
 
 
 class _Sender:

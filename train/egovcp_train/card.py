@@ -137,6 +137,7 @@ def _dataset(entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> dict[str,
     return {
         "repo_id": entry.get("repo_id") or "",
         "revision": entry.get("revision") or "",
+        "episodes": entry.get("episodes") or "",
         "root": Path(root).name,
     }
 

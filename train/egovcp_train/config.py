@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from egovcp.cli import WeightedDatasetConfig
-from egovcp.data import DatasetConfig, ReturnConfig, ShuffleConfig
+from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
+from egovcp.data import ReturnConfig, ShuffleConfig
 from egovcp.data.source import is_repo_id
 from egovcp.errors import UsageError
+from egovcp.hub import Patience
 from egovcp.model import WorldModelConfig
 from egovcp.plan import PlannerConfig
 from egovcp_train.labels.config import PassingConfig
@@ -54,10 +55,16 @@ class LoadingConfig:
     """Where the episodes are while the run draws from them."""
 
     mode: Literal["auto", "ram", "stream"] = "auto"
-    """ram: all in memory, 6.3 kB per frame; stream: read from the disk through a shuffle window;
-    auto: ram if that takes at most half of the free memory."""
+    """ram: all in memory, 6.3 kB per frame; stream: read from the disk through a shuffle window, or
+    from the Hub, file by file as they are needed, where there is no local copy; auto: ram if that
+    takes at most half of the free memory."""
     shuffle: ShuffleConfig = field(default_factory=ShuffleConfig)
     """Shuffle window of mode stream."""
+    sample_files: int = 16
+    """Files of each task that are fetched before the first step where the data comes from the Hub:
+    the episodes in them give the scale of the returns, are evaluated on, and Q is fitted to."""
+    network: Patience = field(default_factory=Patience)
+    """How long the Hub is asked for a file before the run ends; its checkpoints remain."""
 
 
 @dataclass(frozen=True)
@@ -100,7 +107,7 @@ class TrainConfig:
 
     output_dir: str
     """Folder of the run; must not exist unless --resume."""
-    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
     """Dataset to train on."""
     datasets: tuple[WeightedDatasetConfig, ...] = ()
     """Several datasets to train on instead, '[{root: data/ball, weight: 2}, {repo_id: me/wall,

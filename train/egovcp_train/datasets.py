@@ -12,7 +12,7 @@ from typing import Literal
 import torch
 
 from egovcp import spec
-from egovcp.cli import DatasetConfig
+from egovcp.cli import DatasetConfig, SelectedDatasetConfig
 from egovcp.data import (
     BoundedStream,
     DatasetReader,
@@ -21,11 +21,14 @@ from egovcp.data import (
     Mix,
     SequenceStream,
     StreamConfig,
+    sample_files,
     survey,
+    survey_sample,
 )
 from egovcp.data.ahead import Ahead
 from egovcp.data.memory import available_bytes
 from egovcp.data.order import Shard
+from egovcp.data.source import is_local
 from egovcp.errors import UsageError
 from egovcp.model import Batch, WorldModel
 from egovcp_train.batches import (
@@ -43,8 +46,8 @@ EVALUATION_EPISODES = 64  # of each task
 FIT_EPISODES = 2048  # of a dataset that is not in memory: half a GB of states to fit Q to
 FRAME_BYTES = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (spec.STATE_DIM + 2 * spec.ACTION_DIM + 8)
 
-type Stream = SequenceStream | Ahead
 type Learning = EpisodeStore | EpisodeIndex
+type Built = tuple[Learning, Ahead, EpisodeStore, Learning, Mapping[str, ReturnScale]]
 
 
 @dataclass(frozen=True)
@@ -57,22 +60,27 @@ class Material:
     """The options, ``loading.mode`` no longer auto."""
     learning: Learning
     """Episodes to train on."""
-    stream: Stream
+    stream: Ahead
     """Batches of their windows."""
     heldout: EpisodeStore
     """Episodes to evaluate on."""
+    fitting: Learning
+    """Those training episodes that the final fit of Q may draw from."""
     return_scales: Mapping[str, ReturnScale]
     """Task -> the scale that its returns are on, under `returns.scale=per_task`; else empty."""
 
     def training_episodes(self, device: torch.device) -> Iterator[Batch]:
         """Whole training episodes, and their mirror images; a random part of a large dataset."""
-        if isinstance(self.learning, EpisodeIndex):
-            return _from_disk(self.learning, self.config, device)
-        return whole_episodes(self.learning, device, self.config.sampling.mirror)
+        if isinstance(self.fitting, EpisodeIndex):
+            return _from_disk(self.fitting, self.config, device)
+        return whole_episodes(self.fitting, device, self.config.sampling.mirror)
 
 
 def prepare(config: TrainConfig, model: WorldModel, ranks: Ranks = ALONE) -> Material:
-    """Open the datasets, read all of them once, and fix the model's statistics.
+    """Open the datasets and fix the model's statistics.
+
+    What is on disk is read and checked as a whole; of a dataset that is streamed from the Hub a
+    sample of its files.
 
     The first process goes ahead: it alone downloads, refuses what is wrong, and decides.
 
@@ -93,8 +101,12 @@ def _prepare(config: TrainConfig, model: WorldModel, ranks: Ranks) -> Material:
     mix, sampling = mix_of(config), stream_config(config)
     sampling.check()
     config.loading.shuffle.check()
+    if config.loading.sample_files < 1:
+        raise UsageError(f"--loading.sample_files={config.loading.sample_files}: at least 1")
     readers = open_readers(config)
-    config = _decided(config, readers, ranks)
+    config = pinned(_decided(config, readers, ranks), readers)
+    if config.loading.mode == "ram" and any(reader.is_remote for reader in readers):
+        readers = open_readers(config)
     build = _in_memory if config.loading.mode == "ram" else _on_disk
     return Material(readers, config, *build(readers, config, sampling, mix, model, ranks))
 
@@ -108,10 +120,31 @@ def open_readers(config: TrainConfig) -> tuple[DatasetReader, ...]:
         EnvironmentFailure: the Hub cannot be reached.
     """
     if not config.datasets:
-        return (DatasetReader.open(config.dataset),)
-    if config.dataset != DatasetConfig():
+        return (_open(config.dataset, config),)
+    if config.dataset != SelectedDatasetConfig():
         raise UsageError("--dataset and --datasets both name data; give one of them")
-    return tuple(DatasetReader.open(dataset) for dataset in config.datasets)
+    return tuple(_open(dataset, config) for dataset in config.datasets)
+
+
+def _open(dataset: DatasetConfig, config: TrainConfig) -> DatasetReader:
+    if config.loading.mode == "ram":
+        return DatasetReader.open(dataset)
+    return DatasetReader.on_demand(dataset, config.loading.network)
+
+
+def pinned(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:
+    """The options with the commit that each dataset of the Hub is, so that a resumed run keeps
+    it, whatever is pushed meanwhile."""
+    if not config.datasets:
+        return dataclasses.replace(config, dataset=_at_commit(config.dataset, readers[0]))
+    both = zip(config.datasets, readers, strict=True)
+    return dataclasses.replace(config, datasets=tuple(_at_commit(d, r) for d, r in both))
+
+
+def _at_commit[D: DatasetConfig](config: D, reader: DatasetReader) -> D:
+    if is_local(config):
+        return config
+    return dataclasses.replace(config, revision=reader.source.commit)
 
 
 def mix_of(config: TrainConfig) -> Mix:
@@ -151,7 +184,7 @@ def _decided(config: TrainConfig, readers: Sequence[DatasetReader], ranks: Ranks
     """The options with the mode that auto stands for here, so that a resumed run keeps it."""
     if config.loading.mode != "auto":
         return config
-    needed = sum(reader.num_frames for reader in readers) * FRAME_BYTES * ranks.local
+    needed = EpisodeIndex.of(readers).num_frames * FRAME_BYTES * ranks.local
     mode: Literal["ram", "stream"] = "ram" if 2 * needed <= available_bytes() else "stream"
     return dataclasses.replace(config, loading=dataclasses.replace(config.loading, mode=mode))
 
@@ -163,7 +196,7 @@ def _in_memory(
     mix: Mix,
     model: WorldModel,
     ranks: Ranks,
-) -> tuple[Learning, Stream, EpisodeStore, Mapping[str, ReturnScale]]:
+) -> Built:
     learning, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
@@ -177,7 +210,8 @@ def _in_memory(
         learning = label(learning, config.passing)
     rows = ranks.rows(sampling.batch_size)
     sampling = dataclasses.replace(sampling, batch_size=ranks.count * sampling.batch_size)
-    return learning, SequenceStream(learning, sampling, mix, rows), heldout, scales
+    stream = Ahead(SequenceStream(learning, sampling, mix, rows))
+    return learning, stream, heldout, learning, scales
 
 
 def _on_disk(
@@ -187,16 +221,24 @@ def _on_disk(
     mix: Mix,
     model: WorldModel,
     ranks: Ranks,
-) -> tuple[Learning, Stream, EpisodeStore, Mapping[str, ReturnScale]]:
+) -> Built:
     if config.returns.scale == "per_task":
         raise UsageError(
             "--returns.scale=per_task needs all episodes in memory, and these are read from the "
             "disk; give --loading.mode=ram, or --returns.scale=dataset"
         )
     learning, unseen = (EpisodeIndex.of(readers, split) for split in ("train", "heldout"))
+    sample = learning
+    if learning.is_remote:
+        sample, unseen = sample_files(learning, unseen, config.loading.sample_files)
+        for part in (sample, unseen):
+            part.bring()
     heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.returns)
     heldout = label(heldout, config.passing)
-    facts = survey(learning, config.returns, sampling.event_quantile)
+    if learning.is_remote:
+        facts = survey_sample(learning, sample, config.returns, sampling.event_quantile)
+    else:
+        facts = survey(learning, config.returns, sampling.event_quantile)
     longest = int(learning.length.max())
     scaled = config.returns.scale != "none"
     fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest, scaled)
@@ -212,8 +254,9 @@ def _on_disk(
         returns=config.returns,
         events=facts.events,
         label=labelling,
+        checked=not learning.is_remote,
     )
-    return learning, Ahead(stream), heldout, {}
+    return learning, Ahead(stream), heldout, sample, {}
 
 
 def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -> Iterator[Batch]:

@@ -15,6 +15,8 @@ from tqdm import tqdm
 
 from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
+from egovcp.data import EpisodeIndex, describe_heldout
+from egovcp.data.ahead import Ahead
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.model import PRESETS, WorldModel
 from egovcp_train.allocation import keep_freed_memory
@@ -28,7 +30,7 @@ from egovcp_train.checkpoint import (
 )
 from egovcp_train.closed_loop import ClosedLoop, require_simulator
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
-from egovcp_train.datasets import EVALUATION_EPISODES, Material, Stream, prepare
+from egovcp_train.datasets import EVALUATION_EPISODES, Material, prepare
 from egovcp_train.device import choose_bf16, choose_device
 from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
@@ -292,7 +294,7 @@ def _records(config: TrainConfig, output: Path) -> Everywhere:
     return Everywhere(found)
 
 
-def _restore(output: Path, learner: Learner, stream: Stream) -> float:
+def _restore(output: Path, learner: Learner, stream: Ahead) -> float:
     """Continue from the last checkpoint; returns the seconds that the run has taken so far.
 
     Raises:
@@ -318,9 +320,13 @@ def _provenance(material: Material) -> dict[str, Any]:
     readers = material.readers
     return {
         "controller_id": readers[0].controller_id,
-        "tasks": sorted({reader.task(i) for reader in readers for i in range(len(reader))}),
+        "tasks": sorted(set(EpisodeIndex.of(readers).tasks)),
         "versions": versions(),
-        "datasets": [{"repo_id": r.source.repo_id, "revision": r.source.commit} for r in readers],
+        "datasets": [
+            {"repo_id": r.source.repo_id, "revision": r.source.commit, "episodes": r.episodes}
+            for r in readers
+        ],
+        "heldout_episodes": describe_heldout(readers),
         "return_scales": {task: list(scale) for task, scale in material.return_scales.items()},
         "train_config": draccus.encode(material.config),
         "command": [PROG, *sys.argv[1:]],

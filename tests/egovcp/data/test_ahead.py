@@ -6,7 +6,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from egovcp.data import BoundedStream, DatasetReader, EpisodeIndex, ShuffleConfig, StreamConfig
+from egovcp.data import (
+    BoundedStream,
+    DatasetReader,
+    EpisodeIndex,
+    EpisodeStore,
+    SequenceStream,
+    ShuffleConfig,
+    StreamConfig,
+)
 from egovcp.data.ahead import Ahead
 from egovcp.errors import DataError
 
@@ -18,6 +26,15 @@ def make_stream(reader: DatasetReader) -> MakeStream:
     config = StreamConfig(batch_size=4, length=4)
     index = EpisodeIndex.of([reader])
     return lambda: BoundedStream(index, config, shuffle=ShuffleConfig(3))
+
+
+def test_batches_from_memory_are_the_same_too(reader: DatasetReader) -> None:
+    store, config = EpisodeStore.load([reader]), StreamConfig(batch_size=4, length=4)
+    plain, ahead = SequenceStream(store, config), Ahead(SequenceStream(store, config))
+    for _ in range(5):
+        assert ahead.state_dict() == plain.state_dict()
+        expected, found = next(plain), next(ahead)
+        assert all(np.array_equal(expected[k], found[k]) for k in expected)
 
 
 def test_batches_and_states_are_those_of_the_stream(make_stream: MakeStream) -> None:

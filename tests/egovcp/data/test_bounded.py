@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from egovcp import spec
 from egovcp.data import (
     BoundedStream,
     DatasetConfig,
@@ -137,7 +138,7 @@ def test_other_options_or_data_are_not_resumed(six: EpisodeIndex, reader: Datase
     with pytest.raises(UsageError, match="workers 1 -> 2"):
         BoundedStream(six, _config(), shuffle=FEW, shard=Shard(workers=2)).load_state_dict(state)
     with pytest.raises(DataError, match="episodes have changed"):
-        BoundedStream(six.first(5), _config(), shuffle=FEW).load_state_dict(state)
+        BoundedStream(six.select(np.arange(5)), _config(), shuffle=FEW).load_state_dict(state)
     store = EpisodeStore.load([reader])
     with pytest.raises(UsageError, match="bounded"):
         SequenceStream(store, _config()).load_state_dict(state)
@@ -159,7 +160,7 @@ def test_event_windows_hold_an_event(six: EpisodeIndex, reader: DatasetReader) -
 
 def test_passing_is_what_the_label_says(six: EpisodeIndex) -> None:
     def label(depth: np.ndarray, state: np.ndarray) -> np.ndarray:
-        return np.stack([state[:, 0]] * 5, axis=1)
+        return np.stack([state[:, 0]] * spec.PASSING_DIM, axis=1)
 
     batch = next(BoundedStream(six, _config(), shuffle=FEW, label=label))
     np.testing.assert_array_equal(batch["passing"][..., 2], batch["state"][..., 0])

@@ -13,7 +13,7 @@ import draccus
 import torch
 
 from egovcp.artefact import Artefact, load_artefact
-from egovcp.cli import DatasetConfig, run_command
+from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.errors import ArtefactError, UsageError
 from egovcp_train.device import choose_device
@@ -54,7 +54,7 @@ class HeldoutConfig:
     """Folder for heldout.json and the pictures; its other files are left alone."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     """Policy to measure."""
-    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
     """Dataset with the episodes."""
     split: str = "heldout"
     """heldout, train or all; episodes are held out by a hash, the same ones in each training."""
@@ -158,7 +158,11 @@ def _run(config: HeldoutConfig, artefact: Artefact, reader: DatasetReader) -> di
     return {
         "policy": str(artefact.path),
         "step": artefact.manifest.get("step"),
-        "dataset": {"repo_id": reader.source.repo_id, "revision": reader.source.commit},
+        "dataset": {
+            "repo_id": reader.source.repo_id,
+            "revision": reader.source.commit,
+            "episodes": reader.episodes,
+        },
         "split": config.split,
         "stride": config.stride,
         "command": [PROG, *sys.argv[1:]],

@@ -1,0 +1,78 @@
+"""An epoch streamed from a Hub on the same machine, beside the same epoch from the disk."""
+
+from __future__ import annotations
+
+import contextlib
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+from writer import PROVENANCE, make_episode
+
+from egovcp.cli import DatasetConfig
+from egovcp.data import (
+    BoundedStream,
+    DatasetReader,
+    DatasetWriter,
+    EpisodeIndex,
+    ShuffleConfig,
+    StreamConfig,
+)
+from egovcp.hub import Content, Patience, Publication, publish
+from egovcp.testing.hub import in_this_process
+
+_REPO = "me/bench"
+_FILES = 8
+
+
+@contextlib.contextmanager
+def serving(folder: Path) -> Iterator[str]:
+    """A fake Hub in a process of its own; its address."""
+    command = [sys.executable, "-m", "egovcp.testing.hub", "--root", folder]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as hub:
+        assert hub.stdout is not None
+        try:
+            yield hub.stdout.readline().split("HF_ENDPOINT=")[1].split()[0]
+        finally:
+            hub.terminate()
+
+
+def epoch_rates(
+    folder: Path, episodes: int, config: StreamConfig, shuffle: ShuffleConfig, rounds: int
+) -> list[dict[str, float]]:
+    """Windows per second of wall clock of an epoch from the disk and from the Hub, in turns.
+
+    Each time from the Hub begins with an empty cache: every file comes while it is being read.
+    """
+    root = folder / "local"
+    with DatasetWriter(root, PROVENANCE, max(1, episodes // _FILES)) as writer:
+        for number in range(episodes):
+            writer.add(make_episode(number, 150))
+    files = [path for path in root.rglob("*") if path.is_file()]
+    contents = {path.relative_to(root).as_posix(): Content(path) for path in files}
+    with serving(folder / "hub") as endpoint:
+        with in_this_process(endpoint, folder / "home"):
+            publish(Publication(_REPO, contents, "a benchmark"), Patience())
+        return [_round(root, endpoint, config, shuffle) for _ in range(rounds)]
+
+
+def _round(
+    root: Path, endpoint: str, config: StreamConfig, shuffle: ShuffleConfig
+) -> dict[str, float]:
+    disk = _epoch(DatasetReader.open(DatasetConfig(root=str(root))), config, shuffle)
+    with tempfile.TemporaryDirectory() as home, in_this_process(endpoint, Path(home)):
+        hub = _epoch(DatasetReader.on_demand(DatasetConfig(repo_id=_REPO)), config, shuffle)
+    return {"disk": disk, "hub": hub}
+
+
+def _epoch(reader: DatasetReader, config: StreamConfig, shuffle: ShuffleConfig) -> float:
+    index = EpisodeIndex.of([reader])
+    stream = BoundedStream(index, config, shuffle=shuffle, checked=not reader.is_remote)
+    batches = int(index.num_frames * shuffle.reuse / config.length / config.batch_size)
+    start = time.perf_counter()
+    for _ in range(batches):
+        next(stream)
+    return batches * config.batch_size / (time.perf_counter() - start)

@@ -1,0 +1,114 @@
+"""The files of one commit of a dataset, brought when they are needed, and kept."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from tqdm import tqdm
+
+from egovcp.errors import DataError, EgovcpError
+from egovcp.hub.failures import explained, token
+from egovcp.hub.fetch import snapshot
+from egovcp.hub.patience import Patience, patient
+
+
+class _NoBar(tqdm):  # type: ignore[misc]
+    """A progress bar that does not appear in the middle of another one."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        options.pop("name", None)  # what Hugging Face's own bars take
+        super().__init__(*args, **options | {"disable": True})
+
+
+class Shelf:
+    """A folder of the library's cache that fills as its files are asked for.
+
+    What has been brought stays in the cache, where `snapshot` and LeRobot find it again; nothing
+    is asked of the Hub for a file that is there.
+    """
+
+    def __init__(self, repo_id: str, folder: Path, cache_dir: Path, patience: Patience) -> None:
+        """See `open`; the folder is named by the commit."""
+        self.repo_id, self.folder, self.commit = repo_id, folder, folder.name
+        self._cache_dir, self._patience = cache_dir, patience
+        self._lock = threading.Lock()
+        self._ahead: threading.Thread | None = None
+
+    @classmethod
+    def open(
+        cls,
+        repo_id: str,
+        revision: str,
+        patience: Patience,
+        cache_dir: Path,
+        patterns: Sequence[str],
+    ) -> Self:
+        """The commit that a revision is now, with those of its files that match the patterns.
+
+        If the Hub cannot be reached, the commit of an earlier download serves.
+
+        Raises:
+            DataError: there is no such dataset or revision.
+            EnvironmentFailure: the Hub cannot be reached, or refuses.
+        """
+        folder = snapshot(repo_id, revision, patience, cache_dir=cache_dir, patterns=patterns)
+        return cls(repo_id, folder, cache_dir, patience)
+
+    def has(self, name: str) -> bool:
+        """Whether a file has been brought."""
+        return (self.folder / name).exists()
+
+    def bring(self, name: str) -> Path:
+        """A file, which is waited for if it is not here yet.
+
+        Raises:
+            DataError: the commit has no such file.
+            EnvironmentFailure: the Hub cannot be reached, or refuses; or the disk is full.
+        """
+        if not self.has(name):
+            with self._lock:
+                self._fetch(name)
+        return self.folder / name
+
+    def expect(self, names: Iterable[str]) -> None:
+        """Begin to bring the first of these files that is not here, unless one is on its way.
+
+        What goes wrong with it is told to whoever needs the file.
+        """
+        if self._ahead is not None and self._ahead.is_alive():
+            return
+        missing = next((name for name in names if not self.has(name)), None)
+        if missing is not None:
+            self._ahead = threading.Thread(target=self._try, args=(missing,), daemon=True)
+            self._ahead.start()
+
+    def _try(self, name: str) -> None:
+        with contextlib.suppress(EgovcpError, OSError):
+            self.bring(name)
+
+    def _fetch(self, name: str) -> None:
+        if self.has(name):  # whoever held the lock brought it
+            return
+        with explained(self.repo_id, self.commit), patient(self._patience):
+            from huggingface_hub import hf_hub_download
+            from huggingface_hub.errors import EntryNotFoundError
+
+            try:
+                hf_hub_download(
+                    self.repo_id,
+                    name,
+                    repo_type="dataset",
+                    revision=self.commit,
+                    cache_dir=self._cache_dir,
+                    token=token(),
+                    tqdm_class=_NoBar,
+                )
+            except EntryNotFoundError as error:
+                raise DataError(
+                    f"{self.repo_id}@{self.commit} has no {name}; the dataset on the Hub is "
+                    "incomplete"
+                ) from error
