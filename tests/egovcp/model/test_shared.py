@@ -80,7 +80,7 @@ def test_means_of_each_process_alone_would_not_add_up() -> None:
     batch = _uneven()
     terms, _ = _learned(toy_model(), batch)
     alone = [_learned(toy_model(), _part(batch, rank))[0]["loss/value"] for rank in (0, 1)]
-    assert not torch.isclose(sum(alone) / 2, terms["loss/value"], rtol=1e-2)
+    assert not torch.isclose(sum(alone) / 2, terms["loss/value"], rtol=1e-3)
 
 
 def test_the_noise_is_that_of_the_whole_batch() -> None:
