@@ -318,7 +318,7 @@ def test_a_hub_id_is_fetched_at_its_revision(hub: FakeHub, original: Path, commi
 
 def test_only_data_is_fetched(hub: FakeHub, commit: str) -> None:
     found = load_artefact("me/policy", commit).path
-    assert {path.name for path in found.iterdir()} == {CONFIG, WEIGHTS, MANIFEST}
+    assert {path.name for path in found.iterdir()} == FILES
 
 
 def test_a_dataset_of_that_name_is_no_policy(hub: FakeHub, original: Path) -> None:

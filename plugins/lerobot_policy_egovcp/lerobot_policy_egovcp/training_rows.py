@@ -42,14 +42,14 @@ class Targets:
             DataError: the dataset is damaged, or its episodes are too short for any return.
         """
         parts = [_episode_targets(reader, i, config) for i in range(len(reader))]
-        returns, valid, terminal = (np.concatenate(column) for column in zip(*parts, strict=True))
-        if not valid.any():
+        found = cls(*(torch.from_numpy(np.concatenate(c)) for c in zip(*parts, strict=True)))
+        if not found.mc_valid.any():
             raise DataError(
                 f"{reader.root}: no row has a complete Monte Carlo return: the episodes (at most "
                 f"{int(reader.lengths.max())} ticks) are not longer than --policy.returns.steps; "
                 "lower it, or collect longer episodes"
             )
-        return cls(*(torch.from_numpy(x) for x in (returns, valid, terminal)))
+        return found
 
     @property
     def usable(self) -> Tensor:

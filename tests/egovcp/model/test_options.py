@@ -172,7 +172,7 @@ def test_free_nats_are_for_the_step_or_for_each_dimension(per: str, expected: fl
     mean = torch.tensor([[[8.0**0.5, 0.0, 0.0, 0.0]]])
     one, zero = torch.ones(1, 1, 4), torch.zeros(1)
     rollout = Rollout(
-        Carry(zero, zero, zero), Gaussian(mean, one), Gaussian(0 * mean, one), zero, zero
+        Carry(zero, zero), Gaussian(mean, one), Gaussian(0 * mean, one), zero, zero, zero
     )
     config = LossConfig(free_nats=1.0, free_nats_per=per, kl_prior=1.0)  # type: ignore[arg-type]
     losses = kl_losses(rollout, torch.ones(1, 1).bool(), config)
