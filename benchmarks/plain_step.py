@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.model import Batch, LossConfig, WorldModel
-from egovcp.model.depth import paint_disc, within
+from egovcp.model.depth import within
 from egovcp.model.nets import SplitLinear, SplitMlp
 from egovcp.model.world_model import PASSING_UNIT
 from egovcp_train.config import OptimizerConfig
@@ -60,12 +60,15 @@ class PlainModel(nn.Module):
         self.encode_state = mlp(model.encode_state)
         self.mix = nn.Sequential(linear(model.mix), *copy.deepcopy(model.mix_act))
         self.gru = PlainGru(model)
-        self.posterior = nn.Sequential(self._posterior(model), *copy.deepcopy(model.posterior.rest))
+        self.embed = linear(model.embed_observation)
+        self.posterior_h = copy.deepcopy(model.posterior.project_h)
+        self.posterior = copy.deepcopy(model.posterior.rest)
         self.prior = mlp(model.prior)
         self.decoder_input = copy.deepcopy(model.decode_depth.project)
         self.decode_depth = copy.deepcopy(model.decode_depth.layers)
         self.decode_state = mlp(model.decode_state)
         self.decode_motion = mlp(model.decode_motion)
+        self.decode_sight = copy.deepcopy(model.decode_sight)
         self.decode_passing = mlp(model.decode_passing)
         self.termination = mlp(model.termination_head)
         assert model.value_head.reduce is not None
@@ -76,17 +79,6 @@ class PlainModel(nn.Module):
         for name, buffer in model.named_buffers():
             self.register_buffer(name, buffer.clone())
 
-    @staticmethod
-    def _posterior(model: WorldModel) -> nn.Linear:
-        h, image, state = (
-            model.posterior.project_h,
-            *model.embed_observation.parts,
-        )
-        weight = torch.cat([h.weight.data, image.weight.data, state.weight.data], 1)  # type: ignore[list-item]
-        layer = nn.Linear(weight.shape[1], weight.shape[0], bias=False)
-        layer.weight.data = weight
-        return layer
-
     def gaussian(self, logits: Tensor) -> tuple[Tensor, Tensor]:
         mean, raw = logits.chunk(2, -1)
         return mean, F.softplus(raw + 0.54) + self.config.min_std
@@ -95,13 +87,17 @@ class PlainModel(nn.Module):
         new: Tensor = self.gru(self.mix(torch.cat([z, action], -1)), h)
         return new
 
-    def picture(self, features: Tensor) -> Tensor:
-        """(N, features) -> nearness (N, 48, 64), what flies painted over it."""
+    def background(self, features: Tensor) -> Tensor:
+        """(N, features) -> nearness (N, 48, 64) without what flies."""
         maps = self.decoder_input(features)
         maps = maps.view(len(maps), -1, spec.DEPTH_ROWS // 8, spec.DEPTH_COLS // 8)
         image: Tensor = self.decode_depth(maps)[:, 0]
-        out = self.decode_motion(features)
-        return paint_disc(image, out[:, :4], out[:, -2:], self.config.depth_max_m)
+        return image
+
+    def motion(self, features: Tensor) -> Tensor:
+        """(..., features) -> (..., A, 4)."""
+        output: Tensor = self.decode_motion(features)
+        return output.unflatten(-1, (len(self.config.motion_ahead), 4))
 
     def value(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
         """Standardised."""
@@ -146,7 +142,7 @@ def pixel_weights(near: Tensor, batch: Batch, loss: LossConfig) -> Tensor:
     moving = F.pad(moving, (0, 0, 0, 0, 1, 0)) & ~batch.is_first[..., None, None]
     place = batch.passing[..., spec.IN_PICTURE].flatten(0, 1)
     disc = within(near.flatten(0, 1), place).view_as(near)
-    return 1 + loss.moving * moving.float() + loss.flight * disc.float()
+    return (1 + loss.moving * moving.float()) * (~disc).float()
 
 
 def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> Tensor:
@@ -157,7 +153,8 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
     state = ((batch.state - model.state_mean) / model.state_std).clamp(-10, 10)  # type: ignore[operator]
     image = model.encode_depth(torch.stack([near, (near > 0).float()], 1))
     observation = torch.cat([image, model.encode_state(state.flatten(0, 1))], -1)
-    observation = observation.view(size, length, -1)
+    observation = model.embed(observation).view(size, length, -1)
+    sight = model.decode_sight(observation)
     near = near.view(size, length, *near.shape[1:])
 
     h, z = torch.zeros(size, config.hidden), torch.zeros(size, config.latent)
@@ -165,7 +162,7 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
     for t in range(length):
         keep = (~batch.is_first[:, t, None]).float()
         h = model.transition(h * keep, z * keep, batch.prev_action[:, t] * keep)
-        mean, std = model.gaussian(model.posterior(torch.cat([h, observation[:, t]], -1)))
+        mean, std = model.gaussian(model.posterior(model.posterior_h(h) + observation[:, t]))
         z = mean + std * torch.randn(mean.shape, generator=generator)
         hs.append(h)
         zs.append(z)
@@ -179,7 +176,7 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
     error = (0.5 * (model.decode_state(features) - state) ** 2).mean(-1)
     terms = [
         loss.depth * depth_loss(model, features, near, weight, batch, generator),
-        loss.motion * motion_loss(model, features, batch),
+        loss.motion * motion_loss(model, features, sight, batch),
         loss.passing * passing_loss(model, features, batch),
         loss.state * mean_where(error, batch.valid),
         *kl_terms(model, (mean, std), (prior_mean, prior_std), batch),
@@ -199,32 +196,35 @@ def depth_loss(
 ) -> Tensor:
     every = model.config.loss.decode_every
     chosen = slice(int(torch.randint(every, (), generator=generator)), None, every)
-    image = model.picture(features[:, chosen].flatten(0, 1))
+    image = model.background(features[:, chosen].flatten(0, 1))
     error = 0.5 * (image - near[:, chosen].flatten(0, 1)) ** 2
     error = error * weight[:, chosen].flatten(0, 1)
     return mean_where(error.mean((-2, -1)), batch.valid[:, chosen].flatten())
 
 
-def motion_loss(model: PlainModel, features: Tensor, batch: Batch) -> Tensor:
+def motion_target(batch: Batch, max_m: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Place (B, T, 3), whether anything flies, whether that is known, (B, T) each."""
     row, column, radius, depth = batch.passing[..., spec.IN_PICTURE].unbind(-1)
     half = (spec.DEPTH_ROWS - 1) / 2, (spec.DEPTH_COLS - 1) / 2
-    place = [column / half[1] - 1, row / half[0] - 1, 1 - depth / model.config.depth_max_m]
-    target, flies = torch.stack(place, -1), radius > 0
-    labelled = batch.valid & (batch.passing[..., 4] > 0)
-    ahead, length = model.config.motion_ahead, target.shape[1]
-    output = model.decode_motion(features)[..., :-2].unflatten(-1, (len(ahead), 4))
-    total = torch.zeros(())
-    for i, k in enumerate(ahead):
-        if k >= length:
-            continue
-        guess, there = output[:, : length - k, i], flies[:, k:]
-        known = unbroken(batch, k) & labelled[:, k:]
-        error = F.huber_loss(guess[..., :3], target[:, k:], reduction="none", delta=0.1)
-        presence = F.binary_cross_entropy_with_logits(
-            guess[..., 3], there.float(), reduction="none"
-        )
-        total = total + mean_where(error.sum(-1) / 0.1, known & there)
-        total = total + 0.1 * mean_where(presence, known)
+    place = [column / half[1] - 1, row / half[0] - 1, 1 - depth / max_m]
+    return torch.stack(place, -1), radius > 0, batch.passing[..., 4] > 0
+
+
+def motion_error(guess: Tensor, place: Tensor, flies: Tensor, known: Tensor) -> Tensor:
+    error = F.huber_loss(guess[..., :3], place, reduction="none", delta=0.1)
+    presence = F.binary_cross_entropy_with_logits(guess[..., 3], flies.float(), reduction="none")
+    return mean_where(error.sum(-1) / 0.1, known & flies) + 0.3 * mean_where(presence, known)
+
+
+def motion_loss(model: PlainModel, features: Tensor, sight: Tensor, batch: Batch) -> Tensor:
+    place, flies, labelled = motion_target(batch, model.config.depth_max_m)
+    total = motion_error(sight, place, flies, batch.valid & labelled)
+    output, length = model.motion(features), place.shape[1]
+    for i, k in enumerate(model.config.motion_ahead):
+        if k < length:
+            known = unbroken(batch, k) & labelled[:, k:]
+            guess = output[:, : length - k, i]
+            total = total + motion_error(guess, place[:, k:], flies[:, k:], known)
     return total
 
 
@@ -298,10 +298,13 @@ def foresight_terms(
             rows.append(start + k)
             known.append(unbroken(batch, k)[:, start])
     features, at, valid = torch.cat(seen, 1), torch.cat(rows), torch.cat(known, 1)
-    image = model.picture(features.flatten(0, 1)).view(len(near), len(at), *near.shape[2:])
+    image = model.background(features.flatten(0, 1)).view(len(near), len(at), *near.shape[2:])
     picture = (0.5 * weight[:, at] * (image - near[:, at]) ** 2).mean((-2, -1))
     proprioception = (0.5 * (model.decode_state(features) - state[:, at]) ** 2).mean(-1)
+    place, flies, labelled = (x[:, at] for x in motion_target(batch, model.config.depth_max_m))
+    motion = motion_error(model.motion(features)[..., 0, :], place, flies, labelled & valid)
     return [
+        loss.foresight_motion * motion,
         loss.foresight_depth * mean_where(picture, valid),
         loss.foresight_state * mean_where(proprioception, valid),
     ]

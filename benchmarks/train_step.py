@@ -30,10 +30,13 @@ from egovcp.data import EpisodeIndex, EpisodeStore, SequenceStream, StreamConfig
 from egovcp.model import Batch, WorldModel, WorldModelConfig
 from egovcp_train.batches import set_normalisation, to_tensors
 from egovcp_train.config import OptimizerConfig, SamplingConfig
+from egovcp_train.labels.config import PassingConfig
+from egovcp_train.labels.passing import label
 from egovcp_train.loop import Learner
 
 TOLERANCE = 1e-4  # of the loss, relative: sums of some million fp32 numbers in another order
 LENGTH = SamplingConfig().length
+EPISODES = 100  # of each task
 CPU = torch.device("cpu")
 
 type Turn = dict[str, tuple[float, float]]
@@ -113,7 +116,8 @@ def figures(turns: list[Turn], name: str, frames: int) -> dict[str, object]:
 
 def measure(root: Path, batches: list[int], threads: list[int], rounds: int) -> dict[str, object]:
     """All figures; keys say the batch and the number of threads."""
-    store = EpisodeStore.read(EpisodeIndex.of([open_dataset(root)], "train").spread(200))
+    index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
+    store = label(EpisodeStore.read(index), PassingConfig())
     out: dict[str, object] = {"window": LENGTH}
     for size in batches:
         for count in threads:
