@@ -3,7 +3,7 @@
     config.json        "type": "egovcp", network and planner configuration, features
     model.safetensors  weights and normalisation statistics
     policy_*.json      the steps LeRobot takes before and after the policy
-    manifest.json      schema version, SHA-256 of each file, data, controller, code version
+    manifest.json      schema version, SHA-256 of all files and its own, data, controller, code
 
 safetensors and JSON only: loading an artefact never executes code. Other files beside these, such
 as a model card and its pictures, are no part of it: neither read nor, from the Hub, fetched.
@@ -33,7 +33,8 @@ from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.plan import PlannerConfig, Policy
 from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+SEAL = "manifest_sha256"
 CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
 _PATTERNS = ("*.json", "*.safetensors")
 _PATIENCE = Patience()
@@ -140,7 +141,14 @@ def write_artefact(
         "files": {name: _sha256(folder / name) for name in (CONFIG, WEIGHTS, *processors)},
         **provenance,
     }
-    _write_json(folder / MANIFEST, manifest)
+    _write_json(folder / MANIFEST, sealed(manifest))
+
+
+def sealed(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """A manifest with the SHA-256 of all that it says, so that no word of it changes unnoticed."""
+    content = json.loads(json.dumps({k: v for k, v in manifest.items() if k != SEAL}))
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
+    return {**content, SEAL: hashlib.sha256(text.encode()).hexdigest()}
 
 
 def _require_controller_id(path: Path, provenance: Mapping[str, Any]) -> None:
@@ -254,6 +262,11 @@ def _check_manifest(folder: Path, manifest: dict[str, Any]) -> None:
         )
     if not isinstance(manifest.get("controller_id"), str):
         raise ArtefactError(f"{folder / MANIFEST}: no controller_id; the file is damaged")
+    if manifest.get(SEAL) != sealed(manifest)[SEAL]:
+        raise ArtefactError(
+            f"{folder / MANIFEST}: its SHA-256 is not the one that it names; it was changed or "
+            "damaged: fetch it again"
+        )
     files = _object(manifest, "files")
     for name in (CONFIG, WEIGHTS, *(name for name in PROCESSORS if name in files)):
         expected, found = files.get(name), _sha256(folder / name)

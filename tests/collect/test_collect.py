@@ -132,9 +132,9 @@ def test_an_error_is_not_hidden_by_the_commit_that_follows_it(
     monkeypatch.setattr(Crew, "poll", fail)
     monkeypatch.setattr(Committer, "commit", full)
     assert _collect(tmp_path / "new", "--episodes=1", "--num_workers=1") == 3
-    *_, warning, last = capsys.readouterr().err.strip().splitlines()
-    assert last == "egovcp-collect: error: the robot has left the earth"
-    assert "warning" in warning
+    told = capsys.readouterr().err.strip().splitlines()
+    assert told[-1] == "egovcp-collect: error: the robot has left the earth"
+    (warning,) = [line for line in told if "warning" in line]
     assert "No space left" in warning
 
 

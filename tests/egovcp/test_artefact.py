@@ -14,7 +14,7 @@ import torch
 
 from egovcp import artefact as module
 from egovcp import spec
-from egovcp.artefact import CONFIG, MANIFEST, WEIGHTS, load_artefact, save_artefact
+from egovcp.artefact import CONFIG, MANIFEST, WEIGHTS, load_artefact, save_artefact, sealed
 from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
 from egovcp.hub import Content, Patience, Publication, publish
 from egovcp.plan import PlannerConfig, Policy
@@ -50,9 +50,10 @@ def folder(original: Path, tmp_path: Path) -> Path:
 
 
 def _edit(path: Path, change: Callable[[Json], object]) -> None:
+    """A manifest is sealed again: what is wrong with its content is found all the same."""
     content = json.loads(path.read_text())
     change(content)
-    path.write_text(json.dumps(content))
+    path.write_text(json.dumps(sealed(content) if path.name == MANIFEST else content))
 
 
 def _sign(folder: Path) -> None:
@@ -158,6 +159,15 @@ def test_a_changed_byte_is_noticed(folder: Path, name: str, where: int) -> None:
         load_artefact(str(folder))
 
 
+@pytest.mark.parametrize("word", ["stance-1", "sha256", "schema_version", "files"])
+def test_no_word_of_the_manifest_changes_unnoticed(folder: Path, word: str) -> None:
+    text = (folder / MANIFEST).read_text()
+    assert word in text
+    (folder / MANIFEST).write_text(text.replace(word, word.upper(), 1))
+    with pytest.raises(ArtefactError, match=MANIFEST):
+        load_artefact(str(folder))
+
+
 def test_an_older_artefact_without_files_for_lerobot_still_loads(folder: Path) -> None:
     for name in PROCESSORS:
         (folder / name).unlink()
@@ -176,7 +186,7 @@ def test_a_truncated_file_is_noticed(folder: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda m: m.update(schema_version=2), "schema version 2"),
+        (lambda m: m.update(schema_version=1), "schema version 1"),
         (lambda m: m.pop("schema_version"), "schema version None"),
         (lambda m: m["features"].update(planner_hz=50), "another feature spec.*planner_hz"),
         (lambda m: m["features"]["action_box"].update(low=[0] * 7), "feature spec.*action_box"),
@@ -305,7 +315,7 @@ def test_a_card_beside_it_does_no_harm(folder: Path) -> None:
 def test_a_hub_id_is_fetched_at_its_revision(hub: FakeHub, original: Path, commit: str) -> None:
     newer = {path.name: Content(path) for path in original.iterdir()}
     manifest = json.loads((original / MANIFEST).read_text()) | {"controller_id": "walker-2"}
-    newer[MANIFEST] = Content(json.dumps(manifest).encode())
+    newer[MANIFEST] = Content(json.dumps(sealed(manifest)).encode())
     publish(Publication("me/policy", newer, "another", repo_type="model"), QUICK)
     assert load_artefact("me/policy").controller_id == "walker-2"
     pinned = load_artefact("me/policy", commit)

@@ -16,7 +16,7 @@ from lerobot.policies import PreTrainedPolicy
 from torch import Tensor, nn
 
 from egovcp import spec
-from egovcp.artefact import Artefact, load_artefact, write_artefact
+from egovcp.artefact import SEAL, Artefact, load_artefact, write_artefact
 from egovcp.data import DatasetReader
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.model import WorldModel, world_model_loss
@@ -34,7 +34,7 @@ from lerobot_policy_egovcp.training_rows import (
 type Stats = Mapping[str, Mapping[str, Any]]
 
 _PREFIX = "world_model."
-_OWN_KEYS = ("schema_version", "egovcp_version", "features", "files")  # of the manifest
+_OWN_KEYS = ("schema_version", "egovcp_version", "features", "files", SEAL)  # of the manifest
 
 
 class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
