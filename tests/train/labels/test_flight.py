@@ -92,6 +92,6 @@ def test_the_camera_s_view_leads_back_to_the_ground() -> None:
     state += 0.2 * rng.standard_normal(state.shape)
     gravity = spec.STATE_SLICES["projected_gravity"]
     state[:, gravity] /= np.linalg.norm(state[:, gravity], axis=1, keepdims=True)
-    track = camera_track(state, PassingConfig(), age=1.0)
+    track = camera_track(state, PassingConfig()).aged(1.0)
     point = rng.standard_normal((TICKS, 3))
     np.testing.assert_allclose(track.to_ground(track.to_camera(point)), point, atol=1e-9)

@@ -151,7 +151,7 @@ def test_old_pictures_of_a_swaying_robot_are_told_by_their_path(age: float) -> N
     state[:, spec.STATE_SLICES["projected_gravity"]] = np.stack(
         [np.sin(nod), np.zeros(TICKS), -np.cos(nod)], -1
     )
-    track = camera_track(state, CONFIG, age)
+    track = camera_track(state, CONFIG).aged(age)
     start, velocity = np.array([3.3, 0.2, 0.3]), np.array([-4.0, -0.2, 3.0])
     depth = np.zeros((TICKS, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16)
     for row in range(THROW, THROW + 18):

@@ -7,7 +7,7 @@ from the legs, and the way of a robot that steps from the foot that bears it: it
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -38,6 +38,12 @@ class CameraTrack:
     yaw: Array
     """(T,) rad, turn of the heading since the first row."""
 
+    def aged(self, age: float) -> CameraTrack:
+        """The same for pictures that are older than the state beside them, planner ticks."""
+        return replace(
+            self, rotation=earlier(self.rotation, age), position=earlier(self.position, age)
+        )
+
     def to_ground(self, point: Array) -> Array:
         """(T, 3) m, camera frame of each row -> the frame that stays put."""
         out: Array = rotate(self.rotation, point) + self.position
@@ -49,16 +55,8 @@ class CameraTrack:
         return out
 
 
-def camera_track(
-    state: NDArray[np.floating], config: PassingConfig, age: float = 1.0
-) -> CameraTrack:
-    """The camera's way through one episode.
-
-    Args:
-        state: (T, 74).
-        config: mount of the camera.
-        age: how much older than the state of its row a picture is, planner ticks.
-    """
+def camera_track(state: NDArray[np.floating], config: PassingConfig) -> CameraTrack:
+    """The camera's way through one episode (T, 74), at its rows themselves."""
     s: Array = np.asarray(state, dtype=np.float64)
     angle = yaw(s)
     position, rotation = link_transforms(s[:, spec.STATE_SLICES["joint_position"]])
@@ -68,9 +66,7 @@ def camera_track(
     tilt = np.array([[c, 0.0, d], [0.0, 1.0, 0.0], [-d, 0.0, c]])
     mount = position[:, _TORSO] + rotate(rotation[:, _TORSO], np.array(config.camera_position))
     axes = level @ rotation[:, _TORSO] @ tilt
-    return CameraTrack(
-        earlier(axes, age), earlier(pelvis + rotate(level, mount), age), pelvis, angle
-    )
+    return CameraTrack(axes, pelvis + rotate(level, mount), pelvis, angle)
 
 
 def _pelvis(feet: Array) -> Array:

@@ -71,8 +71,9 @@ def find_throw(
     rows = np.flatnonzero(seen)
     t = rows.astype(np.float64) * spec.PLANNER_DT
     throws: list[Throw] = []
+    at_rows = camera_track(state, config)
     for age in config.picture_ages:
-        track = camera_track(state, config, age)
+        track = at_rows.aged(age)
         path = fit_path(t, track.to_ground(point)[rows], config)
         throws.append(Throw(rows, track, age * spec.PLANNER_DT, path))
     found = max(throws, key=_support)
