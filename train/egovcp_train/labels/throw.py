@@ -14,6 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from egovcp import spec
 from egovcp.model.depth import MIN_PIXELS, approaching, nearness
@@ -67,7 +68,8 @@ def find_throw(
     A picture is older than the state beside it, by a time that is drawn for each episode: the
     age under which most sightings lie on one path, and then most closely, is taken.
     """
-    point, seen = sightings(depth, config)
+    near = nearness(torch.from_numpy(depth.astype(np.int32)), spec.DEPTH_MAX_M)
+    point, seen = sightings(near, config)
     rows = np.flatnonzero(seen)
     t = rows.astype(np.float64) * spec.PLANNER_DT
     throws: list[Throw] = []
@@ -78,11 +80,11 @@ def find_throw(
         throws.append(Throw(rows, track, age * spec.PLANNER_DT, path))
     found = max(throws, key=_support)
     for _ in range(_LOOKS):
-        found = _look_again(found, depth, config)
+        found = _look_again(found, near, config)
     return found
 
 
-def _look_again(throw: Throw, depth: NDArray[np.uint16], config: PassingConfig) -> Throw:
+def _look_again(throw: Throw, near: Tensor, config: PassingConfig) -> Throw:
     """The same throw, its path fitted to what is seen around it in every picture of its flight.
 
     Sightings at first glance are few: a thing that flies straight at the camera hardly moves
@@ -90,12 +92,12 @@ def _look_again(throw: Throw, depth: NDArray[np.uint16], config: PassingConfig) 
     """
     if throw.path is None:
         return throw
-    t = np.arange(len(depth), dtype=np.float64) * spec.PLANNER_DT
+    t = np.arange(len(near), dtype=np.float64) * spec.PLANNER_DT
     expected = throw.track.to_camera(throw.path.at(t))
     flies = (t > throw.path.seen[0] - 0.1) & (expected[:, 0] > _HANDS)
     rows = np.flatnonzero(flies & (t < throw.path.time_at(config.plane)))
-    point = np.zeros((len(depth), 3))
-    point[rows], seen = _around(depth[rows], expected[rows], config)
+    point = np.zeros((len(near), 3))
+    point[rows], seen = _around(near[rows], expected[rows], config)
     rows = rows[seen]
     path = fit_path(t[rows], throw.track.to_ground(point)[rows], config)
     better = path is not None and len(path.seen) >= len(throw.path.seen)
@@ -103,30 +105,28 @@ def _look_again(throw: Throw, depth: NDArray[np.uint16], config: PassingConfig) 
 
 
 def _around(
-    depth: NDArray[np.uint16], expected: Array, config: PassingConfig
+    near: Tensor, expected: Array, config: PassingConfig
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """(n, 48, 64) mm and where a thing may be, (n, 3) m, camera frame -> where it is, (n, 3) m;
+    """(n, 48, 64) nearness and where a thing may be, (n, 3) m, camera frame -> where it is, (n, 3) m;
     (n,) whether it is seen."""
-    near = nearness(torch.from_numpy(depth.astype(np.int32)), spec.DEPTH_MAX_M)
-    x, left, up = (torch.from_numpy(expected[:, i, None, None]) for i in range(3))
+    x, left, up = (torch.from_numpy(expected[:, i, None, None]).float() for i in range(3))
     z = (1 - near) * spec.DEPTH_MAX_M + config.radius
     row = (torch.arange(spec.DEPTH_ROWS)[:, None] - (spec.DEPTH_ROWS - 1) / 2) / config.focal
     col = (torch.arange(spec.DEPTH_COLS) - (spec.DEPTH_COLS - 1) / 2) / config.focal
     away = torch.hypot(col * x + left, row * x + up)
-    weight = ((near > 0) & ((z - x).abs() < _SEARCH) & (away < _SEARCH)).double()
+    weight = ((near > 0) & ((z - x).abs() < _SEARCH) & (away < _SEARCH)).float()
     n = weight.sum((1, 2))
     mean = [(weight * v).sum((1, 2)) / n.clamp_min(1) for v in (z, -z * col, -z * row)]
     cut = weight[:, [0, -1]].sum((1, 2)) + weight[:, :, [0, -1]].sum((1, 2))  # its middle is lost
-    return torch.stack(mean, -1).numpy(), ((n >= MIN_PIXELS) & (cut == 0)).numpy()
+    return torch.stack(mean, -1).double().numpy(), ((n >= MIN_PIXELS) & (cut == 0)).numpy()
 
 
 def _support(throw: Throw) -> tuple[int, float]:
     return (0, 0.0) if throw.path is None else (len(throw.path.seen), -throw.path.error)
 
 
-def sightings(depth: NDArray[np.uint16], config: PassingConfig) -> tuple[Array, NDArray[np.bool_]]:
-    """(T, 48, 64) mm -> where something approaches, in the camera frame, (T, 3) m; (T,) seen."""
-    near = nearness(torch.from_numpy(depth.astype(np.int32)), spec.DEPTH_MAX_M)
+def sightings(near: Tensor, config: PassingConfig) -> tuple[Array, NDArray[np.bool_]]:
+    """(T, 48, 64) nearness -> where something approaches, in the camera frame, (T, 3) m; (T,) seen."""
     centre, seen = approaching(near[None])
     centre, seen = centre[0], seen[0]
     focal = config.focal
@@ -143,7 +143,7 @@ def sightings(depth: NDArray[np.uint16], config: PassingConfig) -> tuple[Array, 
     u = (weight * cols).sum((1, 2)) / n
     v = (weight * rows).sum((1, 2)) / n
     z = (1 - (weight * near[t]).sum((1, 2)) / n) * spec.DEPTH_MAX_M + config.radius
-    out = np.zeros((len(depth), 3))
+    out = np.zeros((len(near), 3))
     right = u * ((spec.DEPTH_COLS - 1) / 2) / focal
     down = v * ((spec.DEPTH_ROWS - 1) / 2) / focal
     out[t.numpy()] = torch.stack([z, -z * right, -z * down], -1).numpy()
