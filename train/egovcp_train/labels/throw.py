@@ -126,7 +126,7 @@ def _support(throw: Throw) -> tuple[int, float]:
 
 
 def sightings(near: Tensor, config: PassingConfig) -> tuple[Array, NDArray[np.bool_]]:
-    """(T, 48, 64) nearness -> where something approaches, in the camera frame, (T, 3) m; (T,) seen."""
+    """(T, 48, 64) nearness -> where something approaches, camera frame, (T, 3) m; (T,) seen."""
     centre, seen = approaching(near[None])
     centre, seen = centre[0], seen[0]
     focal = config.focal
