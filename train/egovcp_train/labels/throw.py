@@ -107,8 +107,8 @@ def _look_again(throw: Throw, near: Tensor, config: PassingConfig) -> Throw:
 def _around(
     near: Tensor, expected: Array, config: PassingConfig
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """(n, 48, 64) nearness and where a thing may be, (n, 3) m, camera frame -> where it is, (n, 3) m;
-    (n,) whether it is seen."""
+    """(n, 48, 64) nearness and where a thing may be, (n, 3) m, camera frame -> where it is,
+    (n, 3) m; (n,) whether it is seen."""
     x, left, up = (torch.from_numpy(expected[:, i, None, None]).float() for i in range(3))
     z = (1 - near) * spec.DEPTH_MAX_M + config.radius
     row = (torch.arange(spec.DEPTH_ROWS)[:, None] - (spec.DEPTH_ROWS - 1) / 2) / config.focal
