@@ -17,8 +17,8 @@ epoch from the disk (``hub_ratio``), and, with --growth, rate and memory of the 
 datasets of many more episodes.
 
     python benchmarks/loader.py --root data/wall
-    uv venv /tmp/swm && uv pip install --python /tmp/swm/bin/python stable-worldmodel
-    python benchmarks/loader.py --lance_python /tmp/swm/bin/python --growth 100 1000 10000
+    uv venv outputs/swm && uv pip install --python outputs/swm/bin/python stable-worldmodel
+    python benchmarks/loader.py --lance_python outputs/swm/bin/python --growth 100 1000 10000
 """
 
 from __future__ import annotations
