@@ -7,7 +7,6 @@ checkpoints/last -> 000500
 
 from __future__ import annotations
 
-import os
 import pickle
 import shutil
 from pathlib import Path
@@ -15,6 +14,7 @@ from typing import Any
 
 import torch
 
+from egovcp.data.files import sync, sync_tree
 from egovcp.errors import ArtefactError
 
 STATE_FILE = "state.pt"
@@ -30,7 +30,7 @@ def finish_checkpoint(partial: Path, state: dict[str, Any]) -> Path:
     folder.mkdir(parents=True)
     with (folder / STATE_FILE).open("wb") as file:
         torch.save(state, file)
-    _sync(partial)
+    sync_tree(partial)  # on the disk before it gets its name
     final = partial.with_suffix("")
     shutil.rmtree(final, ignore_errors=True)
     partial.rename(final)
@@ -38,23 +38,8 @@ def finish_checkpoint(partial: Path, state: dict[str, Any]) -> Path:
     link.unlink(missing_ok=True)
     link.symlink_to(final.name)
     link.replace(final.parent / "last")
-    _flush(final.parent)
+    sync(final.parent)
     return final
-
-
-def _sync(folder: Path) -> None:
-    """Everything in the folder is on the disk, should the power fail after it gets its name."""
-    for path in (*folder.rglob("*"), folder):
-        _flush(path)
-
-
-def _flush(path: Path) -> None:
-    """Write out a file's content, or a folder's names."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def begin_checkpoint(output_dir: Path, step: int) -> Path:
