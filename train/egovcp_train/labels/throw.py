@@ -21,7 +21,7 @@ from egovcp.model.depth import MIN_PIXELS, approaching, nearness
 from egovcp_train.labels.camera import Array, CameraTrack, camera_track
 from egovcp_train.labels.config import PassingConfig
 
-_GRAVITY: Final = np.array([0.0, 0.0, -9.81])  # m/s^2
+GRAVITY: Final = np.array([0.0, 0.0, -9.81])  #: m/s^2
 _LOOKS: Final = 3  # a path that leads half way at first leads all the way at last
 _SEARCH: Final = 0.35  # m, around the place where a thing may be
 _HANDS: Final = 0.9  # m before the camera, where hands begin
@@ -38,7 +38,7 @@ class Path(NamedTuple):
     def at(self, t: Array | float) -> Array:
         """(...,) s -> (..., 3) m."""
         s = np.asarray(t, dtype=np.float64)[..., None]
-        return self.position + self.velocity * s + 0.5 * _GRAVITY * s * s
+        return self.position + self.velocity * s + 0.5 * GRAVITY * s * s
 
     def time_at(self, x: Array | float) -> Array:
         """When it is at ``x`` (...,) m, (...,) s."""
@@ -92,6 +92,23 @@ def _look_again(throw: Throw, near: Tensor, config: PassingConfig) -> Throw:
     """
     if throw.path is None:
         return throw
+    rows, point = sightings_along(throw, near, config)
+    path = fit_path(rows.astype(np.float64) * spec.PLANNER_DT, point, config)
+    better = path is not None and len(path.seen) >= len(throw.path.seen)
+    return replace(throw, path=path) if better else throw
+
+
+def sightings_along(
+    throw: Throw, near: Tensor, config: PassingConfig
+) -> tuple[NDArray[np.intp], Array]:
+    """Where a thing is seen around its path: (n,) rows, and (n, 3) m in the frame that stays put.
+
+    Args:
+        throw: with a path.
+        near: (T, 48, 64) nearness of all pictures.
+        config: how throws are found.
+    """
+    assert throw.path is not None
     t = np.arange(len(near), dtype=np.float64) * spec.PLANNER_DT
     expected = throw.track.to_camera(throw.path.at(t))
     flies = (t > throw.path.seen[0] - 0.1) & (expected[:, 0] > _HANDS)
@@ -99,9 +116,7 @@ def _look_again(throw: Throw, near: Tensor, config: PassingConfig) -> Throw:
     point = np.zeros((len(near), 3))
     point[rows], seen = _around(near[rows], expected[rows], config)
     rows = rows[seen]
-    path = fit_path(t[rows], throw.track.to_ground(point)[rows], config)
-    better = path is not None and len(path.seen) >= len(throw.path.seen)
-    return replace(throw, path=path) if better else throw
+    return rows, throw.track.to_ground(point)[rows]
 
 
 def _around(
@@ -158,7 +173,7 @@ def fit_path(t: Array, point: Array, config: PassingConfig) -> Path | None:
     """
     if len(t) < config.min_sightings:
         return None
-    straight = point - 0.5 * _GRAVITY * (t * t)[:, None]  # p + v t
+    straight = point - 0.5 * GRAVITY * (t * t)[:, None]  # p + v t
     i, j = np.triu_indices(len(t), 1)
     v = (straight[j] - straight[i]) / (t[j] - t[i])[:, None]
     p = straight[i] - v * t[i, None]
