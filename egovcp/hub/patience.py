@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import os
 import re
 import threading
 import time
@@ -25,7 +26,7 @@ _LOG = logging.getLogger(__name__)
 _TRANSIENT = {408, 429, 500, 502, 503, 504}
 _OPTIONAL_S = 5.0  # what the library itself would wait less long for, it can do without
 _PROGRESS_BYTES = 1 << 20  # a broken download that brought this much was worth its try
-_ONE_AT_A_TIME = threading.RLock()  # the library has one client, whose factory is exchanged
+_ONE_AT_A_TIME = threading.Lock()  # the library has one client, whose factory is exchanged
 
 
 class HubUnreachable(EnvironmentFailure):
@@ -54,29 +55,84 @@ class Patience:
 def patient(patience: Patience) -> Iterator[None]:
     """Hold every request of `huggingface_hub` in this process to ``patience``.
 
-    Another thread that enters waits until this one has left.
+    Another thread that enters waits until this one has left; blocks are not to be nested.
 
     Raises from those requests, once the tries are used up:
         HubUnreachable: names the request and what came of it.
     """
-    import huggingface_hub
-    from huggingface_hub.utils import _http
+    line = Line(patience)
+    try:
+        with line.open():
+            yield
+    finally:
+        line.close()
 
-    with _ONE_AT_A_TIME:
-        # The library lets one set the factory of its client, but not ask for the present one,
-        # which may carry a user's proxy or certificates.
-        before = _http._GLOBAL_CLIENT_FACTORY
 
-        def factory() -> httpx.Client:
-            client = before()
-            client.send = _Sender(client.send, patience)  # type: ignore[method-assign]
-            return client
+class Line:
+    """`patient` for many blocks: connections stay open in between, threads share them.
 
-        huggingface_hub.set_client_factory(factory)
+    A client costs as much to make as many megabytes to download.
+    """
+
+    def __init__(self, patience: Patience) -> None:
+        """Nothing is connected before the first request."""
+        self._patience = patience
+        self._lock = threading.Lock()
+        self._users = 0
+        self._client: httpx.Client | None = None
+        self._made: tuple[Callable[[], httpx.Client], int] | None = None
+
+    @contextlib.contextmanager
+    def open(self) -> Iterator[None]:
+        """A block as that of `patient`, which other threads with this line may be in, too."""
+        with self._lock:
+            if self._users == 0:
+                self._enter()
+            self._users += 1
         try:
             yield
         finally:
-            huggingface_hub.set_client_factory(before)
+            with self._lock:
+                self._users -= 1
+                if self._users == 0:
+                    self._leave()
+
+    def close(self) -> None:
+        """Close the connections; the next block makes new ones."""
+        client, self._client = self._client, None
+        if client is not None:
+            httpx.Client.close(client)
+
+    def _enter(self) -> None:
+        import huggingface_hub
+        from huggingface_hub.utils import _http
+
+        _ONE_AT_A_TIME.acquire()
+        # The library lets one set the factory of its client, but not ask for the present one,
+        # which may carry a user's proxy or certificates.
+        self._before = _http._GLOBAL_CLIENT_FACTORY
+        huggingface_hub.set_client_factory(self._kept)
+
+    def _leave(self) -> None:
+        import huggingface_hub
+
+        huggingface_hub.set_client_factory(self._before)
+        _ONE_AT_A_TIME.release()
+
+    def _kept(self) -> httpx.Client:
+        """The client, unless it is another factory's, or another process's: sockets survive a
+        fork."""
+        made = (self._before, os.getpid())
+        if self._client is None or self._made != made:
+            self._client, self._made = self._before(), made
+            sender = _Sender(self._client.send, self._patience)
+            self._client.send = sender  # type: ignore[method-assign]
+            self._client.close = _stay_open  # type: ignore[method-assign]
+        return self._client
+
+
+def _stay_open() -> None:
+    """In place of a client's `close`, which the library calls when its factory changes."""
 
 
 class _Sender:
@@ -166,6 +222,8 @@ class _Sender:
         with self._lock:
             self._failures[name] += 1
             failures = self._failures[name]
+            if failures >= self._patience.attempts:
+                del self._failures[name]  # whoever asks anew has all tries again
         if failures >= self._patience.attempts:
             raise _given_up(request, found, failures) from cause
 

@@ -6,14 +6,17 @@ import contextlib
 import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
 from tqdm import tqdm
 
 from egovcp.errors import DataError, EgovcpError
 from egovcp.hub.failures import explained, token
 from egovcp.hub.fetch import snapshot
-from egovcp.hub.patience import Patience, patient
+from egovcp.hub.patience import Line, Patience
+
+#: Files that come at a time: one connection rarely fills a line to the Hub.
+AHEAD: Final = 3
 
 
 class _NoBar(tqdm):  # type: ignore[misc]
@@ -34,9 +37,9 @@ class Shelf:
     def __init__(self, repo_id: str, folder: Path, cache_dir: Path, patience: Patience) -> None:
         """See `open`; the folder is named by the commit."""
         self.repo_id, self.folder, self.commit = repo_id, folder, folder.name
-        self._cache_dir, self._patience = cache_dir, patience
-        self._lock = threading.Lock()
-        self._ahead: threading.Thread | None = None
+        self._cache_dir, self._line = cache_dir, Line(patience)
+        self._locks: dict[str, threading.Lock] = {}
+        self._coming: dict[str, threading.Thread] = {}
 
     @classmethod
     def open(
@@ -70,30 +73,34 @@ class Shelf:
             EnvironmentFailure: the Hub cannot be reached, or refuses; or the disk is full.
         """
         if not self.has(name):
-            with self._lock:
+            with self._locks.setdefault(name, threading.Lock()):
                 self._fetch(name)
         return self.folder / name
 
     def expect(self, names: Iterable[str]) -> None:
-        """Begin to bring the first of these files that is not here, unless one is on its way.
+        """Begin to bring the first of these files that are not here; `AHEAD` come at a time.
 
-        What goes wrong with it is told to whoever needs the file.
+        What goes wrong with them is told to whoever needs the file.
         """
-        if self._ahead is not None and self._ahead.is_alive():
-            return
-        missing = next((name for name in names if not self.has(name)), None)
-        if missing is not None:
-            self._ahead = threading.Thread(target=self._try, args=(missing,), daemon=True)
-            self._ahead.start()
+        for name in names:
+            if len(self._coming) >= AHEAD:
+                return
+            if name not in self._coming and not self.has(name):
+                thread = threading.Thread(target=self._try, args=(name,), daemon=True)
+                self._coming[name] = thread
+                thread.start()
 
     def _try(self, name: str) -> None:
-        with contextlib.suppress(EgovcpError, OSError):
-            self.bring(name)
+        try:
+            with contextlib.suppress(EgovcpError, OSError):
+                self.bring(name)
+        finally:
+            del self._coming[name]
 
     def _fetch(self, name: str) -> None:
         if self.has(name):  # whoever held the lock brought it
             return
-        with explained(self.repo_id, self.commit), patient(self._patience):
+        with explained(self.repo_id, self.commit), self._line.open():
             from huggingface_hub import hf_hub_download
             from huggingface_hub.errors import EntryNotFoundError
 

@@ -20,6 +20,13 @@ def shelf(hub: FakeHub, publication: Publication, quick: Patience, tmp_path: Pat
     return found
 
 
+def _wait(shelf: Shelf) -> None:
+    """Until nothing is on its way."""
+    for thread in list(shelf._coming.values()):
+        thread.join(20)
+        assert not thread.is_alive()
+
+
 def test_a_file_comes_when_it_is_asked_for_and_stays(
     shelf: Shelf, hub: FakeHub, publication: Publication
 ) -> None:
@@ -33,8 +40,7 @@ def test_a_file_comes_when_it_is_asked_for_and_stays(
 
 def test_an_expected_file_comes_meanwhile(shelf: Shelf, hub: FakeHub) -> None:
     shelf.expect(["meta/info.json", DATA])
-    assert shelf._ahead is not None
-    shelf._ahead.join(20)
+    _wait(shelf)
     assert shelf.has(DATA)
 
 
@@ -62,8 +68,7 @@ def test_a_file_that_is_on_its_way_is_not_asked_for_twice(
 def test_a_file_that_could_not_come_ahead_is_asked_for_again(shelf: Shelf, hub: FakeHub) -> None:
     hub.fail("*", 503)
     shelf.expect([DATA])
-    assert shelf._ahead is not None
-    shelf._ahead.join(20)
+    _wait(shelf)
     assert not shelf.has(DATA)
     with pytest.raises(EnvironmentFailure, match="503"):
         shelf.bring(DATA)
