@@ -20,14 +20,17 @@ type Columns = dict[str, NDArray[Any]]
 
 
 def open_data_file(root: Path, path: Path) -> pq.ParquetFile:
-    """A data file of the dataset at ``root``, its pages mapped into memory.
+    """A data file of the dataset at ``root``, read into memory piece by piece.
+
+    Not mapped: pages of a map count as this process's memory as long as the file is open, and a
+    file that somebody cuts short would end it.
 
     Raises:
         DataError: it is missing, damaged, lies elsewhere, or has columns of other types.
     """
     require_file(root, path)
     with metadata.damaged(path):
-        file = pq.ParquetFile(path, memory_map=True)
+        file = pq.ParquetFile(path)
         for problem in schema.type_problems(file.schema_arrow):
             raise DataError.at(path, problem)
         return file

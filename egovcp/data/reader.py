@@ -13,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from egovcp import spec
 from egovcp.cli import DatasetConfig, SelectedDatasetConfig
 from egovcp.data import metadata, schema
 from egovcp.data.columns import EPISODE_FEATURES, Columns, open_data_file, to_numpy
@@ -242,7 +243,7 @@ class DatasetReader:
         path = self.data_path(index)
         try:
             with metadata.damaged(path):
-                table = self._rows(self._open_file(path), index, names)
+                table = self._rows(path, index, names)
                 if table.num_rows != self._table.length[index]:
                     raise DataError("ends before the end of the episode")
                 return {name: to_numpy(table[name], name) for name in names}
@@ -273,30 +274,31 @@ class DatasetReader:
         return metadata.load_episode_stats(self.root, feature, len(self))
 
     def _name(self, index: int) -> str:
-        return self.data_path(index).relative_to(self.root).as_posix()
-
-    def _opened(self, path: Path) -> pq.ParquetFile:
-        if self._shelf is not None:
-            self._shelf.bring(path.relative_to(self.root).as_posix())
-        return open_data_file(self.root, path)
-
-    def data_path(self, index: int) -> Path:
-        """The file that holds an episode."""
-        name = str(self._info["data_path"]).format(
+        return str(self._info["data_path"]).format(
             chunk_index=int(self._table.chunk_index[index]),
             file_index=int(self._table.file_index[index]),
         )
-        return self.root / name
 
-    def _rows(self, file: pq.ParquetFile, index: int, names: Sequence[str]) -> pa.Table:
-        """The rows of an episode, from the row groups that hold them."""
+    def _opened(self, path: Path) -> tuple[pq.ParquetFile, NDArray[np.int64]]:
+        """A data file, and the rows (groups + 1,) at which its row groups begin and end."""
+        if self._shelf is not None:
+            self._shelf.bring(path.relative_to(self.root).as_posix())
+        file = open_data_file(self.root, path)
         content = file.metadata
         groups = [content.row_group(g).num_rows for g in range(content.num_row_groups)]
-        edges = np.concatenate([[0], np.cumsum(groups)])
+        return file, np.cumsum([0, *groups])
+
+    def data_path(self, index: int) -> Path:
+        """The file that holds an episode."""
+        return self.root / self._name(index)
+
+    def _rows(self, path: Path, index: int, names: Sequence[str]) -> pa.Table:
+        """The rows of an episode, from the row groups that hold them."""
+        file, edges = self._open_file(path)
         first = int(self._table.start[index] - self._file_start[index])
         last = first + int(self._table.length[index])
         touched = np.flatnonzero((edges[:-1] < last) & (edges[1:] > first))
-        table = file.read_row_groups(touched.tolist(), columns=list(names), use_threads=False)
+        table = file.read_row_groups(touched.tolist(), columns=_parts(names), use_threads=False)
         offset = first - int(edges[touched[0]]) if len(touched) else 0
         return table.slice(offset, last - first)
 
@@ -328,6 +330,11 @@ class DatasetReader:
 
 def _asked_for(config: DatasetConfig) -> str:
     return config.episodes if isinstance(config, SelectedDatasetConfig) else ""
+
+
+def _parts(names: Sequence[str]) -> list[str]:
+    """The columns as parquet names them; a depth frame's file name is of no use here."""
+    return [f"{name}.bytes" if name == spec.DEPTH_KEY else name for name in names]
 
 
 def _file_starts(table: metadata.EpisodeTable) -> NDArray[np.int64]:

@@ -38,6 +38,7 @@ class Shelf:
         """See `open`; the folder is named by the commit."""
         self.repo_id, self.folder, self.commit = repo_id, folder, folder.name
         self._cache_dir, self._line = cache_dir, Line(patience)
+        self._here: set[str] = set()
         self._locks: dict[str, threading.Lock] = {}
         self._coming: dict[str, threading.Thread] = {}
 
@@ -63,7 +64,9 @@ class Shelf:
 
     def has(self, name: str) -> bool:
         """Whether a file has been brought."""
-        return (self.folder / name).exists()
+        if name not in self._here and (self.folder / name).exists():
+            self._here.add(name)
+        return name in self._here
 
     def bring(self, name: str) -> Path:
         """A file, which is waited for if it is not here yet.
