@@ -38,11 +38,11 @@ class LossConfig:
     passing: float = 3.0
     """Weight of where and when something thrown will pass, Huber loss in units of
     `PASSING_UNIT`; 0: none."""
-    state: float = 1.0
+    state: float = 20.0
     """Weight of the proprioception reconstruction, mean over the 74 standardised values."""
-    kl_prior: float = 1.0
+    kl_prior: float = 0.1
     """Weight of KL(sg q || p), which pulls the prior to the posterior."""
-    kl_posterior: float = 0.1
+    kl_posterior: float = 0.01
     """Weight of KL(q || sg p), which pulls the posterior to the prior."""
     free_nats: float = 1.0
     """KL below this many nats per step costs nothing."""
@@ -60,7 +60,7 @@ class LossConfig:
     """Weight of the value loss on imagined states."""
     foresight_depth: float = 30.0
     """Weight of the pictures of states imagined several ticks ahead; 0: none."""
-    foresight_state: float = 1.0
+    foresight_state: float = 10.0
     """Weight of the proprioception of states imagined several ticks ahead; 0: none."""
     foresight_motion: float = 10.0
     """Weight of the place of what flies in states imagined several ticks ahead; 0: none."""
@@ -138,6 +138,7 @@ PAPER_LOSS = LossConfig(
     motion=0.0,
     passing=0.0,
     state=float(spec.STATE_DIM),
+    kl_prior=1.0,
     kl_posterior=1.0,
     free_nats=0.0,
     imagined_steps=0,
