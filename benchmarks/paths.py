@@ -7,17 +7,17 @@ and a ball is painted over the last picture where the path leads. The fit is tol
 is: which pixels are the ball's, how old the pictures are, and how the camera will move.
 
 * ``fit``: least squares on the sightings;
-* ``fit, prior``: the same, with the mean and the spread of the training throws as prior.
+* ``prior``: the same, with the mean and the spread of the training throws as prior.
 
     python benchmarks/paths.py --dataset.root=data/ball
 """
 
 from __future__ import annotations
 
+import pathlib
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -35,7 +35,7 @@ from egovcp_train.heldout.open_loop import CONTEXT, HORIZONS
 from egovcp_train.labels.camera import Array
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.labels.flight import in_picture
-from egovcp_train.labels.throw import GRAVITY, Throw, find_throw, sightings_along
+from egovcp_train.labels.throw import GRAVITY, Path, Throw, find_throw, sightings_along
 
 PROG = "paths.py"
 STRIDE: Final = 4  # rows from one start to the next, as in `OpenLoop`
@@ -86,7 +86,9 @@ def measure(config: PathsConfig) -> None:
     train = EpisodeIndex.of([reader], "train")
     prior = prior_of(list(flights(train.spread(config.episodes), config.labels)))
     judged = list(flights(EpisodeIndex.of([reader], "heldout"), config.labels))
-    publish(figures(judged, prior, config.labels), Path(config.json) if config.json else None)
+    publish(
+        figures(judged, prior, config.labels), pathlib.Path(config.json) if config.json else None
+    )
 
 
 def flights(index: EpisodeIndex, config: PassingConfig) -> Iterator[Flight]:
@@ -167,8 +169,7 @@ def foreseen(
     path = fitted(t, flight.point[seen], prior)
     if path is None:
         return None
-    late = then * spec.PLANNER_DT - path[0]
-    at = path[1][:3] + path[1][3:] * late + 0.5 * GRAVITY * late * late
+    at = path.at(then * spec.PLANNER_DT - path.seen[0])
     track = flight.throw.track
     x, left, up = track.rotation[then].T @ (at - track.position[then])
     if x < config.radius + 0.05:
@@ -179,8 +180,8 @@ def foreseen(
     return torch.tensor([[column / half[0], row / half[1], near, _CERTAIN]], dtype=torch.float32)
 
 
-def fitted(t: Array, point: Array, prior: Prior | None) -> tuple[float, Array] | None:
-    """Time of the first sighting (s), and place and velocity then, (6,); None: too few."""
+def fitted(t: Array, point: Array, prior: Prior | None) -> Path | None:
+    """The path of sightings (n, 3) at times (n,), whose t = 0 is the first; None: too few."""
     if len(t) < (1 if prior else 2):
         return None
     since = t - t[0]
@@ -191,7 +192,8 @@ def fitted(t: Array, point: Array, prior: Prior | None) -> tuple[float, Array] |
     right = ((design * weight[:, None]).T @ straight).ravel()
     if prior is not None:
         normal, right = normal + prior.precision, right + prior.precision @ prior.mean
-    return float(t[0]), np.linalg.solve(normal, right)
+    start = np.linalg.solve(normal, right)
+    return Path(start[:3], start[3:], t)
 
 
 if __name__ == "__main__":

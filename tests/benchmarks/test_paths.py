@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from paths import GRAVITY, Flight, errors, fitted, foreseen, prior_of
+from paths import Flight, errors, fitted, foreseen, prior_of
 
 from egovcp import spec
 from egovcp.errors import DataError
@@ -47,7 +47,7 @@ def test_a_path_without_errors_is_found() -> None:
     one = flight()
     found = fitted(one.rows[:3] * spec.PLANNER_DT, one.point[:3], None)
     assert found is not None
-    np.testing.assert_allclose(found[1], np.concatenate([START, VELOCITY]), atol=1e-9)
+    np.testing.assert_allclose([found.position, found.velocity], [START, VELOCITY], atol=1e-9)
 
 
 def test_one_sighting_is_no_path_but_with_a_prior() -> None:
@@ -56,8 +56,8 @@ def test_one_sighting_is_no_path_but_with_a_prior() -> None:
     assert fitted(t, point, None) is None
     found = fitted(t, point, prior_of(throws(30)))
     assert found is not None
-    np.testing.assert_allclose(found[1][:3], START, atol=0.05)
-    np.testing.assert_allclose(found[1][3:], VELOCITY, atol=0.3)
+    np.testing.assert_allclose(found.position, START, atol=0.05)
+    np.testing.assert_allclose(found.velocity, VELOCITY, atol=0.3)
 
 
 def test_a_prior_takes_throws() -> None:
@@ -88,9 +88,3 @@ def test_there_is_no_error_where_nothing_flies() -> None:
     landed = int(np.flatnonzero(one.place[:, 2] > 0)[-1])
     assert not errors(one, landed, 1, None, CONFIG).any()
     assert not errors(one, TICKS - 2, 8, None, CONFIG).any()
-
-
-def test_gravity_is_that_of_the_labels() -> None:
-    path = flight().throw.path
-    assert path is not None
-    np.testing.assert_allclose(path.at(1.0) - START - VELOCITY, 0.5 * GRAVITY)
