@@ -37,6 +37,7 @@ from egovcp_deploy.options import (
     versions,
     write_json,
 )
+from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.policy import RolloutPolicy
 from egovcp_deploy.robots import Robot
 from egovcp_deploy.runner import RolloutSummary, Runner
@@ -116,7 +117,9 @@ def deploy(config: DeployConfig) -> None:
         config = replace(config, env=robot.env.config)  # as decided for its controller
         policy = _make_policy(config, artefact, robot)
         folder = make_output_dir(config.output_dir)
-        runner = Runner(policy, robot, FixedRate(PLANNER_HZ, LockstepClock()), config.imagine)
+        clock = LockstepClock()
+        desk = InlineDesk(Thinker(policy, config.imagine), clock)
+        runner = Runner(desk, robot, FixedRate(PLANNER_HZ, clock))
         _play(config, artefact, robot, runner, folder)
     finally:
         robot.close()
@@ -209,7 +212,8 @@ def _run_info(
 
 
 def _show(bar: Any, tick: Tick) -> None:
-    bar.set_postfix_str(f"tick {tick.index}, plan {tick.timing_ms['plan']:.0f} ms", refresh=False)
+    plan = f", plan {tick.timing_ms['plan']:.0f} ms" if "plan" in tick.timing_ms else ""
+    bar.set_postfix_str(f"tick {tick.index}, {tick.mode}{plan}", refresh=False)
     bar.update(0)
 
 
@@ -233,7 +237,7 @@ def _report(
 
 
 def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
-    p50, p99 = np.percentile(summary.plan_ms, [50, 99])
+    p50, p99 = np.percentile(summary.plan_ms or [0.0], [50, 99])
     return {
         "episode": episode,
         "steps": summary.steps,
@@ -241,6 +245,8 @@ def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
         "success": summary.success,
         "terminated": summary.terminated,
         "rejected_plans": summary.rejected,
+        "held_ticks": summary.held,
+        "damped": summary.damped,
         "overruns": summary.overruns,
         "plan_ms_p50": float(p50),
         "plan_ms_p99": float(p99),
