@@ -19,6 +19,7 @@ from egovcp.sim.scene import build_scene
 from egovcp.sim.sensors import Proprioception
 from egovcp.sim.standing import Standing
 from egovcp.sim.tasks import make_task
+from egovcp.sim.tasks.base import PHYSICS_STEPS_PER_TICK
 from egovcp.spec import (
     CONTROLLER_HZ,
     CONTROLLER_TICKS_PER_PLAN,
@@ -130,14 +131,19 @@ class Lane:
         """One controller tick: physics under the joint targets (J,), then the sensors."""
         if self.done:
             return
-        if self._controller_tick % CONTROLLER_TICKS_PER_PLAN == 0:
-            self.task.begin_tick()
         self.robot.data.ctrl[:] = target
         for _ in range(PHYSICS_STEPS_PER_CONTROLLER_TICK):
-            self.task.step()
-        self._controller_tick += 1
-        if not self.robot.broken:
-            self._sense()
+            self.step()
+
+    def step(self) -> None:
+        """One physics step under what the motors were told; the sensors after every fourth."""
+        if self.task.physics_steps % PHYSICS_STEPS_PER_TICK == 0:
+            self.task.begin_tick()
+        self.task.step()
+        if self.task.physics_steps % PHYSICS_STEPS_PER_CONTROLLER_TICK == 0:
+            self._controller_tick += 1
+            if not self.robot.broken:
+                self._sense()
 
     def _sense(self) -> None:
         self.robot.refresh_poses()
@@ -146,8 +152,10 @@ class Lane:
             self._pictures.append(self._take_picture())
 
     def _take_picture(self) -> NDArray[np.uint16]:
-        if not self._sees:
-            return _EMPTY
+        return self.look() if self._sees else _EMPTY
+
+    def look(self) -> NDArray[np.uint16]:
+        """(H, W) mm: a picture taken now, of body poses that are up to date."""
         depth = self._camera.render(self._view, self.robot.data, self.camera_pitch)
         return self._noise.apply(depth)
 

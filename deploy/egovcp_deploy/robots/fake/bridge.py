@@ -1,0 +1,272 @@
+"""The simulated robot behind the wire: one call of `FakeBridge.step` is 5 ms of its life.
+
+Commands in, physics, a state out; a picture whenever the camera has one. What the motors do
+without commands is this fake's own choice, not knowledge about the robot: after 0.2 s they damp.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import zmq
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.robot.g1 import DAMPING, STIFFNESS
+from egovcp.sim.live import LIMP, LiveRobot, Phase, Servos
+from egovcp.spec import PHYSICS_DT
+from egovcp_deploy.robots.body import BodyState
+from egovcp_deploy.robots.depth_wire import WirePicture, encode_picture
+from egovcp_deploy.robots.fake.faults import Faults
+from egovcp_deploy.robots.remote import Remote
+from egovcp_deploy.robots.wire import (
+    CAMERA_PORT,
+    COMMAND_PORT,
+    MOST_BYTES,
+    STATE_PORT,
+    Garbled,
+    LowCommand,
+    LowState,
+    decode_command,
+    encode_state,
+)
+
+WATCHDOG_S: Final = 0.2
+MODE: Final = 5  # what the fake reports as its mode machine
+_COUNTED_S: Final = 0.5  # how long a program counts as one that sends commands
+_MOST_PER_STEP: Final = 100  # commands taken in within 5 ms; the rest waits
+
+
+@dataclass(frozen=True)
+class Ports:
+    """Where the fake listens; port 0 stands for any that is free."""
+
+    host: str = "127.0.0.1"
+    """Interface; the loopback lets nobody else in."""
+    command_port: int = COMMAND_PORT
+    """Commands."""
+    state_port: int = STATE_PORT
+    """States."""
+    camera_port: int = CAMERA_PORT
+    """Depth pictures, in our own format."""
+
+
+@dataclass
+class Counts:
+    """What came in."""
+
+    commands: int = 0
+    """Obeyed, or replaced by a newer one within the same 5 ms."""
+    garbled: int = 0
+    ignored: int = 0
+    """For another mode machine than the robot's, or motor by motor; a G1 obeys neither."""
+
+
+class FakeBridge:
+    """Serves one `LiveRobot`.
+
+    Args:
+        robot: in an episode (`LiveRobot.start`).
+        ports: where to listen.
+        faults: may be changed at any time.
+        announce: whether states tell how many programs send commands, which LeRobot's bridge
+            does not.
+
+    Raises:
+        EnvironmentFailure: a port is in use.
+    """
+
+    def __init__(
+        self,
+        robot: LiveRobot,
+        ports: Ports | None = None,
+        faults: Faults | None = None,
+        announce: bool = False,
+    ) -> None:
+        self.robot = robot
+        self.faults = faults or Faults()
+        self.counts = Counts()
+        self._announce = announce
+        self._rng = np.random.default_rng(0)
+        self._senders: dict[int, float] = {}
+        self._time = 0.0  # s of simulated time since the start
+        self._last_command = -np.inf
+        self._servos = LIMP
+        self._last_state = b""
+        self._sequence = 0
+        self._shown: tuple[int, int] | None = None
+        self._episode = 0
+        self._context = zmq.Context()
+        wanted = ports or Ports()
+        self._commands = self._bind(zmq.PULL, wanted.host, wanted.command_port)
+        self._states = self._bind(zmq.PUB, wanted.host, wanted.state_port)
+        self._pictures = self._bind(zmq.PUB, wanted.host, wanted.camera_port)
+        ends = (self._commands, self._states, self._pictures)
+        self.ports = Ports(wanted.host, *map(_port, ends))
+        """Where it listens."""
+
+    def _bind(self, kind: int, host: str, port: int) -> zmq.Socket[bytes]:
+        end = self._context.socket(kind)
+        end.setsockopt(zmq.LINGER, 0)
+        end.setsockopt(zmq.SNDHWM, 20)
+        end.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
+        try:
+            end.bind(f"tcp://{host}:{port or '*'}")
+        except zmq.ZMQError as error:
+            end.close()
+            self._context.destroy(linger=0)
+            raise EnvironmentFailure(
+                f"cannot listen at {host}:{port}: {error.strerror}; end what uses the port, "
+                "perhaps another egovcp-fake-g1, or choose another"
+            ) from error
+        return end
+
+    @property
+    def commanded(self) -> bool:
+        """Whether the motors are told to hold anything."""
+        return self._servos is not LIMP and bool(self._servos.stiffness.any())
+
+    @property
+    def time(self) -> float:
+        """s of simulated time since the start, all episodes together."""
+        return self._time
+
+    def next_episode(self) -> None:
+        """Whoever holds the robot has started another episode."""
+        self._episode += 1
+
+    def step(self) -> None:
+        """Let 5 ms pass."""
+        self._listen()
+        self._happen()
+        self.robot.drive(self._intruder() if self.faults.intruder else self._servos)
+        self.robot.advance()
+        self._time += PHYSICS_DT
+        self._publish_state()
+        self._publish_picture()
+
+    def _listen(self) -> None:
+        """Take the newest command that makes sense; without any for too long, damp."""
+        waiting: deque[bytes] = deque()
+        while len(waiting) < _MOST_PER_STEP:
+            try:
+                frame = self._commands.recv(zmq.NOBLOCK, copy=False)
+            except zmq.Again:
+                break
+            self._senders[int(frame.get(zmq.SRCFD))] = self._time
+            waiting.append(frame.bytes)
+        while waiting and not self.faults.deaf:
+            if self._take(waiting.pop()):
+                self.counts.commands += len(waiting)
+                break
+        if self._time - self._last_command > WATCHDOG_S:
+            self._servos = LIMP
+
+    def _take(self, payload: bytes) -> bool:
+        """Whether the command is obeyed."""
+        try:
+            command = decode_command(payload)
+        except Garbled:
+            self.counts.garbled += 1
+            return False
+        if command.motors.mode != self._mode or not command.series:
+            self.counts.ignored += 1
+            return False
+        self.counts.commands += 1
+        self._last_command = self._time
+        self._servos = _servos(command)
+        return True
+
+    @property
+    def _mode(self) -> int:
+        return MODE if self.faults.mode is None else self.faults.mode
+
+    def _happen(self) -> None:
+        """Faults that happen once."""
+        faults = self.faults
+        if faults.push is not None:
+            self.robot.push(np.array([*faults.push, 0.0]))
+            faults.push = None
+        if faults.release:
+            self.robot.release()
+            faults.release = False
+
+    def _intruder(self) -> Servos:
+        """Another program, which holds every joint where it is, a little askew."""
+        joints = self.robot.robot.data.qpos[self.robot.robot.index.joint_qpos]
+        return Servos(joints + 0.1, STIFFNESS, DAMPING)
+
+    def _publish_state(self) -> None:
+        faults = self.faults
+        if faults.mute_state:
+            return
+        if not (faults.freeze_state and self._last_state):
+            self._last_state = self._state()
+        if self._lost():
+            return
+        torn = faults.garble_state and self.robot.steps % 2
+        self._states.send(self._last_state[: len(self._last_state) // 2 if torn else None])
+
+    def _lost(self) -> bool:
+        return self.faults.drop > 0.0 and bool(self._rng.random() < self.faults.drop)
+
+    def _state(self) -> bytes:
+        seen = self.robot.measure()
+        body = BodyState(
+            time_ns=0,
+            joint_position=seen.joint_position,
+            joint_velocity=seen.joint_velocity,
+            quaternion_w=seen.quaternion_w,
+            angular_velocity=seen.angular_velocity,
+            mode=self._mode,
+            remote=Remote.asking_for(self.robot.velocity_wish).to_bytes(),
+        )
+        return encode_state(LowState(body, seen.torque, self._sources()), seen.acceleration)
+
+    def _sources(self) -> int | None:
+        """How many programs send commands."""
+        if not (self._announce or self.faults.announce):
+            return None
+        recent = sum(self._time - last < _COUNTED_S for last in self._senders.values())
+        return recent + self.faults.announce
+
+    def _publish_picture(self) -> None:
+        taken, depth = self.robot.picture
+        if self.faults.mute_camera or (self._episode, taken) == self._shown:
+            return
+        self._shown = (self._episode, taken)
+        if not self.faults.freeze_camera:
+            self._sequence += 1
+            fov = self.robot.config.camera.vertical_fov
+            self._last_picture = encode_picture(WirePicture(self._sequence, fov, depth))
+        if self._sequence and not self._lost():
+            self._pictures.send(self._last_picture)
+
+    @property
+    def over(self) -> bool:
+        """Whether the episode has come to its end."""
+        return self.robot.phase is Phase.OVER
+
+    def close(self) -> None:
+        """Stop listening."""
+        self._context.destroy(linger=0)
+
+
+def _port(end: zmq.Socket[bytes]) -> int:
+    """The port that a socket is bound to."""
+    return int(end.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+
+
+def _servos(command: LowCommand) -> Servos:
+    """What the motors do; one that is not enabled does nothing at all."""
+    on = command.enabled.astype(np.float64)
+    motors = command.motors
+    return Servos(
+        motors.position,
+        on * motors.stiffness,
+        on * motors.damping,
+        command.velocity,
+        on * command.torque,
+    )

@@ -1,0 +1,108 @@
+"""Leads the fake robot through its episodes: crane, settling, task, pause, and again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from egovcp.sim.live import Outcome, Phase
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import PHYSICS_DT
+from egovcp_deploy.robots.fake.bridge import FakeBridge
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """When one thing leads to the next, s of simulated time."""
+
+    gantry: float | None = 3.0
+    """How long the motors must be told to hold something before the crane lets go; None: it
+    waits to be told."""
+    settle: float = 2.0
+    """From there to the beginning of the task."""
+    pause: float = 2.0
+    """From the end of an episode to the next, which begins on the crane."""
+
+
+class Stage:
+    """Plays one scenario after the other.
+
+    Args:
+        bridge: serves the robot.
+        scenarios: number of an episode -> its scenario; None: there are no more.
+        tell: is told what happens, in words.
+    """
+
+    def __init__(
+        self,
+        bridge: FakeBridge,
+        scenarios: Callable[[int], Scenario | None],
+        schedule: Schedule | None = None,
+        tell: Callable[[str], None] = lambda line: None,
+    ) -> None:
+        self._bridge = bridge
+        self._scenarios = scenarios
+        self._schedule = schedule or Schedule()
+        self._tell = tell
+        self.outcomes: list[Outcome] = []
+        """Of the episodes that are over."""
+        self.finished = False
+        """Whether there are no more episodes."""
+        self._start()
+
+    def _start(self) -> None:
+        scenario = self._scenarios(len(self.outcomes))
+        if scenario is None:
+            self.finished = True
+            return
+        self._bridge.robot.start(scenario)
+        self._bridge.next_episode()
+        self._enter(Phase.HELD)
+        self._tell(f"episode {scenario.episode} ({scenario.task}): on the crane")
+
+    def _enter(self, phase: Phase) -> None:
+        self._phase, self._since = phase, 0.0
+
+    def step(self) -> None:
+        """5 ms."""
+        if self.finished:
+            return
+        self._bridge.step()
+        robot = self._bridge.robot
+        if robot.phase is not self._phase:
+            self._enter(robot.phase)
+            self._announce()
+        self._since += PHYSICS_DT
+        if self._phase is Phase.HELD:
+            self._wait_for_commands()
+        elif self._phase is Phase.FREE and self._since >= self._schedule.settle:
+            robot.begin()
+        elif self._phase is Phase.OVER and self._since >= self._schedule.pause:
+            self._start()
+
+    def _wait_for_commands(self) -> None:
+        if not self._bridge.commanded:
+            self._since = 0.0
+        elif self._schedule.gantry is not None and self._since > self._schedule.gantry:
+            self._bridge.robot.release()
+
+    def _announce(self) -> None:
+        if self._phase is Phase.FREE:
+            self._tell("the crane lets go")
+        elif self._phase is Phase.EPISODE:
+            self._tell("the task begins")
+        elif self._phase is Phase.OVER:
+            outcome = self._bridge.robot.outcome
+            self.outcomes.append(outcome)
+            self._tell(spoken(outcome))
+
+
+def spoken(outcome: Outcome) -> str:
+    """An outcome in one paragraph."""
+    verdict = "fell" if outcome.fallen else "success" if outcome.success else "failure"
+    terms = ", ".join(f"{k} {v:+.3f}" for k, v in outcome.reward_terms.items() if v)
+    contacts = ", ".join(f"{part} {force:.0f} N" for part, force in outcome.contacts.items())
+    return (
+        f"{verdict} after {outcome.ticks} ticks, reward {outcome.reward:+.3f} "
+        f"({terms or 'nothing'}); contacts: {contacts or 'none'}"
+    )

@@ -1,0 +1,291 @@
+"""One simulated robot and its task under commands to the motors, in steps of 5 ms.
+
+`VectorEnv` brings its own low-level controller; here whoever holds the wire brings one, as with
+the real robot. Nothing waits: `LiveRobot.advance` lets time pass, in lock-step or on a clock.
+
+    HELD  ->  FREE  ->  EPISODE  ->  OVER
+    crane     stands    task runs    fallen, or at the time limit; physics goes on
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.robot.controllers import make_controller
+from egovcp.robot.g1 import DAMPING
+from egovcp.sim.camera import DepthCamera
+from egovcp.sim.config import EnvConfig
+from egovcp.sim.lane import Lane
+from egovcp.sim.robot import SimulatedRobot
+from egovcp.sim.scenario import Scenario
+from egovcp.sim.scene import PARTS, build_scene
+from egovcp.sim.sensors import Proprioception
+from egovcp.sim.standing import settle
+from egovcp.sim.tasks.base import PHYSICS_STEPS_PER_TICK
+from egovcp.spec import (
+    ACTION_BOX,
+    CONTROLLER_HZ,
+    NUM_JOINTS,
+    PHYSICS_DT,
+    STATE_DIM,
+    STATE_SLICES,
+)
+
+Array = NDArray[np.float64]
+
+GRAVITY: Final = 9.81  # m/s^2
+_PICTURE_STEPS: Final = 6  # 30 ms, nearest to the 30 Hz of a D435i
+
+
+class Phase(Enum):
+    """Where the robot is in its episode."""
+
+    HELD = "held"
+    """A crane holds the pelvis where the robot would stand."""
+    FREE = "free"
+    """The robot is on its own feet; the task has not begun."""
+    EPISODE = "episode"
+    OVER = "over"
+
+
+@dataclass(frozen=True)
+class Servos:
+    """What the motors are told: torque = kp (q* - q) + kd (dq* - dq) + tau, (29,) each."""
+
+    position: Array
+    """rad."""
+    stiffness: Array
+    """N m/rad."""
+    damping: Array
+    """N m s/rad."""
+    velocity: Array = field(default_factory=lambda: np.zeros(NUM_JOINTS))
+    """rad/s."""
+    torque: Array = field(default_factory=lambda: np.zeros(NUM_JOINTS))
+    """N m."""
+
+
+#: Motors that only damp.
+LIMP: Final = Servos(np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS), DAMPING)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """What the sensors of the robot say, with their noise."""
+
+    joint_position: Array
+    """(29,) rad."""
+    joint_velocity: Array
+    """(29,) rad/s."""
+    torque: Array
+    """(29,) N m, as the motors applied it."""
+    quaternion_w: Array
+    """(4,) pelvis, wxyz."""
+    angular_velocity: Array
+    """(3,) rad/s, pelvis frame."""
+    acceleration: Array
+    """(3,) m/s^2, pelvis frame; gravity's share alone."""
+
+
+@dataclass
+class Outcome:
+    """What came of an episode."""
+
+    scenario: Scenario
+    ticks: int = 0
+    """Planner ticks of 40 ms."""
+    success: bool = False
+    fallen: bool = False
+    reward_terms: dict[str, float] = field(default_factory=dict)
+    """Sum of each term. The cost of a pose is that of the pose the robot was in: which one it was
+    told to take is not known here."""
+    contacts: dict[str, float] = field(default_factory=dict)
+    """Part of the robot -> its greatest force on the task's object, N."""
+
+    @property
+    def reward(self) -> float:
+        """Sum of all terms."""
+        return float(sum(self.reward_terms.values()))
+
+
+class LiveRobot:
+    """Plays scenarios with one robot.
+
+    Args:
+        config: scenes, sensors and randomisation; of its controller only the standing pose is
+            used, and whether it walks.
+
+    Raises:
+        UsageError: the configuration makes no sense.
+    """
+
+    def __init__(self, config: EnvConfig) -> None:
+        controller = make_controller(config.controller)
+        self.config = config.for_controller(controller.walks)
+        self._camera = DepthCamera(config.camera)
+        self._standing = settle(build_scene("ball", config.feet), controller)
+        self._lane: Lane | None = None
+
+    def start(self, scenario: Scenario) -> None:
+        """Put the robot on the crane in the scene of ``scenario``, motors limp."""
+        if self._lane is None:
+            self._lane = Lane(self.config, self._camera, self._standing, scenario, pictures=False)
+        else:
+            self._lane.start(scenario)
+        self.phase = Phase.HELD
+        self.steps = 0
+        """Physics steps since `start`."""
+        self.outcome = Outcome(scenario)
+        rng = scenario.rng("proprioception")
+        self._sensors = Proprioception(self.config.sensors, self.robot.index, rng)
+        self._measured = np.zeros(STATE_DIM)
+        self._film: deque[tuple[int, NDArray[np.uint16]]] = deque([(0, self.lane.look())])
+        self.drive(LIMP)
+
+    @property
+    def lane(self) -> Lane:
+        """The episode and its sensors."""
+        assert self._lane is not None, "start an episode first"
+        return self._lane
+
+    @property
+    def robot(self) -> SimulatedRobot:
+        """The physics."""
+        return self.lane.robot
+
+    @property
+    def time(self) -> float:
+        """s since `start`."""
+        return self.steps * PHYSICS_DT
+
+    @property
+    def velocity_wish(self) -> Array:
+        """(3,) base velocity that an operator would ask for now: vx, vy (m/s), yaw rate (rad/s)."""
+        return self.lane.task.velocity_command if self.phase is Phase.EPISODE else np.zeros(3)
+
+    def release(self) -> None:
+        """The crane lets go."""
+        if self.phase is Phase.HELD:
+            self.phase = Phase.FREE
+
+    def begin(self) -> None:
+        """The task begins, around the robot as it stands now."""
+        self.lane.task.place()
+        self.robot.refresh_poses()
+        self.phase = Phase.EPISODE
+
+    def push(self, velocity: Array) -> None:
+        """Change the velocity of the base at once, (3,) m/s, world."""
+        self.robot.data.qvel[:3] += velocity
+
+    def drive(self, servos: Servos) -> None:
+        """Tell the motors what to do until the next call; effort limits hold as ever."""
+        model, physics = self.robot.model, self.lane.physics
+        stiffness = servos.stiffness * physics.stiffness_scale
+        damping = servos.damping * physics.damping_scale
+        model.actuator_gainprm[:, 0] = 1.0
+        model.actuator_biasprm[:, 1] = -stiffness
+        model.actuator_biasprm[:, 2] = -damping
+        feed = stiffness * servos.position + damping * servos.velocity + servos.torque
+        self.robot.data.ctrl[:] = feed
+
+    def advance(self, steps: int = 1) -> None:
+        """Let ``steps`` of 5 ms pass."""
+        for _ in range(steps):
+            if self.phase is Phase.EPISODE:
+                self._step_task()
+            else:
+                self._step_physics()
+            self.steps += 1
+            if self.steps % _PICTURE_STEPS == 0:
+                self.robot.refresh_poses()
+                self._film.append((self.steps, self.lane.look()))
+
+    def _step_physics(self) -> None:
+        self.robot.step()
+        if self.phase is Phase.HELD:
+            data = self.robot.data
+            data.qpos[:7] = self._standing.pelvis
+            data.qvel[:6] = 0.0
+        elif self.phase is Phase.FREE and self.lane.task.has_fallen():
+            self.outcome.fallen = True
+            self.phase = Phase.OVER
+
+    def _step_task(self) -> None:
+        self.lane.step()
+        if self.lane.task.physics_steps % PHYSICS_STEPS_PER_TICK:
+            return
+        totals = self.outcome.reward_terms
+        for name, value in self.lane.end_tick(self._pose()).items():
+            totals[name] = totals.get(name, 0.0) + value
+        self._record()
+        if self.lane.done:
+            self.phase = Phase.OVER
+
+    def _record(self) -> None:
+        lane, outcome = self.lane, self.outcome
+        outcome.ticks, outcome.fallen, outcome.success = (
+            lane.tick,
+            lane.terminated,
+            lane.task.success,
+        )
+        for part, force in zip(PARTS, lane.task.forces.tolist(), strict=True):
+            if force > 0.0:
+                outcome.contacts[part] = max(force, outcome.contacts.get(part, 0.0))
+
+    def _pose(self) -> Array:
+        """(7,) the action that would ask for the pose the robot is in, box units."""
+        robot = self.robot
+        hands = (robot.palms_w - robot.data.qpos[:3]) @ robot.heading
+        pose = np.append(hands.ravel(), robot.pelvis_height)
+        return np.clip(ACTION_BOX.to_normalised(pose), -1.0, 1.0)
+
+    def measure(self) -> Measurement:
+        """A fresh reading of the sensors."""
+        data, state = self.robot.data, self._measured
+        self._sensors.measure(data, state)
+        gravity = state[STATE_SLICES["projected_gravity"]]
+        return Measurement(
+            joint_position=state[STATE_SLICES["joint_position"]].copy(),
+            joint_velocity=state[STATE_SLICES["joint_velocity"]].copy(),
+            torque=data.actuator_force.copy(),
+            quaternion_w=_tilted(data.qpos[3:7], self.robot.rotation, gravity),
+            angular_velocity=state[STATE_SLICES["angular_velocity"]].copy(),
+            acceleration=-GRAVITY * gravity,
+        )
+
+    @property
+    def picture(self) -> tuple[int, NDArray[np.uint16]]:
+        """The newest picture that has come out of the camera, and the step it was taken at.
+
+        It comes out after the delay of the episode, less the 20 ms that a picture waits on
+        average for the planner's tick.
+        """
+        late = max(0, self.lane.image_age - 1) / CONTROLLER_HZ / PHYSICS_DT
+        while len(self._film) > 1 and self._film[1][0] + late <= self.steps:
+            self._film.popleft()
+        return self._film[0]
+
+
+def _tilted(quaternion: Array, rotation: Array, gravity: Array) -> Array:
+    """(4,) ``quaternion``, turned by the least angle after which gravity is as measured (3,).
+
+    For unit vectors near each other, measured g' and true g in the pelvis frame, the rotation
+    vector is g' x g.
+    """
+    w, x, y, z = quaternion.tolist()
+    a, b, c = (np.cross(gravity, -rotation[2]) / 2.0).tolist()
+    out = np.array(
+        [
+            w - x * a - y * b - z * c,
+            x + w * a + y * c - z * b,
+            y + w * b + z * a - x * c,
+            z + w * c + x * b - y * a,
+        ]
+    )
+    return np.asarray(out / np.linalg.norm(out))
