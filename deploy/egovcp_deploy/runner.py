@@ -131,7 +131,7 @@ class Runner:
             action_sent=outcome.sent,
             mode=self._pilot.supervisor.state,
             **_outcome(sensed, outcome, (*self._pilot.events(), *outcome.events)),
-            **_thoughts(reply),
+            **thoughts(reply),
             timing_ms=timing,
         )
 
@@ -175,7 +175,7 @@ def _outcome(sensed: Sensed, outcome: Outcome, events: tuple[str, ...]) -> dict[
     }
 
 
-def _thoughts(reply: Reply | None) -> dict[str, Any]:
+def thoughts(reply: Reply | None) -> dict[str, Any]:
     """The fields of `Tick` that the planner fills; what it does not know is left out."""
     if reply is None:
         return {}

@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
@@ -40,6 +40,10 @@ class Report:
     """(7,) a_{t-1} as it was sent."""
     first: bool = False
     """Whether the recurrence starts here: from zeros, with a_{t-1} neutral."""
+    mode: str = ""
+    """State of the robot's state machine now."""
+    events: tuple[str, ...] = ()
+    """What happened since the last report, for the log."""
 
 
 class Decoded(NamedTuple):
@@ -99,15 +103,18 @@ class Thinker:
         self._imagining = policy if imagine and isinstance(policy, ImaginingPolicy) else None
         self._next_tick: int | None = None
 
-    def think(self, reports: Sequence[Report]) -> Reply:
-        """Take ``reports`` in, in order; plan from the last. A gap between them starts afresh."""
+    def think(self, reports: Sequence[Report], deadline_ns: int | None = None) -> Reply:
+        """Take ``reports`` in, in order; plan from the last. A gap between them starts afresh.
+
+        Nothing is decoded yet: see `decode`.
+        """
         begin = time.perf_counter()
         events = [event for report in reports[:-1] for event in self._take(report)]
         last = reports[-1]
         events += self._begin(last)
         step = self._policy.act(last.depth[None], last.state[None])
         plan_ms = (time.perf_counter() - begin) * 1e3
-        return Reply(last.tick, step, plan_ms, self._decode(step), tuple(events))
+        return Reply(last.tick, step, plan_ms, events=tuple(events))
 
     def _take(self, report: Report) -> list[str]:
         """A report that is too old to plan from."""
@@ -125,12 +132,12 @@ class Thinker:
             self._policy.advance(report.sent[None])
         return [f"planner lost {lost} observations: starts afresh"] if gap else []
 
-    def _decode(self, step: PolicyStep) -> Decoded:
-        """Pictures for the log. They come before the carry advances, for they show o_t."""
+    def decode(self, reply: Reply) -> Reply:
+        """``reply`` with pictures for the log, before the recurrence moves on: they show o_t."""
         if self._imagining is None:
-            return NOTHING_DECODED
-        film = self._imagining.imagine(step.plan, self._imagine)
-        return Decoded(self._imagining.reconstruct()[0], film[0])
+            return reply
+        film = self._imagining.imagine(reply.step.plan, self._imagine)
+        return replace(reply, decoded=Decoded(self._imagining.reconstruct()[0], film[0]))
 
 
 class InlineDesk:
@@ -176,5 +183,5 @@ class InlineDesk:
         if self._ready is None and self._waiting:
             reports = list(self._waiting)
             self._waiting.clear()
-            reply = self._thinker.think(reports)
+            reply = self._thinker.decode(self._thinker.think(reports))
             self._ready = (now_ns + self._delay_ns(reply.tick), reply)

@@ -107,9 +107,17 @@ class Pilot:
         )
 
     # --- at every planner tick -----------------------------------------------------------
-    def report(self, now_ns: int, depth: NDArray[np.uint16], state: NDArray[np.float32]) -> None:
-        """Hand o_t to the planner."""
-        report = Report(self.tick, now_ns, depth, state, self.sent.copy(), self._first)
+    def report(
+        self,
+        now_ns: int,
+        depth: NDArray[np.uint16],
+        state: NDArray[np.float32],
+        events: tuple[str, ...] = (),
+    ) -> None:
+        """Hand o_t to the planner, and ``events`` with it for its log."""
+        mode = self.supervisor.state
+        sent = self.sent.copy()
+        report = Report(self.tick, now_ns, depth, state, sent, self._first, mode, events)
         self._first = False
         self._unanswered.append(report)
         self._desk.submit(report)
