@@ -17,8 +17,7 @@ from egovcp.rate import NS_PER_S, Clock, MonotonicClock
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.live import LiveRobot, Outcome
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import PHYSICS_DT, TASKS
-from egovcp_deploy.options import check_choice, write_json
+from egovcp.spec import PHYSICS_DT
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from egovcp_deploy.robots.fake.faults import WORDS, Faults
 from egovcp_deploy.robots.fake.stage import Schedule, Stage
@@ -101,7 +100,7 @@ def run(config: FakeConfig) -> None:
 
 
 def _check(config: FakeConfig) -> None:
-    check_choice("--task", config.task, TASKS)
+    held_out(config.task, config.seed, 0)
     for name in ("episode", "episodes"):
         if getattr(config, name) < 0:
             raise UsageError(f"--{name}={getattr(config, name)}: expected a number from 0")
@@ -131,7 +130,13 @@ def _live(config: FakeConfig, bridge: FakeBridge, stage: Stage) -> None:
             os._exit(1)
         if config.json and len(stage.outcomes) > written:
             written = len(stage.outcomes)
-            write_json(Path(config.json), [record(outcome) for outcome in stage.outcomes])
+            _write(config.json, stage.outcomes)
+
+
+def _write(path: str, outcomes: Sequence[Outcome]) -> None:
+    from egovcp_deploy.options import write_json  # which needs torch: 3 s
+
+    write_json(Path(path), [record(outcome) for outcome in outcomes])
 
 
 class Pace:
