@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from egovcp.plan import PolicyStep
 from egovcp.rate import Clock
+from egovcp.spec import ACTION_DIM, DEPTH_COLS, DEPTH_ROWS, STATE_DIM, STATE_SLICES
 from egovcp_deploy.policy import ImaginingPolicy, RolloutPolicy
 
 BACKLOG: Final = 8  # reports that may wait for a busy planner; older ones are lost
@@ -115,6 +116,16 @@ class Thinker:
         step = self._policy.act(last.depth[None], last.state[None])
         plan_ms = (time.perf_counter() - begin) * 1e3
         return Reply(last.tick, step, plan_ms, events=tuple(events))
+
+    def warm_up(self) -> None:
+        """Plan and decode once for nothing: the first time takes long."""
+        state = np.zeros(STATE_DIM, np.float32)
+        state[STATE_SLICES["projected_gravity"].stop - 1] = -1.0
+        blind = np.zeros((DEPTH_ROWS, DEPTH_COLS), np.uint16)
+        nothing = Report(0, 0, blind, state, np.zeros(ACTION_DIM), first=True)
+        for _ in range(2):
+            self.decode(self.think([nothing]))
+        self._next_tick = None
 
     def _take(self, report: Report) -> list[str]:
         """A report that is too old to plan from."""
