@@ -1,0 +1,134 @@
+"""An `Eye` at the other end of a wire: pictures of `depth_wire` over ZMQ."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import socket
+import threading
+import time
+from dataclasses import dataclass
+from typing import Final
+
+import zmq
+
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.sim.config import CameraConfig
+from egovcp_deploy.robots.body import Picture
+from egovcp_deploy.robots.depth_wire import PICTURE_BYTES, decode_picture
+from egovcp_deploy.robots.wire import CAMERA_PORT, Garbled
+
+_POLL_MS: Final = 50
+_PROBE_S: Final = 1.0
+_FOV_SLACK: Final = math.radians(1.0)
+_START: Final = "start egovcp-depth-server where the camera is, or egovcp-fake-g1 without a robot"
+
+
+@dataclass(frozen=True)
+class ZmqEyeConfig:
+    """Where pictures come from."""
+
+    host: str = "127.0.0.1"
+    """Machine of the depth server."""
+    port: int = CAMERA_PORT
+    """Its port."""
+    vertical_fov: float = CameraConfig.vertical_fov
+    """Field of view that the pictures must have, rad: the policy's."""
+
+    def __post_init__(self) -> None:
+        if not 0 < self.port < 65536:
+            raise UsageError(f"a port is a number from 1 to 65535, found {self.port}")
+
+
+class ZmqEye:
+    """Receives in a thread of its own; `read` looks at the newest. Call `connect` first."""
+
+    def __init__(self, config: ZmqEyeConfig | None = None) -> None:
+        self.config = config or ZmqEyeConfig()
+        self.pictures = self.repeated = self.garbled = 0
+        self.problem = ""
+        """What was wrong with the last message that was dropped."""
+        self._newest: Picture | None = None
+        self._sequence: int | None = None
+        self._stop = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def connect(self, timeout: float = 5.0) -> None:
+        """Wait for the first picture.
+
+        Raises:
+            EnvironmentFailure: none came within ``timeout`` s, or of another field of view.
+        """
+        self._context = zmq.Context()
+        end = self._context.socket(zmq.SUB)
+        for option, value in (
+            (zmq.CONFLATE, 1),
+            (zmq.MAXMSGSIZE, PICTURE_BYTES),
+            (zmq.LINGER, 0),
+            (zmq.HEARTBEAT_IVL, 200),
+            (zmq.HEARTBEAT_TIMEOUT, 1000),
+        ):
+            end.setsockopt(option, value)
+        end.setsockopt(zmq.SUBSCRIBE, b"")
+        end.connect(f"tcp://{self.config.host}:{self.config.port}")
+        self._thread = threading.Thread(target=self._listen, args=(end,), daemon=True)
+        self._thread.start()
+        deadline = time.monotonic() + timeout
+        while self._newest is None and time.monotonic() < deadline:
+            time.sleep(0.005)
+        if self._newest is None:
+            diagnosis = self._diagnosis(timeout)
+            self.close()
+            raise EnvironmentFailure(diagnosis)
+
+    def _listen(self, end: zmq.Socket[bytes]) -> None:
+        with contextlib.closing(end):
+            while not self._stop.is_set():
+                if end.poll(_POLL_MS):
+                    self._take(end.recv(), time.monotonic_ns())
+
+    def _take(self, frame: bytes, time_ns: int) -> None:
+        try:
+            picture = decode_picture(frame)
+            if abs(picture.vertical_fov - self.config.vertical_fov) > _FOV_SLACK:
+                raise Garbled(
+                    f"a vertical field of view of {math.degrees(picture.vertical_fov):.1f} deg, "
+                    f"expected {math.degrees(self.config.vertical_fov):.1f}"
+                )
+        except Garbled as error:
+            self.garbled += 1
+            self.problem = str(error)
+            return
+        if picture.sequence == self._sequence:
+            self.repeated += 1
+            return
+        self.pictures += 1
+        self._sequence = picture.sequence
+        self._newest = Picture(time_ns, picture.depth)
+
+    def read(self) -> Picture | None:
+        """The newest picture; its time is that of its arrival, whenever it is read."""
+        return self._newest
+
+    def _diagnosis(self, timeout: float) -> str:
+        config = self.config
+        where = f"{config.host}:{config.port}"
+        if self.garbled:
+            return (
+                f"{self.garbled} messages from {where}, none a picture that we can use: "
+                f"{self.problem}; {_START}"
+            )
+        try:
+            socket.create_connection((config.host, config.port), _PROBE_S).close()
+        except OSError as error:
+            reason = error.strerror or "no answer"
+            return f"no depth camera at {where} ({reason}); {_START}"
+        return f"no picture from {where} within {timeout:g} s, although something listens there"
+
+    def close(self) -> None:
+        """End the thread; further calls do nothing."""
+        if self._thread is None or self._stop.is_set():
+            return
+        self._stop.set()
+        self._thread.join()
+        self._context.term()
