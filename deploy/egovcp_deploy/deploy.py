@@ -8,7 +8,7 @@ from typing import Final
 
 from egovcp.artefact import Artefact
 from egovcp.cli import run_command
-from egovcp.errors import UsageError
+from egovcp.errors import EgovcpError, UsageError
 from egovcp.spec import TASKS
 from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
@@ -31,9 +31,9 @@ DRIVERS: Final = (PLANNER, *REFERENCES)
 _EPILOG: Final = (
     "In simulation rollout i plays held-out scenario i of --seed, the same that egovcp-eval plays. "
     "Writes rollout-<i>.mcap, rollout-<i>.rrd, a picture rollout-0.png, and deploy.json, which "
-    "sums up the rollouts that came to their end, also when the others were interrupted. On a robot "
-    "the first Ctrl-C holds it, the second damps its motors: a standing robot sinks. Exit code 6: "
-    "the motors were damped for safety."
+    "sums up the rollouts that came to their end, also when the others were interrupted. On a "
+    "robot the first Ctrl-C holds it, the second damps its motors: a standing robot sinks. Exit "
+    "code 6: the motors were damped for safety."
 )
 
 
@@ -87,18 +87,17 @@ def _check(config: DeployConfig) -> None:
 def _findings(config: DeployConfig) -> Iterator[dry_run.Finding]:
     """All that a run needs, each looked at even if another fails."""
     yield dry_run.examine("disk", lambda: dry_run.disk(Path(config.output_dir)))
-    artefacts: list[Artefact] = []
-
-    def load() -> str:
-        artefacts.append(load_policy(config.policy, config.planner))
-        return f"{artefacts[0].path}, for the controller {artefacts[0].controller_id}"
-
+    artefact: Artefact | None = None
     if config.controller == PLANNER:
-        yield dry_run.examine("policy", load)
-    for artefact in artefacts:
-        policy = artefact.make_policy(1, config.seed)
-        yield dry_run.examine("planner", lambda policy=policy: dry_run.plan_time(policy))
-    artefact = artefacts[0] if artefacts else None
+        try:
+            artefact = load_policy(config.policy, config.planner)
+        except EgovcpError as error:
+            yield dry_run.Finding("policy", "", error)
+        else:
+            made_for = f"{artefact.path}, for the controller {artefact.controller_id}"
+            policy = artefact.make_policy(1, config.seed)
+            yield dry_run.Finding("policy", made_for)
+            yield dry_run.examine("planner", lambda: dry_run.plan_time(policy))
     if config.robot.type == SIM:
         yield dry_run.examine("robot", lambda: _simulated(config, artefact))
     else:

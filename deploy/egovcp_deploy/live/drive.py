@@ -17,7 +17,7 @@ from egovcp.log.tick import Tick
 from egovcp.robot.controllers import make_controller
 from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.hardware import HardwareOptions, open_eye
+from egovcp_deploy.live.hardware import CAMERAS, HardwareOptions, open_eye
 from egovcp_deploy.live.operators import OPERATORS, operator
 from egovcp_deploy.live.run import LiveSetup, run_live
 from egovcp_deploy.live.session import LiveSummary
@@ -30,6 +30,7 @@ from egovcp_deploy.robots.bridge import BridgeBody
 def check_live(config: DeployConfig) -> None:
     """Raise `UsageError` for options that make no sense on the wall clock."""
     check_choice("--operator.type", config.operator.type, OPERATORS)
+    check_choice("--robot.camera.type", config.robot.camera.type, CAMERAS)
     if not np.isfinite(config.operator.velocity).all():
         raise UsageError(f"--operator.velocity={config.operator.velocity}: expected numbers")
     if not config.operator.duration >= 0:
@@ -119,9 +120,7 @@ def _print(summary: LiveSummary, folder: Path) -> None:
     print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
 
 
-def examine_hardware(
-    config: DeployConfig, artefact: Artefact | None
-) -> Iterator[dry_run.Finding]:
+def examine_hardware(config: DeployConfig, artefact: Artefact | None) -> Iterator[dry_run.Finding]:
     """Controller, robot and camera."""
 
     def controller() -> str:

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Final
 
 from egovcp_deploy.robots.body import Eye
 from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
+from egovcp_deploy.robots.realsense_eye import RealSenseEye, RealSenseEyeConfig
 from egovcp_deploy.robots.zmq_eye import ZmqEye, ZmqEyeConfig
+
+CAMERAS: Final = ("server", "realsense")
 
 
 @dataclass(frozen=True)
 class CameraOptions:
     """Which depth camera."""
 
+    type: str = "server"
+    """server: one that sends pictures, egovcp-depth-server or egovcp-fake-g1. realsense: one at
+    this machine."""
     server: ZmqEyeConfig = field(default_factory=ZmqEyeConfig)
-    """A depth server, such as that of egovcp-fake-g1."""
+    """Where the server is."""
+    realsense: RealSenseEyeConfig = field(default_factory=RealSenseEyeConfig)
+    """Which RealSense camera."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +70,8 @@ def open_eye(options: CameraOptions) -> Eye:
     Raises:
         EnvironmentFailure: it does not answer.
     """
+    if options.type == "realsense":
+        return RealSenseEye.connect(options.realsense)
     eye = ZmqEye(options.server)
     eye.connect()
     return eye
