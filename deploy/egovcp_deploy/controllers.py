@@ -120,6 +120,9 @@ class Scripted:
         action = self._controller.act(self._robot.env, Observation(depth, state))
         return PolicyStep(np.asarray(action, np.float32), none, none, none, none, none, 0)
 
+    def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
+        """References keep no state of what they saw."""
+
     def advance(self, sent: NDArray[np.floating]) -> None:
         """Hand on what was sent."""
         self._controller.advance(np.asarray(sent, np.float64))

@@ -24,6 +24,10 @@ class RolloutPolicy(Protocol):
         """Depth (E, 48, 64) mm and state (E, 74) -> plans."""
         ...
 
+    def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
+        """Take depth (E, 48, 64) mm and state (E, 74) in, in the place of `act`: no plan needed."""
+        ...
+
     def advance(self, sent: NDArray[np.floating]) -> None:
         """The actions (E, 7) that were really sent."""
         ...

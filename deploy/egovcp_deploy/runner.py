@@ -1,8 +1,8 @@
-"""The closed loop of one rollout: observe, filter and plan, make safe, act, log.
+"""The closed loop of one rollout in lock-step: observe, plan, make safe, act, log.
 
-    o_t -> policy.act -> a_t planned -> safety -> robot.act -> a_t sent -> policy.advance
+    o_t -> pilot.report -> planner -> pilot.decide -> robot.act -> a_t sent -> o_{t+1}
 
-The recurrence of the world model advances with the action that was really sent.
+The planner is told with o_{t+1} what was really sent, and its recurrence advances with that.
 """
 
 from __future__ import annotations
@@ -10,22 +10,19 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, Final
 
 from egovcp.log.sink import Sink
 from egovcp.log.tick import Candidates, Tick
 from egovcp.plan import PolicyStep
 from egovcp.rate import FixedRate
 from egovcp.spec import ACTION_BOX
-from egovcp_deploy.policy import ImaginingPolicy, RolloutPolicy
+from egovcp_deploy.pilot.desk import Desk, Reply
+from egovcp_deploy.pilot.pilot import REJECTED, Pilot
+from egovcp_deploy.pilot.states import Limits, Request, State
 from egovcp_deploy.robots.base import Outcome, Robot, Sensed
-from egovcp_deploy.safety import SafetyFilter
 
 LOGGED_CANDIDATES: Final = 32  # best first; more would hide the picture
-REJECTED: Final = "plan rejected: not finite"
 
 
 @dataclass
@@ -39,11 +36,15 @@ class RolloutSummary:
     terminated: bool = False
     truncated: bool = False
     rejected: int = 0
-    """Plans that were not finite and were replaced."""
+    """Plans that were not finite and were not used."""
+    held: int = 0
+    """Ticks on HOLD."""
+    damped: str = ""
+    """Why the motors were damped; empty: they were not."""
     overruns: int = 0
     """Ticks that took longer than their period."""
     plan_ms: list[float] = field(default_factory=list)
-    """Time to filter and plan, per tick."""
+    """Time to filter and plan, per plan."""
 
     @property
     def over(self) -> bool:
@@ -57,43 +58,43 @@ class RolloutSummary:
         self.success = tick.success
         self.terminated, self.truncated = tick.terminated, tick.truncated
         self.rejected += REJECTED in tick.events
-        self.plan_ms.append(tick.timing_ms["plan"])
+        self.held += tick.mode == State.HOLD
+        if "plan" in tick.timing_ms:
+            self.plan_ms.append(tick.timing_ms["plan"])
 
 
 class Runner:
-    """Drives one robot with one policy.
+    """Drives one robot with one planner.
 
     Args:
-        policy: decides for one robot.
-        robot: lock-step simulation or hardware.
+        desk: where the planner is, for one robot.
+        robot: in lock-step: time passes in its ``act``.
         rate: paces the loop; its clock gives each tick's time.
-        imagine: how many ticks ahead to decode for the log, of a policy that can imagine; 0
-            decodes nothing.
         max_ticks: end of a rollout on a robot that knows no time limit.
+        limits: of the state machine.
+        operator: asked once per tick, with the tick's number, for a request.
     """
 
     def __init__(
         self,
-        policy: RolloutPolicy,
+        desk: Desk,
         robot: Robot,
         rate: FixedRate,
-        imagine: int = 16,
         max_ticks: int | None = None,
+        limits: Limits | None = None,
+        operator: Callable[[int], Request | None] = lambda tick: None,
     ) -> None:
-        self._policy = policy
         self._robot = robot
         self._rate = rate
-        self._imagine = imagine
-        self._imagining = policy if imagine and isinstance(policy, ImaginingPolicy) else None
         self._max_ticks = max_ticks
-        self._safety = SafetyFilter()
+        self._operator = operator
+        self._pilot = Pilot(desk, limits, State.ARMED)
 
     def run(
         self, sink: Sink, on_tick: Callable[[Tick], None] = lambda tick: None
     ) -> RolloutSummary:
         """Play the episode that the robot has started; ``sink`` is open."""
-        self._policy.reset()
-        self._safety.reset()
+        self._pilot.restart()
         self._rate.start()
         begin_ns = self._rate.clock.now_ns()
         summary = RolloutSummary()
@@ -103,30 +104,47 @@ class Runner:
             summary.add(tick)
             on_tick(tick)
             summary.overruns += self._rate.wait() > 0
+        if self._pilot.supervisor.stopped_for_safety:
+            summary.damped = self._pilot.supervisor.reason
         return summary
 
     def _tick(self, index: int, time_ns: int) -> Tick:
         stopwatch = Stopwatch()
         sensed = self._robot.observe()
         stopwatch.lap("observe")
-        step = self._policy.act(sensed.depth[None], sensed.state[None])
-        stopwatch.lap("plan")
-        decoded = self._decode(step)
-        stopwatch.lap("decode")
-        safe = self._safety.filter(step.action)
-        outcome = self._robot.act(safe.action[0])
-        self._policy.advance(outcome.sent[None])
+        reply = self._consult(index, sensed)
+        stopwatch.lap("think")
+        planned = reply.step.action[0] if reply else None
+        wanted = self._pilot.decide()
+        outcome = self._robot.act(wanted)
+        self._pilot.sent = outcome.sent
         stopwatch.lap("robot")
-        events = (*outcome.events, *((REJECTED,) if safe.rejected[0] else ()))
-        seen = _Moment(index, time_ns, sensed, step, decoded, outcome, events, stopwatch.laps_ms)
-        return seen.tick()
+        timing = dict(stopwatch.laps_ms)
+        if reply is not None:
+            timing["plan"] = reply.plan_ms
+        return Tick(
+            index=index,
+            time_ns=time_ns,
+            depth=sensed.depth,
+            state=sensed.state,
+            action_planned=wanted if planned is None else planned,
+            action_sent=outcome.sent,
+            mode=self._pilot.supervisor.state,
+            **_outcome(sensed, outcome, (*self._pilot.events(), *outcome.events)),
+            **thoughts(reply),
+            timing_ms=timing,
+        )
 
-    def _decode(self, step: PolicyStep) -> _Decoded:
-        """Pictures for the log. They come before the carry advances, for they show o_t."""
-        if self._imagining is None:
-            return _Decoded(None, None)
-        film = self._imagining.imagine(step.plan, self._imagine)
-        return _Decoded(self._imagining.reconstruct()[0], film[0])
+    def _consult(self, index: int, sensed: Sensed) -> Reply | None:
+        """Judge the situation and ask the planner; its reply, if it comes before the tick ends."""
+        pilot, now = self._pilot, self._rate.clock.now_ns()
+        pilot.sense(now, sensed.state, sensed.depth)
+        before = pilot.supervisor.state
+        state = pilot.judge(now, Request.RUN if index == 0 else self._operator(index))
+        if state is State.DAMP and before is not State.DAMP:
+            self._robot.damp()
+        pilot.report(now, sensed.depth, sensed.state)
+        return pilot.collect(now + self._rate.period_ns)
 
 
 class Stopwatch:
@@ -143,51 +161,33 @@ class Stopwatch:
         self._last = now
 
 
-class _Decoded(NamedTuple):
-    """Depth pictures decoded for the log, m."""
+def _outcome(sensed: Sensed, outcome: Outcome, events: tuple[str, ...]) -> dict[str, Any]:
+    """The fields of `Tick` that the robot fills."""
+    return {
+        "reward": outcome.reward,
+        "reward_terms": outcome.reward_terms,
+        "terminated": outcome.terminated,
+        "truncated": outcome.truncated,
+        "success": outcome.success,
+        "base": sensed.base,
+        "scene": sensed.scene,
+        "events": events,
+    }
 
-    reconstructed: NDArray[np.float32] | None
-    imagined: NDArray[np.float32] | None
 
-
-@dataclass(frozen=True)
-class _Moment:
-    """The parts that make a `Tick`."""
-
-    index: int
-    time_ns: int
-    sensed: Sensed
-    step: PolicyStep
-    decoded: _Decoded
-    outcome: Outcome
-    events: tuple[str, ...]
-    timing_ms: dict[str, float]
-
-    def tick(self) -> Tick:
-        step, outcome = self.step, self.outcome
-        return Tick(
-            index=self.index,
-            time_ns=self.time_ns,
-            depth=self.sensed.depth,
-            state=self.sensed.state,
-            action_planned=step.action[0],
-            action_sent=outcome.sent,
-            depth_reconstructed=self.decoded.reconstructed,
-            depth_imagined=self.decoded.imagined,
-            plan=step.plan[0] if step.plan.size else None,
-            candidates=_candidates(step) if step.candidates.size else None,
-            value=float(step.value[0]) if step.value.size else None,
-            termination=float(step.termination[0]) if step.termination.size else None,
-            reward=outcome.reward,
-            reward_terms=outcome.reward_terms,
-            terminated=outcome.terminated,
-            truncated=outcome.truncated,
-            success=outcome.success,
-            timing_ms=self.timing_ms,
-            base=self.sensed.base,
-            scene=self.sensed.scene,
-            events=self.events,
-        )
+def thoughts(reply: Reply | None) -> dict[str, Any]:
+    """The fields of `Tick` that the planner fills; what it does not know is left out."""
+    if reply is None:
+        return {}
+    step, decoded = reply.step, reply.decoded
+    return {
+        "depth_reconstructed": decoded.reconstructed,
+        "depth_imagined": decoded.imagined,
+        "plan": step.plan[0] if step.plan.size else None,
+        "candidates": _candidates(step) if step.candidates.size else None,
+        "value": float(step.value[0]) if step.value.size else None,
+        "termination": float(step.termination[0]) if step.termination.size else None,
+    }
 
 
 def _candidates(step: PolicyStep) -> Candidates:

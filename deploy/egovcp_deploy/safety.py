@@ -55,6 +55,15 @@ class SafetyFilter:
         self._last = np.clip(self._last + change, -1.0, 1.0)
         return Filtered(self._last.copy(), rejected)
 
+    def ease(self) -> Array:
+        """(E, 7) the next action on every robot's way to the neutral pose, as sent."""
+        self._last = self._last - np.clip(self._last, -HOLD_RATE, HOLD_RATE)
+        return self._last.copy()
+
+    def repeat(self) -> Array:
+        """(E, 7) the last action once more, as sent."""
+        return self._last.copy()
+
     @property
     def holding(self) -> NDArray[np.bool_]:
         """(E,) robots that have lost their planner and ease to neutral."""

@@ -122,7 +122,9 @@ def _tick(index: int, time_ns: int, messages: Mapping[str, Any]) -> Tick:
         base=_base(messages.get(Topic.BASE)),
         scene=_scene(messages.get(Topic.SCENE)),
         events=tuple(log.msg.split("\n")) if log else (),
-        **flags,
+        terminated=flags["terminated"],
+        truncated=flags["truncated"],
+        success=flags["success"],
     )
 
 

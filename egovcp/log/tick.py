@@ -89,3 +89,5 @@ class Tick:
     scene: tuple[SceneObject, ...] = ()
     events: tuple[str, ...] = ()
     """Human-readable lines: throws, contacts, faults."""
+    mode: str = ""
+    """State of the runner's state machine, such as ``run``; empty: there is none."""

@@ -60,8 +60,8 @@ class Policy:
         self._warm[index] = 0.0
 
     @torch.no_grad()
-    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
-        """Depth (E, 48, 64) mm and state (E, 74) -> the plan from here."""
+    def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
+        """Take depth (E, 48, 64) mm and state (E, 74) into the recurrence, without planning."""
         self._carry = self.model.observe(
             self._carry,
             self._sent,
@@ -70,6 +70,11 @@ class Policy:
             self._first,
         )
         self._first = torch.zeros_like(self._first)
+
+    @torch.no_grad()
+    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+        """Depth (E, 48, 64) mm and state (E, 74) -> the plan from here."""
+        self.observe(depth, state)
         plan = plan_cem(
             self.model,
             self._carry,

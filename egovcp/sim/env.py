@@ -246,6 +246,10 @@ class VectorEnv:
         for pending in [self._pool.submit(work, rows) for rows in chunks]:
             pending.result()
 
+    def damp(self, row: int) -> None:
+        """Damp the motors of ``row`` until its next episode, whatever the controller says."""
+        self.lanes[row].robot.damp()
+
     def snapshot(self) -> Truth:
         """The simulator's truth now: for oracles, probes and logs, never for a policy."""
         return snapshot(self.lanes)

@@ -75,6 +75,11 @@ class SimulatedRobot:
         self.data.qpos[:7] = pelvis
         self.data.qpos[self.index.joint_qpos] = joint_position
 
+    def damp(self) -> None:
+        """Let the servos only damp, until an episode's physics are applied again."""
+        self.model.actuator_gainprm[:, 0] = 0.0
+        self.model.actuator_biasprm[:, 1] = 0.0
+
     def forward(self) -> None:
         """Bring positions, contacts and velocities up to date with the state."""
         mujoco.mj_forward(self.model, self.data)

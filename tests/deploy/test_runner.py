@@ -10,9 +10,11 @@ from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.tick import Tick
 from egovcp.plan import PolicyStep
 from egovcp.rate import FixedRate, LockstepClock
-from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM
+from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM, STATE_SLICES
+from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.pilot.pilot import REJECTED
 from egovcp_deploy.robots import Outcome, Sensed
-from egovcp_deploy.runner import LOGGED_CANDIDATES, REJECTED, Runner
+from egovcp_deploy.runner import LOGGED_CANDIDATES, Runner
 
 
 class PlainPolicy:
@@ -40,6 +42,9 @@ class PlainPolicy:
         one = np.ones(1, np.float32)
         return PolicyStep(plan[:, 0], plan, 0.5 * one, 0.1 * one, candidates, values, 3)
 
+    def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
+        self.act(depth, state)
+
     def advance(self, sent: NDArray[np.floating]) -> None:
         self.sent.append(sent.copy())
 
@@ -63,13 +68,17 @@ class FakeRobot:
     def __init__(self, limit: int = 5) -> None:
         self.limit = limit
         self.count = 0
+        self.damped = False
 
     def start(self, episode: int) -> None:
         self.count = 0
 
     def observe(self) -> Sensed:
         picture = np.full((48, 64), 1000 + self.count, np.uint16)
-        return Sensed(picture, np.zeros(STATE_DIM, np.float32))
+        state = np.zeros(STATE_DIM, np.float32)
+        state[STATE_SLICES["projected_gravity"].stop - 1] = -1.0
+        state[STATE_SLICES["joint_velocity"]] = self.count  # no reading is like the one before
+        return Sensed(picture, state)
 
     def act(self, action: NDArray[np.float64]) -> Outcome:
         assert np.isfinite(action).all()
@@ -80,6 +89,9 @@ class FakeRobot:
             truncated=self.count >= self.limit,
             success=self.count == self.limit,
         )
+
+    def damp(self) -> None:
+        self.damped = True
 
     def close(self) -> None:
         pass
@@ -101,8 +113,12 @@ class Memory:
         pass
 
 
-def runner(policy: PlainPolicy, robot: FakeRobot, **options: int | None) -> Runner:
-    return Runner(policy, robot, FixedRate(25, LockstepClock(time_ns=123)), **options)
+def runner(
+    policy: PlainPolicy, robot: FakeRobot, imagine: int = 16, max_ticks: int | None = None
+) -> Runner:
+    clock = LockstepClock(time_ns=123)
+    desk = InlineDesk(Thinker(policy, imagine), clock)
+    return Runner(desk, robot, FixedRate(25, clock), max_ticks)
 
 
 def test_a_tick_holds_the_observation_the_action_on_it_and_what_followed() -> None:
@@ -127,8 +143,8 @@ def test_a_tick_holds_the_observation_the_action_on_it_and_what_followed() -> No
 def test_the_recurrence_advances_with_what_was_really_sent() -> None:
     policy, memory = FakePolicy([0.3] * 5), Memory()
     runner(policy, FakeRobot()).run(memory)
-    assert len(policy.sent) == 5
-    for sent, tick in zip(policy.sent, memory.ticks, strict=True):
+    assert len(policy.sent) == 4  # the last action has no observation after it
+    for sent, tick in zip(policy.sent, memory.ticks, strict=False):
         np.testing.assert_array_equal(sent[0], tick.action_sent)
 
 
@@ -136,7 +152,7 @@ def test_actions_pass_the_safety_filter_before_the_robot() -> None:
     policy, memory = FakePolicy([5.0, np.nan, 5.0, 5.0, 5.0]), Memory()
     summary = runner(policy, FakeRobot()).run(memory)
     sent = [float(tick.action_sent[0]) * 2 for tick in memory.ticks]
-    np.testing.assert_allclose(sent, [0.32, 0.32, 0.64, 0.96, 1.0])
+    np.testing.assert_allclose(sent, [0.32, 0.64, 0.96, 1.0, 1.0])  # the plan before goes on
     assert [REJECTED in tick.events for tick in memory.ticks] == [False, True, False, False, False]
     assert summary.rejected == 1
 
@@ -194,5 +210,6 @@ def test_overruns_are_counted(late_ms: int) -> None:
             clock.advance(late_ms * 1_000_000)
             return super().act(action)
 
-    loop = Runner(FakePolicy([0.0] * 5), Slow(), FixedRate(25, clock))
+    desk = InlineDesk(Thinker(FakePolicy([0.0] * 5)), clock)
+    loop = Runner(desk, Slow(), FixedRate(25, clock))
     assert loop.run(Memory()).overruns == (5 if late_ms else 0)

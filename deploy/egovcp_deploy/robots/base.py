@@ -64,6 +64,10 @@ class Robot(Protocol):
         """Send an action (7,) that has passed the safety filter."""
         ...
 
+    def damp(self) -> None:
+        """Damp the motors until the next `start`, whatever is sent: a standing robot sinks."""
+        ...
+
     def close(self) -> None:
         """Release what the robot holds; further calls do nothing."""
         ...

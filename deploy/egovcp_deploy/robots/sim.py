@@ -98,6 +98,10 @@ class SimRobot:
         self._reported.update(fresh)
         return fresh
 
+    def damp(self) -> None:
+        """Damp the simulated motors until the next `start`."""
+        self._env.damp(0)
+
     def close(self) -> None:
         """End the simulator's threads."""
         self._env.close()

@@ -1,0 +1,76 @@
+"""Options of `egovcp-deploy`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from egovcp.sim.config import EnvConfig, eventful
+from egovcp_deploy.live.hardware import CameraOptions
+from egovcp_deploy.options import PLANNER, PlannerOptions, PolicyOptions
+from egovcp_deploy.pilot.states import Limits
+from egovcp_deploy.robots.bridge import BridgeConfig
+
+
+@dataclass(frozen=True)
+class RobotOptions:
+    """Which robot."""
+
+    type: str = "sim"
+    """sim: the simulated G1, in lock-step with the planner. unitree_g1: a G1, or egovcp-fake-g1,
+    behind LeRobot's bridge, on the wall clock."""
+    controller: str = "walk"
+    """Low-level controller of a unitree_g1: walk, stance, or the file of a trained one; the one of
+    the policy's data. The simulated robot has --env.controller."""
+    bridge: BridgeConfig = field(default_factory=BridgeConfig)
+    """Where the bridge of a unitree_g1 is."""
+    camera: CameraOptions = field(default_factory=CameraOptions)
+    """The depth camera of a unitree_g1."""
+    limits: Limits = field(default_factory=Limits)
+    """When the robot is held, and when its motors are damped."""
+
+
+@dataclass(frozen=True)
+class OperatorOptions:
+    """Who says when to stand, arm, run, hold and stop; on a G1 its remote control always may."""
+
+    type: str = "auto"
+    """auto: stands up, arms and runs by itself. keyboard: the keys of this terminal."""
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """What auto asks for while running: vx, vy (m/s), yaw rate (rad/s)."""
+    duration: float = 0.0
+    """How long auto runs before it holds and ends, s; 0: until interrupted."""
+
+
+@dataclass(frozen=True)
+class DeployConfig:
+    """Drive a robot with a policy artefact at 25 Hz and record each rollout.
+
+    --controller=oracle shows how a task is solved, with no artefact at all.
+    """
+
+    policy: PolicyOptions = field(default_factory=PolicyOptions)
+    """The policy artefact; not needed without the controller `planner`."""
+    controller: str = PLANNER
+    """Who drives: planner, or in simulation a reference that needs no artefact: hold (neutral
+    pose), random (the data's walk) or oracle (scripted, sees the truth)."""
+    planner: PlannerOptions = field(default_factory=PlannerOptions)
+    """Changes to the artefact's planner."""
+    robot: RobotOptions = field(default_factory=RobotOptions)
+    """The robot."""
+    operator: OperatorOptions = field(default_factory=OperatorOptions)
+    """Who drives a unitree_g1."""
+    dry_run: bool = False
+    """Only check what a run needs, line by line, and say go or no-go; nothing moves."""
+    task: str = "ball"
+    """Scene of the simulated robot: ball, wall or arch. The policy is not told."""
+    episodes: int = 3
+    """Number of rollouts."""
+    seed: int = 0
+    """Which held-out scenarios."""
+    output_dir: str = ""
+    """New folder for recordings and summary."""
+    imagine: int = 16
+    """How far ahead the world model imagines depth for the recordings, ticks of 40 ms; 0: not at
+    all."""
+    env: EnvConfig = field(default_factory=eventful)
+    """Scenes, sensors, delays and randomisation of the simulated robot."""

@@ -1,0 +1,163 @@
+"""`egovcp-deploy --dry_run=true`: is all there that a run needs? Go or no-go, line by line."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from egovcp.errors import EgovcpError, EnvironmentFailure
+from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, STATE_DIM, STATE_SLICES
+from egovcp_deploy.policy import RolloutPolicy
+from egovcp_deploy.robots.body import Body, Eye
+
+FREE_BYTES: Final = 1_000_000_000  # an hour of recording is about 0.6 GB
+PLAN_BUDGET_MS: Final = 36.0
+STATE_HZ: Final = 100.0
+PICTURE_HZ: Final = 15.0
+_PLANS: Final = 50
+_WARM_UP: Final = 5
+_LISTEN_S: Final = 1.0
+_DISK_BYTES: Final = 4_000_000
+_DISK_MS: Final = 200.0
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report."""
+
+    name: str
+    found: str
+    error: EgovcpError | None = None
+    """What speaks against a run; None: nothing."""
+
+    def __str__(self) -> str:
+        if self.error is None:
+            return f"go     {self.name}: {self.found}"
+        return f"NO-GO  {self.name}: {self.error}"
+
+
+def examine(name: str, look: Callable[[], str]) -> Finding:
+    """What ``look`` finds, or the error that it raises."""
+    try:
+        return Finding(name, look())
+    except EgovcpError as error:
+        return Finding(name, "", error)
+
+
+def conclude(findings: Iterator[Finding], say: Callable[[str], None] = print) -> None:
+    """Say each finding as it comes, then go, or raise the first error.
+
+    Raises:
+        EgovcpError: of the first finding that speaks against a run.
+    """
+    errors = []
+    for finding in findings:
+        say(str(finding))
+        if finding.error is not None:
+            errors.append(finding.error)
+    if errors:
+        say(f"no-go: {len(errors)} of the above")
+        raise errors[0]
+    say("go")
+
+
+def disk(folder: Path) -> str:
+    """Room for a recording, and how fast it is written.
+
+    Raises:
+        EnvironmentFailure: too little room, or too slow.
+    """
+    existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
+    free = shutil.disk_usage(existing).free
+    if free < FREE_BYTES:
+        raise EnvironmentFailure(
+            f"{free / 1e9:.1f} GB free at {existing}, expected {FREE_BYTES / 1e9:.0f} GB; "
+            "make room, or choose another --output_dir"
+        )
+    ms = _write_ms(existing)
+    if ms > _DISK_MS:
+        raise EnvironmentFailure(
+            f"writing {_DISK_BYTES / 1e6:.0f} MB to {existing} took {ms:.0f} ms, expected at most "
+            f"{_DISK_MS:.0f}; choose another --output_dir"
+        )
+    return f"{free / 1e9:.0f} GB free, {_DISK_BYTES / 1e3 / max(ms, 1e-3):.0f} MB/s"
+
+
+def _write_ms(folder: Path) -> float:
+    trial = folder / f".egovcp-dry-run-{os.getpid()}"
+    begin = time.perf_counter()
+    try:
+        with trial.open("wb") as file:
+            file.write(os.urandom(_DISK_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise EnvironmentFailure(f"cannot write to {folder}: {error.strerror}") from error
+    finally:
+        trial.unlink(missing_ok=True)
+    return (time.perf_counter() - begin) * 1e3
+
+
+def plan_time(policy: RolloutPolicy) -> str:
+    """How long a plan takes here, on a made-up observation.
+
+    Raises:
+        EnvironmentFailure: too long for 25 Hz.
+    """
+    depth = np.zeros((1, DEPTH_ROWS, DEPTH_COLS), np.uint16)
+    state = np.zeros((1, STATE_DIM), np.float32)
+    state[0, STATE_SLICES["projected_gravity"].stop - 1] = -1.0
+    policy.reset()
+    times = []
+    for _ in range(_WARM_UP + _PLANS):
+        begin = time.perf_counter()
+        policy.act(depth, state)
+        times.append((time.perf_counter() - begin) * 1e3)
+    policy.reset()
+    p50, p99 = np.percentile(times[_WARM_UP:], [50, 99])
+    if p99 > PLAN_BUDGET_MS:
+        raise EnvironmentFailure(
+            f"a plan takes {p50:.0f} ms (p99 {p99:.0f}), expected at most {PLAN_BUDGET_MS:.0f} "
+            "at 25 Hz; end other programs, or plan with fewer --planner.samples"
+        )
+    return f"{p50:.1f} ms per plan, p99 {p99:.1f}"
+
+
+def state_rate(body: Body) -> str:
+    """How often proprioception brings something new.
+
+    Raises:
+        EnvironmentFailure: too rarely.
+    """
+    return _rate(lambda: None if (r := body.read()) is None else r.time_ns, STATE_HZ, "states")
+
+
+def picture_rate(eye: Eye) -> str:
+    """How often the camera brings something new.
+
+    Raises:
+        EnvironmentFailure: too rarely.
+    """
+    return _rate(lambda: None if (p := eye.read()) is None else p.time_ns, PICTURE_HZ, "pictures")
+
+
+def _rate(stamp: Callable[[], int | None], least: float, what: str) -> str:
+    stamps: set[int | None] = set()
+    end = time.monotonic() + _LISTEN_S
+    while time.monotonic() < end:
+        stamps.add(stamp())
+        time.sleep(0.001)
+    hz = len(stamps - {None}) / _LISTEN_S
+    if hz < least:
+        raise EnvironmentFailure(
+            f"{hz:.0f} {what} per second, expected at least {least:.0f}; is the connection good, "
+            "and is the other end busy?"
+        )
+    return f"{hz:.0f} {what} per second"

@@ -1,0 +1,143 @@
+"""The 50 Hz loop beneath the planner: read the body, judge, command the motors. It never waits.
+
+Every second control tick t is a planner tick: o_t goes to the planner, whose plan is taken as soon
+as it is there, at the latest when o_{t+1} is due. So an action takes effect one or two control
+ticks after its observation, as it did in the data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.robot.controller import LowLevelController
+from egovcp.spec import ACTION_BOX, CONTROLLER_TICKS_PER_PLAN
+from egovcp_deploy.live import motors
+from egovcp_deploy.pilot.pilot import Pilot
+from egovcp_deploy.pilot.states import Request, State
+from egovcp_deploy.pilot.velocity import VelocityCommand
+from egovcp_deploy.robots.body import Body, BodyState, Eye, MotorCommand
+from egovcp_deploy.robots.proprioception import proprioception
+
+Array = NDArray[np.float64]
+
+_BLIND: Final = np.zeros((48, 64), np.uint16)
+
+
+class Wishes(NamedTuple):
+    """What the operator wants at a control tick."""
+
+    request: Request | None = None
+    velocity: tuple[float, float, float] | None = None
+    """vx, vy (m/s), yaw rate (rad/s); None: nothing new."""
+
+
+NOTHING: Final = Wishes()
+
+
+class ControlLoop:
+    """One robot's loop; `tick` is called at 50 Hz.
+
+    Args:
+        body: motors and IMU.
+        eye: depth camera.
+        controller: turns commands into joint targets.
+        pilot: the state machine and the way to the planner.
+        velocity: bounds on what the operator may ask for.
+        refusal: why the robot must not be armed; asked at every tick, empty: nothing.
+    """
+
+    def __init__(
+        self,
+        body: Body,
+        eye: Eye,
+        controller: LowLevelController,
+        pilot: Pilot,
+        velocity: VelocityCommand | None = None,
+        refusal: Callable[[], str] = lambda: "",
+    ) -> None:
+        self._body, self._eye = body, eye
+        self._controller = controller
+        self.pilot = pilot
+        self._velocity = velocity or VelocityCommand()
+        self._refusal = refusal
+        self._count = 0
+        self._open = False  # o_t is out, a_t is not decided
+        self._reading: BodyState | None = None
+        self._rising_from: Array | None = None
+        self._moving: Array = np.zeros(3)
+
+    @property
+    def state(self) -> State:
+        """Where the state machine is."""
+        return self.pilot.supervisor.state
+
+    def tick(self, now_ns: int, wishes: Wishes = NOTHING) -> None:
+        """One control tick at ``now_ns``; the motors are told something in every one."""
+        reading, picture = self._read(), self._eye.read()
+        self._close_planner_tick(now_ns)
+        self._steer(now_ns, wishes)
+        sent = np.concatenate([self._moving, ACTION_BOX.to_metric(self.pilot.sent)])
+        state = None if reading is None else proprioception(reading, sent)
+        depth = None if picture is None else picture.depth
+        self.pilot.sense(now_ns, state, depth)
+        before = self.state
+        self.pilot.judge(now_ns, wishes.request, refusal=self._refusal())
+        if state is not None and self._count % CONTROLLER_TICKS_PER_PLAN == 0:
+            seen = _BLIND if depth is None else depth
+            events = self.pilot.events()
+            self.pilot.report(now_ns, seen, state.astype(np.float32), events)
+            self._open = True
+        self._body.write(self._motors(now_ns, before, reading, state))
+        self._count += 1
+
+    def _read(self) -> BodyState | None:
+        """The newest reading that is all numbers; a broken one would poison the controller."""
+        reading = self._body.read()
+        if reading is not None and is_finite(reading):
+            self._reading = reading
+        return self._reading
+
+    def _close_planner_tick(self, now_ns: int) -> None:
+        """Take the plan if it is there, or do without once the next observation is due."""
+        self.pilot.collect(now_ns)
+        due = self._count % CONTROLLER_TICKS_PER_PLAN == 0
+        if self._open and (due or self.pilot.answered):
+            self.pilot.decide()
+            self._open = False
+
+    def _steer(self, now_ns: int, wishes: Wishes) -> None:
+        if wishes.velocity is not None:
+            self._velocity.wish(now_ns, wishes.velocity)
+        self._moving = self._velocity.at(now_ns, allowed=self.state is State.RUN)
+
+    def _motors(
+        self, now_ns: int, before: State, reading: BodyState | None, state: Array | None
+    ) -> MotorCommand:
+        mode = 0 if reading is None else reading.mode
+        position = None if reading is None else reading.joint_position
+        if self.state in (State.INIT, State.DAMP) or state is None or position is None:
+            return motors.damped(position, mode)
+        if self.state is State.STAND and before is not State.STAND:
+            self._rising_from = np.array(position)
+            self._controller.reset(state[None])
+        target = self._controller.step(state[None])[0]
+        if not np.isfinite(target).all():
+            self.pilot.judge(now_ns, controller_ok=False)
+            return motors.damped(position, mode)
+        gains = self._controller.stiffness, self._controller.damping
+        if self.state is State.STAND and self._rising_from is not None:
+            supervisor = self.pilot.supervisor
+            share = supervisor.time_in_state_s(now_ns) / supervisor.limits.stand_s
+            return motors.coming_in(self._rising_from, target, *gains, share, mode)
+        return motors.following(target, *gains, mode)
+
+
+def is_finite(reading: BodyState) -> bool:
+    """Whether a reading is all numbers, with a quaternion that is a rotation."""
+    q = np.asarray(reading.quaternion_w)
+    parts = (reading.joint_position, reading.joint_velocity, reading.angular_velocity)
+    return abs(float(q @ q) - 1.0) < 0.1 and all(np.isfinite(part).all() for part in parts)

@@ -1,0 +1,161 @@
+"""`egovcp-deploy` on the wall clock: a G1 behind LeRobot's bridge, or the fake of one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import draccus
+import numpy as np
+from tqdm import tqdm
+
+from egovcp.artefact import Artefact
+from egovcp.errors import EnvironmentFailure, SafetyStop, UsageError
+from egovcp.log.info import CameraView
+from egovcp.log.tick import Tick
+from egovcp.robot.controllers import make_controller
+from egovcp_deploy import dry_run
+from egovcp_deploy.config import DeployConfig
+from egovcp_deploy.live.hardware import CAMERAS, HardwareOptions, open_eye
+from egovcp_deploy.live.operators import OPERATORS, operator
+from egovcp_deploy.live.run import LiveSetup, run_live
+from egovcp_deploy.live.session import LiveSummary
+from egovcp_deploy.options import check_choice, make_output_dir, versions, write_json
+from egovcp_deploy.pilot.desk import Thinker
+from egovcp_deploy.recording import recording, run_info
+from egovcp_deploy.robots.bridge import BridgeBody
+
+
+def check_live(config: DeployConfig) -> None:
+    """Raise `UsageError` for options that make no sense on the wall clock."""
+    check_choice("--operator.type", config.operator.type, OPERATORS)
+    check_choice("--robot.camera.type", config.robot.camera.type, CAMERAS)
+    if not np.isfinite(config.operator.velocity).all():
+        raise UsageError(f"--operator.velocity={config.operator.velocity}: expected numbers")
+    if not config.operator.duration >= 0:
+        raise UsageError(f"--operator.duration={config.operator.duration}: expected s from 0")
+
+
+def drive(config: DeployConfig, artefact: Artefact) -> None:
+    """One run, recorded as rollout 0.
+
+    Raises:
+        ArtefactError: the artefact is not made for the low-level controller.
+        EnvironmentFailure: robot, camera or disk fail.
+        SafetyStop: the motors were damped for safety.
+    """
+    options = config.operator
+    controller_id = make_controller(config.robot.controller).id
+    artefact.require_controller(controller_id)
+    setup = LiveSetup(
+        HardwareOptions(config.robot.bridge, config.robot.camera),
+        config.robot.controller,
+        config.robot.limits,
+        stays=options.type != "auto" or not options.duration,
+    )
+    folder = make_output_dir(config.output_dir)
+    info = run_info(
+        config.task, config.seed, 0, CameraView(), draccus.encode(config), controller_id, artefact
+    )
+    thinker = Thinker(artefact.make_policy(1, config.seed), config.imagine)
+    thinker.warm_up()
+    with (
+        operator(options.type, options.velocity, options.duration) as who,
+        recording(folder, 0, info) as sink,
+        tqdm(unit="tick", desc="live") as bar,
+    ):
+        summary = run_live(setup, thinker, who, sink, lambda tick: _show(bar, tick))
+    write_json(folder / "deploy.json", _report(config, artefact, controller_id, summary))
+    _print(summary, folder)
+    if summary.damped:
+        raise SafetyStop(
+            f"the motors were damped: {summary.damped}. The log is in {folder}; "
+            "find the cause before the next run"
+        )
+
+
+def _show(bar: Any, tick: Tick) -> None:
+    for event in tick.events:
+        bar.write(f"{tick.time_ns / 1e9:8.2f} s  {event}")
+    plan = f", plan {tick.timing_ms['plan']:.0f} ms" if "plan" in tick.timing_ms else ""
+    bar.set_postfix_str(f"{tick.mode}{plan}", refresh=False)
+    bar.update(1)
+
+
+def _report(
+    config: DeployConfig, artefact: Artefact, controller_id: str, summary: LiveSummary
+) -> dict[str, Any]:
+    """Content of ``deploy.json``."""
+    return {
+        "robot": config.robot.type,
+        "ticks": summary.ticks,
+        "ticks_running": summary.running,
+        "ticks_held": summary.held,
+        "plans": summary.planned,
+        "plans_late": summary.late,
+        **_percentiles("plan_ms", summary.plan_ms),
+        **_percentiles("latency_ms", summary.latency_ms),
+        "iterations_mean": float(np.mean(summary.iterations or [0])),
+        "damped": summary.damped,
+        "events": summary.events,
+        "config": draccus.encode(config),
+        "artefact": artefact.manifest["files"],
+        "low_level_controller": controller_id,
+        "versions": versions(),
+    }
+
+
+def _percentiles(name: str, values: list[float]) -> dict[str, float]:
+    p50, p99 = np.percentile(values or [0.0], [50, 99])
+    return {f"{name}_p50": float(p50), f"{name}_p99": float(p99)}
+
+
+def _print(summary: LiveSummary, folder: Path) -> None:
+    latency = _percentiles("ms", summary.latency_ms)
+    print(
+        f"{summary.ticks} ticks, {summary.running} running, {summary.held} held; observation to "
+        f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late"
+    )
+    print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
+
+
+def examine_hardware(config: DeployConfig, artefact: Artefact | None) -> Iterator[dry_run.Finding]:
+    """Controller, robot and camera."""
+
+    def controller() -> str:
+        found = make_controller(config.robot.controller).id
+        if artefact is not None:
+            artefact.require_controller(found)
+        return found
+
+    yield dry_run.examine("controller", controller)
+    body = BridgeBody(config.robot.bridge)
+    connected = dry_run.examine("robot", lambda: _connect(body))
+    yield connected
+    if connected.error is None:
+        yield dry_run.examine("robot's states", lambda: dry_run.state_rate(body))
+        yield dry_run.examine("other publishers", lambda: _alone(body))
+        body.close()
+    yield dry_run.examine("camera", lambda: _camera(config))
+
+
+def _connect(body: BridgeBody) -> str:
+    body.connect()
+    reading = body.read()
+    assert reading is not None, "connect waits for a reading"
+    return f"answers at {body.config.host}, mode machine {reading.mode}"
+
+
+def _alone(body: BridgeBody) -> str:
+    if body.trouble:
+        raise EnvironmentFailure(body.trouble)
+    return "none noticed"
+
+
+def _camera(config: DeployConfig) -> str:
+    eye = open_eye(config.robot.camera)
+    try:
+        return dry_run.picture_rate(eye)
+    finally:
+        eye.close()

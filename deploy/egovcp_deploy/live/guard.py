@@ -1,0 +1,42 @@
+"""Watches over the control process: if it dies, its robot is damped from here."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from multiprocessing.connection import wait
+from multiprocessing.process import BaseProcess
+from typing import Final
+
+from egovcp_deploy.live.process import last_words
+from egovcp_deploy.robots.body import Body
+
+_ROUNDS: Final = 20  # of last words, 50 ms each
+
+
+class Guard:
+    """A thread that sleeps until the control process ends.
+
+    Args:
+        process: the control process.
+        body: a second connection to the robot, used for nothing else.
+        wanted: whether the process is supposed to end.
+    """
+
+    def __init__(self, process: BaseProcess, body: Body, wanted: Callable[[], bool]) -> None:
+        self._process, self._body, self._wanted = process, body, wanted
+        self.acted = False
+        """Whether the robot had to be damped from here."""
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    def _watch(self) -> None:
+        wait([self._process.sentinel])
+        if not self._wanted():
+            self.acted = True
+            for _ in range(_ROUNDS):
+                last_words(self._body)
+
+    def join(self) -> None:
+        """Wait until nothing is left to do; the process has ended."""
+        self._thread.join()

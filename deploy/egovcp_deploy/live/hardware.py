@@ -1,0 +1,77 @@
+"""Body and camera of a robot on the wall clock, from the options that name them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from egovcp_deploy.robots.body import Eye
+from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
+from egovcp_deploy.robots.realsense_eye import RealSenseEye, RealSenseEyeConfig
+from egovcp_deploy.robots.zmq_eye import ZmqEye, ZmqEyeConfig
+
+CAMERAS: Final = ("server", "realsense")
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """Which depth camera."""
+
+    type: str = "server"
+    """server: one that sends pictures, egovcp-depth-server or egovcp-fake-g1. realsense: one at
+    this machine."""
+    server: ZmqEyeConfig = field(default_factory=ZmqEyeConfig)
+    """Where the server is."""
+    realsense: RealSenseEyeConfig = field(default_factory=RealSenseEyeConfig)
+    """Which RealSense camera."""
+
+
+@dataclass(frozen=True)
+class HardwareOptions:
+    """A G1 behind LeRobot's bridge, and its depth camera."""
+
+    bridge: BridgeConfig = field(default_factory=BridgeConfig)
+    """LeRobot's bridge on the robot, or egovcp-fake-g1."""
+    camera: CameraOptions = field(default_factory=CameraOptions)
+    """The depth camera."""
+
+
+@dataclass(frozen=True)
+class Hardware:
+    """What the control loop reads and writes."""
+
+    body: BridgeBody
+    eye: Eye
+
+    def close(self) -> None:
+        """Let go of both."""
+        self.eye.close()
+        self.body.close()
+
+
+def open_hardware(options: HardwareOptions) -> Hardware:
+    """Connect to both.
+
+    Raises:
+        EnvironmentFailure: one does not answer.
+    """
+    body = BridgeBody(options.bridge)
+    body.connect()
+    try:
+        return Hardware(body, open_eye(options.camera))
+    except BaseException:
+        body.close()
+        raise
+
+
+def open_eye(options: CameraOptions) -> Eye:
+    """Connect to the camera.
+
+    Raises:
+        EnvironmentFailure: it does not answer.
+    """
+    if options.type == "realsense":
+        return RealSenseEye.connect(options.realsense)
+    eye = ZmqEye(options.server)
+    eye.connect()
+    return eye

@@ -1,0 +1,151 @@
+"""The control process: the 50 Hz loop on the robot, which outlives the planner.
+
+It owns the wire to the robot. If the planner's process dies or stops, it holds the robot; if it
+ends itself, in whatever way, the last thing it tells the motors is to damp.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+from egovcp.errors import EgovcpError
+from egovcp.rate import FixedRate, MonotonicClock
+from egovcp.robot.controllers import make_controller
+from egovcp.spec import CONTROLLER_HZ
+from egovcp_deploy.live import motors
+from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
+from egovcp_deploy.live.hardware import Hardware, HardwareOptions, open_hardware
+from egovcp_deploy.live.link import Link, Order, RemoteDesk
+from egovcp_deploy.pilot.pilot import Pilot
+from egovcp_deploy.pilot.states import Limits, Request, State
+from egovcp_deploy.robots.body import Body
+from egovcp_deploy.robots.remote import Remote
+
+_ORPHAN_TICKS: Final = 100  # a damped robot without a planner is left after 2 s
+_LAST_WORDS: Final = 10  # how often the motors are told to damp at the end
+
+
+@dataclass(frozen=True)
+class ControlSetup:
+    """All that the control process needs; plain data."""
+
+    address: str
+    """Of the link to the planner's process."""
+    hardware: HardwareOptions
+    """Where the robot is."""
+    controller: str
+    """Low-level controller, see `make_controller`."""
+    limits: Limits
+    parent: int
+    """Process id of the planner."""
+
+
+def control_process(setup: ControlSetup) -> None:
+    """Body of the process; returns when it is told to quit, or is no longer needed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the planner's process to judge
+    quitting = Flag()
+    signal.signal(signal.SIGTERM, lambda number, frame: quitting.set())
+    try:
+        hardware = open_hardware(setup.hardware)
+    except EgovcpError as error:
+        print(f"egovcp-deploy: error: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    link = Link(setup.address, serve=False)
+    try:
+        ControlProcess(setup, hardware, link).run(quitting)
+    finally:
+        last_words(hardware.body)
+        hardware.close()
+        link.close()
+
+
+class Flag:
+    """Set once, from a signal handler."""
+
+    def __init__(self) -> None:
+        self.is_set = False
+
+    def set(self) -> None:
+        """Set it."""
+        self.is_set = True
+
+
+class ControlProcess:
+    """The loop with all that surrounds it: orders, the remote control, the end."""
+
+    def __init__(self, setup: ControlSetup, hardware: Hardware, link: Link) -> None:
+        self._parent = setup.parent
+        self._hardware = hardware
+        self._desk = RemoteDesk(link)
+        self._loop = ControlLoop(
+            hardware.body,
+            hardware.eye,
+            make_controller(setup.controller),
+            Pilot(self._desk, setup.limits),
+            refusal=lambda: hardware.body.trouble,
+        )
+        self._remote = RemoteKeys()
+        self._orphaned = 0
+
+    def run(self, quitting: Flag, alive: Callable[[], bool] | None = None) -> None:
+        """Until told to quit."""
+        rate = FixedRate(CONTROLLER_HZ, MonotonicClock())
+        rate.start()
+        while not quitting.is_set and self._orphaned < _ORPHAN_TICKS:
+            now = rate.clock.now_ns()
+            orders, self._desk.orders = self._desk.orders, []
+            if any(order.quit for order in orders):
+                return
+            self._loop.tick(now, self._wishes(orders))
+            self._look_for_parent()
+            rate.wait()
+
+    def _wishes(self, orders: list[Order]) -> Wishes:
+        """Of all that came since the last tick: an emergency stop first, else the last."""
+        wishes = NOTHING
+        for order in [*orders, *self._remote.orders(self._hardware.body)]:
+            if wishes.request is Request.ESTOP:
+                break
+            wishes = Wishes(order.request or wishes.request, order.velocity or wishes.velocity)
+        return wishes
+
+    def _look_for_parent(self) -> None:
+        if os.getppid() != self._parent:
+            self._desk.alive = False
+            self._orphaned += self._loop.state in (State.INIT, State.DAMP)
+
+
+class RemoteKeys:
+    """The robot's own remote control: A arms, start runs, B holds, L1 + B stops at once."""
+
+    def __init__(self) -> None:
+        self._before: frozenset[str] = frozenset()
+
+    def orders(self, body: Body) -> list[Order]:
+        """What was pressed since the last call, and where the sticks point."""
+        reading = body.read()
+        remote = None if reading is None else Remote.parse(reading.remote)
+        if remote is None:
+            return []
+        pressed, self._before = remote.pressed - self._before, remote.pressed
+        vx, vy, turn = remote.velocity.tolist()
+        orders = [Order(velocity=(vx, vy, turn))] if any((vx, vy, turn)) else []
+        if {"L1", "B"} <= remote.pressed:
+            return [*orders, Order(Request.ESTOP)]
+        keys = {"Y": Request.STAND, "A": Request.ARM, "start": Request.RUN, "B": Request.HOLD}
+        return orders + [Order(keys[key]) for key in sorted(pressed) if key in keys]
+
+
+def last_words(body: Body) -> None:
+    """Tell the motors to damp, a few times over."""
+    clock = MonotonicClock()
+    for _ in range(_LAST_WORDS):
+        reading = body.read()
+        position, mode = (None, 0) if reading is None else (reading.joint_position, reading.mode)
+        body.write(motors.damped(position, mode))
+        clock.sleep_until(clock.now_ns() + 5_000_000)

@@ -1,0 +1,203 @@
+"""The planner's side of a run on the wall clock: think, log, and pass on the operator's orders."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from types import FrameType
+from typing import Final
+
+from egovcp.log.sink import Sink
+from egovcp.log.tick import Tick
+from egovcp.rate import Clock
+from egovcp.spec import PLANNER_DT
+from egovcp_deploy.live.link import Link, Order, decode_report, encode_order, encode_reply
+from egovcp_deploy.live.operators import EASE_S, Operator
+from egovcp_deploy.pilot.desk import Reply, Report, Thinker
+from egovcp_deploy.pilot.states import Request, State
+from egovcp_deploy.runner import thoughts
+
+_WAIT_S: Final = 0.01
+_AFTERMATH_S: Final = 1.0  # what is still recorded once the motors are damped
+_START_S: Final = 20.0  # for the control process to come up
+_NS: Final = 1e9
+BUDGET_S: Final = 0.034  # from an observation to its plan; the rest of the tick carries it over
+
+
+@dataclass
+class LiveSummary:
+    """What came of a run."""
+
+    ticks: int = 0
+    planned: int = 0
+    """Ticks whose plan came from their own observation."""
+    late: int = 0
+    """Plans that came after their tick."""
+    running: int = 0
+    """Ticks in RUN."""
+    held: int = 0
+    """Ticks in HOLD."""
+    damped: str = ""
+    """Why the motors were damped before the run was over; empty: they were not."""
+    plan_ms: list[float] = field(default_factory=list)
+    latency_ms: list[float] = field(default_factory=list)
+    """From the observation to the plan on its way back, per plan."""
+    iterations: list[int] = field(default_factory=list)
+    events: list[str] = field(default_factory=list)
+
+
+class Interrupts:
+    """Counts Ctrl-C: the first asks for a graceful end, the second for an immediate one."""
+
+    def __init__(self) -> None:
+        self.count = 0
+
+    @contextmanager
+    def caught(self) -> Iterator[None]:
+        """While this lasts, an interrupt is counted and raises nothing."""
+        before = signal.signal(signal.SIGINT, self._count)
+        try:
+            yield
+        finally:
+            signal.signal(signal.SIGINT, before)
+
+    def _count(self, number: int, frame: FrameType | None) -> None:
+        self.count += 1
+
+
+class Session:
+    """One run.
+
+    Args:
+        thinker: the planner.
+        link: to the control process.
+        operator: who says what to do.
+        sink: the log; it must not block.
+        clock: the monotonic one that reports are stamped with.
+        control_alive: whether the control process is there.
+        stays: whether a robot that holds after Ctrl-C goes on standing until the second one, as a
+            real one must that nobody has hung up yet.
+    """
+
+    def __init__(
+        self,
+        thinker: Thinker,
+        link: Link,
+        operator: Operator,
+        sink: Sink,
+        clock: Clock,
+        control_alive: Callable[[], bool],
+        stays: bool = False,
+    ) -> None:
+        self._thinker, self._link, self._operator = thinker, link, operator
+        self._sink, self._clock, self._control_alive = sink, clock, control_alive
+        self._stays = stays
+        self.summary = LiveSummary()
+        self.interrupts = Interrupts()
+        self.quitting = False
+        """Whether the control process has been told to end."""
+        self._mode = ""
+        self._begin_ns: int | None = None
+        self._pending: tuple[Report, Reply | None] | None = None
+        self._held_ns: int | None = None
+        self._damped_ns: int | None = None
+
+    def run(self, on_tick: Callable[[Tick], None] = lambda tick: None) -> LiveSummary:
+        """Until the operator ends it, the motors are damped, or the control process is gone."""
+        started_ns = self._clock.now_ns()
+        with self.interrupts.caught():
+            while not self.quitting and self._control_alive():
+                now = self._clock.now_ns()
+                if self._begin_ns is None and now - started_ns > _START_S * _NS:
+                    break
+                self._obey(now)
+                reports = self._receive()
+                if reports:
+                    self._think(reports, on_tick)
+        return self.summary
+
+    def _receive(self) -> list[Report]:
+        found = (decode_report(parts) for parts in self._link.receive(_WAIT_S))
+        return [report for report in found if report is not None]
+
+    def _think(self, reports: Sequence[Report], on_tick: Callable[[Tick], None]) -> None:
+        last = reports[-1]
+        self._begin_ns = reports[0].time_ns if self._begin_ns is None else self._begin_ns
+        self._mode = last.mode
+        reply = self._thinker.think(reports, last.time_ns + round(BUDGET_S * _NS))
+        self._link.send(encode_reply(reply))
+        self._measure(last, reply)
+        reply = self._thinker.decode(reply)
+        for report in reports:
+            self._log(report, reply if report is last else None, on_tick)
+
+    def _measure(self, report: Report, reply: Reply) -> None:
+        latency = (self._clock.now_ns() - report.time_ns) / _NS
+        self.summary.planned += 1
+        self.summary.late += latency > PLANNER_DT
+        self.summary.plan_ms.append(reply.plan_ms)
+        self.summary.latency_ms.append(latency * 1e3)
+        self.summary.iterations.append(reply.step.iterations)
+
+    # --- the log -------------------------------------------------------------------------
+    def _log(self, report: Report, reply: Reply | None, on_tick: Callable[[Tick], None]) -> None:
+        """A tick is complete when the next report tells what was sent in it."""
+        if self._pending is not None and self._pending[0].tick == report.tick - 1:
+            tick = self._tick(*self._pending, report)
+            self._sink.write(tick)
+            on_tick(tick)
+        self._pending = report, reply
+        self.summary.ticks += 1
+        self.summary.running += report.mode == State.RUN
+        self.summary.held += report.mode == State.HOLD
+        self.summary.events += report.events
+        if report.mode == State.DAMP and self._damped_ns is None:
+            self._damped_ns = report.time_ns
+            self.summary.damped = _reason(report.events)
+
+    def _tick(self, report: Report, reply: Reply | None, following: Report) -> Tick:
+        assert self._begin_ns is not None
+        events = report.events if reply is None else (*report.events, *reply.events)
+        return Tick(
+            index=report.tick,
+            time_ns=report.time_ns - self._begin_ns,
+            depth=report.depth,
+            state=report.state,
+            action_planned=following.sent if reply is None else reply.step.action[0],
+            action_sent=following.sent,
+            timing_ms={} if reply is None else {"plan": reply.plan_ms},
+            events=events,
+            mode=report.mode,
+            **thoughts(reply),
+        )
+
+    # --- the end -------------------------------------------------------------------------
+    def _obey(self, now_ns: int) -> None:
+        for order in (*self._operator.orders(now_ns, self._mode), *self._interrupted(now_ns)):
+            self._link.send(encode_order(order))
+            self.quitting |= order.quit
+        if self._damped_ns is not None and now_ns - self._damped_ns > _AFTERMATH_S * _NS:
+            self._quit()
+
+    def _interrupted(self, now_ns: int) -> list[Order]:
+        """Ctrl-C once: hold, let the hands come to rest, end if that is safe. Twice: damp."""
+        if self.interrupts.count >= 2:
+            return [Order(Request.ESTOP)] if self._damped_ns is None else []
+        if self.interrupts.count == 1 and self._held_ns is None:
+            self._held_ns = now_ns
+            return [Order(Request.HOLD)]
+        if self._held_ns is None or now_ns - self._held_ns <= EASE_S * _NS:
+            return []
+        return [Order(Request.HOLD, quit=not self._stays)]
+
+    def _quit(self) -> None:
+        self._link.send(encode_order(Order(quit=True)))
+        self.quitting = True
+
+
+def _reason(events: Sequence[str]) -> str:
+    """Why, from the line that tells of the change to DAMP."""
+    told = [event.partition(": ")[2] for event in events if f"-> {State.DAMP}" in event]
+    return told[-1] if told else "unknown"

@@ -1,0 +1,160 @@
+"""Rollouts of the simulated robot, in lock-step with the planner."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import draccus
+import numpy as np
+from tqdm import tqdm
+
+from egovcp.artefact import Artefact
+from egovcp.errors import EnvironmentFailure
+from egovcp.log.info import RunInfo
+from egovcp.log.tick import Tick
+from egovcp.rate import FixedRate, LockstepClock
+from egovcp.spec import PLANNER_HZ
+from egovcp_deploy.config import DeployConfig
+from egovcp_deploy.options import make_output_dir, versions, write_json
+from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.policy import RolloutPolicy
+from egovcp_deploy.recording import recording, run_info
+from egovcp_deploy.robots import Robot
+from egovcp_deploy.runner import RolloutSummary, Runner
+
+if TYPE_CHECKING:
+    from egovcp_deploy.robots.sim import SimRobot
+
+
+def play_rollouts(config: DeployConfig, artefact: Artefact | None) -> None:
+    """Play and record; whatever ends it, the rollouts that came to their end are summed up.
+
+    Raises:
+        ArtefactError: the artefact is not made for this robot.
+        EnvironmentFailure: the simulator is not installed.
+    """
+    robot = make_robot(config)
+    try:
+        config = replace(config, env=robot.env.config)  # as decided for its controller
+        policy = _make_policy(config, artefact, robot)
+        folder = make_output_dir(config.output_dir)
+        clock = LockstepClock()
+        desk = InlineDesk(Thinker(policy, config.imagine), clock)
+        runner = Runner(desk, robot, FixedRate(PLANNER_HZ, clock), limits=config.robot.limits)
+        _play(config, artefact, robot, runner, folder)
+    finally:
+        robot.close()
+
+
+def _make_policy(config: DeployConfig, artefact: Artefact | None, robot: SimRobot) -> RolloutPolicy:
+    if artefact is None:
+        from egovcp_deploy.controllers import Scripted, reference
+
+        return Scripted(reference(config.controller), robot)
+    artefact.require_controller(robot.controller_id)
+    return artefact.make_policy(1, config.seed)
+
+
+def make_robot(config: DeployConfig) -> SimRobot:
+    """The robot of ``--robot.type``.
+
+    Raises:
+        EnvironmentFailure: the simulator is not installed.
+    """
+    try:
+        from egovcp_deploy.robots.sim import SimRobot
+    except ModuleNotFoundError as error:
+        raise EnvironmentFailure(
+            f"--robot.type=sim needs the simulator, but {error.name} is not installed; "
+            "install it: pip install 'egovcp-deploy[sim]'"
+        ) from error
+    return SimRobot(config.env, config.task, config.seed)
+
+
+def _play(
+    config: DeployConfig, artefact: Artefact | None, robot: Robot, runner: Runner, folder: Path
+) -> None:
+    """Record one rollout after the other and, whatever ends them, sum up the complete ones."""
+    summaries: list[RolloutSummary] = []
+    try:
+        with tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar:
+            for episode in range(config.episodes):
+                robot.start(episode)
+                info = _info(config, artefact, robot, episode)
+                with recording(folder, episode, info) as sink:
+                    summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))
+                bar.update(1)
+    finally:
+        if summaries:
+            write_json(folder / "deploy.json", _report(config, artefact, robot, summaries))
+            _print(summaries, folder)
+
+
+def _info(config: DeployConfig, artefact: Artefact | None, robot: Robot, episode: int) -> RunInfo:
+    return run_info(
+        config.task,
+        config.seed,
+        episode,
+        robot.camera,
+        draccus.encode(config),
+        robot.controller_id,
+        artefact,
+    )
+
+
+def _show(bar: Any, tick: Tick) -> None:
+    plan = f", plan {tick.timing_ms['plan']:.0f} ms" if "plan" in tick.timing_ms else ""
+    bar.set_postfix_str(f"tick {tick.index}, {tick.mode}{plan}", refresh=False)
+    bar.update(0)
+
+
+def _report(
+    config: DeployConfig,
+    artefact: Artefact | None,
+    robot: Robot,
+    summaries: Sequence[RolloutSummary],
+) -> dict[str, Any]:
+    """Content of ``deploy.json``."""
+    return {
+        "task": config.task,
+        "seed": config.seed,
+        "success_rate": float(np.mean([summary.success for summary in summaries])),
+        "rollouts": [_row(i, summary) for i, summary in enumerate(summaries)],
+        "config": draccus.encode(config),
+        "artefact": artefact.manifest["files"] if artefact else None,
+        "low_level_controller": robot.controller_id,
+        "versions": versions(),
+    }
+
+
+def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
+    p50, p99 = np.percentile(summary.plan_ms or [0.0], [50, 99])
+    return {
+        "episode": episode,
+        "steps": summary.steps,
+        "reward_mean": summary.reward / summary.steps,
+        "success": summary.success,
+        "terminated": summary.terminated,
+        "rejected_plans": summary.rejected,
+        "held_ticks": summary.held,
+        "damped": summary.damped,
+        "overruns": summary.overruns,
+        "plan_ms_p50": float(p50),
+        "plan_ms_p99": float(p99),
+        "mcap": f"rollout-{episode}.mcap",
+        "rrd": f"rollout-{episode}.rrd",
+    }
+
+
+def _print(summaries: Sequence[RolloutSummary], folder: Path) -> None:
+    for i, summary in enumerate(summaries):
+        verdict = "success" if summary.success else "fell" if summary.terminated else "failure"
+        print(
+            f"rollout {i}: {verdict}, {summary.steps} ticks, "
+            f"mean reward {summary.reward / summary.steps:+.4f}, "
+            f"plan {np.median(summary.plan_ms):.0f} ms"
+        )
+    print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")

@@ -1,0 +1,179 @@
+"""A simulated robot under motor commands, in lock-step: the control loop without a wall clock."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from egovcp.plan import PolicyStep
+from egovcp.rate import LockstepClock
+from egovcp.robot.stance import StanceController
+from egovcp.sim.config import EnvConfig, EpisodeConfig
+from egovcp.sim.live import LiveRobot, Servos
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import ACTION_DIM
+from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
+from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.pilot.pilot import Pilot
+from egovcp_deploy.pilot.states import Limits, Request, State
+from egovcp_deploy.robots.body import BodyState, MotorCommand, Picture
+
+TICK_NS = 20_000_000
+
+
+@dataclass
+class Faults:
+    """What is wrong with the readings at the moment."""
+
+    frozen: bool = False
+    blind: bool = False
+    silent: bool = False
+    nan: bool = False
+    refusal: str = ""
+
+
+class SimBody:
+    """Motors and IMU of a `LiveRobot`; remembers every command."""
+
+    def __init__(self, robot: LiveRobot, clock: LockstepClock, faults: Faults) -> None:
+        self._robot, self._clock, self._faults = robot, clock, faults
+        self._last: BodyState | None = None
+        self.commands: list[MotorCommand] = []
+
+    def read(self) -> BodyState | None:
+        if self._faults.frozen or self._faults.silent:
+            return self._last
+        m = self._robot.measure()
+        reading = BodyState(
+            self._clock.now_ns(),
+            m.joint_position,
+            m.joint_velocity,
+            m.quaternion_w,
+            m.angular_velocity,
+            mode=5,
+        )
+        if self._faults.nan:
+            return replace(reading, joint_velocity=np.full(29, np.nan))
+        self._last = reading
+        return reading
+
+    def write(self, command: MotorCommand) -> None:
+        self.commands.append(command)
+        self._robot.drive(Servos(command.position, command.stiffness, command.damping))
+
+    def close(self) -> None:
+        pass
+
+
+class SimEye:
+    """The camera of a `LiveRobot`."""
+
+    def __init__(self, robot: LiveRobot, faults: Faults) -> None:
+        self._robot, self._faults = robot, faults
+        self._last: Picture | None = None
+
+    def read(self) -> Picture | None:
+        if not self._faults.blind or self._last is None:
+            step, depth = self._robot.picture
+            self._last = Picture(step * 5_000_000, depth)
+        return self._last
+
+    def close(self) -> None:
+        pass
+
+
+class Reaching:
+    """A policy whose plan is the same reach always, with the pelvis at its neutral height."""
+
+    def __init__(self, level: float = 0.5) -> None:
+        self.level = level
+        self.seen: list[NDArray[np.floating]] = []
+        self.sent: list[NDArray[np.floating]] = []
+        self.resets = 0
+
+    def reset(self) -> None:
+        self.resets += 1
+
+    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+        self.observe(depth, state)
+        plan = np.full((1, 4, ACTION_DIM), self.level, np.float32)
+        plan[..., -1] = 0.0
+        none = np.zeros(0, np.float32)
+        return PolicyStep(plan[:, 0], plan, none, none, none, none, 1)
+
+    def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
+        self.seen.append(state[0].copy())
+
+    def advance(self, sent: NDArray[np.floating]) -> None:
+        self.sent.append(sent[0].copy())
+
+
+@dataclass
+class Rig:
+    """Everything, and the clock that drives it."""
+
+    robot: LiveRobot
+    clock: LockstepClock
+    faults: Faults
+    body: SimBody
+    policy: Reaching
+    loop: ControlLoop
+    states: list[State] = field(default_factory=list)
+
+    def run(
+        self,
+        seconds: float,
+        request: Request | None = None,
+        velocity: tuple[float, float, float] | None = None,
+        each: Callable[[int], None] = lambda tick: None,
+    ) -> None:
+        """Let time pass; the operator's request comes at its first tick."""
+        for k in range(round(seconds * 50)):
+            each(k)
+            wishes = Wishes(request if k == 0 else None, velocity) if k == 0 else NOTHING
+            self.loop.tick(self.clock.now_ns(), wishes)
+            self.states.append(self.loop.state)
+            self.robot.advance(4)
+            self.clock.advance(TICK_NS)
+
+    def stand(self) -> None:
+        """From the crane to ARMED, on its own feet."""
+        self.run(0.1)
+        self.run(3.1, Request.STAND)
+        self.robot.release()
+        self.run(0.5)
+        self.run(0.1, Request.ARM)
+        assert self.loop.state is State.ARMED
+
+    def go(self) -> None:
+        """From the crane to RUN."""
+        self.stand()
+        self.run(0.5, Request.RUN)
+        assert self.loop.state is State.RUN
+
+
+@pytest.fixture
+def make_rig() -> Callable[..., Rig]:
+    """A robot on the crane before an empty scene; ``delay_ms`` by tick is the planner's."""
+
+    def make(delay_ms: Callable[[int], int] = lambda tick: 10, level: float = 0.5) -> Rig:
+        quiet = EpisodeConfig(ticks=10_000, event_ticks=(9000, 9000), empty_probability=1.0)
+        robot = LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
+        robot.start(Scenario("ball", 0, 0))
+        clock, faults, policy = LockstepClock(time_ns=10**12), Faults(), Reaching(level)
+        body = SimBody(robot, clock, faults)
+        desk = InlineDesk(Thinker(policy), clock, lambda tick: delay_ms(tick) * 1_000_000)
+        loop = ControlLoop(
+            body,
+            SimEye(robot, faults),
+            StanceController(),
+            Pilot(desk, Limits()),
+            refusal=lambda: faults.refusal,
+        )
+        return Rig(robot, clock, faults, body, policy, loop)
+
+    return make

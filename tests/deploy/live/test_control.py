@@ -1,0 +1,227 @@
+"""The 50 Hz loop on a simulated body: what the motors are told, whatever goes wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from egovcp.robot.stance import TARGET_HIGH, TARGET_LOW
+from egovcp.spec import ACTION_BOX, COMMAND_SLICE, STATE_SLICES
+from egovcp_deploy.pilot.states import Request, State
+from egovcp_deploy.robots.body import MotorCommand
+
+from .conftest import Rig
+
+Make = Callable[..., Rig]
+
+
+def limp(command: MotorCommand) -> bool:
+    return not command.stiffness.any()
+
+
+def assert_sane(commands: list[MotorCommand]) -> None:
+    """Every command that was ever written is finite and within what the joints can do."""
+    for command in commands:
+        for part in (command.position, command.stiffness, command.damping):
+            assert np.isfinite(part).all()
+        assert (command.stiffness >= 0).all()
+        assert (command.damping > 0).all()
+        if not limp(command):
+            assert (command.position >= TARGET_LOW - 1e-9).all()
+            assert (command.position <= TARGET_HIGH + 1e-9).all()
+
+
+def test_the_motors_are_damped_until_somebody_asks_to_stand(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.run(1.0)
+    assert set(rig.states) == {State.INIT}
+    assert all(limp(command) for command in rig.body.commands)
+    assert len(rig.body.commands) == 50
+
+
+def test_the_gains_come_in_without_a_jump(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.run(0.1)
+    before = len(rig.body.commands)
+    rig.run(3.1, Request.STAND)
+    gains = np.array([command.stiffness[0] for command in rig.body.commands[before:]])
+    assert (np.diff(gains) >= 0).all()
+    assert np.diff(gains).max() < gains[-1] / 100
+    assert gains[0] < gains[-1] / 100
+    targets = np.stack([command.position for command in rig.body.commands[before:]])
+    assert np.abs(np.diff(targets, axis=0)).max() < 0.2
+
+
+def test_it_stands_on_its_own_feet_and_reaches_where_the_planner_says(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.go()
+    rig.run(2.0)
+    assert rig.loop.state is State.RUN
+    assert rig.robot.robot.pelvis_height > 0.7
+    np.testing.assert_allclose(rig.loop.pilot.sent[:6], 0.5)
+    palms = (rig.robot.robot.palms_w - rig.robot.robot.data.qpos[:3]) @ rig.robot.robot.heading
+    wanted = ACTION_BOX.to_metric(rig.loop.pilot.sent)[:6].reshape(2, 3)
+    assert np.abs(palms - wanted).max() < 0.1
+    assert_sane(rig.body.commands)
+
+
+def test_the_recurrence_begins_at_run_and_hears_what_was_sent(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.stand()
+    resets = rig.policy.resets
+    seen = len(rig.policy.seen)
+    rig.run(1.0, Request.RUN)
+    assert rig.policy.resets == resets + 1
+    states = np.stack(rig.policy.seen[seen:])
+    commands = states[:, COMMAND_SLICE]
+    np.testing.assert_allclose(commands[0, 3:], ACTION_BOX.neutral, atol=1e-6)
+    sent = np.stack(rig.policy.sent)[-len(states) + 1 :]  # none is told with the first
+    np.testing.assert_allclose(commands[1:, 3:], ACTION_BOX.to_metric(sent), atol=1e-6)
+
+
+@pytest.mark.parametrize("delay_ms", [5, 15, 30, 38])
+def test_a_plan_that_is_ready_within_its_tick_is_never_missed(
+    make_rig: Make, delay_ms: int
+) -> None:
+    rig = make_rig(lambda tick: delay_ms)
+    rig.go()
+    rig.run(2.0)
+    assert rig.loop.pilot.misses == 0
+    assert set(rig.states[-100:]) == {State.RUN}
+
+
+@pytest.mark.parametrize("delay_ms", [60, 100, 200, 400])
+def test_a_slow_planner_never_moves_the_robot_roughly(make_rig: Make, delay_ms: int) -> None:
+    slow = [False]
+    rig = make_rig(lambda tick: delay_ms if slow[0] else 10)
+    rig.go()
+    slow[0] = True
+    rig.run(4.0)
+    assert State.DAMP not in rig.states
+    assert State.HOLD in rig.states
+    assert rig.robot.robot.pelvis_height > 0.7
+    assert_sane(rig.body.commands)
+    slow[0] = False
+    rig.run(2.0)
+    assert rig.loop.state is State.RUN
+
+
+def test_a_silent_planner_is_held_within_200_ms_and_the_hands_go_home(make_rig: Make) -> None:
+    dead = [False]
+    rig = make_rig(lambda tick: 10**6 if dead[0] else 10)
+    rig.go()
+    dead[0] = True
+    start = len(rig.states)
+    rig.run(3.0)
+    assert (rig.states[start:].index(State.HOLD) + 1) * 20 <= 200
+    np.testing.assert_allclose(rig.loop.pilot.sent, 0.0, atol=1e-9)
+    assert rig.robot.robot.pelvis_height > 0.7
+
+
+@pytest.mark.parametrize(("ms", "worst"), [(60, State.RUN), (160, State.HOLD), (300, State.DAMP)])
+def test_frozen_proprioception(make_rig: Make, ms: int, worst: State) -> None:
+    rig = make_rig(level=0.0)
+    rig.go()
+    start = len(rig.states)
+    rig.faults.frozen = True
+    rig.run(ms / 1e3)
+    rig.faults.frozen = False
+    rig.run(2.0)
+    seen = set(rig.states[start:])
+    order = [State.RUN, State.HOLD, State.DAMP]
+    assert max(seen, key=order.index) is worst
+    if worst is State.DAMP:
+        assert (rig.states[start:].index(State.DAMP) + 1) * 20 <= 240
+        assert all(limp(command) for command in rig.body.commands[-50:])
+    else:
+        assert rig.loop.state is State.RUN
+
+
+def test_readings_that_are_no_numbers_count_as_none_and_reach_nobody(make_rig: Make) -> None:
+    rig = make_rig(level=0.0)
+    rig.go()
+    rig.faults.nan = True
+    rig.run(0.08)
+    assert rig.loop.state is State.RUN
+    rig.faults.nan = False
+    rig.run(0.5)
+    assert rig.loop.state is State.RUN
+    rig.faults.nan = True
+    rig.run(0.4)
+    assert rig.loop.state is State.DAMP
+    assert np.isfinite(np.stack(rig.policy.seen)).all()
+    assert_sane(rig.body.commands)
+
+
+def test_a_blind_camera_holds_and_sight_lets_it_go_on(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.go()
+    rig.faults.blind = True
+    rig.run(0.5)
+    assert rig.loop.state is State.HOLD
+    rig.faults.blind = False
+    rig.run(2.0)
+    assert rig.loop.state is State.RUN
+
+
+def test_pushed_over_it_is_damped_within_60_ms_of_tilting_and_stays_so(make_rig: Make) -> None:
+    rig = make_rig(level=0.0)
+    rig.go()
+    start = len(rig.states)
+    tilts: list[float] = []
+
+    def each(tick: int) -> None:
+        if tick == 0:
+            rig.robot.push(np.array([0.0, 3.0, 0.0]))
+        tilts.append(rig.robot.robot.tilt)
+
+    rig.run(2.0, each=each)
+    tilted = next(k for k, tilt in enumerate(tilts) if tilt > 1.0)
+    damped = rig.states[start:].index(State.DAMP)
+    assert (damped - tilted) * 20 <= 60
+    assert set(rig.states[start + damped :]) == {State.DAMP}
+    for request in Request:
+        rig.run(0.1, request)
+    assert rig.loop.state is State.DAMP
+    assert all(limp(command) for command in rig.body.commands[start + damped :])
+
+
+def test_a_controller_without_numbers_damps_in_the_same_tick(
+    make_rig: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = make_rig()
+    rig.go()
+    before = len(rig.body.commands)
+
+    def broken(state: NDArray[np.floating]) -> NDArray[np.float64]:
+        return np.full((1, 29), np.nan)
+
+    monkeypatch.setattr(rig.loop._controller, "step", broken)
+    rig.run(0.1)
+    assert rig.loop.state is State.DAMP
+    assert all(limp(command) for command in rig.body.commands[before:])
+    assert_sane(rig.body.commands)
+
+
+def test_it_is_not_armed_while_somebody_else_drives(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.faults.refusal = "another publisher is alive"
+    rig.run(0.1)
+    rig.run(0.5, Request.STAND)
+    assert rig.loop.state is State.INIT
+    assert all(limp(command) for command in rig.body.commands)
+
+
+def test_the_operators_velocity_is_sent_only_while_running(make_rig: Make) -> None:
+    rig = make_rig(level=0.0)
+    rig.stand()
+    rig.run(0.4, velocity=(0.2, 0.0, 0.0))
+    assert rig.policy.seen[-1][STATE_SLICES["command_velocity"]][0] == 0.0
+    rig.run(0.5, Request.RUN)
+    rig.run(0.4, velocity=(0.2, 0.0, 0.0))
+    assert rig.policy.seen[-1][STATE_SLICES["command_velocity"]][0] == pytest.approx(0.2)
+    rig.run(1.5)  # the operator has fallen silent
+    assert rig.policy.seen[-1][STATE_SLICES["command_velocity"]][0] == 0.0

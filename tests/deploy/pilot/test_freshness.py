@@ -1,0 +1,32 @@
+"""A reading is as old as its content."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from egovcp_deploy.pilot.freshness import Freshness
+
+
+def test_nothing_yet_is_infinitely_old() -> None:
+    assert Freshness().age_s(10**9) == math.inf
+
+
+def test_a_repeated_reading_ages_however_often_it_comes() -> None:
+    fresh, reading = Freshness(), np.arange(3.0)
+    for k in range(6):
+        fresh.update(k * 50_000_000, reading)
+    assert fresh.age_s(250_000_000) == 0.25
+    fresh.update(250_000_000, reading + 1e-12)
+    assert fresh.age_s(250_000_000) == 0.0
+
+
+def test_numbers_that_are_not_finite_and_silence_are_nothing_new() -> None:
+    fresh = Freshness()
+    fresh.update(0, np.zeros(3))
+    fresh.update(100_000_000, np.array([1.0, math.nan, 0.0]))
+    fresh.update(150_000_000, None)
+    assert fresh.age_s(200_000_000) == 0.2
+    fresh.reset()
+    assert fresh.age_s(200_000_000) == math.inf

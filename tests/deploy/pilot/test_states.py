@@ -1,0 +1,192 @@
+"""The state machine goes where it should, when it should, and never out of DAMP."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from egovcp_deploy.pilot.states import Facts, Limits, Request, State, Supervisor
+
+TICK_NS = 20_000_000
+WELL = Facts(time_ns=0)
+
+
+def at(state: State) -> Supervisor:
+    return Supervisor(state=state)
+
+
+def feed(machine: Supervisor, facts: Facts, seconds: float, start_ns: int = 0) -> int:
+    """The same facts for ``seconds`` at 50 Hz; the time afterwards."""
+    ticks = round(seconds * 50)
+    for k in range(ticks):
+        machine.update(replace(facts, time_ns=start_ns + k * TICK_NS))
+    return start_ns + ticks * TICK_NS
+
+
+def test_the_way_from_start_to_run() -> None:
+    machine = Supervisor()
+    assert machine.update(WELL) == ()
+    assert machine.state is State.INIT
+    assert machine.update(WELL, Request.STAND) == ("init -> stand: the operator asked for it",)
+    (refused,) = machine.update(WELL, Request.ARM)
+    assert refused == "arm refused: still standing up, 3.0 s to go"
+    now = feed(machine, WELL, 3.0)
+    machine.update(replace(WELL, time_ns=now), Request.ARM)
+    assert machine.state is State.ARMED
+    machine.update(replace(WELL, time_ns=now), Request.RUN)
+    assert machine.state is State.RUN
+
+
+@pytest.mark.parametrize("request_", [Request.ARM, Request.RUN])
+def test_no_step_is_left_out(request_: Request) -> None:
+    machine = Supervisor()
+    (refused,) = machine.update(WELL, request_)
+    assert refused.startswith(f"{request_} refused: the robot is in init")
+    assert machine.state is State.INIT
+
+
+def test_nothing_moves_before_the_first_reading() -> None:
+    machine = Supervisor()
+    (refused,) = machine.update(replace(WELL, state_age_s=math.inf), Request.STAND)
+    assert "proprioception" in refused
+    assert machine.state is State.INIT
+
+
+def test_a_refusal_of_the_robot_keeps_it_from_being_armed() -> None:
+    machine = at(State.STAND)
+    now = feed(machine, WELL, 4.0)
+    (refused,) = machine.update(
+        replace(WELL, time_ns=now, refusal="another publisher is alive"), Request.ARM
+    )
+    assert refused == "arm refused: another publisher is alive"
+
+
+def test_run_is_refused_without_a_picture() -> None:
+    machine = at(State.ARMED)
+    machine.update(replace(WELL, picture_age_s=math.inf), Request.RUN)
+    assert machine.state is State.ARMED
+
+
+DAMPS = [
+    {"state_age_s": 0.201},
+    {"tilt": 1.01},
+    {"tilt": math.nan},
+    {"height": 0.39},
+    {"height": math.nan},
+    {"controller_ok": False},
+]
+
+
+@pytest.mark.parametrize("state", [State.ARMED, State.RUN, State.HOLD])
+@pytest.mark.parametrize("fault", DAMPS, ids=str)
+def test_what_standing_cannot_survive_damps_at_once_and_for_good(
+    state: State, fault: dict[str, float]
+) -> None:
+    machine = at(state)
+    machine.update(replace(WELL, **fault))
+    assert machine.state is State.DAMP
+    assert machine.stopped_for_safety
+    reason = machine.reason
+    now = feed(machine, WELL, 5.0)
+    for request in Request:
+        machine.update(replace(WELL, time_ns=now), request)
+    assert machine.state is State.DAMP
+    assert machine.reason == reason
+
+
+@pytest.mark.parametrize("state", list(State))
+def test_the_emergency_stop_works_in_every_state(state: State) -> None:
+    machine = at(state)
+    machine.update(WELL, Request.ESTOP)
+    assert machine.state is State.DAMP
+
+
+HOLDS = [
+    {"state_age_s": 0.101},
+    {"picture_age_s": 0.201},
+    {"planner_silence_s": 0.141},
+    {"misses": 6},
+    {"planner_alive": False},
+]
+
+
+@pytest.mark.parametrize("fault", HOLDS, ids=str)
+def test_what_standing_survives_holds_and_recovers(fault: dict[str, float]) -> None:
+    machine = at(State.RUN)
+    machine.update(replace(WELL, **fault))
+    assert machine.state is State.HOLD
+    now = feed(machine, WELL, 0.98, TICK_NS)
+    assert machine.state is State.HOLD
+    feed(machine, WELL, 0.2, now)
+    assert machine.state is State.RUN
+
+
+ALMOST = [
+    {"state_age_s": 0.05},
+    {"picture_age_s": 0.19},
+    {"planner_silence_s": 0.13},
+    {"misses": 5},
+    {"tilt": 0.9},
+    {"height": 0.5},
+]
+
+
+@pytest.mark.parametrize("fault", ALMOST, ids=str)
+def test_less_is_run_through(fault: dict[str, float]) -> None:
+    machine = at(State.RUN)
+    feed(machine, replace(WELL, **fault), 2.0)
+    assert machine.state is State.RUN
+
+
+def test_a_fault_that_comes_and_goes_does_not_flicker() -> None:
+    machine, changes, now = at(State.RUN), 0, 0
+    for _ in range(20):
+        before = machine.state
+        now = feed(machine, replace(WELL, misses=6), 0.1, now)
+        changes += machine.state is not before
+        now = feed(machine, WELL, 0.5, now)
+    assert changes == 1
+    assert machine.state is State.HOLD
+
+
+def test_an_operators_hold_ends_only_with_the_operator() -> None:
+    machine = at(State.RUN)
+    machine.update(WELL, Request.HOLD)
+    now = feed(machine, WELL, 5.0)
+    assert machine.state is State.HOLD
+    machine.update(replace(WELL, time_ns=now), Request.RUN)
+    feed(machine, WELL, 1.1, now)
+    assert machine.state is State.RUN
+
+
+def test_standing_up_may_begin_low_but_not_end_there() -> None:
+    machine = at(State.STAND)
+    low = replace(WELL, height=0.3)
+    now = feed(machine, low, 4.0)
+    assert machine.state is State.STAND
+    (refused,) = machine.update(replace(low, time_ns=now), Request.ARM)
+    assert "0.30 m" in refused
+
+
+def test_whatever_comes_damp_is_latched_and_run_is_never_entered_unasked() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        machine, now, asked, damped = Supervisor(Limits(stand_s=0.1)), 0, False, False
+        for _ in range(100):
+            now += TICK_NS
+            facts = Facts(
+                now,
+                state_age_s=float(rng.choice([0.0, 0.15, 0.25], p=[0.9, 0.07, 0.03])),
+                picture_age_s=float(rng.choice([0.0, 0.3], p=[0.9, 0.1])),
+                misses=int(rng.choice([0, 7], p=[0.9, 0.1])),
+                tilt=float(rng.choice([0.0, 1.2], p=[0.99, 0.01])),
+            )
+            request = rng.choice([None, *Request], p=[0.7, 0.1, 0.1, 0.06, 0.03, 0.01])
+            machine.update(facts, request)
+            asked |= request is Request.RUN
+            assert not (damped and machine.state is not State.DAMP)
+            damped = machine.state is State.DAMP
+            assert asked or machine.state is not State.RUN

@@ -1,0 +1,271 @@
+"""Faults injected into the lock-step loop of a simulated robot: what happens, and how soon."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from egovcp.log.info import CameraView, RunInfo
+from egovcp.log.tick import Tick
+from egovcp.plan import PolicyStep
+from egovcp.rate import FixedRate, LockstepClock
+from egovcp.sim.config import EnvConfig, EpisodeConfig
+from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
+from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.pilot.states import Request, State
+from egovcp_deploy.robots import Outcome, Sensed
+from egovcp_deploy.robots.sim import SimRobot
+from egovcp_deploy.runner import Runner
+from egovcp_deploy.safety import HOLD_RATE
+
+MS = 1_000_000
+TICK_MS = 40
+
+
+class Steady:
+    """Plans the same reach always; ``broken`` makes its plan unusable."""
+
+    def __init__(self, level: float = 0.5, broken: Callable[[int], float | None] = lambda k: None):
+        self._level, self._broken, self._count = level, broken, 0
+
+    def reset(self) -> None:
+        pass
+
+    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+        level = self._broken(self._count)
+        self._count += 1
+        plan = np.full((1, 4, ACTION_DIM), self._level if level is None else level, np.float32)
+        plan[..., -1] = 0.0  # stay upright
+        none = np.zeros(0, np.float32)
+        return PolicyStep(plan[:, 0], plan, none, none, none, none, 1)
+
+    def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
+        pass
+
+    def advance(self, sent: NDArray[np.floating]) -> None:
+        pass
+
+
+class Disturbed:
+    """A simulated robot whose readings or body are tampered with, by tick."""
+
+    def __init__(self, robot: SimRobot, tamper: Callable[[int, Sensed, SimRobot], Sensed]) -> None:
+        self._robot, self._tamper, self.tick, self.damped_at = robot, tamper, 0, -1
+
+    @property
+    def controller_id(self) -> str:
+        return self._robot.controller_id
+
+    @property
+    def camera(self) -> CameraView:
+        return self._robot.camera
+
+    def start(self, episode: int) -> None:
+        self.tick, self.damped_at = 0, -1
+        self._robot.start(episode)
+
+    def observe(self) -> Sensed:
+        return self._tamper(self.tick, self._robot.observe(), self._robot)
+
+    def act(self, action: NDArray[np.float64]) -> Outcome:
+        assert np.isfinite(action).all()
+        assert np.abs(action).max() <= 1.0
+        self.tick += 1
+        outcome = self._robot.act(action)
+        return replace(outcome, terminated=False)  # a real robot has no task that ends
+
+    def damp(self) -> None:
+        self.damped_at = self.tick
+        self._robot.damp()
+
+    def close(self) -> None:
+        self._robot.close()
+
+
+class Memory:
+    def __init__(self) -> None:
+        self.ticks: list[Tick] = []
+
+    def open(self, info: RunInfo) -> None:
+        pass
+
+    def write(self, tick: Tick) -> None:
+        self.ticks.append(tick)
+
+    def close(self) -> None:
+        pass
+
+
+def untouched(tick: int, sensed: Sensed, robot: SimRobot) -> Sensed:
+    return sensed
+
+
+@pytest.fixture(scope="module")
+def sim() -> Iterator[SimRobot]:
+    """Nothing is thrown, and an episode lasts 3 s."""
+    quiet = EpisodeConfig(ticks=75, event_ticks=(70, 70), empty_probability=1.0)
+    robot = SimRobot(EnvConfig(controller="stance", ball_episode=quiet), "ball", seed=0)
+    yield robot
+    robot.close()
+
+
+def play(
+    sim: SimRobot,
+    policy: Steady,
+    tamper: Callable[[int, Sensed, SimRobot], Sensed] = untouched,
+    delay_ms: Callable[[int], int] = lambda tick: 0,
+    operator: Callable[[int], Request | None] = lambda tick: None,
+) -> tuple[list[Tick], Disturbed]:
+    clock, robot, memory = LockstepClock(), Disturbed(sim, tamper), Memory()
+    desk = InlineDesk(Thinker(policy), clock, lambda tick: delay_ms(tick) * MS)
+    robot.start(0)
+    Runner(desk, robot, FixedRate(25, clock), max_ticks=75, operator=operator).run(memory)
+    return memory.ticks, robot
+
+
+def modes(ticks: list[Tick]) -> list[str]:
+    return [tick.mode for tick in ticks]
+
+
+def assert_gentle(ticks: list[Tick]) -> None:
+    sent = np.stack([np.zeros(ACTION_DIM), *(tick.action_sent for tick in ticks)])
+    assert np.isfinite(sent).all()
+    assert np.abs(sent).max() <= 1.0
+    assert np.abs(np.diff(sent, axis=0)).max() <= ACTION_RATE_LIMIT + 1e-9
+
+
+@pytest.mark.parametrize("delay", [0, 20, 40, 60, 100, 200, 400])
+def test_a_planner_that_is_late_by_so_much_is_run_through_or_held(
+    sim: SimRobot, delay: int
+) -> None:
+    ticks, robot = play(sim, Steady(), delay_ms=lambda tick: delay)
+    assert_gentle(ticks)
+    assert robot.damped_at == -1
+    if delay <= TICK_MS:
+        assert set(modes(ticks)) == {State.RUN}
+        np.testing.assert_allclose(ticks[-1].action_sent[:6], 0.5)
+    elif delay >= 200:
+        held = modes(ticks).index(State.HOLD)
+        assert held * TICK_MS <= 200 + TICK_MS  # nothing is known to be wrong before
+        assert ticks[-1].mode == State.HOLD
+        np.testing.assert_allclose(ticks[-1].action_sent, 0.0, atol=1e-9)
+
+
+def test_one_long_plan_is_bridged_by_the_plan_before(sim: SimRobot) -> None:
+    ticks, _ = play(sim, Steady(), delay_ms=lambda tick: 130 if tick == 30 else 0)
+    assert set(modes(ticks)) == {State.RUN}
+    np.testing.assert_allclose([t.action_sent[0] for t in ticks[10:]], 0.5)
+
+
+def test_a_planner_that_stops_is_noticed_in_200_ms_and_the_hands_ease(sim: SimRobot) -> None:
+    ticks, robot = play(sim, Steady(), delay_ms=lambda tick: 10**6 if tick >= 30 else 0)
+    first = modes(ticks).index(State.HOLD)
+    assert (first - 30) * TICK_MS <= 200
+    assert robot.damped_at == -1
+    after = np.stack([t.action_sent for t in ticks[first:]])
+    assert np.abs(np.diff(after, axis=0)).max() <= HOLD_RATE + 1e-9
+    np.testing.assert_allclose(after[-1], 0.0, atol=1e-9)
+    assert ticks[-1].base is not None
+    assert ticks[-1].base.position_w[2] > 0.7  # it stands
+
+
+def frozen(begin: int, ticks: int, what: str) -> Callable[[int, Sensed, SimRobot], Sensed]:
+    """The readings of tick ``begin`` are repeated for ``ticks`` more."""
+    kept: list[Sensed] = []
+
+    def tamper(tick: int, sensed: Sensed, robot: SimRobot) -> Sensed:
+        if tick == begin:
+            kept.append(sensed)
+        if not begin < tick <= begin + ticks:
+            return sensed
+        if what == "picture":
+            return Sensed(kept[0].depth, sensed.state)
+        return Sensed(sensed.depth, kept[0].state)
+
+    return tamper
+
+
+@pytest.mark.parametrize(
+    ("what", "repeats", "worst"),
+    [
+        ("state", 1, State.RUN),  # 40 ms
+        ("state", 3, State.HOLD),  # 120 ms, at a limit of 100
+        ("state", 7, State.DAMP),  # 280 ms, at a limit of 200
+        ("picture", 1, State.RUN),
+        ("picture", 4, State.RUN),  # 160 ms, at a limit of 200
+        ("picture", 8, State.HOLD),
+    ],
+)
+def test_frozen_readings(sim: SimRobot, what: str, repeats: int, worst: State) -> None:
+    ticks, robot = play(sim, Steady(), frozen(20, repeats, what))
+    seen = set(modes(ticks))
+    assert worst in seen
+    if worst is State.DAMP:
+        assert (robot.damped_at - 20) * TICK_MS <= 200 + TICK_MS
+        assert ticks[-1].mode == State.DAMP
+    else:
+        assert State.DAMP not in seen
+        assert ticks[-1].mode == State.RUN  # it recovers
+    if worst is State.RUN:
+        assert seen == {State.RUN}
+    assert_gentle(ticks)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, -1e30])
+def test_numbers_that_are_no_plan_are_never_sent(sim: SimRobot, value: float) -> None:
+    rng = np.random.default_rng(1)
+    bad = rng.random(200) < 0.3
+    ticks, robot = play(sim, Steady(broken=lambda k: value if bad[k] else None))
+    assert_gentle(ticks)
+    assert robot.damped_at == -1
+
+
+def test_nothing_but_nan_is_held(sim: SimRobot) -> None:
+    ticks, _ = play(sim, Steady(broken=lambda k: np.nan))
+    assert ticks[-1].mode == State.HOLD
+    assert_gentle(ticks)
+
+
+def test_a_robot_that_is_pushed_over_is_damped_within_60_ms_of_tilting(sim: SimRobot) -> None:
+    tilts: list[float] = []
+
+    def push(tick: int, sensed: Sensed, robot: SimRobot) -> Sensed:
+        body = robot.env.lanes[0].robot
+        if tick == 20:
+            body.data.qvel[:3] += (0.0, 3.0, 0.0)
+            body.data.qvel[3:6] += (-4.0, 0.0, 0.0)
+        tilts.append(body.tilt)
+        return sensed
+
+    ticks, robot = play(sim, Steady(0.0), push)
+    fallen = next(k for k, tilt in enumerate(tilts) if tilt > 1.0)
+    assert (robot.damped_at - fallen) * TICK_MS <= 60
+    assert modes(ticks)[robot.damped_at :] == [State.DAMP] * (len(ticks) - robot.damped_at)
+
+
+def test_damped_motors_do_not_hold_the_robot_up_and_the_next_episode_is_whole(
+    sim: SimRobot,
+) -> None:
+    ticks, robot = play(
+        sim, Steady(0.0), operator=lambda tick: Request.ESTOP if tick == 10 else None
+    )
+    assert robot.damped_at == 10
+    assert ticks[-1].base is not None
+    assert ticks[-1].base.position_w[2] < 0.6
+    ticks, _ = play(sim, Steady(0.0))
+    assert set(modes(ticks)) == {State.RUN}
+    assert ticks[-1].base is not None
+    assert ticks[-1].base.position_w[2] > 0.7
+
+
+def test_the_operator_holds_and_goes_on(sim: SimRobot) -> None:
+    script = {20: Request.HOLD, 40: Request.RUN}
+    ticks, _ = play(sim, Steady(), operator=script.get)
+    assert modes(ticks)[19] == State.RUN
+    assert modes(ticks)[20] == State.HOLD
+    assert modes(ticks)[39] == State.HOLD
+    assert ticks[-1].mode == State.RUN
