@@ -20,6 +20,7 @@ from egovcp.log.info import CameraView
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import Tick
 from egovcp.sim.config import CameraConfig
+from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.base import Outcome, Sensed
 
 if TYPE_CHECKING:
@@ -107,6 +108,9 @@ class ReplayRobot:
             return replace(outcome, truncated=True, events=(*outcome.events, *cut))
         return outcome
 
+    def damp(self) -> None:
+        """The past cannot be changed."""
+
     def close(self) -> None:
         """Nothing is held."""
 
@@ -142,19 +146,23 @@ def _number(path: Path) -> tuple[int, str]:
 def recorded_run(path: Path) -> Recorded:
     """The run in an MCAP file of ours, also if it was cut short.
 
+    One on the wall clock begins where the planner took over: its recurrence started there.
+
     Raises:
         DataError: it is none, or holds no ticks.
     """
     recording = read_recording(path)
+    running = [i for i, tick in enumerate(recording.ticks) if tick.mode == State.RUN]
+    ticks = recording.ticks[running[0] if running else 0 :]
     return Recorded(
         name=str(path),
         controller_id=recording.info.hashes.get("low_level_controller", ""),
         camera=recording.info.camera,
         sensed=[
             Sensed(tick.depth, np.asarray(tick.state, np.float32), tick.base, tick.scene)
-            for tick in recording.ticks
+            for tick in ticks
         ],
-        outcomes=[_outcome(tick) for tick in recording.ticks],
+        outcomes=[_outcome(tick) for tick in ticks],
     )
 
 

@@ -14,11 +14,14 @@ from egovcp.data import DatasetWriter, Provenance
 from egovcp.errors import DataError, UsageError
 from egovcp.log.info import RunInfo
 from egovcp.log.mcap import McapSink
+from egovcp.log.sink import Sink
 from egovcp.log.tick import Tick
 from egovcp.plan import Policy, PolicyStep
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.testing import random_episode
+from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.robots import Robot
 from egovcp_deploy.robots.replay import ENDS, ReplayRobot, open_recordings
 from egovcp_deploy.robots.sim import SimRobot
 from egovcp_deploy.runner import Runner
@@ -44,6 +47,9 @@ class Watched:
         self.values.append(float(step.value[0]))
         return step._replace(action=step.action + self._askew)
 
+    def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
+        self._policy.observe(depth, state)
+
     def advance(self, sent: NDArray[np.floating]) -> None:
         self._policy.advance(sent)
 
@@ -68,10 +74,15 @@ def watched(artefact_dir: Path, askew: float = 0.0) -> Watched:
     return Watched(load_artefact(str(artefact_dir)).make_policy(1, seed=5), askew)
 
 
+def run(policy: Watched, robot: Robot, sink: Sink) -> None:
+    clock = LockstepClock()
+    Runner(InlineDesk(Thinker(policy), clock), robot, FixedRate(25, clock)).run(sink)
+
+
 def play(policy: Watched, robot: ReplayRobot, episode: int = 0) -> list[Tick]:
     sink = Kept()
     robot.start(episode)
-    Runner(policy, robot, FixedRate(25, LockstepClock()), imagine=0).run(sink)
+    run(policy, robot, sink)
     return sink.ticks
 
 
@@ -93,7 +104,7 @@ def recorded(
                 hashes={"low_level_controller": robot.controller_id},
             )
         )
-        Runner(policy, robot, FixedRate(25, LockstepClock()), imagine=0).run(sink)
+        run(policy, robot, sink)
         sink.close()
         thoughts.append(policy)
     robot.close()
