@@ -60,7 +60,7 @@ def run_live(
         spare = BridgeBody(setup.hardware.bridge)
         spare.connect()
         stack.callback(spare.close)
-        process = stack.enter_context(_started(setup, address))
+        process = stack.enter_context(started(setup, address))
         session = Session(
             thinker, link, operator, sink, MonotonicClock(), process.is_alive, setup.stays
         )
@@ -73,7 +73,7 @@ def run_live(
 
 
 @contextmanager
-def _started(setup: LiveSetup, address: str) -> Iterator[BaseProcess]:
+def started(setup: LiveSetup, address: str) -> Iterator[BaseProcess]:
     """The control process, which has ended afterwards whatever happens."""
     control = ControlSetup(address, setup.hardware, setup.controller, setup.limits, os.getpid())
     process = multiprocessing.get_context("spawn").Process(

@@ -17,9 +17,7 @@ from egovcp.sim.config import CameraConfig
 from egovcp_deploy.robots.body import Picture
 from egovcp_deploy.robots.resample import Intrinsics, Resampler
 
-_INSTALL: Final = (
-    "install the camera's driver: pip install 'lerobot[intelrealsense]', which brings pyrealsense2"
-)
+_INSTALL: Final = "install the camera's driver: pip install 'egovcp-deploy[realsense]'"
 _LEAST_COVERAGE: Final = 0.9
 _OLDEST_MS: Final = 10_000  # the age of a picture is the caller's business; this only peeks
 

@@ -85,7 +85,7 @@ class FakeBridge:
         faults: Faults | None = None,
         announce: bool = False,
     ) -> None:
-        self.robot = robot
+        self._robot = robot
         self.faults = faults or Faults()
         self.counts = Counts()
         self._announce = announce
@@ -122,6 +122,11 @@ class FakeBridge:
                 "perhaps another egovcp-fake-g1, or choose another"
             ) from error
         return end
+
+    @property
+    def robot(self) -> LiveRobot:
+        """What is behind the wire."""
+        return self._robot
 
     @property
     def commanded(self) -> bool:

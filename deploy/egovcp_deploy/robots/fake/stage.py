@@ -4,11 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Protocol
 
-from egovcp.sim.live import Outcome, Phase
+from egovcp.sim.live import LiveRobot, Outcome, Phase
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import PHYSICS_DT
-from egovcp_deploy.robots.fake.bridge import FakeBridge
+
+
+class Plant(Protocol):
+    """A simulated robot and whoever passes it its commands."""
+
+    @property
+    def robot(self) -> LiveRobot:
+        """The robot."""
+        ...
+
+    @property
+    def commanded(self) -> bool:
+        """Whether the motors are told to hold anything."""
+        ...
+
+    def next_episode(self) -> None:
+        """The robot has started another episode."""
+        ...
+
+    def step(self) -> None:
+        """Let 5 ms pass."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -28,19 +50,19 @@ class Stage:
     """Plays one scenario after the other.
 
     Args:
-        bridge: serves the robot.
+        plant: the robot, behind a wire or not.
         scenarios: number of an episode -> its scenario; None: there are no more.
         tell: is told what happens, in words.
     """
 
     def __init__(
         self,
-        bridge: FakeBridge,
+        plant: Plant,
         scenarios: Callable[[int], Scenario | None],
         schedule: Schedule | None = None,
         tell: Callable[[str], None] = lambda line: None,
     ) -> None:
-        self._bridge = bridge
+        self._plant = plant
         self._scenarios = scenarios
         self._schedule = schedule or Schedule()
         self._tell = tell
@@ -55,8 +77,8 @@ class Stage:
         if scenario is None:
             self.finished = True
             return
-        self._bridge.robot.start(scenario)
-        self._bridge.next_episode()
+        self._plant.robot.start(scenario)
+        self._plant.next_episode()
         self._enter(Phase.HELD)
         self._tell(f"episode {scenario.episode} ({scenario.task}): on the crane")
 
@@ -67,8 +89,8 @@ class Stage:
         """5 ms."""
         if self.finished:
             return
-        self._bridge.step()
-        robot = self._bridge.robot
+        self._plant.step()
+        robot = self._plant.robot
         if robot.phase is not self._phase:
             self._enter(robot.phase)
             self._announce()
@@ -81,10 +103,10 @@ class Stage:
             self._start()
 
     def _wait_for_commands(self) -> None:
-        if not self._bridge.commanded:
+        if not self._plant.commanded:
             self._since = 0.0
         elif self._schedule.gantry is not None and self._since > self._schedule.gantry:
-            self._bridge.robot.release()
+            self._plant.robot.release()
 
     def _announce(self) -> None:
         if self._phase is Phase.FREE:
@@ -92,7 +114,7 @@ class Stage:
         elif self._phase is Phase.EPISODE:
             self._tell("the task begins")
         elif self._phase is Phase.OVER:
-            outcome = self._bridge.robot.outcome
+            outcome = self._plant.robot.outcome
             self.outcomes.append(outcome)
             self._tell(spoken(outcome))
 

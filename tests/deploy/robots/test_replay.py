@@ -1,0 +1,195 @@
+"""A recorded run, played back: the same filter takes the same steps, bit for bit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+
+from egovcp.artefact import load_artefact
+from egovcp.data import DatasetWriter, Provenance
+from egovcp.errors import DataError, UsageError
+from egovcp.log.info import RunInfo
+from egovcp.log.mcap import McapSink
+from egovcp.log.sink import Sink
+from egovcp.log.tick import Tick
+from egovcp.plan import Policy, PolicyStep
+from egovcp.rate import FixedRate, LockstepClock
+from egovcp.sim.config import EnvConfig, EpisodeConfig
+from egovcp.testing import random_episode
+from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.robots import Robot
+from egovcp_deploy.robots.replay import ENDS, ReplayRobot, open_recordings
+from egovcp_deploy.robots.sim import SimRobot
+from egovcp_deploy.runner import Runner
+
+TICKS = 12
+CONFIG = EnvConfig(controller="stance", ball_episode=EpisodeConfig(TICKS, (2, 3), 0.0))
+
+
+class Watched:
+    """A policy whose carry and value are written down each tick."""
+
+    def __init__(self, policy: Policy, askew: float = 0.0) -> None:
+        self._policy, self._askew = policy, askew
+        self.carries: list[torch.Tensor] = []
+        self.values: list[float] = []
+
+    def reset(self) -> None:
+        self._policy.reset()
+
+    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+        step = self._policy.act(depth, state)
+        self.carries.append(self._policy.carry.features.clone())
+        self.values.append(float(step.value[0]))
+        return step._replace(action=step.action + self._askew)
+
+    def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
+        self._policy.observe(depth, state)
+
+    def advance(self, sent: NDArray[np.floating]) -> None:
+        self._policy.advance(sent)
+
+
+class Kept:
+    """A sink that keeps ticks."""
+
+    def __init__(self) -> None:
+        self.ticks: list[Tick] = []
+
+    def open(self, info: RunInfo) -> None:
+        pass
+
+    def write(self, tick: Tick) -> None:
+        self.ticks.append(tick)
+
+    def close(self) -> None:
+        pass
+
+
+def watched(artefact_dir: Path, askew: float = 0.0) -> Watched:
+    return Watched(load_artefact(str(artefact_dir)).make_policy(1, seed=5), askew)
+
+
+def run(policy: Watched, robot: Robot, sink: Sink) -> None:
+    clock = LockstepClock()
+    Runner(InlineDesk(Thinker(policy), clock), robot, FixedRate(25, clock)).run(sink)
+
+
+def play(policy: Watched, robot: ReplayRobot, episode: int = 0) -> list[Tick]:
+    sink = Kept()
+    robot.start(episode)
+    run(policy, robot, sink)
+    return sink.ticks
+
+
+@pytest.fixture(scope="module")
+def recorded(
+    artefact_dir: Path, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Path, list[Watched]]:
+    """Two simulated rollouts on disk, and what the policy thought."""
+    folder, thoughts = tmp_path_factory.mktemp("runs"), []
+    robot = SimRobot(CONFIG, "ball", seed=1)
+    for episode in range(2):
+        policy, sink = watched(artefact_dir), McapSink(folder / f"rollout-{episode}.mcap")
+        robot.start(episode)
+        sink.open(
+            RunInfo(
+                "ball",
+                episode=episode,
+                camera=robot.camera,
+                hashes={"low_level_controller": robot.controller_id},
+            )
+        )
+        run(policy, robot, sink)
+        sink.close()
+        thoughts.append(policy)
+    robot.close()
+    return folder, thoughts
+
+
+@pytest.mark.parametrize("askew", [0.0, 0.5])
+@pytest.mark.parametrize("episode", [0, 1])
+def test_the_recurrence_takes_the_same_steps(
+    recorded: tuple[Path, list[Watched]], artefact_dir: Path, episode: int, askew: float
+) -> None:
+    folder, thoughts = recorded
+    again = watched(artefact_dir, askew)  # whatever it plans now, what was sent was sent
+    ticks = play(again, open_recordings(folder), episode)
+    then = thoughts[episode]
+    assert len(ticks) == len(then.carries) == TICKS
+    for a, b in zip(again.carries, then.carries, strict=True):
+        assert torch.equal(a, b)
+    assert again.values == then.values
+
+
+def test_everything_that_was_recorded_comes_back(
+    recorded: tuple[Path, list[Watched]], artefact_dir: Path
+) -> None:
+    folder, _ = recorded
+    robot = open_recordings(folder / "rollout-1.mcap")
+    ticks = play(watched(artefact_dir), robot)
+    live = SimRobot(CONFIG, "ball", seed=1)
+    live.start(1)
+    assert robot.controller_id == live.controller_id
+    assert robot.camera == live.camera
+    for tick in ticks:
+        seen = live.observe()
+        np.testing.assert_array_equal(tick.depth, seen.depth)
+        np.testing.assert_array_equal(tick.state, seen.state)
+        np.testing.assert_allclose(tick.base.position_w, seen.base.position_w)
+        outcome = live.act(tick.action_sent)
+        assert tick.reward == pytest.approx(outcome.reward, abs=1e-6)
+        assert tick.terminated == outcome.terminated
+    assert ticks[-1].truncated
+    live.close()
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("data") / "two"
+    with DatasetWriter(root, Provenance("stance-1", seed=0, command="collect")) as writer:
+        writer.add(random_episode(0, 6))
+        writer.add(random_episode(1, 4, time_limit=9))
+    return root
+
+
+def test_an_episode_of_a_dataset_plays_back(dataset: Path, artefact_dir: Path) -> None:
+    robot = open_recordings(dataset)
+    assert robot.count == 2
+    assert robot.controller_id == "stance-1"
+    for number, episode in enumerate((random_episode(0, 6), random_episode(1, 4, time_limit=9))):
+        ticks = play(watched(artefact_dir), robot, number)
+        for t, tick in enumerate(ticks):
+            np.testing.assert_array_equal(tick.depth, episode.depth[t])
+            np.testing.assert_array_equal(tick.state, episode.state[t])
+            np.testing.assert_array_equal(tick.action_sent, episode.action[t])
+            assert tick.reward == episode.reward[t]
+        assert ticks[-1].terminated is (number == 1)
+        assert ticks[-1].truncated is (number == 0)
+        assert len(ticks) == len(episode)
+
+
+def test_a_recording_that_was_torn_off_ends_where_it_ends(
+    recorded: tuple[Path, list[Watched]], artefact_dir: Path, tmp_path: Path
+) -> None:
+    whole = (recorded[0] / "rollout-0.mcap").read_bytes()
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(whole[: len(whole) * 2 // 3])
+    ticks = play(watched(artefact_dir), open_recordings(torn))
+    assert 0 < len(ticks) < TICKS
+    assert ticks[-1].truncated
+    assert ENDS in ticks[-1].events
+
+
+def test_what_is_not_there_is_said(recorded: tuple[Path, list[Watched]], tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="no recording, folder of recordings"):
+        open_recordings(tmp_path)
+    with pytest.raises(UsageError, match="there are 2 recordings"):
+        open_recordings(recorded[0]).start(2)
+    (tmp_path / "empty.mcap").write_bytes(b"")
+    with pytest.raises(DataError):
+        open_recordings(tmp_path / "empty.mcap")

@@ -1,0 +1,75 @@
+"""The lock-step body: a control loop on its clock is the one that runs on hardware."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from egovcp.rate import FixedRate
+from egovcp.robot.controllers import make_controller
+from egovcp.sim.live import LiveRobot, Outcome
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import ACTION_BOX
+from egovcp_deploy.robots.body import MotorCommand
+from egovcp_deploy.robots.fake.stage import Schedule, Stage
+from egovcp_deploy.robots.proprioception import proprioception
+from egovcp_deploy.robots.sim_body import SimBody, SimClock
+
+NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
+
+
+def play(live: LiveRobot) -> tuple[list[Outcome], list[np.ndarray]]:
+    """One ball, under a controller at 50 Hz."""
+    live.start(Scenario("ball", 4, 0))
+    body = SimBody(live)
+    stage = Stage(
+        body,
+        lambda n: Scenario("ball", 4, 0) if n == 0 else None,
+        Schedule(gantry=0.3, settle=0.3, pause=0.0),
+    )
+    clock = SimClock(stage.step)
+    rate = FixedRate(50, clock)
+    controller = make_controller("stance")
+    controller.reset(proprioception(body.read(), NEUTRAL)[None])
+    rate.start()
+    trace: list[np.ndarray] = []
+    while not stage.finished:
+        state = body.read()
+        assert state.time_ns == clock.now_ns() == body.time_ns
+        target = controller.step(proprioception(state, NEUTRAL)[None])[0]
+        body.write(MotorCommand(target, controller.stiffness, controller.damping, mode=state.mode))
+        picture = body.eye.read()
+        age = clock.now_ns() - picture.time_ns
+        assert 0 <= age <= (25_000_000 if clock.now_ns() > 200_000_000 else 200_000_000)
+        trace += [state.joint_position, picture.depth]
+        rate.wait()
+    assert rate.counters.overruns == 0
+    return stage.outcomes, trace
+
+
+def test_a_rollout_in_lockstep_repeats_bit_for_bit(live: LiveRobot) -> None:
+    (one, first), (two, second) = play(live), play(live)
+    assert one[0].ticks == 20
+    assert not one[0].fallen
+    assert one == two
+    for a, b in zip(first, second, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_reading_is_measured_once_per_step(live: LiveRobot) -> None:
+    live.start(Scenario("ball", 0, 0))
+    body = SimBody(live)
+    first = body.read()
+    assert body.read() is first
+    body.step()
+    assert body.read() is not first
+    assert body.read().time_ns == 5_000_000
+
+
+def test_the_clock_lives_in_whole_steps() -> None:
+    steps: list[int] = []
+    clock = SimClock(lambda: steps.append(1))
+    clock.sleep_until(12_000_000)
+    assert (clock.now_ns(), len(steps)) == (12_000_000, 2)
+    clock.sleep_until(5)
+    clock.sleep_until(20_000_000)
+    assert (clock.now_ns(), len(steps)) == (20_000_000, 4)
