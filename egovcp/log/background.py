@@ -267,7 +267,7 @@ class _Worker:
             command,
             pass_fds=(theirs, theirs_too),
             stdin=subprocess.DEVNULL,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(p for p in sys.path if p)},
+            env=_environment(),
             start_new_session=True,  # a Ctrl-C in the terminal is not for it
         )
         os.close(theirs)
@@ -318,6 +318,12 @@ class _Worker:
             self._process.wait(_LAST_BREATH_S)
         for descriptor in (self._commands, self._reports):
             os.close(descriptor)
+
+
+def _environment() -> dict[str, str]:
+    """The same modules; quiet, since what goes wrong is reported through the pipe."""
+    modules = os.pathsep.join(path for path in sys.path if path)
+    return {"RUST_LOG": "off"} | os.environ | {"PYTHONPATH": modules}
 
 
 def _words(error: Exception) -> str:

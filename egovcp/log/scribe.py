@@ -76,6 +76,8 @@ def main() -> None:
     with suppress(OSError):
         os.nice(NICENESS)
     serve(int(sys.argv[1]), int(sys.argv[2]))
+    sys.stderr.flush()
+    os._exit(0)  # a library's clean-up may wait for a viewer that hangs
 
 
 if __name__ == "__main__":
