@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from egovcp.errors import DataError
 from egovcp.log.info import RunInfo
-from egovcp.log.mcap import METADATA_NAME
+from egovcp.log.mcap import METADATA_NAME, Line
 from egovcp.log.messages import VALUE_MAPS, Topic
 from egovcp.log.tick import BasePose, Candidates, SceneObject, Tick, ValueMap
 from egovcp.spec import DEPTH_COLS
@@ -66,15 +66,6 @@ def read_recording(path: Path) -> Recording:
     reader = RecordingReader(path)
     ticks = [moment.tick() for moment in reader.moments()]
     return Recording(reader.info, ticks, reader.complete)
-
-
-@dataclass(frozen=True)
-class Line:
-    """A topic of the file."""
-
-    topic: str
-    schema: Schema
-    encoding: str
 
 
 @dataclass
@@ -132,7 +123,9 @@ class RecordingReader:
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._records = self._read()
-        self.info = self._first_info()
+        self.metadata = self._first_metadata()
+        """The record ``egovcp`` as it stands in the file."""
+        self.info = self._info()
 
     def moments(self) -> Iterator[Moment]:
         """The ticks in order, once."""
@@ -175,21 +168,24 @@ class RecordingReader:
             return record.channel_id not in self._channels
         return isinstance(record, Channel) and record.schema_id not in self._schemas
 
-    def _first_info(self) -> RunInfo:
+    def _first_metadata(self) -> Mapping[str, str]:
         """The metadata record, which comes before any tick."""
         for record in self._records:
             if isinstance(record, Metadata) and record.name == METADATA_NAME:
-                try:
-                    return RunInfo.from_metadata(record.metadata)
-                except (KeyError, ValueError, TypeError) as error:
-                    problem = f"its metadata record {METADATA_NAME!r} is damaged: {error!r}"
-                    raise DataError(f"{self._path}: {problem}") from error
+                return record.metadata
             if isinstance(record, Message | Channel | Schema):
                 break
         raise DataError(
             f"{self._path} has no metadata record {METADATA_NAME!r} before its first message; "
             "expected a recording of egovcp"
         )
+
+    def _info(self) -> RunInfo:
+        try:
+            return RunInfo.from_metadata(self.metadata)
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
+            problem = f"its metadata record {METADATA_NAME!r} is damaged: {error!r}"
+            raise DataError(f"{self._path}: {problem}") from error
 
 
 def _require_mcap(path: Path) -> None:

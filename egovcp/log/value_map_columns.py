@@ -1,4 +1,4 @@
-"""Value maps as pictures: x to the right, z up, the best yellow; a ring where the plan goes."""
+"""Value maps as pictures: x to the right, z up, the best yellow; a dot where the plan goes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from egovcp.log import paths
-from egovcp.log.colour import value_colours
+from egovcp.log.colour import BALL, value_colours
 from egovcp.log.tick import Hand, Tick, ValueMap
 from egovcp.spec import ACTION_BOX
 
@@ -21,8 +21,8 @@ _FIRST: Final = {"left": 0, "right": 3}  # of the hand's x, y, z in an action
 def log_value_map_styles(stream: rr.RecordingStream) -> None:
     """How the plan's target is drawn, once per recording."""
     for hand in HANDS:
-        ring = rr.Points2D.from_fields(colors=[(255, 255, 255)], radii=[0.4], draw_order=1.0)
-        stream.log(f"{paths.VALUE_MAP}/{hand}/{paths.CHOSEN}", ring, static=True)
+        dot = rr.Points2D.from_fields(colors=[BALL], radii=[0.6], draw_order=1.0)
+        stream.log(f"{paths.VALUE_MAP}/{hand}/{paths.CHOSEN}", dot, static=True)
 
 
 def value_map_columns(ticks: Sequence[Tick]) -> Iterator[tuple[str, Sequence[Tick], Any]]:

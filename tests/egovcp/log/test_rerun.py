@@ -109,7 +109,7 @@ def test_value_maps_are_pictures_with_the_best_point_bright(tmp_path: Path, make
         assert image[row, best[1]].tolist() == [253, 231, 37]
 
 
-def test_the_ring_marks_where_the_plan_puts_the_hand(make_tick: Any) -> None:
+def test_the_dot_marks_where_the_plan_puts_the_hand(make_tick: Any) -> None:
     grid = np.array([0.1, 0.2, 0.3], np.float32)
     value_map = ValueMap("right", grid, -0.2, grid, np.zeros((3, 3), np.float32))
     target = ACTION_BOX.to_metric(np.zeros(7))
