@@ -87,7 +87,7 @@ class Puppet:
         self._stack.callback(spare.close)
         self._process = self._stack.enter_context(started(self._setup, address))
         guard = Guard(self._process, spare, lambda: self._closing)
-        self._stack.callback(lambda: guard.acted and guard.join())
+        self._stack.callback(guard.join_if_acting)
 
     def _await(self, happened: object, limit_s: float, what: str) -> None:
         assert callable(happened)
