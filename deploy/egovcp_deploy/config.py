@@ -8,6 +8,7 @@ from egovcp.sim.config import EnvConfig, eventful
 from egovcp_deploy.live.hardware import CameraOptions
 from egovcp_deploy.options import PLANNER, PlannerOptions, PolicyOptions
 from egovcp_deploy.pilot.states import Limits
+from egovcp_deploy.recording import LogOptions
 from egovcp_deploy.robots.bridge import BridgeConfig
 
 
@@ -16,8 +17,11 @@ class RobotOptions:
     """Which robot."""
 
     type: str = "sim"
-    """sim: the simulated G1, in lock-step with the planner. unitree_g1: a G1, or egovcp-fake-g1,
-    behind LeRobot's bridge, on the wall clock."""
+    """sim: the simulated G1, in lock-step with the planner, or with --realtime on the wall clock.
+    unitree_g1: a G1, or egovcp-fake-g1, behind LeRobot's bridge, on the wall clock. replay: what
+    was recorded once; the policy watches it again, and nothing is driven."""
+    recordings: str = ""
+    """Of a replay: an MCAP file, a folder of them, or a LeRobot dataset on disk."""
     controller: str = "walk"
     """Low-level controller of a unitree_g1: walk, stance, or the file of a trained one; the one of
     the policy's data. The simulated robot has --env.controller."""
@@ -59,6 +63,8 @@ class DeployConfig:
     """The robot."""
     operator: OperatorOptions = field(default_factory=OperatorOptions)
     """Who drives a unitree_g1."""
+    realtime: bool = False
+    """Run the simulated robot on the wall clock, behind the same wire as a real one."""
     dry_run: bool = False
     """Only check what a run needs, line by line, and say go or no-go; nothing moves."""
     task: str = "ball"
@@ -69,6 +75,8 @@ class DeployConfig:
     """Which held-out scenarios."""
     output_dir: str = ""
     """New folder for recordings and summary."""
+    log: LogOptions = field(default_factory=LogOptions)
+    """What is recorded, and shown live."""
     imagine: int = 16
     """How far ahead the world model imagines depth for the recordings, ticks of 40 ms; 0: not at
     all."""

@@ -12,7 +12,7 @@ from egovcp.errors import EgovcpError, UsageError
 from egovcp.spec import TASKS
 from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.drive import check_live, drive, examine_hardware
+from egovcp_deploy.live.drive import check_live, drive, drive_simulated, examine_hardware
 from egovcp_deploy.options import (
     PLANNER,
     REFERENCES,
@@ -21,12 +21,14 @@ from egovcp_deploy.options import (
     check_positive,
     load_policy,
 )
-from egovcp_deploy.rollouts import make_robot, play_rollouts
+from egovcp_deploy.robots.replay import open_recordings
+from egovcp_deploy.rollouts import make_robot, play_rollouts, replay
 from egovcp_deploy.scenarios import held_out
 
 PROG: Final = "egovcp-deploy"
 SIM: Final = "sim"
-ROBOTS: Final = (SIM, "unitree_g1")
+REPLAY: Final = "replay"
+ROBOTS: Final = (SIM, "unitree_g1", REPLAY)
 DRIVERS: Final = (PLANNER, *REFERENCES)
 _EPILOG: Final = (
     "In simulation rollout i plays held-out scenario i of --seed, the same that egovcp-eval plays. "
@@ -57,10 +59,15 @@ def deploy(config: DeployConfig) -> None:
         return
     planned = config.controller == PLANNER
     artefact = load_policy(config.policy, config.planner) if planned else None
-    if config.robot.type == SIM:
+    if config.robot.type == SIM and not config.realtime:
         play_rollouts(config, artefact)
+        return
+    assert artefact is not None, "checked: all else is driven by the planner"
+    if config.robot.type == REPLAY:
+        replay(config, artefact)
+    elif config.robot.type == SIM:
+        drive_simulated(config, artefact)
     else:
-        assert artefact is not None, "checked: only the planner drives a robot"
         drive(config, artefact)
 
 
@@ -72,15 +79,22 @@ def _check(config: DeployConfig) -> None:
     held_out(config.task, config.seed, 0)
     if config.controller == PLANNER:
         config.policy.require("choose a reference that needs none, such as --controller=oracle")
-    elif config.robot.type != SIM:
+    elif config.robot.type != SIM or config.realtime:
         raise UsageError(
-            f"--controller={config.controller} needs the simulator's truth; "
-            f"--robot.type={config.robot.type} is driven by the planner only"
+            f"--controller={config.controller} needs the simulator in lock-step; on the wall clock "
+            "and in a replay there is the planner only"
+        )
+    if config.realtime and config.robot.type != SIM:
+        raise UsageError(
+            f"--realtime is for --robot.type=sim; --robot.type={config.robot.type} knows one pace"
+        )
+    if config.robot.type == REPLAY and not config.robot.recordings:
+        raise UsageError(
+            "--robot.recordings is missing; name an MCAP file, a folder of them, or a dataset"
         )
     if config.imagine < 0:
         raise UsageError(f"--imagine={config.imagine}: expected a number of ticks from 0")
-    if config.robot.type != SIM:
-        check_live(config)
+    check_live(config)
     check_output_dir(config.output_dir)
 
 
@@ -100,6 +114,8 @@ def _findings(config: DeployConfig) -> Iterator[dry_run.Finding]:
             yield dry_run.examine("planner", lambda: dry_run.plan_time(policy))
     if config.robot.type == SIM:
         yield dry_run.examine("robot", lambda: _simulated(config, artefact))
+    elif config.robot.type == REPLAY:
+        yield dry_run.examine("recordings", lambda: _recorded(config, artefact))
     else:
         yield from examine_hardware(config, artefact)
 
@@ -114,6 +130,13 @@ def _simulated(config: DeployConfig, artefact: Artefact | None) -> str:
         return f"simulated, with the controller {robot.controller_id}"
     finally:
         robot.close()
+
+
+def _recorded(config: DeployConfig, artefact: Artefact | None) -> str:
+    robot = open_recordings(Path(config.robot.recordings))
+    if artefact is not None:
+        artefact.require_controller(robot.controller_id)
+    return f"{robot.count}, of a robot with the controller {robot.controller_id}"
 
 
 if __name__ == "__main__":

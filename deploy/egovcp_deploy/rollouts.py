@@ -23,6 +23,7 @@ from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.policy import RolloutPolicy
 from egovcp_deploy.recording import recording, run_info
 from egovcp_deploy.robots import Robot
+from egovcp_deploy.robots.replay import open_recordings
 from egovcp_deploy.runner import RolloutSummary, Runner
 
 if TYPE_CHECKING:
@@ -39,14 +40,22 @@ def play_rollouts(config: DeployConfig, artefact: Artefact | None) -> None:
     robot = make_robot(config)
     try:
         config = replace(config, env=robot.env.config)  # as decided for its controller
-        policy = _make_policy(config, artefact, robot)
-        folder = make_output_dir(config.output_dir)
-        clock = LockstepClock()
-        desk = InlineDesk(Thinker(policy, config.imagine), clock)
-        runner = Runner(desk, robot, FixedRate(PLANNER_HZ, clock), limits=config.robot.limits)
-        _play(config, artefact, robot, runner, folder)
+        _play(config, artefact, robot, _make_policy(config, artefact, robot))
     finally:
         robot.close()
+
+
+def replay(config: DeployConfig, artefact: Artefact) -> None:
+    """Let the policy watch what was recorded; at most ``episodes`` of the recordings.
+
+    Raises:
+        ArtefactError: the artefact is not made for the robot that was recorded.
+        UsageError, DataError: there is nothing to play back, or it is damaged.
+    """
+    robot = open_recordings(Path(config.robot.recordings))
+    artefact.require_controller(robot.controller_id)
+    config = replace(config, episodes=min(config.episodes, robot.count))
+    _play(config, artefact, robot, artefact.make_policy(1, config.seed))
 
 
 def _make_policy(config: DeployConfig, artefact: Artefact | None, robot: SimRobot) -> RolloutPolicy:
@@ -75,16 +84,20 @@ def make_robot(config: DeployConfig) -> SimRobot:
 
 
 def _play(
-    config: DeployConfig, artefact: Artefact | None, robot: Robot, runner: Runner, folder: Path
+    config: DeployConfig, artefact: Artefact | None, robot: Robot, policy: RolloutPolicy
 ) -> None:
     """Record one rollout after the other and, whatever ends them, sum up the complete ones."""
+    folder = make_output_dir(config.output_dir)
+    clock = LockstepClock()
+    desk = InlineDesk(Thinker(policy, config.imagine), clock)
+    runner = Runner(desk, robot, FixedRate(PLANNER_HZ, clock), limits=config.robot.limits)
     summaries: list[RolloutSummary] = []
     try:
         with tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar:
             for episode in range(config.episodes):
                 robot.start(episode)
                 info = _info(config, artefact, robot, episode)
-                with recording(folder, episode, info) as sink:
+                with recording(folder, episode, info, config.log, lossless=True) as sink:
                     summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))
                 bar.update(1)
     finally:

@@ -183,6 +183,7 @@ def thoughts(reply: Reply | None) -> dict[str, Any]:
     return {
         "depth_reconstructed": decoded.reconstructed,
         "depth_imagined": decoded.imagined,
+        "value_maps": decoded.value_maps,
         "plan": step.plan[0] if step.plan.size else None,
         "candidates": _candidates(step) if step.candidates.size else None,
         "value": float(step.value[0]) if step.value.size else None,

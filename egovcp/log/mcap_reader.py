@@ -231,6 +231,7 @@ def _tick(index: int, time_ns: int, messages: Mapping[str, Any]) -> Tick:
         base=_base(messages.get(Topic.BASE)),
         scene=_scene(messages.get(Topic.SCENE)),
         events=tuple(log.msg.split("\n")) if log else (),
+        mode=_mode(messages.get(Topic.MODE)),
         terminated=flags["terminated"],
         truncated=flags["truncated"],
         success=flags["success"],
@@ -247,6 +248,10 @@ def _scalars(message: Any) -> dict[str, float]:
         return {}
     names = message.layout.dim[0].label.split(",")
     return dict(zip(names, map(float, message.data), strict=True))
+
+
+def _mode(message: Any) -> str:
+    return "".join(name for name, is_in in _scalars(message).items() if is_in)
 
 
 def _image(message: Any) -> NDArray[np.uint16]:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from egovcp.log import ros2
 from egovcp.log.info import CameraView
 from egovcp.log.pose import RobotPose, robot_pose
-from egovcp.log.tick import Candidates, Hand, Tick, ValueMap
+from egovcp.log.tick import MODES, Candidates, Hand, Tick, ValueMap
 from egovcp.robot.kinematics import LINK_NAMES, quaternion
 from egovcp.spec import ACTION_NAMES, JOINT_NAMES, STATE_NAMES, STATE_SLICES
 
@@ -48,6 +48,7 @@ class Topic(StrEnum):
     VALUE_MAP_RIGHT = "/plan/value_map/right"
     REWARD = "/reward"
     TIMING = "/timing"
+    MODE = "/runner/state"  # 1 at the state that the runner is in
     SCENE = "/scene/objects"
     LOG = "/rosout"
 
@@ -158,6 +159,8 @@ def _outcome_messages(tick: Tick) -> dict[Topic, bytes]:
     flags = ("terminated", "truncated", "success")
     reward = {"reward": tick.reward} | {flag: float(getattr(tick, flag)) for flag in flags}
     messages = {Topic.REWARD: _named(reward | dict(tick.reward_terms))}
+    if tick.mode:
+        messages[Topic.MODE] = _named({mode: float(mode == tick.mode) for mode in MODES})
     if tick.timing_ms:
         messages[Topic.TIMING] = _named(dict(tick.timing_ms))
     if tick.scene:

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
+
+#: What a robot that is driven by a runner can be doing.
+MODES: Final = ("init", "stand", "armed", "run", "hold", "damp")
 type Hand = Literal["left", "right"]
 
 
@@ -111,4 +114,4 @@ class Tick:
     events: tuple[str, ...] = ()
     """Human-readable lines: throws, contacts, faults."""
     mode: str = ""
-    """State of the runner's state machine, such as ``run``; empty: there is none."""
+    """State of the runner's state machine, one of `MODES`; empty: there is none."""

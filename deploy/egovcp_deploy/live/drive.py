@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import draccus
 import numpy as np
@@ -21,10 +22,14 @@ from egovcp_deploy.live.hardware import CAMERAS, HardwareOptions, open_eye
 from egovcp_deploy.live.operators import OPERATORS, operator
 from egovcp_deploy.live.run import LiveSetup, run_live
 from egovcp_deploy.live.session import LiveSummary
+from egovcp_deploy.live.simulated import simulated
 from egovcp_deploy.options import check_choice, make_output_dir, versions, write_json
 from egovcp_deploy.pilot.desk import Thinker
+from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.recording import recording, run_info
 from egovcp_deploy.robots.bridge import BridgeBody
+
+SIMULATED_S: Final = 15.0  # in RUN: the crane lets go, the robot settles, the episode
 
 
 def check_live(config: DeployConfig) -> None:
@@ -38,23 +43,47 @@ def check_live(config: DeployConfig) -> None:
 
 
 def drive(config: DeployConfig, artefact: Artefact) -> None:
-    """One run, recorded as rollout 0.
+    """One run of a robot, recorded as rollout 0.
 
     Raises:
         ArtefactError: the artefact is not made for the low-level controller.
         EnvironmentFailure: robot, camera or disk fail.
         SafetyStop: the motors were damped for safety.
     """
+    hardware = HardwareOptions(config.robot.bridge, config.robot.camera)
+    folder = _prepare(config, artefact)
+    stays = config.operator.type != "auto" or not config.operator.duration
+    _run(config, artefact, folder, LiveSetup(hardware, *_how(config), stays))
+
+
+def drive_simulated(config: DeployConfig, artefact: Artefact) -> None:
+    """The same with the simulator on the wall clock, for one episode.
+
+    Raises:
+        ArtefactError, EnvironmentFailure, SafetyStop: as `drive`.
+    """
+    operator_options = config.operator
+    if operator_options.type == "auto" and not operator_options.duration:
+        operator_options = replace(operator_options, duration=SIMULATED_S)
+    robot = replace(config.robot, controller=config.env.controller)
+    config = replace(config, robot=robot, operator=operator_options)
+    folder = _prepare(config, artefact)
+    with simulated(config, folder / "task.json") as hardware:
+        _run(config, artefact, folder, LiveSetup(hardware, *_how(config), stays=False))
+
+
+def _prepare(config: DeployConfig, artefact: Artefact) -> Path:
+    artefact.require_controller(make_controller(config.robot.controller).id)
+    return make_output_dir(config.output_dir)
+
+
+def _how(config: DeployConfig) -> tuple[str, Limits]:
+    return config.robot.controller, config.robot.limits
+
+
+def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetup) -> None:
     options = config.operator
-    controller_id = make_controller(config.robot.controller).id
-    artefact.require_controller(controller_id)
-    setup = LiveSetup(
-        HardwareOptions(config.robot.bridge, config.robot.camera),
-        config.robot.controller,
-        config.robot.limits,
-        stays=options.type != "auto" or not options.duration,
-    )
-    folder = make_output_dir(config.output_dir)
+    controller_id = make_controller(setup.controller).id
     info = run_info(
         config.task, config.seed, 0, CameraView(), draccus.encode(config), controller_id, artefact
     )
@@ -62,7 +91,7 @@ def drive(config: DeployConfig, artefact: Artefact) -> None:
     thinker.warm_up()
     with (
         operator(options.type, options.velocity, options.duration) as who,
-        recording(folder, 0, info) as sink,
+        recording(folder, 0, info, config.log, lossless=False) as sink,
         tqdm(unit="tick", desc="live") as bar,
     ):
         summary = run_live(setup, thinker, who, sink, lambda tick: _show(bar, tick))

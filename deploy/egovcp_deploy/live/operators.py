@@ -18,6 +18,7 @@ from egovcp_deploy.pilot.states import Request, State
 OPERATORS: Final = ("auto", "keyboard")
 EASE_S: Final = 2.0  # from HOLD until the hands have come to rest
 _REPEAT_NS: Final = 100_000_000
+_ASK_AGAIN_NS: Final = 500_000_000  # a request that was refused; more often only fills the log
 _S: Final = 1_000_000_000
 
 
@@ -45,11 +46,12 @@ class Auto:
         self._held_ns: int | None = None
 
     def orders(self, now_ns: int, mode: str) -> list[Order]:
-        """The next step, repeated ten times a second until it is taken."""
+        """The next step, repeated until it is taken."""
         if now_ns < self._next_ns:
             return []
-        self._next_ns = now_ns + _REPEAT_NS
-        return [self._next(now_ns, mode)]
+        order = self._next(now_ns, mode)
+        self._next_ns = now_ns + (_ASK_AGAIN_NS if order.request else _REPEAT_NS)
+        return [order]
 
     def _next(self, now_ns: int, mode: str) -> Order:
         if self._held_ns is not None:

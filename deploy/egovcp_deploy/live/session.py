@@ -22,6 +22,7 @@ from egovcp_deploy.runner import thoughts
 _WAIT_S: Final = 0.01
 _AFTERMATH_S: Final = 1.0  # what is still recorded once the motors are damped
 _START_S: Final = 20.0  # for the control process to come up
+_DECODE_BY_S: Final = 0.03  # after an observation; later, the next one must not wait for pictures
 _NS: Final = 1e9
 BUDGET_S: Final = 0.034  # from an observation to its plan; the rest of the tick carries it over
 
@@ -130,7 +131,8 @@ class Session:
         reply = self._thinker.think(reports, last.time_ns + round(BUDGET_S * _NS))
         self._link.send(encode_reply(reply))
         self._measure(last, reply)
-        reply = self._thinker.decode(reply)
+        if self._clock.now_ns() - last.time_ns < _DECODE_BY_S * _NS:
+            reply = self._thinker.decode(reply)
         for report in reports:
             self._log(report, reply if report is last else None, on_tick)
 

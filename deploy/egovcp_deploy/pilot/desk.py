@@ -17,11 +17,13 @@ from typing import Final, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.plan import PolicyStep
+from egovcp.log.tick import ValueMap
+from egovcp.plan import Policy, PolicyStep
 from egovcp.rate import Clock
 from egovcp.spec import ACTION_DIM, DEPTH_COLS, DEPTH_ROWS, STATE_DIM, STATE_SLICES
 from egovcp_deploy.pilot.effort import Effort
 from egovcp_deploy.policy import Adjustable, ImaginingPolicy, RolloutPolicy
+from egovcp_deploy.value_maps import value_maps
 
 BACKLOG: Final = 8  # reports that may wait for a busy planner; older ones are lost
 
@@ -55,6 +57,7 @@ class Decoded(NamedTuple):
     """(48, 64) the present."""
     imagined: NDArray[np.float32] | None
     """(K, 48, 64) 1..K ticks ahead."""
+    value_maps: tuple[ValueMap, ...] = ()
 
 
 NOTHING_DECODED: Final = Decoded(None, None)
@@ -163,7 +166,11 @@ class Thinker:
         if self._imagining is None:
             return reply
         film = self._imagining.imagine(reply.step.plan, self._imagine)
-        return replace(reply, decoded=Decoded(self._imagining.reconstruct()[0], film[0]))
+        maps: tuple[ValueMap, ...] = ()
+        if isinstance(self._policy, Policy):
+            maps = value_maps(self._policy.model, self._policy.carry, reply.step.action[0])
+        decoded = Decoded(self._imagining.reconstruct()[0], film[0], maps)
+        return replace(reply, decoded=decoded)
 
 
 class InlineDesk:

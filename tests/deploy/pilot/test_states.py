@@ -8,10 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from egovcp.log.tick import MODES
 from egovcp_deploy.pilot.states import Facts, Limits, Request, State, Supervisor
 
 TICK_NS = 20_000_000
 WELL = Facts(time_ns=0)
+
+
+def test_the_states_are_those_that_logs_know() -> None:
+    assert tuple(State) == MODES
 
 
 def at(state: State) -> Supervisor:

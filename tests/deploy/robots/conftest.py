@@ -11,8 +11,7 @@ from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp_deploy.robots.bridge import BridgeBody
 from egovcp_deploy.robots.fake import FakeBridge, Ports
-
-from .running import PATIENCE_S, Running, config_of
+from egovcp_deploy.robots.fake.running import PATIENCE_S, Running, config_of
 
 SHORT = EpisodeConfig(ticks=20, event_ticks=(3, 4), empty_probability=0.0)
 

@@ -16,8 +16,7 @@ from egovcp_deploy.robots.body import MotorCommand
 from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
 from egovcp_deploy.robots.fake import FakeBridge
 from egovcp_deploy.robots.fake.bridge import MODE
-
-from .running import Running, config_of, eventually
+from egovcp_deploy.robots.fake.running import Running, config_of, eventually
 
 ZERO = np.zeros(29)
 DAMP = MotorCommand(ZERO, ZERO, DAMPING, MODE)

@@ -20,12 +20,11 @@ from egovcp_deploy.robots.body import Picture
 from egovcp_deploy.robots.depth_server import DepthServer
 from egovcp_deploy.robots.depth_server import main as serve_depth
 from egovcp_deploy.robots.depth_wire import WirePicture, decode_picture, encode_picture
+from egovcp_deploy.robots.fake.running import PATIENCE_S, Running, eventually
 from egovcp_deploy.robots.realsense_eye import RealSenseEye, RealSenseEyeConfig
 from egovcp_deploy.robots.resample import Intrinsics, Resampler
 from egovcp_deploy.robots.wire import Garbled
 from egovcp_deploy.robots.zmq_eye import ZmqEye, ZmqEyeConfig
-
-from .running import PATIENCE_S, Running, eventually
 
 FOV = CameraConfig.vertical_fov
 D435I = Intrinsics(848, 480, 425.0, 425.0, 423.5, 239.5)

@@ -19,11 +19,10 @@ from egovcp_deploy.robots.bridge import BridgeBody
 from egovcp_deploy.robots.depth_wire import decode_picture
 from egovcp_deploy.robots.fake import FakeBridge, Faults, Ports
 from egovcp_deploy.robots.fake.bridge import MODE, WATCHDOG_S
+from egovcp_deploy.robots.fake.running import PATIENCE_S, Running, config_of, eventually
 from egovcp_deploy.robots.fake.stage import Schedule, Stage, spoken
 from egovcp_deploy.robots.proprioception import proprioception
 from egovcp_deploy.robots.wire import encode_command
-
-from .running import PATIENCE_S, Running, config_of, eventually
 
 NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
 

@@ -6,7 +6,7 @@ import os
 import queue
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -72,8 +72,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run_command(FakeConfig, run, argv, prog=PROG, epilog=_EPILOG)
 
 
-def run(config: FakeConfig) -> None:
+def run(config: FakeConfig, opened: Callable[[Ports], None] = lambda ports: None) -> None:
     """Serve until the episodes are over, or the user has had enough.
+
+    Args:
+        config: the options.
+        opened: is told where the robot listens, once it does.
 
     Raises:
         UsageError: an option makes no sense.
@@ -90,6 +94,7 @@ def run(config: FakeConfig) -> None:
         f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
         f"depth {ports.camera_port}; Ctrl-C ends it"
     )
+    opened(ports)
     try:
         _live(config, bridge, stage)
     except KeyboardInterrupt:

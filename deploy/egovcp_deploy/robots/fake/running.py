@@ -1,4 +1,4 @@
-"""Time for a fake robot, and patience for what comes over a wire."""
+"""For tests: time for a fake robot, and patience for what comes over a wire."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ import time
 from collections.abc import Callable
 
 from egovcp_deploy.robots.bridge import BridgeConfig
-from egovcp_deploy.robots.fake import FakeBridge
+from egovcp_deploy.robots.fake.bridge import FakeBridge
 
-PATIENCE_S = 20.0
+PATIENCE_S = 60.0
 
 
 def eventually(condition: Callable[[], bool]) -> bool:
@@ -36,10 +36,12 @@ class Running:
             self.fake.step()
 
     def stop(self) -> None:
+        """Let no more time pass."""
         self._stop.set()
         self._thread.join()
 
 
 def config_of(fake: FakeBridge, mode: int | None = None) -> BridgeConfig:
+    """Where ``fake`` listens."""
     ports = fake.ports
     return BridgeConfig(ports.host, ports.state_port, ports.command_port, mode)

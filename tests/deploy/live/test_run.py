@@ -1,0 +1,207 @@
+"""egovcp-deploy before the fake robot, on the wall clock: processes are killed and interrupted.
+
+How soon things happen is for `tests/deploy/test_faults.py` and `test_control.py`, whose time does
+not depend on the machine; here it is whether they happen at all.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import psutil
+import pytest
+
+from egovcp.errors import DataError
+from egovcp.log.mcap_reader import read_recording
+from egovcp.sim.config import EnvConfig, EpisodeConfig
+from egovcp.sim.live import LiveRobot
+from egovcp.sim.scenario import Scenario
+from egovcp_deploy.pilot.states import State
+from egovcp_deploy.robots.fake import FakeBridge, Ports
+from egovcp_deploy.robots.fake.running import Running, eventually
+
+QUICK = [
+    *("--robot.limits.stand_s=0.3", "--imagine=0"),
+    *("--planner.samples=16", "--planner.elites=4"),
+]
+#: A busy machine is no fault here.
+PATIENT = [
+    "--robot.limits.planner_hold_s=5",
+    "--robot.limits.misses_hold=100000",
+    "--robot.limits.picture_hold_s=5",
+    "--robot.limits.state_hold_s=5",
+    "--robot.limits.state_damp_s=10",
+]
+
+
+@dataclass
+class Stand:
+    """A fake robot whose time passes, and a program that drives it."""
+
+    fake: FakeBridge
+    program: subprocess.Popen[str]
+    folder: Path
+
+    @property
+    def holds(self) -> bool:
+        """Whether its motors are told to hold something."""
+        return bool(self.fake.robot.robot.model.actuator_biasprm[:, 1].any())
+
+    @property
+    def control(self) -> psutil.Process:
+        """The control process."""
+        children = psutil.Process(self.program.pid).children()
+        (found,) = [c for c in children if "spawn_main" in " ".join(c.cmdline())]
+        return found
+
+    def await_run(self) -> None:
+        assert eventually(lambda: State.RUN in self.modes()), self.program.poll()
+
+    def modes(self) -> list[str]:
+        """Of the ticks that are in the recording by now."""
+        try:
+            recording = read_recording(self.folder / "rollout-0.mcap")
+        except DataError:  # nothing has been written yet
+            return []
+        return [tick.mode for tick in recording.ticks]
+
+    def end(self) -> str:
+        """Its last words."""
+        return self.program.communicate(timeout=60)[1]
+
+
+@pytest.fixture(scope="module")
+def robot() -> LiveRobot:
+    quiet = EpisodeConfig(ticks=10_000, event_ticks=(9000, 9000), empty_probability=1.0)
+    return LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
+
+
+@pytest.fixture
+def drive(robot: LiveRobot, artefact_dir: Path, tmp_path: Path) -> Iterator[Callable[..., Stand]]:
+    robot.start(Scenario("ball", 0, 0))
+    fake = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
+    running, programs = Running(fake), list[subprocess.Popen[str]]()
+
+    def start(*flags: str) -> Stand:
+        folder, ports = tmp_path / "run", fake.ports
+        command = [
+            *(sys.executable, "-m", "egovcp_deploy.deploy", "--robot.type=unitree_g1"),
+            *(f"--policy.path={artefact_dir}", f"--output_dir={folder}", "--log.rrd=false"),
+            "--robot.controller=stance",
+            f"--robot.bridge.state_port={ports.state_port}",
+            f"--robot.bridge.command_port={ports.command_port}",
+            f"--robot.camera.server.port={ports.camera_port}",
+            *QUICK,
+            *PATIENT,
+            *flags,
+        ]
+        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        program = subprocess.Popen(
+            command, stderr=subprocess.PIPE, text=True, env=environment, start_new_session=True
+        )
+        programs.append(program)
+        return Stand(fake, program, folder)
+
+    yield start
+    for program in programs:
+        with_children = [psutil.Process(program.pid)] if program.poll() is None else []
+        for process in [c for p in with_children for c in (*p.children(recursive=True), p)]:
+            process.kill()
+        program.wait()
+    running.stop()
+    fake.close()
+
+
+def test_a_run_stands_up_runs_holds_and_leaves_the_motors_damped(
+    drive: Callable[..., Stand],
+) -> None:
+    stand = drive("--operator.duration=1")
+    words = stand.end()
+    assert stand.program.returncode == 0, words
+    modes = stand.modes()
+    order = [State.INIT, State.STAND, State.ARMED, State.RUN, State.HOLD]
+    assert list(dict.fromkeys(modes)) == order
+    assert not stand.holds
+    report = json.loads((stand.folder / "deploy.json").read_text())
+    assert report["ticks_running"] == pytest.approx(modes.count(State.RUN), abs=1)
+    assert report["damped"] == ""
+
+
+def test_killing_the_control_process_damps_the_robot_and_ends_with_a_safety_stop(
+    drive: Callable[..., Stand],
+) -> None:
+    stand = drive()
+    stand.await_run()
+    assert stand.holds
+    stand.control.kill()
+    assert eventually(lambda: not stand.holds)
+    words = stand.end()
+    assert stand.program.returncode == 6, words
+    assert "the control process died" in words
+    assert read_recording(stand.folder / "rollout-0.mcap").complete
+
+
+def test_killing_the_planner_leaves_a_robot_that_stands_until_it_is_told_to_end(
+    drive: Callable[..., Stand],
+) -> None:
+    stand = drive()
+    stand.await_run()
+    control = stand.control
+    stand.program.kill()
+    stand.program.wait()
+    before = stand.fake.counts.commands
+    assert eventually(lambda: stand.fake.counts.commands > before + 50)
+    assert stand.holds
+    control.terminate()
+    assert eventually(lambda: not control.is_running() or control.status() == "zombie")
+    assert not stand.holds
+    recording = read_recording(stand.folder / "rollout-0.mcap")
+    assert State.RUN in [tick.mode for tick in recording.ticks]
+
+
+def test_the_first_interrupt_holds_the_second_damps(drive: Callable[..., Stand]) -> None:
+    stand = drive()
+    stand.await_run()
+    stand.program.send_signal(signal.SIGINT)
+    assert eventually(lambda: stand.modes()[-1] == State.HOLD)
+    assert stand.holds
+    stand.program.send_signal(signal.SIGINT)
+    assert eventually(lambda: not stand.holds)
+    words = stand.end()
+    assert stand.program.returncode == 6, words
+    assert "emergency stop" in words
+
+
+def test_a_robot_that_goes_silent_is_damped_and_the_run_is_a_safety_stop(
+    drive: Callable[..., Stand],
+) -> None:
+    stand = drive("--robot.limits.state_damp_s=0.4", "--robot.limits.state_hold_s=0.3")
+    stand.await_run()
+    stand.fake.faults.freeze_state = True
+    assert eventually(lambda: not stand.holds)
+    words = stand.end()
+    assert stand.program.returncode == 6, words
+    assert "no new proprioception" in words
+
+
+def test_no_robot_there_is_said_at_once(artefact_dir: Path, tmp_path: Path) -> None:
+    result = subprocess.run(
+        [
+            *(sys.executable, "-m", "egovcp_deploy.deploy", "--robot.type=unitree_g1"),
+            *(f"--policy.path={artefact_dir}", f"--output_dir={tmp_path / 'run'}"),
+            *("--robot.controller=stance", "--robot.bridge.state_port=1"),
+        ],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 5
+    assert "egovcp-fake-g1" in result.stderr
+    assert "Traceback" not in result.stderr
