@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
@@ -87,10 +88,9 @@ class Puppet:
         self._stack.callback(spare.close)
         self._process = self._stack.enter_context(started(self._setup, address))
         guard = Guard(self._process, spare, lambda: self._closing)
-        self._stack.callback(lambda: guard.acted and guard.join())
+        self._stack.callback(_let_finish, guard)
 
-    def _await(self, happened: object, limit_s: float, what: str) -> None:
-        assert callable(happened)
+    def _await(self, happened: Callable[[], bool], limit_s: float, what: str) -> None:
         deadline = time.monotonic() + limit_s
         while not happened():
             if not self._process.is_alive():
@@ -172,3 +172,9 @@ class Puppet:
             self._link.send(encode_order(Order(quit=True)))
             self._process.join(_END_S)
         self._stack.close()
+
+
+def _let_finish(guard: Guard) -> None:
+    """Keep the spare connection until a guard that has to act has done so."""
+    if guard.acted:
+        guard.join()
