@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import queue
 import sys
@@ -134,9 +135,10 @@ def _live(config: FakeConfig, bridge: FakeBridge, stage: Stage) -> None:
 
 
 def _write(path: str, outcomes: Sequence[Outcome]) -> None:
-    from egovcp_deploy.options import write_json  # which needs torch: 3 s
-
-    write_json(Path(path), [record(outcome) for outcome in outcomes])
+    """Complete or absent, and quickly: the robot waits meanwhile."""
+    part = Path(f"{path}.partial")
+    part.write_text(json.dumps([record(outcome) for outcome in outcomes], indent=2) + "\n")
+    part.replace(path)
 
 
 class Pace:
