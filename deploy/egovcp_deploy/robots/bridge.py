@@ -124,9 +124,19 @@ class BridgeBody:
             end.setsockopt(zmq.LINGER, 0)
             end.setsockopt(zmq.HEARTBEAT_IVL, 200)  # ms; notices a cable that was pulled
             end.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1000)
-            end.connect(f"tcp://{self.config.host}:{port}")
+            self._connect(end, f"tcp://{self.config.host}:{port}")
         self._thread = threading.Thread(target=self._listen, args=(states,), daemon=True)
         self._thread.start()
+
+    def _connect(self, end: zmq.Socket[bytes], address: str) -> None:
+        try:
+            end.connect(address)
+        except zmq.ZMQError as error:
+            self._context.destroy(linger=0)
+            raise EnvironmentFailure(
+                f"{address} is no address ({error.strerror}); expected the name or the address "
+                "of a machine"
+            ) from error
 
     def _listen(self, states: zmq.Socket[bytes]) -> None:
         with contextlib.closing(states):
@@ -201,7 +211,7 @@ class BridgeBody:
             )
         try:
             socket.create_connection((config.host, config.state_port), _PROBE_S).close()
-        except socket.gaierror:
+        except (socket.gaierror, UnicodeError):  # the latter: too long to be a name
             return f"no machine is called {config.host}; check the name, or give the address"
         except OSError as error:
             reason = error.strerror or "no answer"

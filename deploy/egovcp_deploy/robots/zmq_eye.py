@@ -70,7 +70,15 @@ class ZmqEye:
         ):
             end.setsockopt(option, value)
         end.setsockopt(zmq.SUBSCRIBE, b"")
-        end.connect(f"tcp://{self.config.host}:{self.config.port}")
+        address = f"tcp://{self.config.host}:{self.config.port}"
+        try:
+            end.connect(address)
+        except zmq.ZMQError as error:
+            self._context.destroy(linger=0)
+            raise EnvironmentFailure(
+                f"{address} is no address ({error.strerror}); expected the name or the address "
+                "of a machine"
+            ) from error
         self._thread = threading.Thread(target=self._listen, args=(end,), daemon=True)
         self._thread.start()
         deadline = time.monotonic() + timeout
@@ -120,8 +128,8 @@ class ZmqEye:
             )
         try:
             socket.create_connection((config.host, config.port), _PROBE_S).close()
-        except OSError as error:
-            reason = error.strerror or "no answer"
+        except (OSError, UnicodeError) as error:
+            reason = getattr(error, "strerror", None) or "no answer"
             return f"no depth camera at {where} ({reason}); {_START}"
         return f"no picture from {where} within {timeout:g} s, although something listens there"
 
