@@ -86,11 +86,6 @@ def run(config: FakeConfig) -> None:
     bridge = FakeBridge(robot, config.ports, announce=config.announce)
     schedule = Schedule(config.gantry, config.settle, config.pause)
     stage = Stage(bridge, _scenarios(config), schedule, _say)
-    ports = bridge.ports
-    _say(
-        f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
-        f"depth {ports.camera_port}; Ctrl-C ends it"
-    )
     try:
         _live(config, bridge, stage)
     except KeyboardInterrupt:
@@ -121,6 +116,11 @@ def _scenarios(config: FakeConfig) -> Any:
 
 def _live(config: FakeConfig, bridge: FakeBridge, stage: Stage) -> None:
     """Keep step with the wall clock."""
+    ports = bridge.ports
+    _say(
+        f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
+        f"depth {ports.camera_port}; Ctrl-C ends it"
+    )
     words, pace, written = Console(), Pace(MonotonicClock()), 0
     while not stage.finished:
         for _ in range(pace.due()):
