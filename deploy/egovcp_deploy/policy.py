@@ -7,7 +7,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.plan import PolicyStep
+from egovcp.plan import PlannerConfig, PolicyStep
 
 
 class RolloutPolicy(Protocol):
@@ -44,3 +44,11 @@ class ImaginingPolicy(RolloutPolicy, Protocol):
     def imagine(self, plan: NDArray[np.floating], horizon: int) -> NDArray[np.float32]:
         """(E, horizon, 48, 64) m: what the plans (E, N, 7) lead to."""
         ...
+
+
+@runtime_checkable
+class Adjustable(RolloutPolicy, Protocol):
+    """A policy that can be told to plan with more or less care."""
+
+    config: PlannerConfig
+    """What the next plan is made with; its horizon must stay."""

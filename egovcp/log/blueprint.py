@@ -19,19 +19,20 @@ from egovcp.log.paths import (
     REWARD,
     STATE,
     TIMING,
+    VALUE_MAP,
     WORLD,
 )
 
 
 def blueprint(imagined: tuple[int, ...] = ()) -> rrb.Blueprint:
-    """3D view at the left; at the right the depth images over the time series.
+    """3D view over value maps and events at the left; at the right depth over the time series.
 
     Args:
         imagined: horizons of the imagined depth images, ticks ahead; none leaves them out.
     """
     return rrb.Blueprint(
         rrb.Horizontal(
-            _scene(),
+            rrb.Vertical(_scene(), _below_scene(), row_shares=[5, 2]),
             rrb.Vertical(*_pictures(imagined), *_curves(), row_shares=_shares(imagined)),
             column_shares=[3, 2],
         ),
@@ -107,9 +108,24 @@ def _command_curves() -> rrb.Container:
 
 
 def _shares(imagined: tuple[int, ...]) -> list[float]:
-    return [3.0, *([2.0] if imagined else []), 2.0, 2.0, 1.5]
+    return [3.0, *([2.0] if imagined else []), 2.0, 2.0]
 
 
+def _below_scene() -> rrb.Container:
+    maps = [
+        rrb.Spatial2DView(
+            name=f"Q over x, z of the {hand} hand", origin=f"{VALUE_MAP}/{hand}", background=_DARK
+        )
+        for hand in ("left", "right")
+    ]
+    words = rrb.Tabs(
+        rrb.TextLogView(name="events", origin=EVENTS),
+        rrb.TextDocumentView(name="run", origin=INFO),
+    )
+    return rrb.Horizontal(*maps, words, column_shares=[1, 1, 1.4])
+
+
+_DARK: Final = [24, 26, 32]
 _FRONT: Final = (1.9, 1.5, 1.2)  # both the hands and what approaches are seen
 _SIDE: Final = (0.3, 3.1, 1.6)  # a surface before the robot, seen edge on, does not hide it
 
@@ -120,7 +136,7 @@ def _scene(eye: tuple[float, float, float] = _FRONT) -> rrb.View:
         name="robot",
         origin=WORLD,
         contents=[f"{WORLD}/**"],
-        background=[24, 26, 32],
+        background=_DARK,
         eye_controls=rrb.EyeControls3D(
             position=eye, look_target=(0.45, 0.0, 0.68), eye_up=(0.0, 0.0, 1.0)
         ),
@@ -146,10 +162,8 @@ def _curves() -> list[rrb.View | rrb.Container]:
             rrb.TimeSeriesView(name="value of the plan", origin=f"{PLAN}/value"),
             rrb.TimeSeriesView(name="termination probability", origin=f"{PLAN}/termination"),
         ),
-        rrb.TimeSeriesView(name="reward", origin=REWARD),
-        rrb.Tabs(
-            rrb.TextLogView(name="events", origin=EVENTS),
+        rrb.Horizontal(
+            rrb.TimeSeriesView(name="reward", origin=REWARD),
             rrb.TimeSeriesView(name="timing (ms)", origin=TIMING),
-            rrb.TextDocumentView(name="run", origin=INFO),
         ),
     ]

@@ -2,19 +2,25 @@
 
 The metadata record ``egovcp`` comes first. Every tick gives at most one message per topic,
 all with the tick's time as log time, so a recording converts to dataset rows exactly; the
-file is flushed after every tick, so a killed process loses none that were written.
-`messages.Topic` lists the topics.
+file is flushed after every tick, so a killed process loses none that were written, and told to
+reach the disk every second, so losing power loses little more. `messages.Topic` lists the topics.
 """
 
 from __future__ import annotations
 
+import errno
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import IO, Final
+from typing import IO, Final, cast
 
+from mcap.records import Schema
 from mcap.well_known import MessageEncoding, Profile, SchemaEncoding
 from mcap.writer import CompressionType, Writer
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.log.append import SYNC_PERIOD_S, AppendFile
 from egovcp.log.info import RunInfo
 from egovcp.log.messages import Topic, encode_tick, message_type
 from egovcp.log.ros2 import definition
@@ -23,63 +29,132 @@ from egovcp.log.tick import Tick
 METADATA_NAME: Final = "egovcp"
 
 
-class McapSink:
-    """Writes ticks to ``path``; raises `EnvironmentFailure` where that cannot be created."""
+@dataclass(frozen=True)
+class Line:
+    """A topic of a file."""
 
-    def __init__(self, path: Path) -> None:
+    topic: str
+    schema: Schema
+    encoding: str
+    """Of its messages."""
+
+
+class McapFile:
+    """A new recording, message by message; raises `EnvironmentFailure` where it cannot be created.
+
+    After an OSError (a full disk) the file ends with the last flush that fitted, without an
+    index, as after a kill; what is written later is refused.
+    """
+
+    def __init__(self, path: Path, sync_period_s: float = SYNC_PERIOD_S) -> None:
         self._path = path
-        self._file: IO[bytes] | None = None
-        self._channels: dict[Topic, int] = {}
+        self._sync_period_s = sync_period_s
+        self._file: AppendFile | None = None
+        self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
+        self._torn = False
 
-    def open(self, info: RunInfo) -> None:
+    def open(self, metadata: Mapping[str, str]) -> None:
         """Create the file and write the metadata record."""
         try:
-            self._file = self._path.open("xb")
+            self._file = AppendFile(self._path, self._sync_period_s)
         except FileExistsError as error:
             raise EnvironmentFailure(
                 f"{self._path} exists already; recordings are never overwritten: choose another"
             ) from error
-        self._view = info.camera
-        self._writer = Writer(self._file, compression=CompressionType.ZSTD)
+        except FileNotFoundError as error:
+            raise EnvironmentFailure(f"{self._path} would lie in a folder that is not there") from (
+                error
+            )
+        self._writer = Writer(cast(IO[bytes], self._file), compression=CompressionType.ZSTD)
         self._writer.start(profile=Profile.ROS2, library="egovcp")
-        self._writer.add_metadata(METADATA_NAME, info.to_metadata())
-        self._writer.flush()  # type: ignore[no-untyped-call]
+        self._writer.add_metadata(METADATA_NAME, dict(metadata))
+        self.flush()
+
+    def add(self, line: Line, index: int, time_ns: int, data: bytes) -> None:
+        """A message of tick ``index``."""
+        if self._torn:
+            raise OSError(errno.EIO, "given up after an earlier failure", str(self._path))
+        self._writer.add_message(
+            channel_id=self._channel(line),
+            log_time=time_ns,
+            publish_time=time_ns,
+            sequence=index,
+            data=data,
+        )
+
+    def flush(self) -> None:
+        """Hand everything to the operating system; raises OSError when the disk is full."""
+        try:
+            self._writer.flush()  # type: ignore[no-untyped-call]
+        except OSError:
+            self._torn = True
+            raise
+
+    def close(self) -> None:
+        """Write the index and close the file. Further calls do nothing."""
+        file, self._file = self._file, None
+        if file is not None:
+            if not self._torn:  # else the index would list what is not there
+                self._writer.finish()  # type: ignore[no-untyped-call]
+            file.close()
+
+    def _channel(self, line: Line) -> int:
+        if line.topic not in self._channels:
+            self._channels[line.topic] = self._writer.register_channel(
+                topic=line.topic,
+                message_encoding=line.encoding,
+                schema_id=self._schema(line.schema),
+            )
+        return self._channels[line.topic]
+
+    def _schema(self, schema: Schema) -> int:
+        if schema.name not in self._schemas:
+            self._schemas[schema.name] = self._writer.register_schema(
+                name=schema.name, encoding=schema.encoding, data=schema.data
+            )
+        return self._schemas[schema.name]
+
+
+class McapSink:
+    """Writes ticks to ``path``, as an `McapFile`.
+
+    Args:
+        path: the file to create.
+        sync_period_s: seconds between two commands to the disk to keep what it has been given.
+    """
+
+    def __init__(self, path: Path, sync_period_s: float = SYNC_PERIOD_S) -> None:
+        self._file = McapFile(path, sync_period_s)
+
+    def open(self, info: RunInfo) -> None:
+        """Create the file and write the metadata record."""
+        self._file.open(info.to_metadata())
+        self._view = info.camera
 
     def write(self, tick: Tick) -> None:
-        """Write the tick's messages and flush them to the operating system."""
+        """Write the tick's messages and hand them to the operating system.
+
+        Raises:
+            OSError: the disk is full or broken.
+        """
         for topic, message in encode_tick(tick, self._view).items():
-            self._writer.add_message(
-                channel_id=self._channel(topic),
-                log_time=tick.time_ns,
-                publish_time=tick.time_ns,
-                sequence=tick.index,
-                data=message,
-            )
-        self._writer.flush()  # type: ignore[no-untyped-call]
+            self._file.add(_line(topic), tick.index, tick.time_ns, message)
+        self._file.flush()
 
     def close(self) -> None:
         """Write the index and close the file."""
-        if self._file is not None:
-            self._writer.finish()  # type: ignore[no-untyped-call]
-            self._file.close()
-            self._file = None
+        self._file.close()
 
-    def _channel(self, topic: Topic) -> int:
-        if topic not in self._channels:
-            self._channels[topic] = self._writer.register_channel(
-                topic=topic.value,
-                message_encoding=MessageEncoding.CDR,
-                schema_id=self._schema(message_type(topic)),
-            )
-        return self._channels[topic]
 
-    def _schema(self, name: str) -> int:
-        if name not in self._schemas:
-            package, _, message = name.partition("/")
-            self._schemas[name] = self._writer.register_schema(
-                name=f"{package}/msg/{message}",
-                encoding=SchemaEncoding.ROS2,
-                data=definition(name).encode(),
-            )
-        return self._schemas[name]
+@cache
+def _line(topic: Topic) -> Line:
+    name = message_type(topic)
+    package, _, message = name.partition("/")
+    schema = Schema(
+        id=0,
+        name=f"{package}/msg/{message}",
+        encoding=SchemaEncoding.ROS2,
+        data=definition(name).encode(),
+    )
+    return Line(topic.value, schema, MessageEncoding.CDR)

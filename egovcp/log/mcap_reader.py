@@ -1,16 +1,25 @@
-"""Reads a recorded run back: what `McapSink` wrote, also from a file that was cut short."""
+"""Reads a recorded run back: what `McapSink` wrote, also from a file that was cut short.
+
+Moment by moment, so that an hour takes no more memory than a second::
+
+    reader = RecordingReader(path)
+    for moment in reader.moments():
+        moment.tick()
+    reader.complete  # False: the file was torn
+"""
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
-from mcap.exceptions import EndOfFile, McapError
+import zstandard
+from mcap.exceptions import McapError
 from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
@@ -18,12 +27,24 @@ from numpy.typing import NDArray
 
 from egovcp.errors import DataError
 from egovcp.log.info import RunInfo
-from egovcp.log.mcap import METADATA_NAME
-from egovcp.log.messages import Topic
-from egovcp.log.tick import BasePose, Candidates, SceneObject, Tick
+from egovcp.log.mcap import METADATA_NAME, Line
+from egovcp.log.messages import VALUE_MAPS, Topic
+from egovcp.log.tick import BasePose, Candidates, SceneObject, Tick, ValueMap
 from egovcp.spec import DEPTH_COLS
 
 _FLAGS = ("terminated", "truncated", "success")
+_MAGIC: Final = b"\x89MCAP0\r\n"
+#: What is left of a record where a file was torn can go wrong in any of these ways.
+_TORN: Final = (
+    McapError,
+    struct.error,
+    ValueError,
+    OverflowError,
+    MemoryError,
+    zstandard.ZstdError,
+)
+#: What a row of a dataset needs of a tick.
+ROW_TOPICS: Final = frozenset({Topic.DEPTH, Topic.STATE, Topic.ACTION, Topic.REWARD})
 
 
 @dataclass(frozen=True)
@@ -37,63 +58,148 @@ class Recording:
 
 
 def read_recording(path: Path) -> Recording:
-    """Read ``path`` up to its end, or up to where it was torn off.
+    """Read ``path`` into memory, up to its end, or up to where it was torn off.
 
     Raises:
         DataError: not an MCAP file, or not one of ours.
     """
-    reader = _Reader()
-    try:
-        with path.open("rb") as file:
-            complete = reader.consume(StreamReader(file).records)
-    except FileNotFoundError as error:
-        raise DataError(f"no recording at {path}; expected an MCAP file") from error
-    except McapError as error:
-        raise DataError(f"{path} is not an MCAP file: {error}") from error
-    if reader.info is None:
-        raise DataError(
-            f"{path} has no metadata record {METADATA_NAME!r}; expected a recording of egovcp"
-        )
-    return Recording(reader.info, [_tick(i, t, m) for i, t, m in reader.groups], complete)
+    reader = RecordingReader(path)
+    ticks = [moment.tick() for moment in reader.moments()]
+    return Recording(reader.info, ticks, reader.complete)
 
 
-class _Reader:
-    """Decodes records and groups messages by tick."""
+@dataclass
+class Moment:
+    """The messages of one tick, not decoded."""
 
-    def __init__(self) -> None:
-        self.info: RunInfo | None = None
-        self.groups: list[tuple[int, int, dict[str, Any]]] = []
+    index: int
+    time_ns: int
+    messages: dict[str, Message] = field(default_factory=dict)
+    lines: Mapping[str, Line] = field(default_factory=dict)
+
+    def tick(self, topics: Collection[str] | None = None) -> Tick:
+        """Decode the tick, or only those of its parts that are on ``topics``.
+
+        Raises:
+            DataError: it lacks what every tick has, or a message is damaged.
+        """
+        wanted = self.messages.keys() if topics is None else self.messages.keys() & set(topics)
+        try:
+            return _tick(self.index, self.time_ns, {name: self._decode(name) for name in wanted})
+        except KeyError as error:
+            raise DataError(f"tick {self.index} has nothing on topic {error.args[0]}") from error
+        except (struct.error, ValueError, IndexError, AttributeError) as error:
+            raise DataError(f"tick {self.index} is damaged: {error}") from error
+
+    def text(self, topic: str) -> str:
+        """The words on ``topic``, a log; empty where there are none."""
+        return str(self._decode(topic).msg) if topic in self.messages else ""
+
+    def _decode(self, topic: str) -> Any:
+        line = self.lines[topic]
+        decode = _FACTORY.decoder_for(line.encoding, line.schema)
+        if decode is None:
+            raise DataError(f"topic {topic} is {line.schema.name} in {line.encoding}, not ROS 2")
+        return decode(self.messages[topic].data)
+
+
+_FACTORY: Final = DecoderFactory()
+
+
+class RecordingReader:
+    """Goes through a recording once, up to its end, or to where it was torn off.
+
+    Raises:
+        DataError: not an MCAP file, or not one of ours.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        _require_mcap(path)
+        self.complete = False
+        """Whether `moments` has come to the end that the writer gave the file."""
+        self.lines: dict[str, Line] = {}
+        """The topics met so far."""
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
-        self._factory = DecoderFactory()
+        self._records = self._read()
+        self.metadata = self._first_metadata()
+        """The record ``egovcp`` as it stands in the file."""
+        self.info = self._info()
 
-    def consume(self, records: Iterator[McapRecord]) -> bool:
-        """Take in every record; False if they stop before the end of the file."""
-        try:
-            for record in records:
-                self._take(record)
-        except (EndOfFile, struct.error):
-            return False
-        return True
+    def moments(self) -> Iterator[Moment]:
+        """The ticks in order, once."""
+        moment: Moment | None = None
+        for record in self._records:
+            if isinstance(record, Schema):
+                self._schemas[record.id] = record
+            elif isinstance(record, Channel):
+                self._add_channel(record)
+            elif isinstance(record, Message):
+                if moment is None or moment.index != record.sequence:
+                    if moment is not None:
+                        yield moment
+                    moment = Moment(record.sequence, record.log_time, lines=self.lines)
+                moment.messages[self._channels[record.channel_id].topic] = record
+        if moment is not None:
+            yield moment
 
-    def _take(self, record: McapRecord) -> None:
-        if isinstance(record, Metadata) and record.name == METADATA_NAME:
-            self.info = RunInfo.from_metadata(record.metadata)
-        elif isinstance(record, Schema):
-            self._schemas[record.id] = record
-        elif isinstance(record, Channel):
-            self._channels[record.id] = record
-        elif isinstance(record, Message):
-            self._take_message(record)
-
-    def _take_message(self, message: Message) -> None:
-        if not self.groups or self.groups[-1][0] != message.sequence:
-            self.groups.append((message.sequence, message.log_time, {}))
-        channel = self._channels[message.channel_id]
+    def _add_channel(self, channel: Channel) -> None:
+        self._channels[channel.id] = channel
         schema = self._schemas[channel.schema_id]
-        decode = self._factory.decoder_for(channel.message_encoding, schema)
-        if decode is not None:
-            self.groups[-1][2][channel.topic] = decode(message.data)
+        self.lines[channel.topic] = Line(channel.topic, schema, channel.message_encoding)
+
+    def _read(self) -> Iterator[McapRecord]:
+        """Every record that is whole and belongs to what was read before."""
+        with self._path.open("rb") as file:
+            limit = self._path.stat().st_size  # no record is longer than its file
+            reader = StreamReader(file, validate_crcs=True, record_size_limit=limit)
+            try:
+                for record in reader.records:
+                    if self._is_orphan(record):
+                        return
+                    yield record
+            except _TORN:
+                return
+            self.complete = True
+
+    def _is_orphan(self, record: McapRecord) -> bool:
+        if isinstance(record, Message):
+            return record.channel_id not in self._channels
+        return isinstance(record, Channel) and record.schema_id not in self._schemas
+
+    def _first_metadata(self) -> Mapping[str, str]:
+        """The metadata record, which comes before any tick."""
+        for record in self._records:
+            if isinstance(record, Metadata) and record.name == METADATA_NAME:
+                return record.metadata
+            if isinstance(record, Message | Channel | Schema):
+                break
+        raise DataError(
+            f"{self._path} has no metadata record {METADATA_NAME!r} before its first message; "
+            "expected a recording of egovcp"
+        )
+
+    def _info(self) -> RunInfo:
+        try:
+            return RunInfo.from_metadata(self.metadata)
+        except (KeyError, ValueError, TypeError, AttributeError) as error:
+            problem = f"its metadata record {METADATA_NAME!r} is damaged: {error!r}"
+            raise DataError(f"{self._path}: {problem}") from error
+
+
+def _require_mcap(path: Path) -> None:
+    """Raise `DataError` for what does not begin like an MCAP file."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(len(_MAGIC))
+    except FileNotFoundError as error:
+        raise DataError(f"no recording at {path}; expected an MCAP file") from error
+    except IsADirectoryError as error:
+        raise DataError(f"{path} is a folder; expected an MCAP file") from error
+    if start != _MAGIC:
+        found = "is empty" if not start else f"begins with {start!r}"
+        raise DataError(f"{path} {found}; expected an MCAP file")
 
 
 def _tick(index: int, time_ns: int, messages: Mapping[str, Any]) -> Tick:
@@ -103,19 +209,22 @@ def _tick(index: int, time_ns: int, messages: Mapping[str, Any]) -> Tick:
     flags = {name: bool(reward.pop(name)) for name in _FLAGS}
     total = reward.pop("reward")
     log = messages.get(Topic.LOG)
+    sent = _array(messages[Topic.ACTION]).astype(np.float32)
+    planned = messages.get(Topic.ACTION_PLANNED)
     return Tick(
         index=index,
         time_ns=time_ns,
         depth=_image(messages[Topic.DEPTH]),
         state=_array(messages[Topic.STATE]).astype(np.float32),
-        action_planned=_array(messages[Topic.ACTION_PLANNED]).astype(np.float32),
-        action_sent=_array(messages[Topic.ACTION]).astype(np.float32),
+        action_planned=sent if planned is None else _array(planned).astype(np.float32),
+        action_sent=sent,
         depth_reconstructed=_metres(messages.get(Topic.RECONSTRUCTED)),
         depth_imagined=_film(messages.get(Topic.IMAGINED)),
         plan=_array(messages[Topic.PLAN]) if Topic.PLAN in messages else None,
         candidates=_candidates(messages.get(Topic.CANDIDATES)),
         value=plan.get("value"),
         termination=plan.get("termination"),
+        value_maps=_value_maps(messages),
         reward=total,
         reward_terms=reward,
         timing_ms=_scalars(messages.get(Topic.TIMING)),
@@ -158,6 +267,17 @@ def _candidates(message: Any) -> Candidates | None:
         return None
     points = np.frombuffer(message.data, "<f4").reshape(message.height, -1, 2, 4)
     return Candidates(hands_b=points[..., :3], values=points[:, 0, 0, 3])
+
+
+def _value_maps(messages: Mapping[str, Any]) -> tuple[ValueMap, ...]:
+    maps = []
+    for hand, topic in VALUE_MAPS.items():
+        if topic in messages:
+            message = messages[topic]
+            cloud = np.frombuffer(message.data, "<f4").reshape(message.height, message.width, 4)
+            x, z, y = cloud[0, :, 0], cloud[:, 0, 2], float(cloud[0, 0, 1])
+            maps.append(ValueMap(hand, x, y, z, cloud[..., 3]))
+    return tuple(maps)
 
 
 def _base(message: Any) -> BasePose | None:

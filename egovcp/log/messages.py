@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from egovcp.log import ros2
 from egovcp.log.info import CameraView
 from egovcp.log.pose import RobotPose, robot_pose
-from egovcp.log.tick import Candidates, Tick
+from egovcp.log.tick import Candidates, Hand, Tick, ValueMap
 from egovcp.robot.kinematics import LINK_NAMES, quaternion
 from egovcp.spec import ACTION_NAMES, JOINT_NAMES, STATE_NAMES, STATE_SLICES
 
@@ -44,12 +44,18 @@ class Topic(StrEnum):
     PLAN = "/plan/best"
     CANDIDATES = "/plan/candidates"  # rows: candidates; columns: left then right per step
     PLAN_SCALARS = "/plan/scalars"
+    VALUE_MAP_LEFT = "/plan/value_map/left"  # rows: z ascending; columns: x ascending
+    VALUE_MAP_RIGHT = "/plan/value_map/right"
     REWARD = "/reward"
     TIMING = "/timing"
     SCENE = "/scene/objects"
     LOG = "/rosout"
 
 
+VALUE_MAPS: Final[dict[Hand, Topic]] = {
+    "left": Topic.VALUE_MAP_LEFT,
+    "right": Topic.VALUE_MAP_RIGHT,
+}
 MESSAGE_TYPES: Final = {
     Topic.DEPTH: "sensor_msgs/Image",
     Topic.RECONSTRUCTED: "sensor_msgs/Image",
@@ -59,6 +65,8 @@ MESSAGE_TYPES: Final = {
     Topic.BASE: "geometry_msgs/PoseStamped",
     Topic.JOINTS: "sensor_msgs/JointState",
     Topic.CANDIDATES: "sensor_msgs/PointCloud2",
+    Topic.VALUE_MAP_LEFT: "sensor_msgs/PointCloud2",
+    Topic.VALUE_MAP_RIGHT: "sensor_msgs/PointCloud2",
     Topic.LOG: "rcl_interfaces/Log",
 }
 
@@ -135,6 +143,10 @@ def _plan_messages(tick: Tick) -> dict[Topic, bytes]:
         messages[Topic.CANDIDATES] = ros2.point_cloud(
             tick.time_ns, HEADING_FRAME, cloud, CANDIDATE_FIELDS
         )
+    for value_map in tick.value_maps:
+        messages[VALUE_MAPS[value_map.hand]] = ros2.point_cloud(
+            tick.time_ns, HEADING_FRAME, value_map_cloud(value_map), CANDIDATE_FIELDS
+        )
     scalars = {"value": tick.value, "termination": tick.termination}
     known = {name: value for name, value in scalars.items() if value is not None}
     if known:
@@ -174,3 +186,9 @@ def candidate_cloud(candidates: Candidates) -> NDArray[np.float32]:
     points = hands.reshape(len(hands), -1, 3)
     values = np.asarray(candidates.values, np.float32)[:, None, None]
     return np.concatenate([points, np.broadcast_to(values, (*points.shape[:2], 1))], axis=2)
+
+
+def value_map_cloud(value_map: ValueMap) -> NDArray[np.float32]:
+    """(n, m, 4) points x, y, z, value: an organised cloud, which viewers place in the scene."""
+    z, x = np.meshgrid(value_map.z_b, value_map.x_b, indexing="ij")
+    return np.stack([x, np.full_like(x, value_map.y_b), z, value_map.values], axis=-1)

@@ -19,23 +19,30 @@ from egovcp.errors import EnvironmentFailure
 from egovcp.log import paths
 from egovcp.log.blueprint import blueprint, signals_blueprint
 from egovcp.log.colour import BALL, LEFT, OBSTACLE, RIGHT
+from egovcp.log.destination import Destination, RrdFile
 from egovcp.log.info import CameraView, RunInfo
-from egovcp.log.meshes import link_meshes
+from egovcp.log.meshes import LinkMesh, link_meshes
 from egovcp.log.pose import robot_poses
-from egovcp.log.rerun_columns import Frame, all_columns, skeleton_columns
+from egovcp.log.rerun_columns import Columns, Frame, all_columns, skeleton_columns
 from egovcp.log.signals import log_styles, signal_columns
 from egovcp.log.tick import SceneObject, Tick
+from egovcp.log.value_map_columns import log_value_map_styles, value_map_columns
 from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_ROWS
 
 BATCH_TICKS: Final = 25  # one second
+LIVE_BATCH_TICKS: Final = 3  # what is looked at must not lag behind
+_FLUSH_TIMEOUT_S: Final = 10.0
 _NS: Final = "ns"
 
 
 class RerunSink:
-    """Writes ticks to the Rerun file ``path``.
+    """Sends ticks to a Rerun file or viewer.
+
+    A viewer may die or hang: put the sink behind a `BackgroundSink`, which does not wait for it.
 
     Args:
-        path: the ``.rrd`` to create; raises `EnvironmentFailure` when it exists.
+        destination: the ``.rrd`` to create, or where else to; `open` raises `EnvironmentFailure`
+            when the file exists or nobody listens.
         imagined: horizons of the imagined depth to show, planner ticks ahead.
         meshes: draw the links' surfaces where the model is installed, else a skeleton.
         signals: show action and proprioception as curves in the place of a planner's thoughts,
@@ -44,35 +51,42 @@ class RerunSink:
 
     def __init__(
         self,
-        path: Path,
+        destination: Path | Destination,
         imagined: tuple[int, ...] = (4, 8, 16),
         meshes: bool = True,
         signals: bool = False,
     ) -> None:
-        self._path = path
+        if isinstance(destination, Path):
+            destination = RrdFile(destination)
+        self._destination = destination
         self._imagined = imagined
-        self._meshes = link_meshes() if meshes else {}
+        self._wants_meshes = meshes
+        self._meshes: dict[str, LinkMesh] = {}
         self._signals = signals
         self._batch: list[Tick] = []
         self._known: set[str] = set()
         self._stream: rr.RecordingStream | None = None
+        self._gone = False
+
+    @property
+    def _batch_ticks(self) -> int:
+        return LIVE_BATCH_TICKS if self._destination.is_live else BATCH_TICKS
 
     def open(self, info: RunInfo) -> None:
-        """Create the file and log all that does not change."""
-        if self._path.exists():
-            raise EnvironmentFailure(
-                f"{self._path} exists already; recordings are never overwritten: choose another"
-            )
+        """Begin the recording and log all that does not change."""
         self._view = info.camera
         name = f"{info.task} seed {info.seed} episode {info.episode}"
         stream = rr.RecordingStream("egovcp", recording_id=name)
         look = signals_blueprint() if self._signals else blueprint(self._imagined)
-        stream.save(self._path, default_blueprint=look)
+        self._destination.attach(stream, look)
         stream.send_recording_name(name)
         self._stream = stream
         _log_static(stream, info, self._imagined)
         if self._signals:
             log_styles(stream)
+        else:
+            log_value_map_styles(stream)
+        self._meshes = link_meshes() if self._wants_meshes else {}
         for link, mesh in self._meshes.items():
             surface = rr.Mesh3D(
                 vertex_positions=mesh.vertices,
@@ -83,20 +97,34 @@ class RerunSink:
             stream.log(f"{paths.ROBOT}/{link}", surface, static=True)
 
     def write(self, tick: Tick) -> None:
-        """Take the tick; a full batch goes to the file."""
+        """Take the tick; a full batch goes out.
+
+        Raises:
+            EnvironmentFailure: the viewer is gone, or hangs.
+        """
         self._batch.append(tick)
-        if len(self._batch) >= BATCH_TICKS:
+        if len(self._batch) >= self._batch_ticks:
             self._send()
+            if self._destination.is_live:
+                self._flush()
 
     def close(self) -> None:
         """Send what is left and finish the file."""
-        if self._stream is None:
+        if self._stream is None or self._gone:  # who is gone cannot be said goodbye to
             return
         if self._batch:
             self._send()
-        self._stream.flush()
+        self._flush()
         self._stream.disconnect()
         self._stream = None
+
+    def _flush(self) -> None:
+        assert self._stream is not None, "open the sink before writing to it"
+        try:
+            self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+        except RuntimeError as error:
+            self._gone = True
+            raise EnvironmentFailure(f"the recording could not be sent: {error}") from error
 
     def _send(self) -> None:
         assert self._stream is not None, "open the sink before writing to it"
@@ -104,6 +132,7 @@ class RerunSink:
         frames = [Frame(*pair) for pair in zip(self._batch, poses, strict=True)]
         self._log_new_objects()
         groups = [*all_columns(frames, self._view, self._imagined)]
+        groups += [Columns(*group) for group in value_map_columns(self._batch)]
         if not self._meshes:
             groups.append(skeleton_columns(frames))
         if self._signals:

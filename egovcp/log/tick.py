@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.floating]
+type Hand = Literal["left", "right"]
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,24 @@ class Candidates:
 
 
 @dataclass(frozen=True)
+class ValueMap:
+    """What the policy thinks of putting one hand elsewhere, all else as planned (paper fig. 7a).
+
+    A grid in the hand's x-z plane of the pelvis heading frame.
+    """
+
+    hand: Hand
+    x_b: NDArray[np.float32]
+    """(m,) hand target, m forward, ascending."""
+    y_b: float
+    """Planned hand target, m to the left: where the plane lies."""
+    z_b: NDArray[np.float32]
+    """(n,) hand target, m up, ascending."""
+    values: NDArray[np.float32]
+    """(n, m) Q at (z, x), return units."""
+
+
+@dataclass(frozen=True)
 class Tick:
     """Everything that one planner tick saw, thought and did.
 
@@ -78,6 +97,8 @@ class Tick:
     """Objective of the chosen plan, return units."""
     termination: float | None = None
     """Probability that the present state is a failure, in [0, 1]."""
+    value_maps: tuple[ValueMap, ...] = ()
+    """At most one per hand."""
     reward: float = 0.0
     reward_terms: Mapping[str, float] = field(default_factory=dict)
     terminated: bool = False

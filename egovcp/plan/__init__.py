@@ -2,5 +2,15 @@
 
 from egovcp.plan.cem import Plan, PlannerConfig, plan_cem
 from egovcp.plan.policy import Policy, PolicyStep
+from egovcp.plan.value_map import HandGrid, hand_grid, value_map
 
-__all__ = ["Plan", "PlannerConfig", "Policy", "PolicyStep", "plan_cem"]
+__all__ = [
+    "HandGrid",
+    "Plan",
+    "PlannerConfig",
+    "Policy",
+    "PolicyStep",
+    "hand_grid",
+    "plan_cem",
+    "value_map",
+]

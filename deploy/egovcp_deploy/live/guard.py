@@ -40,3 +40,8 @@ class Guard:
     def join(self) -> None:
         """Wait until nothing is left to do; the process has ended."""
         self._thread.join()
+
+    def join_if_acting(self) -> None:
+        """Wait until a robot that has to be damped from here has been."""
+        if self.acted:
+            self.join()

@@ -88,7 +88,7 @@ class Puppet:
         self._stack.callback(spare.close)
         self._process = self._stack.enter_context(started(self._setup, address))
         guard = Guard(self._process, spare, lambda: self._closing)
-        self._stack.callback(_let_finish, guard)
+        self._stack.callback(guard.join_if_acting)
 
     def _await(self, happened: Callable[[], bool], limit_s: float, what: str) -> None:
         deadline = time.monotonic() + limit_s
@@ -172,9 +172,3 @@ class Puppet:
             self._link.send(encode_order(Order(quit=True)))
             self._process.join(_END_S)
         self._stack.close()
-
-
-def _let_finish(guard: Guard) -> None:
-    """Keep the spare connection until a guard that has to act has done so."""
-    if guard.acted:
-        guard.join()

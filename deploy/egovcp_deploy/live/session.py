@@ -99,6 +99,7 @@ class Session:
         self.quitting = False
         """Whether the control process has been told to end."""
         self._mode = ""
+        self._told: list[str] = []  # events of this side, for the next tick
         self._begin_ns: int | None = None
         self._pending: tuple[Report, Reply | None] | None = None
         self._held_ns: int | None = None
@@ -135,8 +136,12 @@ class Session:
 
     def _measure(self, report: Report, reply: Reply) -> None:
         latency = (self._clock.now_ns() - report.time_ns) / _NS
+        late = latency > PLANNER_DT
         self.summary.planned += 1
-        self.summary.late += latency > PLANNER_DT
+        self.summary.late += late
+        if self._thinker.pace(late):
+            change = "late plans" if late else "time to spare"
+            self._told.append(f"{change}: {self._thinker.samples} candidates from now on")
         self.summary.plan_ms.append(reply.plan_ms)
         self.summary.latency_ms.append(latency * 1e3)
         self.summary.iterations.append(reply.step.iterations)
@@ -159,7 +164,8 @@ class Session:
 
     def _tick(self, report: Report, reply: Reply | None, following: Report) -> Tick:
         assert self._begin_ns is not None
-        events = report.events if reply is None else (*report.events, *reply.events)
+        events = (*report.events, *(reply.events if reply else ()), *self._told)
+        self._told.clear()
         return Tick(
             index=report.tick,
             time_ns=report.time_ns - self._begin_ns,

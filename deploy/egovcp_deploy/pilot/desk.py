@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 from egovcp.plan import PolicyStep
 from egovcp.rate import Clock
 from egovcp.spec import ACTION_DIM, DEPTH_COLS, DEPTH_ROWS, STATE_DIM, STATE_SLICES
-from egovcp_deploy.policy import ImaginingPolicy, RolloutPolicy
+from egovcp_deploy.pilot.effort import Effort
+from egovcp_deploy.policy import Adjustable, ImaginingPolicy, RolloutPolicy
 
 BACKLOG: Final = 8  # reports that may wait for a busy planner; older ones are lost
 
@@ -100,6 +101,7 @@ class Thinker:
 
     def __init__(self, policy: RolloutPolicy, imagine: int = 0) -> None:
         self._policy = policy
+        self._effort = Effort(policy.config) if isinstance(policy, Adjustable) else None
         self._imagine = imagine
         self._imagining = policy if imagine and isinstance(policy, ImaginingPolicy) else None
         self._next_tick: int | None = None
@@ -116,6 +118,19 @@ class Thinker:
         step = self._policy.act(last.depth[None], last.state[None])
         plan_ms = (time.perf_counter() - begin) * 1e3
         return Reply(last.tick, step, plan_ms, events=tuple(events))
+
+    def pace(self, late: bool) -> bool:
+        """Told of each plan whether it was late; true if less, or more, is now weighed."""
+        if self._effort is None or not self._effort.record(late):
+            return False
+        assert isinstance(self._policy, Adjustable)
+        self._policy.config = self._effort.config
+        return True
+
+    @property
+    def samples(self) -> int:
+        """Candidates per iteration at present; 0 of a policy that does not plan."""
+        return 0 if self._effort is None else self._effort.config.samples
 
     def warm_up(self) -> None:
         """Plan and decode once for nothing: the first time takes long."""

@@ -11,9 +11,10 @@ from egovcp import spec
 from egovcp.data import DatasetReader
 from egovcp.log import paths
 from egovcp.robot.kinematics import LINK_NAMES
+from egovcp.rollouts import camera_view, ticks_of
 from egovcp_collect.dataset import viz
 from egovcp_collect.dataset.cli import main
-from egovcp_collect.dataset.viz import camera_view, ticks_of, write_recording
+from egovcp_collect.dataset.viz import write_recording
 
 from .scenes import SETTINGS, scene, three_balls, write_scenes
 

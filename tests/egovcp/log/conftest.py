@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 
-from egovcp.log.tick import BasePose, Candidates, SceneObject, Tick
+from egovcp.log.tick import BasePose, Candidates, SceneObject, Tick, ValueMap
 from egovcp.spec import STATE_DIM, STATE_SLICES
 
 MakeTick = Callable[..., Tick]
@@ -50,6 +51,7 @@ def _rest(index: int, rng: np.random.Generator) -> dict[str, object]:
             rng.uniform(0, 0.5, (8, 4, 2, 3)).astype(np.float32),
             rng.normal(size=8).astype(np.float32),
         ),
+        "value_maps": tuple(_value_map(hand, rng) for hand in ("left", "right")),
         "value": float(rng.normal()),
         "termination": 0.01 * index,
         "reward_terms": {"block": 1.0 * index, "pose": -0.1},
@@ -62,3 +64,8 @@ def _rest(index: int, rng: np.random.Generator) -> dict[str, object]:
         ),
         "events": ("ball thrown", "second line") if index == 1 else (),
     }
+
+
+def _value_map(hand: Any, rng: np.random.Generator) -> ValueMap:
+    x, z = np.linspace(0, 0.5, 6, dtype=np.float32), np.linspace(-0.2, 0.5, 4, dtype=np.float32)
+    return ValueMap(hand, x, 0.25, z, rng.normal(size=(4, 6)).astype(np.float32))

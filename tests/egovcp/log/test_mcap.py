@@ -44,6 +44,10 @@ def assert_same(a: Any, b: Any, where: str = "tick") -> None:
     if is_dataclass(a):
         for field in fields(a):
             assert_same(getattr(a, field.name), getattr(b, field.name), f"{where}.{field.name}")
+    elif isinstance(a, tuple):
+        assert len(a) == len(b), where
+        for i, (left, right) in enumerate(zip(a, b, strict=True)):
+            assert_same(left, right, f"{where}[{i}]")
     elif isinstance(a, np.ndarray):
         assert a.shape == b.shape, where
         np.testing.assert_array_equal(a, b, err_msg=where)

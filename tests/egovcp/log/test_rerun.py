@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from rerun.blueprint import Container
 from rerun.experimental import RrdReader
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.log import paths
+from egovcp.log.blueprint import blueprint
 from egovcp.log.info import RunInfo
+from egovcp.log.pose import robot_pose
 from egovcp.log.rerun import BATCH_TICKS, RerunSink
-from egovcp.log.tick import Tick
+from egovcp.log.tick import Tick, ValueMap
+from egovcp.log.value_map_columns import chosen_pixel
 from egovcp.robot.kinematics import LINK_NAMES
+from egovcp.spec import ACTION_BOX
 
 INFO = RunInfo(task="ball", seed=1, episode=2)
 
@@ -90,3 +96,55 @@ def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
     with pytest.raises(EnvironmentFailure, match="exists already"):
         RerunSink(path, meshes=False).open(INFO)
     assert path.read_bytes() == b"precious"
+
+
+def test_value_maps_are_pictures_with_the_best_point_bright(tmp_path: Path, make_tick: Any) -> None:
+    tick = make_tick(1)
+    store = record(tmp_path / "a.rrd", [tick], meshes=False)
+    for value_map in tick.value_maps:
+        (blob,) = column(store, f"{paths.VALUE_MAP}/{value_map.hand}", "Image:buffer")
+        image = np.asarray(blob[0], np.uint8).reshape(*value_map.values.shape, 3)
+        best = np.unravel_index(value_map.values.argmax(), value_map.values.shape)
+        row = len(value_map.z_b) - 1 - best[0]  # high is up
+        assert image[row, best[1]].tolist() == [253, 231, 37]
+
+
+def test_the_dot_marks_where_the_plan_puts_the_hand(make_tick: Any) -> None:
+    grid = np.array([0.1, 0.2, 0.3], np.float32)
+    value_map = ValueMap("right", grid, -0.2, grid, np.zeros((3, 3), np.float32))
+    target = ACTION_BOX.to_metric(np.zeros(7))
+    target[3], target[5] = 0.2, 0.3
+    tick = replace(make_tick(0), action_planned=ACTION_BOX.to_normalised(target))
+    np.testing.assert_allclose(chosen_pixel(tick, value_map), (1.5, 0.5), atol=1e-5)
+
+
+def test_candidates_are_paths_in_the_world_coloured_by_value(
+    tmp_path: Path, make_tick: Any
+) -> None:
+    tick = make_tick(1)
+    store = record(tmp_path / "a.rrd", [tick], meshes=False)
+    (strips,) = column(store, paths.CANDIDATES, "LineStrips3D:strips")
+    (colours,) = column(store, paths.CANDIDATES, "LineStrips3D:colors")
+    hands = robot_pose(tick).from_heading(tick.candidates.hands_b)  # (n, N, 2, 3)
+    expected = np.concatenate([hands[:, :, 0], hands[:, :, 1]])
+    np.testing.assert_allclose(np.array(strips), expected, atol=1e-6)
+    n = len(tick.candidates.values)
+    assert colours[:n] == colours[n:]
+    best = int(tick.candidates.values.argmax())
+    assert [i for i in range(n) if colours[i] == 0xFDE725FF] == [best]
+
+
+def test_every_view_of_the_blueprint_has_something_to_show(tmp_path: Path, make_tick: Any) -> None:
+    found = entities(record(tmp_path / "a.rrd", [make_tick(i) for i in range(3)], imagined=(1, 5)))
+    origins = [view.origin for view in views(blueprint((1, 5)).root_container)]
+    assert len(origins) == 13
+    for origin in origins:
+        assert any(path == origin or path.startswith(f"{origin}/") for path in found), origin
+
+
+def views(part: Any) -> list[Any]:
+    """The views within a container."""
+    contents = getattr(part, "contents", None)
+    if isinstance(part, Container):
+        return [view for inner in contents or () for view in views(inner)]
+    return [part]

@@ -1,0 +1,114 @@
+"""`egovcp-mcap`: look at recorded runs, save torn ones, turn them into data and back."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Any, Final
+
+from egovcp.cli import run_command
+from egovcp.errors import UsageError, suggest
+
+PROG: Final = "egovcp-mcap"
+
+
+@dataclass(frozen=True)
+class Subcommand:
+    """Where a subcommand lives, how it is called, and what the help says of it.
+
+    ``names`` are the options that its arguments without a flag stand for, in order; ``many``
+    takes all of them.
+    """
+
+    module: str
+    usage: str
+    summary: str
+    names: tuple[str, ...] = ()
+    many: str = ""
+
+
+SUBCOMMANDS: Final[Mapping[str, Subcommand]] = MappingProxyType(
+    {
+        "info": Subcommand(
+            "egovcp_deploy.mcap.info",
+            "info FILE",
+            "what is in it: the run, ticks, rates, topics, gaps; whole or torn",
+            ("file",),
+        ),
+        "recover": Subcommand(
+            "egovcp_deploy.mcap.recover",
+            "recover TORN OUT",
+            "copy every whole tick of a torn file into a new one with an index",
+            ("file", "output"),
+        ),
+        "to-dataset": Subcommand(
+            "egovcp_deploy.mcap.to_dataset",
+            "to-dataset FILE... --dataset.root=ROOT",
+            "rollouts as episodes of a new LeRobot dataset, to train on",
+            many="files",
+        ),
+        "from-dataset": Subcommand(
+            "egovcp_deploy.mcap.from_dataset",
+            "from-dataset ROOT OUT --episode=N",
+            "an episode of a dataset as a recording",
+            ("dataset.root", "output"),
+        ),
+    }
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    if not args or args[0] in ("-h", "--help"):
+        print(_help())
+        return 0 if args else UsageError.exit_code
+    try:
+        if args[0] not in SUBCOMMANDS:
+            raise UsageError(f"unknown subcommand {args[0]!r}{suggest(args[0], SUBCOMMANDS)}")
+        entry = SUBCOMMANDS[args[0]]
+        flags = _flags(args[1:], entry)
+    except UsageError as error:
+        print(f"{PROG}: error: {error}", file=sys.stderr)
+        return error.exit_code
+    module: Any = importlib.import_module(entry.module)
+    return run_command(module.CONFIG, module.run, flags, prog=f"{PROG} {args[0]}")
+
+
+def _help() -> str:
+    width = max(len(entry.usage) for entry in SUBCOMMANDS.values())
+    lines = [f"  {entry.usage:{width}}  {entry.summary}" for entry in SUBCOMMANDS.values()]
+    return "\n".join(
+        [
+            f"usage: {PROG} SUBCOMMAND [FILES] [--flags]",
+            "",
+            "Look at recorded runs (MCAP), save torn ones, turn them into datasets and back.",
+            "",
+            *lines,
+            "",
+            f"`{PROG} SUBCOMMAND --help` explains the options of one.",
+        ]
+    )
+
+
+def _flags(args: Sequence[str], entry: Subcommand) -> list[str]:
+    """The arguments with those that have no flag turned into flags."""
+    flags = [arg for arg in args if arg.startswith("-")]
+    places = [arg for arg in args if not arg.startswith("-")]
+    if entry.many:
+        return [*([f"--{entry.many}={json.dumps(places)}"] if places else []), *flags]
+    if len(places) > len(entry.names):
+        raise UsageError(
+            f"unexpected argument {places[len(entry.names)]!r}; expected {PROG} {entry.usage}; "
+            "the value of an option is written --name=value"
+        )
+    named = zip(entry.names, places, strict=False)
+    return [*(f"--{name}={place}" for name, place in named), *flags]
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

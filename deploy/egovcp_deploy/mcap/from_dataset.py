@@ -1,0 +1,60 @@
+"""`egovcp-mcap from-dataset`: an episode of a dataset as a recording, to look at or to replay."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+
+from egovcp.cli import DatasetConfig
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.log.mcap import McapSink
+
+
+@dataclass(frozen=True)
+class FromDatasetConfig:
+    """Write an episode of a dataset as a recording (MCAP). `to-dataset` makes the same rows of
+    it again."""
+
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """The dataset: a folder, or an id of the Hub."""
+    episode: int = 0
+    """Which episode, counted from 0."""
+    output: str = ""
+    """The recording to create."""
+
+
+CONFIG = FromDatasetConfig
+
+
+def run(config: FromDatasetConfig) -> None:
+    """Write the recording.
+
+    Raises:
+        UsageError: there is no such episode, or no output is named.
+        DataError: the dataset is damaged.
+        EnvironmentFailure: the output exists, or what reads datasets is not installed.
+    """
+    if not config.output:
+        raise UsageError("where to? egovcp-mcap from-dataset ROOT OUT.mcap --episode=N")
+    if find_spec("pyarrow") is None:
+        raise EnvironmentFailure(
+            "datasets are read with pyarrow, which is not installed: pip install 'egovcp[data]'"
+        )
+    from egovcp.data import DatasetReader
+    from egovcp.rollouts import run_info, ticks_of
+
+    reader = DatasetReader.open(config.dataset)
+    if not 0 <= config.episode < len(reader):
+        raise UsageError(
+            f"--episode={config.episode}: {reader.root} has episodes 0 to {len(reader) - 1}"
+        )
+    episode = reader.read(config.episode)
+    sink = McapSink(Path(config.output))
+    sink.open(run_info(reader, config.episode, episode))
+    try:
+        for tick in ticks_of(episode):
+            sink.write(tick)
+    finally:
+        sink.close()
+    print(f"{config.output}: {len(episode)} ticks of {episode.task}")

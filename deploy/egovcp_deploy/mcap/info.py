@@ -1,0 +1,173 @@
+"""`egovcp-mcap info`: what is in a recording, and is it whole?"""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from egovcp.errors import UsageError
+from egovcp.log.info import RunInfo
+from egovcp.log.mcap_reader import Moment, RecordingReader
+from egovcp.log.messages import Topic
+from egovcp.rate import NS_PER_S
+
+
+@dataclass(frozen=True)
+class InfoConfig:
+    """Say what is in a recording: the run, its ticks and rates, its topics, what is missing, and
+    whether the file is complete."""
+
+    file: str = ""
+    """The recording, an MCAP file."""
+    json: str = ""
+    """File for the same in JSON; `-`: print that instead."""
+
+
+CONFIG = InfoConfig
+
+
+@dataclass(frozen=True)
+class Gap:
+    """Ticks that were made but are not in the recording, or a pause."""
+
+    after: int
+    """Index of the tick before it."""
+    missing: int
+    """Ticks that are not there; 0 for a pause."""
+    seconds: float
+    """From the tick before it to the tick after it."""
+
+
+@dataclass
+class Summary:
+    """What `egovcp-mcap info` says."""
+
+    file: str
+    bytes: int
+    info: RunInfo
+    complete: bool = False
+    """The file ends as its writer meant it to."""
+    ticks: int = 0
+    duration_s: float = 0.0
+    """From the first tick to one period after the last."""
+    gaps: list[Gap] = field(default_factory=list)
+    events: int = 0
+    """Lines in the log."""
+    messages: Counter[str] = field(default_factory=Counter)
+    types: dict[str, str] = field(default_factory=dict)
+
+    @property
+    def missing(self) -> int:
+        """Ticks that were dropped."""
+        return sum(gap.missing for gap in self.gaps)
+
+    @property
+    def rate_hz(self) -> float:
+        """Recorded ticks per second."""
+        return self.ticks / self.duration_s if self.duration_s else 0.0
+
+    def to_json(self) -> dict[str, Any]:
+        """Keys of the report."""
+        return {
+            "file": self.file,
+            "bytes": self.bytes,
+            "complete": self.complete,
+            "ticks": self.ticks,
+            "duration_s": self.duration_s,
+            "rate_hz": self.rate_hz,
+            "missing": self.missing,
+            "gaps": [asdict(gap) for gap in self.gaps],
+            "events": self.events,
+            "topics": {
+                topic: {
+                    "type": self.types[topic],
+                    "messages": count,
+                    "rate_hz": count / self.duration_s if self.duration_s else 0.0,
+                }
+                for topic, count in sorted(self.messages.items())
+            },
+            "run": asdict(self.info),
+        }
+
+
+def run(config: InfoConfig) -> None:
+    """Print the summary.
+
+    Raises:
+        DataError: not a recording of ours.
+    """
+    if not config.file:
+        raise UsageError("which recording? egovcp-mcap info FILE")
+    summary = summarise(Path(config.file))
+    report = json.dumps(summary.to_json(), indent=2)
+    if config.json == "-":
+        print(report)
+        return
+    if config.json:
+        Path(config.json).write_text(report + "\n", encoding="utf-8")
+    print(text(summary))
+
+
+def summarise(path: Path) -> Summary:
+    """Go through the whole recording once; what is inside the messages is not looked at."""
+    reader = RecordingReader(path)
+    summary = Summary(str(path), path.stat().st_size, reader.info)
+    period_ns = NS_PER_S // reader.info.fps
+    first_ns, last = 0, None
+    for moment in reader.moments():
+        if last is None:
+            first_ns = moment.time_ns
+        elif gap := _gap(last, moment, period_ns):
+            summary.gaps.append(gap)
+        last = moment
+        summary.ticks += 1
+        summary.messages.update(moment.messages.keys())
+        summary.events += len(moment.text(Topic.LOG).splitlines())
+    if last is not None:
+        summary.duration_s = (last.time_ns - first_ns + period_ns) / NS_PER_S
+    summary.complete = reader.complete
+    summary.types = {line.topic: line.schema.name for line in reader.lines.values()}
+    return summary
+
+
+def _gap(before: Moment, moment: Moment, period_ns: int) -> Gap | None:
+    missing = moment.index - before.index - 1
+    passed = moment.time_ns - before.time_ns
+    late = passed - (missing + 1) * period_ns > period_ns / 2
+    return Gap(before.index, missing, passed / NS_PER_S) if missing or late else None
+
+
+def text(summary: Summary) -> str:
+    """For reading."""
+    info = summary.info
+    lines = [
+        f"{summary.file}: {'complete' if summary.complete else 'TORN'}, "
+        f"{summary.bytes / 1e6:.1f} MB",
+        f"run       {info.task}, seed {info.seed}, episode {info.episode}",
+        f"ticks     {summary.ticks} in {summary.duration_s:.2f} s, {summary.rate_hz:.2f} Hz",
+        f"missing   {summary.missing} ticks in {len(summary.gaps)} gaps",
+        *(f"          after tick {g.after}: {_words(g)}" for g in summary.gaps[:_SHOWN_GAPS]),
+        f"events    {summary.events}",
+        *(f"hash      {name} {value}" for name, value in info.hashes.items()),
+        f"versions  {', '.join(f'{name} {v}' for name, v in info.versions.items())}",
+        "topics",
+    ]
+    width = max(map(len, summary.messages), default=0)
+    lines += [
+        f"  {topic:{width}}  {count:6d}  {summary.types[topic]}"
+        for topic, count in sorted(summary.messages.items())
+    ]
+    if not summary.complete:
+        lines.append(f"save its ticks: egovcp-mcap recover {summary.file} OUT.mcap")
+    return "\n".join(lines)
+
+
+_SHOWN_GAPS = 10
+
+
+def _words(gap: Gap) -> str:
+    what = f"{gap.missing} missing" if gap.missing else "a pause"
+    return f"{what}, {gap.seconds:.2f} s"

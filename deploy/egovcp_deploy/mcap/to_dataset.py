@@ -1,0 +1,154 @@
+"""`egovcp-mcap to-dataset`: rollouts as episodes of a dataset, from the robot back to training."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from egovcp.cli import DatasetConfig
+from egovcp.errors import DataError, EnvironmentFailure, UsageError
+from egovcp.log.info import RunInfo
+from egovcp.log.mcap_reader import ROW_TOPICS, RecordingReader
+from egovcp.log.tick import Tick
+
+if TYPE_CHECKING:
+    from egovcp.data import Episode, Provenance
+
+
+@dataclass(frozen=True)
+class ToDatasetConfig:
+    """Make a LeRobot dataset out of recorded rollouts, one episode each: row t is what was observed
+    at tick t, the action as it was sent, the reward after it, and whether that was the end.
+
+    The robots must have had the same low-level controller: what an action does depends on it.
+    `egovcp-dataset merge` joins the dataset with others of that controller.
+    """
+
+    files: list[str] = field(default_factory=list)
+    """The recordings, MCAP files."""
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """Where the dataset goes; without a root, into LeRobot's local folder under its id."""
+    gaps: Literal["refuse", "cut"] = "refuse"
+    """What to do with a recording in which ticks are missing: rows of an episode are one period
+    apart. refuse: nothing is written; cut: keep what comes before the first gap (not what comes
+    after it, since an episode begins in the neutral pose)."""
+
+
+CONFIG = ToDatasetConfig
+
+
+def run(config: ToDatasetConfig) -> None:
+    """Convert, and say what was kept.
+
+    Raises:
+        UsageError: no file is given, or the dataset exists.
+        DataError: a file is no recording of ours, has gaps, or another controller.
+        EnvironmentFailure: what writes datasets is not installed.
+    """
+    if not config.files:
+        raise UsageError("which recordings? egovcp-mcap to-dataset FILE... --dataset.root=ROOT")
+    if config.dataset.revision:
+        raise UsageError("--dataset.revision has no meaning for a new dataset; drop it")
+    if find_spec("pyarrow") is None:
+        raise EnvironmentFailure(
+            "datasets are written with pyarrow, which is not installed: pip install 'egovcp[data]'"
+        )
+    from egovcp.data import DatasetWriter
+    from egovcp.data.source import local_root
+
+    paths = [Path(file).expanduser() for file in config.files]
+    with DatasetWriter(local_root(config.dataset), provenance(paths)) as writer:
+        for path in paths:
+            episode, cut = read_episode(path, config.gaps)
+            writer.add(episode)
+            print(f"{path}: {len(episode)} ticks{cut}")
+    print(f"{writer.root}: {writer.num_episodes} episodes, {writer.num_frames} frames")
+
+
+def provenance(paths: Sequence[Path]) -> Provenance:
+    """What the recordings have in common.
+
+    Raises:
+        DataError: they have different low-level controllers, or one does not say which.
+    """
+    from egovcp.data import Provenance
+    from egovcp.rollouts import CONTROLLER
+
+    infos = {path: RecordingReader(path).info for path in paths}
+    ids = {path: info.hashes.get(CONTROLLER, "") for path, info in infos.items()}
+    for path, controller in ids.items():
+        if not controller:
+            raise DataError(f"{path} does not say which low-level controller the robot had")
+        if controller != ids[paths[0]]:
+            raise DataError(
+                f"{path} was recorded with the low-level controller {controller}, "
+                f"{paths[0]} with {ids[paths[0]]}; make a dataset of each"
+            )
+    first = infos[paths[0]]
+    command = shlex.join(["egovcp-mcap", "to-dataset", *map(str, paths)])
+    return Provenance(
+        controller_id=ids[paths[0]],
+        command=command,
+        versions=dict(first.versions),
+        config=_config(first),
+    )
+
+
+def _config(info: RunInfo) -> dict[str, object]:
+    """The run's configuration, without what is of one episode alone."""
+    own = ("pose", "dataset", "index in the dataset", "scenario", "time_limit", "command")
+    return {name: value for name, value in info.config.items() if name not in own}
+
+
+def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
+    """A recording as an episode, and words on what was left out.
+
+    Raises:
+        DataError: not a recording of ours, ticks are missing, or a value is out of its range.
+    """
+    from egovcp.rollouts import episode_of
+
+    reader = RecordingReader(path)
+    try:
+        ticks = _until_over(moment.tick(ROW_TOPICS) for moment in reader.moments())
+        whole, why = _before_gap(ticks)
+        if why and gaps == "refuse":
+            raise DataError(
+                f"{why}; rows of an episode are one period apart. --gaps=cut keeps what comes "
+                "before the first gap"
+            )
+        episode = episode_of(reader.info, whole)
+        episode.validate()
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+    cut = f", cut: {why}" if why else ""
+    return episode, cut if reader.complete else f"{cut}; the file is torn there"
+
+
+def _until_over(ticks: Iterator[Tick]) -> list[Tick]:
+    """The ticks up to the one that ends the episode; the robot may have been recorded longer."""
+    kept = []
+    for tick in ticks:
+        kept.append(tick)
+        if tick.terminated or tick.truncated:
+            break
+    return kept
+
+
+def _before_gap(ticks: Sequence[Tick]) -> tuple[list[Tick], str]:
+    """The ticks before the first gap, and where that is; empty if there is none."""
+    from egovcp.rollouts import follows
+
+    if ticks and ticks[0].index != 0:
+        return [], f"its first {ticks[0].index} ticks are missing"
+    for i in range(1, len(ticks)):
+        before, tick = ticks[i - 1], ticks[i]
+        if not follows(before, tick):
+            count = tick.index - before.index - 1
+            words = f"{count} ticks are missing" if count else "the robot paused"
+            return list(ticks[:i]), f"{words} after tick {before.index}"
+    return list(ticks), ""

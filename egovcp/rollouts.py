@@ -1,0 +1,163 @@
+"""Episodes of a dataset as recordings, and recordings as episodes.
+
+Row t of an episode is tick t of a recording, with nothing shifted: o_t, a_t as sent, r_t, done.
+Shared by what shows datasets and by what turns rollouts into data.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from egovcp.data import DatasetReader, Episode
+from egovcp.errors import DataError
+from egovcp.log.info import CameraView, RunInfo
+from egovcp.log.tick import Tick
+from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, PLANNER_HZ, TASKS
+
+TICK_NS: Final = 1_000_000_000 // PLANNER_HZ
+#: Key of `RunInfo.hashes` that names the low-level controller.
+CONTROLLER: Final = "low_level_controller"
+POSE: Final = (
+    "The pelvis pose is not recorded: the robot is drawn at the origin, at its commanded height, "
+    "tilted as its IMU says."
+)
+_EVENT: Final = {"ball": "the ball is thrown", "wall": "the push", "arch": "the way to the arch"}
+_STANDS_OUT: Final = 0.2  # a block, a hit, a passage or a fall; not a tick of bracing
+_SEED_DIGITS: Final = 12  # hexadecimal; far beyond the seeds of collections and evaluations
+
+
+def run_info(reader: DatasetReader, index: int, episode: Episode) -> RunInfo:
+    """What the recording of an episode says before its first tick."""
+    facts, known = episode.metadata, reader.provenance
+    return RunInfo(
+        task=episode.task,
+        seed=int(facts.get("seed") or 0),
+        episode=int(facts.get("episode", index)),
+        camera=camera_view(known.get("config", {}), facts),
+        config={
+            **known.get("config", {}),
+            "pose": POSE,
+            "dataset": str(reader.root),
+            "index in the dataset": index,
+            "scenario": dict(facts),
+            "time_limit": episode.time_limit,
+            "command": known.get("command", ""),
+        },
+        hashes={CONTROLLER: reader.controller_id, "dataset commit": reader.source.commit},
+        versions=dict(known.get("versions", {})),
+    )
+
+
+def camera_view(config: Mapping[str, Any], facts: Mapping[str, Any]) -> CameraView:
+    """The camera as it was mounted in an episode; the default where that is not recorded."""
+    camera, usual = config.get("env", {}).get("camera", {}), CameraView()
+    x, y, z = camera.get("position", usual.position)
+    return CameraView(
+        position=(x, y, z),
+        pitch=facts.get("camera_pitch", usual.pitch),
+        vertical_fov=camera.get("vertical_fov", usual.vertical_fov),
+    )
+
+
+def ticks_of(episode: Episode) -> Iterator[Tick]:
+    """The rows of an episode as the logs know them."""
+    for t in range(len(episode)):
+        ended = bool(episode.done[t])
+        yield Tick(
+            index=t,
+            time_ns=t * TICK_NS,
+            depth=episode.depth[t],
+            state=episode.state[t],
+            action_planned=episode.action[t],
+            action_sent=episode.action[t],
+            reward=float(episode.reward[t]),
+            terminated=ended and not episode.truncated[t],
+            truncated=bool(episode.truncated[t]),
+            success=bool(episode.success[t]),
+            events=tuple(_events(episode, t)),
+        )
+
+
+def _events(episode: Episode, t: int) -> Iterator[str]:
+    if t == episode.metadata.get("event_tick"):
+        yield _EVENT[episode.task]
+    if t > 0 and episode.success[t] != episode.success[t - 1]:
+        yield "success" if episode.success[t] else "no success any more"
+    if abs(episode.reward[t] - np.median(episode.reward)) > _STANDS_OUT:
+        yield f"reward {episode.reward[t]:+.3f}"
+    if episode.done[t]:
+        yield "a fall ends the episode" if episode.terminated else "the time is up"
+
+
+def follows(before: Tick, tick: Tick) -> bool:
+    """Whether a tick comes one period after another, so that both may be rows of an episode."""
+    late = abs(tick.time_ns - before.time_ns - TICK_NS) > TICK_NS / 2
+    return tick.index == before.index + 1 and not late
+
+
+def episode_of(info: RunInfo, ticks: Sequence[Tick]) -> Episode:
+    """The rows of consecutive ticks, the first of which begins the run.
+
+    What ends it without a fall (the time is up, an operator, a gap) truncates it: its planned
+    length is then the number of its ticks. After a fall it is the one that was configured.
+
+    Raises:
+        DataError: there is no tick, or the run's task is none of ours.
+    """
+    if info.task not in TASKS:
+        raise DataError(f"its task is {info.task!r}; expected one of {', '.join(TASKS)}")
+    if not ticks:
+        raise DataError("it holds no tick; expected at least one")
+    length, last = len(ticks), np.arange(len(ticks)) == len(ticks) - 1
+    fallen = ticks[-1].terminated
+    episode = Episode(
+        depth=np.stack([_depth(tick) for tick in ticks]),
+        state=np.stack([tick.state for tick in ticks]).astype(np.float32),
+        action=np.stack([tick.action_sent for tick in ticks]).astype(np.float32),
+        reward=np.array([tick.reward for tick in ticks], np.float32),
+        done=last,
+        success=np.array([tick.success for tick in ticks], np.bool_),
+        truncated=last & (not fallen),
+        task=info.task,
+        time_limit=max(length, planned_ticks(info)) if fallen else length,
+    )
+    facts = _facts(info, episode)
+    return Episode(**{**vars(episode), "metadata": facts})
+
+
+def _depth(tick: Tick) -> np.ndarray[Any, np.dtype[np.uint16]]:
+    if tick.depth.shape != (DEPTH_ROWS, DEPTH_COLS):
+        raise DataError(
+            f"tick {tick.index}: depth of {tick.depth.shape} pixels, "
+            f"expected {(DEPTH_ROWS, DEPTH_COLS)}"
+        )
+    return tick.depth
+
+
+def planned_ticks(info: RunInfo) -> int:
+    """How long the run was to be, ticks; 0 where its configuration does not say."""
+    if "time_limit" in info.config:
+        return int(str(info.config["time_limit"]))
+    env = info.config.get("env")
+    scene = env.get(f"{info.task}_episode", {}) if isinstance(env, Mapping) else {}
+    return int(scene.get("ticks", 0))
+
+
+def _facts(info: RunInfo, episode: Episode) -> dict[str, Any]:
+    """What the dataset keeps of an episode beside its rows.
+
+    A rollout is named after its content, not after its scenario: another policy plays the same
+    scenario, and an episode of a collection may have the same numbers.
+    """
+    scenario = info.config.get("scenario")
+    if isinstance(scenario, Mapping):  # it was an episode of a dataset
+        return dict(scenario)
+    return {
+        "seed": int(episode.digest()[:_SEED_DIGITS], 16),
+        "episode": 0,
+        "camera_pitch": info.camera.pitch,
+        "rollout": {"seed": info.seed, "episode": info.episode, "hashes": dict(info.hashes)},
+    }

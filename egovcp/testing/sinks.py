@@ -1,0 +1,43 @@
+"""Sinks that fail in the ways in which disks and viewers do."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from egovcp.log.info import RunInfo
+from egovcp.log.tick import Tick
+
+
+@dataclass
+class DiarySink:
+    """Writes a line per call into a text file, and misbehaves on request."""
+
+    path: Path
+    stall_at: int = -1
+    """Index of the tick at which it hangs for ``stall_s``."""
+    stall_s: float = 0.0
+    raise_at: int = -1
+    """Index of the tick at which the disk is full."""
+    close_s: float = 0.0
+    """How long closing takes."""
+
+    def open(self, info: RunInfo) -> None:
+        self._note(f"open {info.task}")
+
+    def write(self, tick: Tick) -> None:
+        if tick.index == self.stall_at:
+            self._note("stall")
+            time.sleep(self.stall_s)
+        if tick.index == self.raise_at:
+            raise OSError(28, "No space left on device", str(self.path))
+        self._note(" ".join([f"tick {tick.index}", *tick.events]))
+
+    def close(self) -> None:
+        time.sleep(self.close_s)
+        self._note("close")
+
+    def _note(self, line: str) -> None:
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(f"{line}\n")

@@ -1,0 +1,136 @@
+"""A rollout becomes an episode that the dataset's own tools accept; and the way back."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from egovcp.checks.dataset import dataset_problems
+from egovcp.data import DatasetReader, open_dataset
+from egovcp.log.tick import Tick
+from egovcp.rollouts import CONTROLLER
+from egovcp_deploy.mcap.cli import main
+
+from .conftest import INFO, Record
+
+
+def test_episode_to_recording_to_episode_is_the_identity(
+    dataset: DatasetReader, tmp_path: Path
+) -> None:
+    files = [str(tmp_path / f"{index}.mcap") for index in range(len(dataset))]
+    for index, file in enumerate(files):
+        assert main(["from-dataset", str(dataset.root), file, f"--episode={index}"]) == 0
+    assert main(["to-dataset", *files, f"--dataset.root={tmp_path / 'back'}"]) == 0
+    back = open_dataset(tmp_path / "back")
+    assert list(dataset_problems(back.root)) == []
+    assert back.controller_id == dataset.controller_id
+    assert back.provenance["config"] == dataset.provenance["config"]
+    for index in range(len(dataset)):
+        before, after = dataset.read(index), back.read(index)
+        assert before.digest() == after.digest()
+        assert (before.task, before.time_limit) == (after.task, after.time_limit)
+        assert before.metadata == after.metadata
+
+
+def test_rows_are_what_was_sent(record: Record, tmp_path: Path) -> None:
+    planned = np.full(7, 0.9, np.float32)
+    file = record(keep=lambda tick: replace(tick, action_planned=planned))
+    assert main(["to-dataset", str(file), f"--dataset.root={tmp_path / 'new'}"]) == 0
+    episode = open_dataset(tmp_path / "new").read(0)
+    assert not np.isclose(episode.action, 0.9).all(axis=1).any()
+    assert episode.done.tolist() == [False] * 7 + [True]
+    assert episode.truncated[-1]
+    assert list(dataset_problems(tmp_path / "new")) == []
+
+
+def test_after_a_fall_nothing_is_kept(
+    record: Record, fallen: Callable[[Tick], Tick], tmp_path: Path
+) -> None:
+    info = replace(INFO, config={"env": {"ball_episode": {"ticks": 40}}})
+    file = record(info=info, keep=fallen)
+    assert main(["to-dataset", str(file), f"--dataset.root={tmp_path / 'new'}"]) == 0
+    episode = open_dataset(tmp_path / "new").read(0)
+    assert (len(episode), episode.terminated, episode.time_limit) == (6, True, 40)
+
+
+def test_rollouts_of_one_scenario_are_different_episodes(record: Record, tmp_path: Path) -> None:
+    files = [str(record(f"{n}.mcap", number=n)) for n in range(2)]
+    assert main(["to-dataset", *files, f"--dataset.root={tmp_path / 'new'}"]) == 0
+    reader = open_dataset(tmp_path / "new")
+    assert reader.identity(0) != reader.identity(1)
+    assert reader.metadata(0)["rollout"]["seed"] == INFO.seed
+
+
+def test_controllers_do_not_mix(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = replace(INFO, hashes={CONTROLLER: "walk-2"})
+    files = [str(record()), str(record("b.mcap", info=other))]
+    assert main(["to-dataset", *files, f"--dataset.root={tmp_path / 'new'}"]) == 3
+    assert "walk-2" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_missing_ticks_are_refused_or_cut(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file, flag = str(record(missing=(5, 6))), f"--dataset.root={tmp_path / 'new'}"
+    assert main(["to-dataset", file, flag]) == 3
+    assert "2 ticks are missing after tick 4" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+    assert main(["to-dataset", file, flag, "--gaps=cut"]) == 0
+    assert "cut: 2 ticks are missing after tick 4" in capsys.readouterr().out
+    episode = open_dataset(tmp_path / "new").read(0)
+    assert (len(episode), bool(episode.truncated[-1]), episode.time_limit) == (5, True, 5)
+    assert list(dataset_problems(tmp_path / "new")) == []
+
+
+def test_a_pause_is_a_gap(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    late = 40_000_000
+    file = record(keep=lambda t: replace(t, time_ns=t.time_ns + (late if t.index > 2 else 0)))
+    assert main(["to-dataset", str(file), f"--dataset.root={tmp_path / 'new'}"]) == 3
+    assert "paused after tick 2" in capsys.readouterr().err
+    assert main(["info", str(file), "--json=-"]) == 0
+    gaps = json.loads(capsys.readouterr().out)["gaps"]
+    assert gaps == [{"after": 2, "missing": 0, "seconds": 0.08}]
+
+
+@pytest.mark.parametrize(
+    ("info", "words"),
+    [
+        (replace(INFO, hashes={}), "does not say which low-level controller"),
+        (replace(INFO, task="juggle"), "its task is 'juggle'"),
+    ],
+)
+def test_what_a_dataset_needs_to_know(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str], info: object, words: str
+) -> None:
+    file = record(info=info)
+    assert main(["to-dataset", str(file), f"--dataset.root={tmp_path / 'new'}"]) == 3
+    assert words in capsys.readouterr().err
+
+
+def test_values_out_of_range_are_refused(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = record(keep=lambda tick: replace(tick, state=tick.state * np.nan))
+    assert main(["to-dataset", str(file), f"--dataset.root={tmp_path / 'new'}"]) == 3
+    assert "state is not finite" in capsys.readouterr().err
+
+
+def test_it_trains(record: Record, tmp_path: Path) -> None:
+    from egovcp_train.train import main as train
+
+    files = [str(record(f"{n}.mcap", number=n)) for n in range(3)]
+    assert main(["to-dataset", *files, f"--dataset.root={tmp_path / 'new'}"]) == 0
+    flags = ["--preset=debug", "--steps=2", "--batch_size=2", f"--output_dir={tmp_path / 'run'}"]
+    flags += ["--returns.steps=4", "--sampling.length=6"]
+    assert train([f"--dataset.root={tmp_path / 'new'}", *flags]) == 0
+    assert (tmp_path / "run/checkpoints/last/pretrained_model/model.safetensors").is_file()

@@ -1,0 +1,86 @@
+"""A file that ends with a whole piece, on a disk that is too small, too."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from egovcp.log import append
+from egovcp.log.append import AppendFile
+from egovcp.log.background import BackgroundSink
+from egovcp.log.info import RunInfo
+from egovcp.log.mcap import McapSink
+from egovcp.log.mcap_reader import read_recording
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Iterator[Path]:
+    """A disk of one megabyte."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "none", str(folder)]
+    if os.geteuid() != 0 or subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("only the superuser may mount a small file system")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+
+
+def test_nothing_is_there_before_the_flush_and_all_of_it_after(tmp_path: Path) -> None:
+    file = AppendFile(tmp_path / "a")
+    file.write(b"one")
+    file.write(b"two")
+    assert (tmp_path / "a").read_bytes() == b""
+    assert file.tell() == 6
+    file.flush()
+    assert (tmp_path / "a").read_bytes() == b"onetwo"
+    file.close()
+
+
+def test_a_piece_that_does_not_fit_is_taken_back(small: Path) -> None:
+    file = AppendFile(small / "a")
+    file.write(b"whole")
+    file.flush()
+    file.write(bytes(1 << 21))
+    with pytest.raises(OSError, match="No space left"):
+        file.flush()
+    file.close()
+    assert (small / "a").read_bytes() == b"whole"
+
+
+def test_the_disk_is_told_once_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, synced = [0.0], []
+    monkeypatch.setattr(append.time, "monotonic", lambda: now[0])
+    file = AppendFile(tmp_path / "a")
+    monkeypatch.setattr(append.os, "fsync", lambda descriptor: synced.append(now[0]))
+    for tick in range(76):
+        now[0] = tick * 0.04
+        file.write(b"tick")
+        file.flush()
+    assert synced == [1.0, 2.0, 3.0]
+    file.close()
+    assert len(synced) == 4
+
+
+def test_a_full_disk_keeps_every_whole_tick_and_never_reaches_the_loop(
+    small: Path, make_tick: Any
+) -> None:
+    told: list[str] = []
+    sink = BackgroundSink(McapSink(small / "a.mcap"), "a.mcap", lossless=True, tell=told.append)
+    sink.open(RunInfo("ball"))
+    index = 0
+    while sink.failure is None:
+        sink.write(make_tick(index))
+        index += 1
+    sink.write(make_tick(index))
+    sink.close()
+    recording = read_recording(small / "a.mcap")
+    assert not recording.complete
+    assert [tick.index for tick in recording.ticks] == list(range(len(recording.ticks)))
+    assert len(recording.ticks) + sink.lost + sink.dropped == index + 1
+    assert told[0] == "a.mcap: No space left on device; the run goes on without this log"
+    assert len(told) == 2

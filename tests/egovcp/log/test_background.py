@@ -1,0 +1,248 @@
+"""A log behind the loop: nothing that happens to it reaches the loop, and nothing is hushed up."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.log.background import BackgroundFanout, BackgroundSink
+from egovcp.log.info import RunInfo
+from egovcp.log.mcap import McapSink
+from egovcp.log.mcap_reader import read_recording
+from egovcp.testing.sinks import DiarySink
+
+INFO = RunInfo("ball")
+type Start = Callable[..., BackgroundSink]
+
+
+@pytest.fixture
+def told() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def start(told: list[str]) -> Iterator[Start]:
+    """An open background sink around the given one; closed after the test."""
+    sinks: list[BackgroundSink] = []
+
+    def start(sink: Any, **options: Any) -> BackgroundSink:
+        sinks.append(BackgroundSink(sink, "the log", tell=told.append, **options))
+        sinks[-1].open(INFO)
+        return sinks[-1]
+
+    yield start
+    for sink in sinks:
+        sink.close()
+
+
+def lines(path: Path) -> list[str]:
+    return path.read_text(encoding="utf-8").splitlines()
+
+
+def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
+    end = time.monotonic() + seconds
+    while not condition() and time.monotonic() < end:
+        time.sleep(0.01)
+    assert condition()
+
+
+def test_every_call_arrives_in_order(
+    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+) -> None:
+    sink = start(DiarySink(tmp_path / "diary"))
+    for index in range(40):
+        sink.write(make_tick(index, bare=True))
+    sink.close()
+    ticks = [f"tick {index}" for index in range(40)]
+    assert lines(tmp_path / "diary") == ["open ball", *ticks, "close"]
+    assert (sink.dropped, sink.lost, sink.failure, told) == (0, 0, None, [])
+
+
+def test_a_tick_is_recorded_as_it_was_handed_over(
+    tmp_path: Path, start: Start, make_tick: Any
+) -> None:
+    sink = start(McapSink(tmp_path / "a.mcap"))
+    tick = make_tick(0)
+    depth = tick.depth.copy()
+    sink.write(tick)
+    tick.depth[:] = 0
+    sink.close()
+    recording = read_recording(tmp_path / "a.mcap")
+    assert recording.complete
+    assert (recording.ticks[0].depth == depth).all()
+
+
+def test_what_does_not_fit_is_dropped_counted_and_told_in_the_log(
+    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+) -> None:
+    diary = tmp_path / "diary"
+    sink = start(DiarySink(diary, stall_at=0, stall_s=1.0), queue_ticks=3)
+    sink.write(make_tick(0, bare=True))
+    until(lambda: "stall" in lines(diary))
+    index = 0
+    while sink.dropped < 5:
+        index += 1
+        sink.write(make_tick(index, bare=True))
+    while "missing" not in lines(diary)[-1]:
+        index += 1
+        sink.write(make_tick(index, bare=True))
+        time.sleep(0.01)
+    sink.close()
+    words = [line.split() for line in lines(diary) if line.startswith("tick")]
+    kept = [int(number) for _, number, *_ in words]
+    assert kept == sorted(set(kept))
+    assert index + 1 - len(kept) == sink.dropped
+    gaps = [(int(number), int(event[0])) for _, number, *event in words if event]
+    assert gaps == [(b, b - a - 1) for a, b in pairwise(kept) if b > a + 1]
+    assert sink.lost == 0
+    drops = f"{sink.dropped} of {index + 1} ticks were dropped"
+    assert told == [f"the log: {drops}, 0 more may be missing at its end"]
+
+
+def test_a_disk_that_hangs_loses_nothing_if_the_queue_is_long_enough(
+    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+) -> None:
+    sink = start(DiarySink(tmp_path / "diary", stall_at=1, stall_s=1.0))
+    for index in range(250):  # 10 s at 25 Hz
+        sink.write(make_tick(index))
+    sink.close()
+    assert sum(line.startswith("tick") for line in lines(tmp_path / "diary")) == 250
+    assert (sink.dropped, told) == (0, [])
+
+
+def test_close_does_not_wait_for_a_disk_that_hangs(
+    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+) -> None:
+    sink = start(DiarySink(tmp_path / "diary", stall_at=1, stall_s=200.0), close_timeout_s=0.3)
+    for index in range(4):
+        sink.write(make_tick(index, bare=True))
+    until(lambda: "stall" in lines(tmp_path / "diary"))
+    sink.close()
+    assert sink.lost == 3
+    assert told == [
+        "the log: 0 of 4 ticks were dropped, 3 more may be missing at its end; it is not finished"
+    ]
+
+
+def test_a_full_disk_is_told_once_and_the_run_goes_on(
+    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+) -> None:
+    sink = start(DiarySink(tmp_path / "diary", raise_at=2))
+    for index in range(3):
+        sink.write(make_tick(index, bare=True))
+    until(lambda: "close" in lines(tmp_path / "diary"))
+    for index in range(3, 6):
+        sink.write(make_tick(index, bare=True))
+    assert isinstance(sink.failure, OSError)
+    assert told == ["the log: No space left on device; the run goes on without this log"]
+    sink.close()
+    assert sink.dropped + sink.lost == 4
+    assert len(told) == 2
+
+
+def test_the_death_of_its_process_is_told_once(
+    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+) -> None:
+    sink = start(DiarySink(tmp_path / "diary"))
+    os.kill(sink.pid, signal.SIGKILL)
+    index = 0
+    while sink.failure is None:
+        sink.write(make_tick(index, bare=True))
+        index += 1
+        time.sleep(0.01)
+    sink.write(make_tick(index, bare=True))
+    assert told == [
+        "the log: the process that writes it ended by signal 9; the run goes on without this log"
+    ]
+
+
+def test_a_sink_that_cannot_be_opened_raises_there(tmp_path: Path, told: list[str]) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"precious")
+    sink = BackgroundSink(McapSink(tmp_path / "a.mcap"), "the log", tell=told.append)
+    with pytest.raises(EnvironmentFailure, match="exists already"):
+        sink.open(INFO)
+    sink.close()
+    assert told == []
+
+
+def test_lossless_waits_instead_of_dropping(
+    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+) -> None:
+    sink = start(
+        DiarySink(tmp_path / "diary", stall_at=1, stall_s=0.5), queue_ticks=2, lossless=True
+    )
+    for index in range(60):
+        sink.write(make_tick(index))
+    sink.close()
+    assert sum(line.startswith("tick") for line in lines(tmp_path / "diary")) == 60
+    assert (sink.dropped, told) == (0, [])
+
+
+def test_one_that_hangs_does_not_hold_up_its_neighbours(
+    tmp_path: Path, make_tick: Any, told: list[str]
+) -> None:
+    sinks = [
+        BackgroundSink(DiarySink(tmp_path / "a", stall_at=0, stall_s=200.0), "a",
+                       close_timeout_s=0.2, tell=told.append),
+        BackgroundSink(DiarySink(tmp_path / "b"), "b", tell=told.append),
+    ]  # fmt: skip
+    with BackgroundFanout(sinks) as both:
+        both.open(INFO)
+        for index in range(3):
+            both.write(make_tick(index, bare=True))
+    assert lines(tmp_path / "b") == ["open ball", "tick 0", "tick 1", "tick 2", "close"]
+    assert [line[:2] for line in told] == ["a:"]
+
+
+def test_if_one_cannot_be_opened_none_is_left_running(tmp_path: Path, told: list[str]) -> None:
+    (tmp_path / "a.mcap").write_bytes(b"precious")
+    sinks = [
+        BackgroundSink(DiarySink(tmp_path / "b"), "b", tell=told.append),
+        BackgroundSink(McapSink(tmp_path / "a.mcap"), "a", tell=told.append),
+    ]
+    with pytest.raises(EnvironmentFailure):
+        BackgroundFanout(sinks).open(INFO)
+    assert lines(tmp_path / "b") == ["open ball", "close"]
+
+
+_RUN = """
+import sys, time
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from conftest import _tick
+from egovcp.log.background import BackgroundSink
+from egovcp.log.info import RunInfo
+from egovcp.log.mcap import McapSink
+sink = McapSink(Path({path!r}))
+sink = BackgroundSink(sink, "log") if {background} else sink
+sink.open(RunInfo("ball"))
+for index in range(10_000):
+    sink.write(_tick(index))
+    print(index, flush=True)
+    time.sleep(0.01)
+"""
+
+
+@pytest.mark.parametrize("background", [False, True])
+def test_kill_9_loses_less_than_a_second(tmp_path: Path, background: bool) -> None:
+    path = tmp_path / "a.mcap"
+    code = _RUN.format(tests=str(Path(__file__).parent), path=str(path), background=background)
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout is not None
+        said = [int(run.stdout.readline()) for _ in range(60)]
+        run.kill()
+        said += [int(line) for line in run.stdout]
+    until(lambda: read_recording(path).complete == background)  # its process finishes the file
+    recording = read_recording(path)
+    assert [tick.index for tick in recording.ticks] == list(range(len(recording.ticks)))
+    assert len(recording.ticks) >= said[-1] + 1 - 25

@@ -1,0 +1,129 @@
+"""A live viewer: on the loopback only, and never able to hold up the run."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.log.background import BackgroundSink
+from egovcp.log.destination import Viewer
+from egovcp.log.info import RunInfo
+from egovcp.log.live import LiveRerun
+from egovcp.log.rerun import RerunSink
+
+INFO = RunInfo("ball")
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+        return port
+
+
+def address(port: int) -> str:
+    return f"rerun+http://127.0.0.1:{port}/proxy"
+
+
+@pytest.fixture
+def web() -> Iterator[LiveRerun]:
+    with LiveRerun("web", Viewer(address(free_port())), free_port()) as live:
+        yield live
+
+
+def connection(live: LiveRerun, told: list[str], **options: Any) -> BackgroundSink:
+    """An open recording that goes to the viewer."""
+    sink = BackgroundSink(
+        RerunSink(live.viewer, meshes=False), "Rerun", tell=told.append, **options
+    )
+    sink.open(INFO)
+    return sink
+
+
+def test_nothing_listens_beyond_the_loopback(web: LiveRerun, make_tick: Any) -> None:
+    sink = connection(web, [])
+    sink.write(make_tick(0))
+    mine = psutil.Process()
+    listening = [
+        c.laddr
+        for process in (mine, *mine.children(recursive=True))
+        for c in process.net_connections(kind="inet")
+        if c.status == psutil.CONN_LISTEN
+    ]
+    sink.close()
+    assert {a.port for a in listening} == {web.viewer.address[1], web.web_port}
+    assert {a.ip for a in listening} == {"127.0.0.1"}
+
+
+def test_ticks_arrive_and_the_server_ends_with_the_run(web: LiveRerun, make_tick: Any) -> None:
+    told: list[str] = []
+    sink = connection(web, told)
+    for index in range(5):
+        sink.write(make_tick(index))
+    sink.close()
+    assert (sink.lost, sink.dropped, told) == (0, 0, [])
+    assert str(web.web_port) in web.page
+    assert web.pid is not None
+    process = psutil.Process(web.pid)
+    web.close()
+    assert not process.is_running()
+
+
+def test_a_dead_viewer_is_told_once_and_given_up(web: LiveRerun, make_tick: Any) -> None:
+    told: list[str] = []
+    sink = connection(web, told)
+    assert web.pid is not None
+    os.kill(web.pid, signal.SIGKILL)
+    index, end = 0, time.monotonic() + 60
+    while sink.failure is None and time.monotonic() < end:
+        sink.write(make_tick(index, bare=True))
+        index += 1
+        time.sleep(0.02)
+    sink.close()
+    assert isinstance(sink.failure, EnvironmentFailure)
+    assert "could not be sent" in told[0]
+    assert "the run goes on without this log" in told[0]
+    assert len(told) == 2
+
+
+def test_a_viewer_that_hangs_does_not_hold_up_the_end(web: LiveRerun, make_tick: Any) -> None:
+    told: list[str] = []
+    sink = connection(web, told, close_timeout_s=0.5)
+    pid = sink.pid
+    assert web.pid is not None
+    os.kill(web.pid, signal.SIGSTOP)
+    for index in range(60):
+        sink.write(make_tick(index))
+    sink.close()
+    os.kill(web.pid, signal.SIGCONT)
+    assert not psutil.pid_exists(pid)
+    assert len(told) == 1
+
+
+def test_nobody_to_connect_to(tmp_path: Path) -> None:
+    sink = BackgroundSink(RerunSink(Viewer(address(free_port())), meshes=False), "Rerun")
+    with pytest.raises(EnvironmentFailure, match="no Rerun viewer answers"):
+        sink.open(INFO)
+
+
+def test_a_port_in_use() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        live = LiveRerun("web", Viewer(address(free_port())), web_port=port)
+        with pytest.raises(EnvironmentFailure, match=f"port {port} is in use"):
+            live.start()
+
+
+@pytest.mark.parametrize("words", ["", "http://127.0.0.1:9876", "rerun+http://a b:1/proxy", "x"])
+def test_what_is_no_address_is_refused(words: str) -> None:
+    with pytest.raises(UsageError, match="expected rerun"):
+        LiveRerun.of(words)
