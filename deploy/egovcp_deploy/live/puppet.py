@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import tempfile
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from typing import Final
 
@@ -89,8 +90,7 @@ class Puppet:
         guard = Guard(self._process, spare, lambda: self._closing)
         self._stack.callback(guard.join_if_acting)
 
-    def _await(self, happened: object, limit_s: float, what: str) -> None:
-        assert callable(happened)
+    def _await(self, happened: Callable[[], bool], limit_s: float, what: str) -> None:
         deadline = time.monotonic() + limit_s
         while not happened():
             if not self._process.is_alive():

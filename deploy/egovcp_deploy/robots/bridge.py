@@ -6,9 +6,6 @@ at the newest. Commands go out at once or not at all: none waits for a robot to 
 
 from __future__ import annotations
 
-import contextlib
-import socket
-import threading
 import time
 from dataclasses import dataclass
 from typing import Final
@@ -17,6 +14,7 @@ import zmq
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp_deploy.robots.body import BodyState, MotorCommand
+from egovcp_deploy.robots.listener import Listener, join, probe
 from egovcp_deploy.robots.publisher import PublisherWatch
 from egovcp_deploy.robots.wire import (
     COMMAND_PORT,
@@ -27,8 +25,6 @@ from egovcp_deploy.robots.wire import (
     encode_command,
 )
 
-_POLL_MS: Final = 50
-_PROBE_S: Final = 1.0
 _START: Final = (
     "start it on the robot: python -m lerobot.robots.unitree_g1.run_g1_server; or without a "
     "robot, here: egovcp-fake-g1"
@@ -86,8 +82,7 @@ class BridgeBody:
         self._newest: BodyState | None = None
         self._payload = b""
         self._mode: int | None = None
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._listener: Listener | None = None
 
     def connect(self, timeout: float = 5.0) -> None:
         """Wait for the first reading.
@@ -109,30 +104,17 @@ class BridgeBody:
             raise
 
     def _open(self) -> None:
+        config = self.config
         self._context = zmq.Context()
         self._commands = self._context.socket(zmq.PUSH)
         self._commands.setsockopt(zmq.CONFLATE, 1)  # a newer command replaces one that waits
         self._commands.setsockopt(zmq.IMMEDIATE, 1)  # and none waits for a peer that is not there
-        states = self._context.socket(zmq.SUB)
-        states.setsockopt(zmq.CONFLATE, 1)
-        states.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
-        states.setsockopt(zmq.SUBSCRIBE, b"")
-        for end, port in (
-            (self._commands, self.config.command_port),
-            (states, self.config.state_port),
-        ):
-            end.setsockopt(zmq.LINGER, 0)
-            end.setsockopt(zmq.HEARTBEAT_IVL, 200)  # ms; notices a cable that was pulled
-            end.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1000)
-            end.connect(f"tcp://{self.config.host}:{port}")
-        self._thread = threading.Thread(target=self._listen, args=(states,), daemon=True)
-        self._thread.start()
-
-    def _listen(self, states: zmq.Socket[bytes]) -> None:
-        with contextlib.closing(states):
-            while not self._stop.is_set():
-                if states.poll(_POLL_MS):
-                    self._take(states.recv(), time.monotonic_ns())
+        try:
+            join(self._commands, config.host, config.command_port)
+            self._listener = Listener(config.host, config.state_port, MOST_BYTES, self._take)
+        except EnvironmentFailure:
+            self._context.destroy(linger=0)
+            raise
 
     def _take(self, payload: bytes, time_ns: int) -> None:
         """A message that arrived at ``time_ns``."""
@@ -199,12 +181,7 @@ class BridgeBody:
                 f"{traffic.garbled} messages from {where}, none a state of a G1: "
                 f"{traffic.problem}; expected LeRobot's bridge there, of lerobot 0.6"
             )
-        try:
-            socket.create_connection((config.host, config.state_port), _PROBE_S).close()
-        except socket.gaierror:
-            return f"no machine is called {config.host}; check the name, or give the address"
-        except OSError as error:
-            reason = error.strerror or "no answer"
+        if reason := probe(config.host, config.state_port):
             return f"nothing at {where} ({reason}): expected LeRobot's bridge; {_START}"
         return (
             f"no state from {where} within {timeout:g} s, although something listens there; "
@@ -216,9 +193,8 @@ class BridgeBody:
 
         Sends nothing: the motors keep what they were told last.
         """
-        if self._thread is None or self._stop.is_set():
+        if self._listener is None or self._commands.closed:
             return
-        self._stop.set()
-        self._thread.join()
+        self._listener.close()
         self._commands.close()
         self._context.term()

@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-import socket
-import threading
 import time
 from dataclasses import dataclass
 from typing import Final
-
-import zmq
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.sim.config import CameraConfig
 from egovcp_deploy.robots.body import Picture
 from egovcp_deploy.robots.depth_wire import PICTURE_BYTES, decode_picture
+from egovcp_deploy.robots.listener import Listener, probe
 from egovcp_deploy.robots.wire import CAMERA_PORT, Garbled
 
-_POLL_MS: Final = 50
-_PROBE_S: Final = 1.0
 _FOV_SLACK: Final = math.radians(1.0)
 _START: Final = "start egovcp-depth-server where the camera is, or egovcp-fake-g1 without a robot"
 
@@ -50,8 +44,7 @@ class ZmqEye:
         """What was wrong with the last message that was dropped."""
         self._newest: Picture | None = None
         self._sequence: int | None = None
-        self._stop = threading.Event()
-        self._thread: threading.Thread | None = None
+        self._listener: Listener | None = None
 
     def connect(self, timeout: float = 5.0) -> None:
         """Wait for the first picture.
@@ -59,20 +52,8 @@ class ZmqEye:
         Raises:
             EnvironmentFailure: none came within ``timeout`` s, or of another field of view.
         """
-        self._context = zmq.Context()
-        end = self._context.socket(zmq.SUB)
-        for option, value in (
-            (zmq.CONFLATE, 1),
-            (zmq.MAXMSGSIZE, PICTURE_BYTES),
-            (zmq.LINGER, 0),
-            (zmq.HEARTBEAT_IVL, 200),
-            (zmq.HEARTBEAT_TIMEOUT, 1000),
-        ):
-            end.setsockopt(option, value)
-        end.setsockopt(zmq.SUBSCRIBE, b"")
-        end.connect(f"tcp://{self.config.host}:{self.config.port}")
-        self._thread = threading.Thread(target=self._listen, args=(end,), daemon=True)
-        self._thread.start()
+        config = self.config
+        self._listener = Listener(config.host, config.port, PICTURE_BYTES, self._take)
         deadline = time.monotonic() + timeout
         while self._newest is None and time.monotonic() < deadline:
             time.sleep(0.005)
@@ -80,12 +61,6 @@ class ZmqEye:
             diagnosis = self._diagnosis(timeout)
             self.close()
             raise EnvironmentFailure(diagnosis)
-
-    def _listen(self, end: zmq.Socket[bytes]) -> None:
-        with contextlib.closing(end):
-            while not self._stop.is_set():
-                if end.poll(_POLL_MS):
-                    self._take(end.recv(), time.monotonic_ns())
 
     def _take(self, frame: bytes, time_ns: int) -> None:
         try:
@@ -118,17 +93,11 @@ class ZmqEye:
                 f"{self.garbled} messages from {where}, none a picture that we can use: "
                 f"{self.problem}; {_START}"
             )
-        try:
-            socket.create_connection((config.host, config.port), _PROBE_S).close()
-        except OSError as error:
-            reason = error.strerror or "no answer"
+        if reason := probe(config.host, config.port):
             return f"no depth camera at {where} ({reason}); {_START}"
         return f"no picture from {where} within {timeout:g} s, although something listens there"
 
     def close(self) -> None:
         """End the thread; further calls do nothing."""
-        if self._thread is None or self._stop.is_set():
-            return
-        self._stop.set()
-        self._thread.join()
-        self._context.term()
+        if self._listener is not None:
+            self._listener.close()

@@ -17,6 +17,7 @@ from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
 from egovcp_deploy.robots.fake import FakeBridge
 from egovcp_deploy.robots.fake.bridge import MODE
 from egovcp_deploy.robots.fake.running import Running, config_of, eventually
+from egovcp_deploy.robots.zmq_eye import ZmqEye, ZmqEyeConfig
 
 ZERO = np.zeros(29)
 DAMP = MotorCommand(ZERO, ZERO, DAMPING, MODE)
@@ -171,9 +172,32 @@ def test_another_service_is_told_from_a_bridge(publisher: zmq.Socket[bytes]) -> 
     body.close()
 
 
+def test_a_message_of_any_size_ends_nothing(publisher: zmq.Socket[bytes], fake: FakeBridge) -> None:
+    body = BridgeBody(config_for(publisher))
+    body._open()
+    for _ in range(100):
+        publisher.send(b"x" * 1_000_000)
+        time.sleep(0.005)
+
+    def heard() -> bool:
+        publisher.send(fake._state())
+        return body.read() is not None
+
+    assert eventually(heard)
+    body.close()
+
+
 def test_a_name_nobody_has_is_said() -> None:
-    with pytest.raises(EnvironmentFailure, match=r"no machine is called g1\.invalid"):
+    with pytest.raises(EnvironmentFailure, match=r"g1\.invalid:6001 \(no machine has that name"):
         BridgeBody(BridgeConfig(host="g1.invalid")).connect(0.1)
+
+
+@pytest.mark.parametrize("host", ["", "a b", "*", "tcp://127.0.0.1", "g1" * 100])
+def test_what_is_no_address_is_said(host: str) -> None:
+    with pytest.raises(EnvironmentFailure, match=r"is no address|no machine has"):
+        BridgeBody(BridgeConfig(host=host)).connect(0.1)
+    with pytest.raises(EnvironmentFailure, match=r"is no address|no depth camera"):
+        ZmqEye(ZmqEyeConfig(host=host)).connect(0.1)
 
 
 def test_ports_are_ports() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import queue
 import sys
@@ -89,13 +90,8 @@ def run(config: FakeConfig, opened: Callable[[Ports], None] = lambda ports: None
     bridge = FakeBridge(robot, config.ports, announce=config.announce)
     schedule = Schedule(config.gantry, config.settle, config.pause)
     stage = Stage(bridge, _scenarios(config), schedule, _say)
-    ports = bridge.ports
-    _say(
-        f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
-        f"depth {ports.camera_port}; Ctrl-C ends it"
-    )
-    opened(ports)
     try:
+        opened(bridge.ports)
         _live(config, bridge, stage)
     except KeyboardInterrupt:
         _say("interrupted")
@@ -125,6 +121,11 @@ def _scenarios(config: FakeConfig) -> Any:
 
 def _live(config: FakeConfig, bridge: FakeBridge, stage: Stage) -> None:
     """Keep step with the wall clock."""
+    ports = bridge.ports
+    _say(
+        f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
+        f"depth {ports.camera_port}; Ctrl-C ends it"
+    )
     words, pace, written = Console(), Pace(MonotonicClock()), 0
     while not stage.finished:
         for _ in range(pace.due()):
@@ -139,9 +140,10 @@ def _live(config: FakeConfig, bridge: FakeBridge, stage: Stage) -> None:
 
 
 def _write(path: str, outcomes: Sequence[Outcome]) -> None:
-    from egovcp_deploy.options import write_json  # which needs torch: 3 s
-
-    write_json(Path(path), [record(outcome) for outcome in outcomes])
+    """Complete or absent, and quickly: the robot waits meanwhile."""
+    part = Path(f"{path}.partial")
+    part.write_text(json.dumps([record(outcome) for outcome in outcomes], indent=2) + "\n")
+    part.replace(path)
 
 
 class Pace:
