@@ -60,7 +60,7 @@ check: install
 
 bench: install
 	@mkdir -p outputs/benchmarks
-	for b in simulation writer memory loader train_step planner controller; do python benchmarks/$$b.py --json outputs/benchmarks/$$b.json || exit 1; done
+	for b in simulation writer memory loader train_step planner tick controller; do python benchmarks/$$b.py --json outputs/benchmarks/$$b.json || exit 1; done
 
 build: install
 	rm -rf dist

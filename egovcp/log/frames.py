@@ -7,6 +7,7 @@ import os
 import pickle
 import struct
 import sys
+import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import suppress
@@ -14,7 +15,8 @@ from typing import Any, Final
 
 _LENGTH: Final = struct.Struct("<I")
 _PIPE_BYTES: Final = 1 << 20  # room for several ticks; 64 KiB, the usual, does not hold one
-_READ_BYTES: Final = 1 << 16
+_READ_BYTES: Final = 1 << 20
+_LOOK_EVERY_S: Final = 0.005
 _MOST_PARTS: Final = 64  # of one system call
 
 
@@ -108,18 +110,17 @@ class Inbox:
 
 
 def receive(descriptor: int) -> Iterator[Any]:
-    """Messages out of a pipe that blocks, until nobody writes any more."""
-    with suppress(EOFError), os.fdopen(descriptor, "rb") as pipe:
+    """Messages out of a pipe, until nobody writes any more.
+
+    It looks every few milliseconds instead of waiting in the pipe: whoever waits there is woken
+    by the write, and takes the writer's core where there is no other.
+    """
+    os.set_blocking(descriptor, False)
+    inbox = Inbox(descriptor)
+    with suppress(EOFError):
         while True:
-            (length,) = _LENGTH.unpack(_exactly(pipe, _LENGTH.size))
-            yield _load(_exactly(pipe, length))
-
-
-def _exactly(pipe: Any, count: int) -> bytes:
-    data: bytes = pipe.read(count)
-    if len(data) < count:
-        raise EOFError
-    return data
+            yield from inbox.ready()
+            time.sleep(_LOOK_EVERY_S)
 
 
 def _load(data: bytes) -> Any:

@@ -74,8 +74,10 @@ class Moment:
 
     index: int
     time_ns: int
+    lines: Mapping[str, Line]
+    decoders: DecoderFactory
+    """Of this file: it remembers them by the numbers that the file gives its schemas."""
     messages: dict[str, Message] = field(default_factory=dict)
-    lines: Mapping[str, Line] = field(default_factory=dict)
 
     def tick(self, topics: Collection[str] | None = None) -> Tick:
         """Decode the tick, or only those of its parts that are on ``topics``.
@@ -97,13 +99,10 @@ class Moment:
 
     def _decode(self, topic: str) -> Any:
         line = self.lines[topic]
-        decode = _FACTORY.decoder_for(line.encoding, line.schema)
+        decode = self.decoders.decoder_for(line.encoding, line.schema)
         if decode is None:
             raise DataError(f"topic {topic} is {line.schema.name} in {line.encoding}, not ROS 2")
         return decode(self.messages[topic].data)
-
-
-_FACTORY: Final = DecoderFactory()
 
 
 class RecordingReader:
@@ -122,6 +121,7 @@ class RecordingReader:
         """The topics met so far."""
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
+        self._decoders = DecoderFactory()
         self._records = self._read()
         self.metadata = self._first_metadata()
         """The record ``egovcp`` as it stands in the file."""
@@ -139,10 +139,13 @@ class RecordingReader:
                 if moment is None or moment.index != record.sequence:
                     if moment is not None:
                         yield moment
-                    moment = Moment(record.sequence, record.log_time, lines=self.lines)
+                    moment = self._moment(record)
                 moment.messages[self._channels[record.channel_id].topic] = record
         if moment is not None:
             yield moment
+
+    def _moment(self, first: Message) -> Moment:
+        return Moment(first.sequence, first.log_time, self.lines, self._decoders)
 
     def _add_channel(self, channel: Channel) -> None:
         self._channels[channel.id] = channel

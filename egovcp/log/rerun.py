@@ -31,7 +31,8 @@ from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_ROWS
 
 BATCH_TICKS: Final = 25  # one second
 LIVE_BATCH_TICKS: Final = 3  # what is looked at must not lag behind
-_FLUSH_TIMEOUT_S: Final = 10.0
+_VIEWER_PATIENCE_S: Final = 10.0
+_DISK_PATIENCE_S: Final = 60.0
 _NS: Final = "ns"
 
 
@@ -69,6 +70,10 @@ class RerunSink:
         self._gone = False
 
     @property
+    def _patience_s(self) -> float:
+        return _VIEWER_PATIENCE_S if self._destination.is_live else _DISK_PATIENCE_S
+
+    @property
     def _batch_ticks(self) -> int:
         return LIVE_BATCH_TICKS if self._destination.is_live else BATCH_TICKS
 
@@ -100,13 +105,12 @@ class RerunSink:
         """Take the tick; a full batch goes out.
 
         Raises:
-            EnvironmentFailure: the viewer is gone, or hangs.
+            EnvironmentFailure: the disk is full, the viewer is gone, or one of them hangs.
         """
         self._batch.append(tick)
         if len(self._batch) >= self._batch_ticks:
             self._send()
-            if self._destination.is_live:
-                self._flush()
+            self._flush()
 
     def close(self) -> None:
         """Send what is left and finish the file."""
@@ -121,10 +125,12 @@ class RerunSink:
     def _flush(self) -> None:
         assert self._stream is not None, "open the sink before writing to it"
         try:
-            self._stream.flush(timeout_sec=_FLUSH_TIMEOUT_S)
+            self._stream.flush(timeout_sec=self._patience_s)
         except RuntimeError as error:
             self._gone = True
-            raise EnvironmentFailure(f"the recording could not be sent: {error}") from error
+            raise EnvironmentFailure(
+                f"the recording could not be sent (disk full, viewer gone?): {error}"
+            ) from error
 
     def _send(self) -> None:
         assert self._stream is not None, "open the sink before writing to it"

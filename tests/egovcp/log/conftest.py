@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+import subprocess
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -69,3 +72,15 @@ def _rest(index: int, rng: np.random.Generator) -> dict[str, object]:
 def _value_map(hand: Any, rng: np.random.Generator) -> ValueMap:
     x, z = np.linspace(0, 0.5, 6, dtype=np.float32), np.linspace(-0.2, 0.5, 4, dtype=np.float32)
     return ValueMap(hand, x, 0.25, z, rng.normal(size=(4, 6)).astype(np.float32))
+
+
+@pytest.fixture
+def small(tmp_path: Path) -> Iterator[Path]:
+    """A disk of one megabyte."""
+    folder = tmp_path / "small"
+    folder.mkdir()
+    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "none", str(folder)]
+    if os.geteuid() != 0 or subprocess.run(command, capture_output=True, check=False).returncode:
+        pytest.skip("only the superuser may mount a small file system")
+    yield folder
+    subprocess.run(["umount", "--lazy", str(folder)], check=True)

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +13,7 @@ from egovcp.log.background import BackgroundSink
 from egovcp.log.info import RunInfo
 from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
-
-
-@pytest.fixture
-def small(tmp_path: Path) -> Iterator[Path]:
-    """A disk of one megabyte."""
-    folder = tmp_path / "small"
-    folder.mkdir()
-    command = ["mount", "-t", "tmpfs", "-o", "size=1m", "none", str(folder)]
-    if os.geteuid() != 0 or subprocess.run(command, capture_output=True, check=False).returncode:
-        pytest.skip("only the superuser may mount a small file system")
-    yield folder
-    subprocess.run(["umount", "--lazy", str(folder)], check=True)
+from egovcp.log.rerun import RerunSink
 
 
 def test_nothing_is_there_before_the_flush_and_all_of_it_after(tmp_path: Path) -> None:
@@ -83,4 +69,19 @@ def test_a_full_disk_keeps_every_whole_tick_and_never_reaches_the_loop(
     assert [tick.index for tick in recording.ticks] == list(range(len(recording.ticks)))
     assert len(recording.ticks) + sink.lost + sink.dropped == index + 1
     assert told[0] == "a.mcap: No space left on device; the run goes on without this log"
+    assert len(told) == 2
+
+
+def test_a_full_disk_under_rerun_is_told_once(small: Path, make_tick: Any) -> None:
+    told: list[str] = []
+    rerun = RerunSink(small / "a.rrd", meshes=False)
+    sink = BackgroundSink(rerun, "a.rrd", lossless=True, tell=told.append)
+    sink.open(RunInfo("ball"))
+    index = 0
+    while sink.failure is None:
+        sink.write(make_tick(index))
+        index += 1
+    sink.close()
+    assert "disk full" in told[0]
+    assert "the run goes on without this log" in told[0]
     assert len(told) == 2

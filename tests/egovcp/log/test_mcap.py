@@ -65,6 +65,13 @@ def test_write_then_read_is_the_identity(tmp_path: Path, make_tick: Any) -> None
         assert_same(written, read)
 
 
+def test_two_files_that_number_their_topics_differently(tmp_path: Path, make_tick: Any) -> None:
+    bare, full = [make_tick(0, bare=True)], [make_tick(0)]
+    for name, ticks in (("a", bare), ("b", full), ("c", bare)):
+        (read,) = read_recording(record(tmp_path / f"{name}.mcap", ticks)).ticks
+        assert_same(ticks[0], read)
+
+
 def test_the_metadata_record_comes_before_any_tick(tmp_path: Path, make_tick: Any) -> None:
     path = record(tmp_path / "a.mcap", [make_tick(0)])
     with path.open("rb") as file:

@@ -1,0 +1,236 @@
+"""What logging adds to a tick: in the loop, on a thread, and in a process of its own.
+
+The loop plans (a small model: many short operations, so that whoever takes the interpreter lock
+is felt), then writes a tick with everything in it to an MCAP file and to Rerun.
+
+    none          no log
+    inline        the sinks are called by the loop
+    thread        a queue and a thread
+    process       `BackgroundFanout`
+    stalled_disk  the same; the process that writes the MCAP file is stopped, as by a disk
+    dead_viewer   the same; Rerun goes to a viewer that has been killed
+
+``cpu`` figures are the time that the loop's thread itself computed while it wrote: what is left
+when other programs do not take its core in between.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import queue
+import signal
+import socket
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from egovcp.log.background import BackgroundFanout, BackgroundSink
+from egovcp.log.destination import LOOPBACK, Viewer
+from egovcp.log.info import RunInfo
+from egovcp.log.live import LiveRerun
+from egovcp.log.mcap import McapSink
+from egovcp.log.rerun import RerunSink
+from egovcp.log.sink import Fanout, Sink
+from egovcp.log.tick import BasePose, Candidates, Tick
+from egovcp.plan import PlannerConfig, plan_cem
+from egovcp.spec import PLANNER_DT, PLANNER_HZ, STATE_DIM
+from egovcp.testing import toy_model
+
+_INFO = RunInfo("ball")
+_PAUSE_S = 0.2  # between two cases: what the one before has left behind is written meanwhile
+
+
+class Nowhere:
+    """No log."""
+
+    def open(self, info: RunInfo) -> None: ...
+
+    def write(self, tick: Tick) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class Threaded:
+    """The plain alternative to a process."""
+
+    def __init__(self, sink: Sink) -> None:
+        self._sink = sink
+        self._queue: queue.Queue[Tick | None] = queue.Queue(300)
+        self._thread = threading.Thread(target=self._work)
+
+    def open(self, info: RunInfo) -> None:
+        self._sink.open(info)
+        self._thread.start()
+
+    def write(self, tick: Tick) -> None:
+        self._queue.put_nowait(tick)
+
+    def close(self) -> None:
+        self._queue.put(None)
+        self._thread.join()
+        self._sink.close()
+
+    def _work(self) -> None:
+        while (tick := self._queue.get()) is not None:
+            self._sink.write(tick)
+
+
+def logging_figures(rounds: int) -> dict[str, object]:
+    """Percentiles of each case over ``rounds`` seconds; differences and ratios to ``none``."""
+    torch.set_num_threads(1)
+    with contextlib.ExitStack() as stack:
+        cases = {name: stack.enter_context(case) for name, case in _cases(stack).items()}
+        spent = _measure(cases, rounds)
+    figures: dict[str, object] = {"seconds_per_case": rounds}
+    for name, times in spent.items():
+        figures |= _percentiles(f"tick_{name}", times.tick)
+        figures |= _percentiles(f"write_{name}", times.write)
+        figures |= _percentiles(f"write_{name}_cpu", times.write_cpu)
+    for name in spent:
+        if name != "none":
+            base, own = spent["none"].tick, spent[name].tick
+            for q in (50, 99):
+                without, with_log = np.percentile(base, q), np.percentile(own, q)
+                figures[f"logging_{name}_added_ms_p{q}"] = float(1e3 * (with_log - without))
+            figures[f"logging_{name}_ratio"] = float(np.median(own) / np.median(base))
+    return figures
+
+
+def _percentiles(name: str, seconds: list[float]) -> dict[str, object]:
+    return {f"{name}_ms_p{q}": float(1e3 * np.percentile(seconds, q)) for q in (50, 99)}
+
+
+@dataclass(frozen=True)
+class _Times:
+    """Seconds, one per tick."""
+
+    tick: list[float] = field(default_factory=list)
+    write: list[float] = field(default_factory=list)
+    write_cpu: list[float] = field(default_factory=list)
+
+
+def _measure(cases: dict[str, Sink], rounds: int) -> dict[str, _Times]:
+    """Case -> what its ticks took."""
+    work, tick = _planning(), _tick()
+    spent = {name: _Times() for name in cases}
+    index = 0
+    for _ in range(rounds):
+        for name, sink in cases.items():
+            time.sleep(_PAUSE_S)
+            for _ in range(PLANNER_HZ):
+                begin = time.perf_counter()
+                work()
+                planned, cpu = time.perf_counter(), time.thread_time()
+                sink.write(replace(tick, index=index, time_ns=index * 40_000_000))
+                end = time.perf_counter()
+                index += 1
+                spent[name].write_cpu.append(time.thread_time() - cpu)
+                spent[name].tick.append(end - begin)
+                spent[name].write.append(end - planned)
+                time.sleep(max(0.0, PLANNER_DT - (end - begin)))
+    return spent
+
+
+def _planning() -> Callable[[], object]:
+    model = toy_model()
+    config = PlannerConfig(samples=64, elites=16)
+    carry, executed = model.initial(1), torch.zeros(1, 7)
+
+    def plan() -> object:
+        with torch.no_grad():
+            return plan_cem(model, carry, executed, config, torch.Generator().manual_seed(0))
+
+    return plan
+
+
+def _tick() -> Tick:
+    """A tick with everything that a run with a world model logs."""
+    rng = np.random.default_rng(0)
+    film = np.linspace(0.5, 4.5, 48 * 64).reshape(48, 64) + rng.normal(0, 0.01, (17, 48, 64))
+    state = rng.normal(0, 0.1, STATE_DIM).astype(np.float32)
+    state[3:6] = (0.0, 0.0, -1.0)
+    return Tick(
+        index=0,
+        time_ns=0,
+        depth=(1000 * film[0]).astype(np.uint16),
+        state=state,
+        action_planned=np.zeros(7, np.float32),
+        action_sent=np.zeros(7, np.float32),
+        depth_reconstructed=film[0].astype(np.float32),
+        depth_imagined=film[1:].astype(np.float32),
+        plan=np.zeros((4, 7), np.float32),
+        candidates=Candidates(rng.uniform(0, 0.5, (32, 4, 2, 3)), rng.normal(size=32)),
+        value=1.0,
+        termination=0.01,
+        reward_terms={"block": 0.0, "hit": 0.0, "fall": 0.0, "pose": -0.005},
+        timing_ms={"observe": 1.0, "plan": 20.0, "decode": 5.0, "robot": 3.0},
+        base=BasePose(np.array([0.0, 0.0, 0.74]), np.array([1.0, 0.0, 0.0, 0.0])),
+    )
+
+
+def _cases(stack: contextlib.ExitStack) -> dict[str, contextlib.AbstractContextManager[Sink]]:
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+
+    def pair(name: str) -> tuple[Sink, Sink]:
+        return McapSink(folder / f"{name}.mcap"), RerunSink(folder / f"{name}.rrd")
+
+    return {
+        "none": _opened(Nowhere()),
+        "inline": _opened(Fanout(pair("inline"))),
+        "thread": _opened(Threaded(Fanout(pair("thread")))),
+        "process": _opened(_fanout(*pair("process"))),
+        "stalled_disk": _stalled(*pair("stalled")),
+        "dead_viewer": _dead(McapSink(folder / "dead.mcap")),
+    }
+
+
+def _fanout(mcap: Sink, rerun: Sink) -> BackgroundFanout:
+    sinks = {"MCAP": mcap, "Rerun": rerun}
+    return BackgroundFanout(
+        [
+            BackgroundSink(s, n, close_timeout_s=2.0, tell=lambda line: None)
+            for n, s in sinks.items()
+        ]
+    )
+
+
+@contextlib.contextmanager
+def _opened(sink: Sink) -> Iterator[Sink]:
+    sink.open(_INFO)
+    try:
+        yield sink
+    finally:
+        sink.close()
+
+
+@contextlib.contextmanager
+def _stalled(mcap: Sink, rerun: Sink) -> Iterator[Sink]:
+    with _opened(fanout := _fanout(mcap, rerun)):
+        os.kill(fanout.sinks[0].pid, signal.SIGSTOP)
+        yield fanout
+
+
+@contextlib.contextmanager
+def _dead(mcap: Sink) -> Iterator[Sink]:
+    viewer = Viewer(f"rerun+http://{LOOPBACK}:{_free_port()}/proxy")
+    with (
+        LiveRerun("web", viewer, _free_port()) as live,
+        _opened(_fanout(mcap, RerunSink(live.viewer))) as sink,
+    ):
+        assert live.pid is not None
+        os.kill(live.pid, signal.SIGKILL)
+        yield sink
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind((LOOPBACK, 0))
+        port: int = probe.getsockname()[1]
+        return port

@@ -1,0 +1,54 @@
+"""Messages arrive whole and in order, however little the pipe takes at a time."""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from egovcp.log.frames import Inbox, Outbox, enlarge, pack, receive
+
+
+@pytest.mark.parametrize("large", [False, True])
+def test_what_goes_in_comes_out(large: bool) -> None:
+    rng = np.random.default_rng(0)
+    messages = [rng.bytes(int(size)) for size in rng.integers(0, 300_000, 40)]
+    reader, writer = os.pipe()
+    if large:
+        enlarge(writer)
+    os.set_blocking(reader, False)
+    outbox, inbox, arrived = Outbox(writer), Inbox(reader), []
+    for number, message in enumerate(messages):
+        outbox.put(pack(message))
+        outbox.pump()
+        if number < 20:
+            arrived += list(inbox.ready())
+    assert len(outbox) > 0
+    while len(outbox):
+        outbox.pump()
+        arrived += list(inbox.ready())
+    assert arrived == messages
+    os.close(writer)
+    with pytest.raises(EOFError):
+        list(inbox.ready())
+    os.close(reader)
+
+
+def test_a_message_that_was_cut_off_is_not_handed_out() -> None:
+    reader, writer = os.pipe()
+    whole = pack("whole")
+    os.write(writer, len(whole).to_bytes(4, "little") + whole + b"\x20\x00\x00\x00half")
+    os.close(writer)
+    assert list(receive(reader)) == ["whole"]
+    os.close(reader)
+
+
+def test_a_reader_that_is_gone_is_told() -> None:
+    reader, writer = os.pipe()
+    outbox = Outbox(writer)
+    os.close(reader)
+    outbox.put(pack("hello"))
+    with pytest.raises(BrokenPipeError):
+        outbox.pump()
+    os.close(writer)
