@@ -1,4 +1,7 @@
-"""Hears a publisher, newest message only, in a thread of its own that stamps each on arrival."""
+"""Hears a publisher, newest message only, in a thread of its own that stamps each on arrival.
+
+Of messages that follow each other within 3 ms the last is heard, up to 3 ms late.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +17,7 @@ import zmq
 from egovcp.errors import EnvironmentFailure
 
 _POLL_MS: Final = 50
+_REST_S: Final = 0.003  # after each message: 50 Hz loops need no 500 Hz, and checking takes time
 _SILENCE_S: Final = 1.0  # after which the connection is made anew
 _PROBE_S: Final = 1.0
 
@@ -87,6 +91,7 @@ class Listener:
                 if end.poll(_POLL_MS):
                     self._take(end.recv(), time.monotonic_ns())
                     heard = time.monotonic()
+                    self._stop.wait(_REST_S)
                 elif time.monotonic() - heard > _SILENCE_S:
                     # libzmq never comes back by itself from a message that was too long
                     end.disconnect(self._address)

@@ -152,8 +152,7 @@ def recorded_run(path: Path) -> Recorded:
         DataError: it is none, or holds no ticks.
     """
     recording = read_recording(path)
-    running = [i for i, tick in enumerate(recording.ticks) if tick.mode == State.RUN]
-    ticks = recording.ticks[running[0] if running else 0 :]
+    ticks = recording.ticks[_take_over(recording.ticks) :]
     return Recorded(
         name=str(path),
         controller_id=recording.info.hashes.get("low_level_controller", ""),
@@ -164,6 +163,13 @@ def recorded_run(path: Path) -> Recorded:
         ],
         outcomes=[_outcome(tick) for tick in ticks],
     )
+
+
+def _take_over(ticks: Sequence[Tick]) -> int:
+    """The tick at which the robot was handed to the planner; 0 if nothing tells of it."""
+    handed = f"{State.ARMED} -> {State.RUN}"
+    found = (i for i, t in enumerate(ticks) if any(e.startswith(handed) for e in t.events))
+    return next(found, 0)
 
 
 def _outcome(tick: Tick) -> Outcome:

@@ -225,7 +225,7 @@ def _numbers(values: object, most: float, name: str, count: int = NUM_JOINTS) ->
     """(count,) finite numbers within +-``most``."""
     if not isinstance(values, list) or len(values) != count:
         raise Garbled(f"{name} is not {count} numbers")
-    if not all(type(value) in (float, int) for value in values):
+    if not {float, int}.issuperset(map(type, values)):
         raise Garbled(f"{name} holds something else than numbers")
     try:
         array = np.array(values, np.float64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from egovcp.data import DatasetWriter, Provenance
 from egovcp.errors import DataError, UsageError
 from egovcp.log.info import RunInfo
 from egovcp.log.mcap import McapSink
+from egovcp.log.mcap_reader import read_recording
 from egovcp.log.sink import Sink
 from egovcp.log.tick import Tick
 from egovcp.plan import Policy, PolicyStep
@@ -22,7 +24,7 @@ from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.testing import random_episode
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.robots import Robot
-from egovcp_deploy.robots.replay import ENDS, ReplayRobot, open_recordings
+from egovcp_deploy.robots.replay import ENDS, ReplayRobot, open_recordings, recorded_run
 from egovcp_deploy.robots.sim import SimRobot
 from egovcp_deploy.runner import Runner
 
@@ -171,6 +173,24 @@ def test_an_episode_of_a_dataset_plays_back(dataset: Path, artefact_dir: Path) -
         assert ticks[-1].terminated is (number == 1)
         assert ticks[-1].truncated is (number == 0)
         assert len(ticks) == len(episode)
+
+
+def test_a_run_on_the_wall_clock_begins_where_the_planner_took_over(
+    recorded: tuple[Path, list[Watched]], tmp_path: Path
+) -> None:
+    """While the robot stands up the planner runs along; its recurrence starts anew with RUN."""
+    ticks = read_recording(recorded[0] / "rollout-0.mcap").ticks
+    standing = [replace(t, index=i, events=("stand -> armed: asked",)) for i, t in enumerate(ticks)]
+    running = [replace(t, index=TICKS + i) for i, t in enumerate(ticks)]
+    assert "armed -> run" in running[0].events[0]
+    sink = McapSink(tmp_path / "live.mcap")
+    sink.open(RunInfo("ball"))
+    for tick in (*standing, *running):
+        sink.write(tick)
+    sink.close()
+    run = recorded_run(tmp_path / "live.mcap")
+    assert len(run) == TICKS
+    np.testing.assert_array_equal(run.sensed[0].state, ticks[0].state)
 
 
 def test_a_recording_that_was_torn_off_ends_where_it_ends(
