@@ -13,9 +13,6 @@ from egovcp.plan.backends.integers import Bytes
 from egovcp.plan.backends.network import PlanningNetwork, Root
 from egovcp.plan.objective import Worth
 
-PARTS_PER_THREAD = 2
-"""Of a robot's candidates: a thread that something else holds up leaves parts to the other."""
-
 
 class FloatJudge:
     """All candidates of all robots at once, on any device.
@@ -45,7 +42,7 @@ class FloatJudge:
 
 
 class IntegerJudge:
-    """Parts of a robot's candidates, on as many threads as torch uses."""
+    """A robot's candidates in as many parts as torch uses threads."""
 
     def __init__(self, network: PlanningNetwork[Bytes]) -> None:
         self._network = network
@@ -62,11 +59,10 @@ class IntegerJudge:
         def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:
             noise = network.noise(actions.shape[-2], generator)
             finite = actions.isfinite().flatten(2).all(-1) & sound[:, None]
-            parts = self._threads * PARTS_PER_THREAD if self._threads > 1 else 1
             jobs = [
                 (root, part.contiguous(), noise)
                 for root, rows in zip(roots, actions, strict=True)
-                for part in rows.chunk(parts)
+                for part in rows.chunk(self._threads)
             ]
             values = torch.cat(self._run(jobs)).view(finite.shape)
             return values.masked_fill(~finite, torch.nan)  # bytes know no NaN

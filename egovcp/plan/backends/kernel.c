@@ -160,28 +160,34 @@ static void wide_product(const Wide *w, int n_outputs, Bytes in, int row, int co
     for (; n < n_outputs; n += LANES) add_products(w, n, 1, n_outputs, fours, scale, y);
 }
 
-/* y [count][N] = add + all products. */
+/* y [BLOCK][N] += the product of `count` rows with the narrow weight. */
+static void narrow_product(const Layer *l, const float *narrow, int row, int count, float *y) {
+    const int n_outputs = l->outputs;
+    const float *x[BLOCK];
+    for (int r = 0; r < BLOCK; r++) x[r] = narrow + (int64_t)(row + (r < count ? r : 0)) * l->narrow;
+    for (int n = 0; n < n_outputs; n += LANES) {
+        Floats acc[BLOCK];
+        for (int r = 0; r < BLOCK; r++) acc[r] = load(y + (int64_t)r * n_outputs + n);
+        for (int k = 0; k < l->narrow; k++) {
+            const Floats weight = load(l->narrow_weight + (int64_t)k * n_outputs + n);
+            for (int r = 0; r < BLOCK; r++) acc[r] += x[r][k] * weight;
+        }
+        for (int r = 0; r < BLOCK; r++) store(y + (int64_t)r * n_outputs + n, acc[r]);
+    }
+}
+
+/* y [BLOCK][N] = add + all products; rows from `count` on repeat the first. */
 static void sums(const Layer *l, const Bytes *in, const float *narrow, const float *add, int row,
                  int count, float *y) {
-    const int n_outputs = l->outputs;
     for (int r = 0; r < BLOCK; r++) {
-        float *out = y + (int64_t)r * n_outputs;
-        if (add) memcpy(out, add, n_outputs * sizeof(float));
-        else memset(out, 0, n_outputs * sizeof(float));
+        float *out = y + (int64_t)r * l->outputs;
+        if (add) memcpy(out, add, l->outputs * sizeof(float));
+        else memset(out, 0, l->outputs * sizeof(float));
     }
     for (int i = 0; i < 2; i++)
         if (l->wide[i].inputs && in[i].values)
-            wide_product(&l->wide[i], n_outputs, in[i], row, count, y);
-    for (int r = 0; r < count && l->narrow; r++) {
-        float *out = y + (int64_t)r * n_outputs;
-        const float *x = narrow + (int64_t)(row + r) * l->narrow;
-        for (int n = 0; n < n_outputs; n += LANES) {
-            Floats acc = load(out + n);
-            const float *weight = l->narrow_weight + n;
-            for (int k = 0; k < l->narrow; k++) acc += x[k] * load(weight + (int64_t)k * n_outputs);
-            store(out + n, acc);
-        }
-    }
+            wide_product(&l->wide[i], l->outputs, in[i], row, count, y);
+    if (l->narrow) narrow_product(l, narrow, row, count, y);
 }
 
 /* Means and reciprocal deviations of a block of rows of sums, as the layer normalises them. */

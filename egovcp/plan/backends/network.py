@@ -170,6 +170,11 @@ class PlanningNetwork[R]:
     def _read(self, outputs: list[Tensor]) -> Tensor:
         """Q in units of return of what its heads say."""
         model = self._model
-        each = torch.stack([value.read(q, model.config.value_loss) for q in outputs])
-        q = each.mean(0) if self._config.ensemble == "mean" else each.amin(0)
-        return q * model.return_std + model.return_mean
+        each = [value.read(q, model.config.value_loss) for q in outputs]
+        if len(each) == 1:
+            q = each[0]
+        elif self._config.ensemble == "mean":
+            q = torch.stack(each).mean(0)
+        else:
+            q = torch.stack(each).amin(0)
+        return torch.addcmul(model.return_mean, q, model.return_std)
