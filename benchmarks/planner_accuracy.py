@@ -40,7 +40,7 @@ def states(model: WorldModel, root: str, episodes: int, every: int) -> tuple[Car
         action = torch.from_numpy(np.vstack([0 * episode.action[:1], episode.action[:-1]])).float()
         carry = model.initial(1)
         for t in range(len(depth)):
-            state = torch.from_numpy(episode.state[t : t + 1]).float()
+            state = torch.tensor(episode.state[t : t + 1], dtype=torch.float32)
             first = torch.tensor([t == 0])
             carry = model.observe(carry, action[t : t + 1], depth[t : t + 1], state, first)
             if t % every == every - 1:
