@@ -1,20 +1,31 @@
-"""Milliseconds per plan, against a plain eager PyTorch implementation of the same mathematics.
+"""Milliseconds per plan of every backend, against plain eager PyTorch of the same mathematics.
 
 The plain one writes equation 15 down: every candidate carries its own copy of the state, and
-every step runs every network. Both are fp32 on the CPU with the same weights and random draws,
-and must choose the same action.
+every step runs every network, in float32. All have the same weights and random draws.
+
+`arithmetic_share` says which part of the rate of a plain matrix product of the same precision, in
+the same run, a backend reaches, counting only the arithmetic that a plan needs. `observe` is
+the filter's step; `command` is from an observation to the action, with the backend of `auto`.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
 import torch
-from report import interleaved, parser, publish
-from torch import Tensor
+from report import interleaved_times, parser, publish
+from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.model import Carry, WorldModel, WorldModelConfig
-from egovcp.plan import PlannerConfig, plan_cem
-from egovcp.plan.cem import reflect
+from egovcp.plan import Judge, PlannerConfig, Policy, make_plan, optimiser_of
+from egovcp.plan.backends import judge_of_model
+from egovcp.plan.config import BackendName
+from egovcp.plan.process import reflect
+
+SIDE = 1024  # of the matrices of the plain product
+PRODUCTS = {"float32": "float32", "bfloat16": "bfloat16", "int8": "int8", "compile": "float32"}
 
 
 def plain_plan(
@@ -43,39 +54,122 @@ def plain_plan(
     return reflect(executed[0] + config.eta * mean[0])
 
 
+def needed_gflop(model: WorldModel, config: PlannerConfig) -> float:
+    """Arithmetic of one plan: multiplications and additions of matrix products, without those that
+    all candidates share at k = 0, the prior's deviation, and what follows the last step."""
+
+    def macs(*modules: nn.Module | None) -> int:
+        linears = [x for m in modules if m is not None for x in m.modules()]
+        return sum(x.weight.numel() for x in linears if isinstance(x, nn.Linear))
+
+    def state_parts(module: nn.Module) -> int:
+        return macs(*list(module.parts)[:-1])  # type: ignore[arg-type]
+
+    heads = [part for head in model.q_heads for part in head if part is not None]
+    mlps = [getattr(part, "mlp", part) for part in heads]
+    told = model.decode_passing if model.passing_value_head is not None else None
+    q_start = sum(macs(mlp) - state_parts(mlp.first) for mlp in mlps)
+    q_later = macs(*heads, told)
+    prior = macs(model.prior) - model.config.latent * model.config.units
+    first = macs(model.mix.parts[1], model.gru.project.parts[0])
+    later = macs(model.mix, model.gru)
+    n = config.horizon
+    each = q_start + (n - 1) * (q_later + prior) + max(n - 2, 0) * macs(model.termination_head)
+    each += (first if n > 1 else 0) + max(n - 2, 0) * later
+    return 2e-9 * each * config.samples * config.iterations
+
+
+def plain_products() -> dict[str, Callable[[], object]]:
+    """Precision -> a product of two square matrices, by the fastest call that torch has."""
+    a, b = torch.randn(SIDE, SIDE), torch.randn(SIDE, SIDE)
+    a16, b16 = a.bfloat16(), b.bfloat16()
+    weight = torch.randint(-127, 128, (SIDE, SIDE), dtype=torch.int8)
+    packed = torch.ops.onednn.qlinear_prepack(weight, [SIDE, SIDE])
+    rows = torch.randint(0, 256, (SIDE, SIDE), dtype=torch.uint8)
+    scale, zero = torch.ones(SIDE), torch.zeros(SIDE, dtype=torch.int32)
+    return {
+        "float32": lambda: a @ b,
+        "bfloat16": lambda: a16 @ b16,
+        "int8": lambda: torch.ops.onednn.qlinear_pointwise(
+            rows, 1.0, 0, packed, scale, zero, None, 1.0, 0, torch.float32, "none", [], ""
+        ),
+    }
+
+
 @torch.no_grad()
 def main() -> None:
     p = parser(__doc__)
     p.add_argument("--samples", type=int, default=1024, help="M")
+    p.add_argument("--compile", action="store_true", help="also torch.compile: it takes minutes")
     args = p.parse_args()
     torch.manual_seed(0)
-    model = WorldModel(WorldModelConfig()).eval()
+    model = WorldModel(WorldModelConfig()).eval().requires_grad_(False)
     torch.nn.init.normal_(model.value_head.mlp.rest[-1].weight, std=0.1)
     config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))
-    carry = Carry(torch.randn(1, model.config.hidden), torch.randn(1, model.config.latent))
+    carry = Carry(torch.randn(1, model.config.hidden).tanh(), torch.randn(1, model.config.latent))
     executed = torch.zeros(1, spec.ACTION_DIM)
 
-    def ours() -> Tensor:
-        generator = torch.Generator().manual_seed(1)
-        return plan_cem(model, carry, executed, config, generator).actions[0, 0]
+    def planned(judge: Judge[Carry]) -> Callable[[], Tensor]:
+        def run() -> Tensor:
+            generator = torch.Generator().manual_seed(1)
+            search = optimiser_of(config)
+            return make_plan(judge, search, carry, executed, config, generator).actions[0, 0]
+
+        return run
+
+    names: list[BackendName] = ["auto", "eager", "float32", "bfloat16", "int8"]
+    names += ["compile"] if args.compile else []
+    plans = {name: planned(judge_of_model(model, PlannerConfig(backend=name))) for name in names}
 
     def plain() -> Tensor:
         return plain_plan(model, carry, executed, config, 1)
 
-    difference = float((ours() - plain()).abs().max())
-    seconds = interleaved({"plan": ours, "plain": plain}, args.rounds)
-    publish(
-        {
-            "plan_ms": 1e3 * seconds["plan"],
-            "plan_plain_eager_ms": 1e3 * seconds["plain"],
-            "plan_ratio": seconds["plain"] / seconds["plan"],
-            "action_difference": difference,
-            "samples": config.samples,
-            "horizon": config.horizon,
-            "iterations": config.iterations,
-        },
-        args.json,
-    )
+    differences = {name: float((plan() - plain()).abs().max()) for name, plan in plans.items()}
+    policy = Policy(model, config, num_envs=1)
+    depth = np.full((1, spec.DEPTH_ROWS, spec.DEPTH_COLS), 2000, np.uint16)
+    state = np.zeros((1, spec.STATE_DIM), np.float32)
+    seen = (torch.from_numpy(depth.astype(np.int32)), torch.from_numpy(state))
+    first = torch.zeros(1, dtype=torch.bool)
+    products = plain_products()
+    cases: dict[str, Callable[[], object]] = {
+        **{f"plan_{name}": plan for name, plan in plans.items()},
+        "plain": plain,
+        "observe": lambda: model.observe(carry, executed, *seen, first),
+        "command": lambda: policy.act(depth, state),
+        **{f"product_{name}": product for name, product in products.items()},
+    }
+    times = interleaved_times(cases, args.rounds)
+    p50 = {name: values[len(values) // 2] for name, values in times.items()}
+    p99 = {
+        name: values[min(len(values) - 1, int(0.99 * len(values)))]
+        for name, values in times.items()
+    }
+    gflop = needed_gflop(model, config)
+    rate = {name: 2e-9 * SIDE**3 / p50[f"product_{name}"] for name in products}
+    figures: dict[str, object] = {
+        "plan_ms": 1e3 * p50["plan_auto"],
+        "plan_ms_p99": 1e3 * p99["plan_auto"],
+        "plan_plain_eager_ms": 1e3 * p50["plain"],
+        "plan_ratio": p50["plain"] / p50["plan_auto"],
+        "needed_gflop": gflop,
+    }
+    for name in plans:
+        if name == "auto":
+            continue
+        seconds = p50[f"plan_{name}"]
+        figures[f"{name}_ms"] = 1e3 * seconds
+        figures[f"{name}_ms_p99"] = 1e3 * p99[f"plan_{name}"]
+        figures[f"{name}_ratio"] = p50["plain"] / seconds
+        figures[f"{name}_action_difference"] = differences[name]
+        figures[f"{name}_gflops"] = gflop / seconds
+        if name in PRODUCTS:
+            figures[f"{name}_arithmetic_share"] = gflop / seconds / rate[PRODUCTS[name]]
+    for name in products:
+        figures[f"product_{name}_gflops"] = rate[name]
+    for name in ("observe", "command"):
+        figures[f"{name}_ms"], figures[f"{name}_ms_p99"] = 1e3 * p50[name], 1e3 * p99[name]
+    shape = {"samples": config.samples, "horizon": config.horizon, "iterations": config.iterations}
+    publish(figures | shape, args.json)
 
 
 if __name__ == "__main__":

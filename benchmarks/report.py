@@ -30,8 +30,10 @@ def hardware() -> dict[str, object]:
     }
 
 
-def interleaved(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
-    """Median seconds of each case; the cases take turns, so that drift hits all alike."""
+def interleaved_times(
+    cases: dict[str, Callable[[], object]], rounds: int
+) -> dict[str, list[float]]:
+    """Seconds of each case, ascending; the cases take turns, so that drift hits all alike."""
     times: dict[str, list[float]] = {name: [] for name in cases}
     for case in cases.values():
         case()
@@ -40,6 +42,12 @@ def interleaved(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str
             start = time.perf_counter()
             case()
             times[name].append(time.perf_counter() - start)
+    return {name: sorted(values) for name, values in times.items()}
+
+
+def interleaved(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str, float]:
+    """Median seconds of each case; see `interleaved_times`."""
+    times = interleaved_times(cases, rounds)
     return {name: statistics.median(values) for name, values in times.items()}
 
 

@@ -39,7 +39,7 @@ from egovcp.log.mcap import McapSink
 from egovcp.log.rerun import RerunSink
 from egovcp.log.sink import Fanout, Sink
 from egovcp.log.tick import BasePose, Candidates, Tick
-from egovcp.plan import PlannerConfig, plan_cem
+from egovcp.plan import PlannerConfig, StepByStep, make_plan, optimiser_of
 from egovcp.spec import PLANNER_DT, PLANNER_HZ, STATE_DIM
 from egovcp.testing import toy_model
 
@@ -142,10 +142,12 @@ def _planning() -> Callable[[], object]:
     model = toy_model()
     config = PlannerConfig(samples=64, elites=16)
     carry, executed = model.initial(1), torch.zeros(1, 7)
+    judge = StepByStep(model, config)
 
     def plan() -> object:
         with torch.no_grad():
-            return plan_cem(model, carry, executed, config, torch.Generator().manual_seed(0))
+            generator = torch.Generator().manual_seed(0)
+            return make_plan(judge, optimiser_of(config), carry, executed, config, generator)
 
     return plan
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Final, Protocol
 
 import numpy as np
@@ -114,8 +114,13 @@ class Scripted:
         """The robot has just begun an episode."""
         self._controller.reset(self._robot.env, [self._robot.scenario])
 
-    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
-        """The reference's action, and no plan."""
+    def act(
+        self,
+        depth: NDArray[np.uint16],
+        state: NDArray[np.floating],
+        remaining: Callable[[], float] | None = None,
+    ) -> PolicyStep:
+        """The reference's action, and no plan; it takes no time worth limiting."""
         none = np.zeros(0, np.float32)
         action = self._controller.act(self._robot.env, Observation(depth, state))
         return PolicyStep(np.asarray(action, np.float32), none, none, none, none, none, 0)

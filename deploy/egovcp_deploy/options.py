@@ -13,8 +13,8 @@ from typing import Any, Final
 from egovcp.artefact import Artefact, load_artefact
 from egovcp.errors import EnvironmentFailure, UsageError, suggest
 from egovcp.plan import PlannerConfig
-from egovcp.plan.cem import TerminationRule
 from egovcp.plan.choices import Ensemble, Latent
+from egovcp.plan.config import BackendName, OptimiserName, TerminationRule
 
 PLANNER: Final = "planner"
 REFERENCES: Final = ("hold", "random", "oracle")
@@ -45,7 +45,7 @@ class PlannerOptions:
     horizon: int | None = None
     """N, planner ticks of 40 ms."""
     iterations: int | None = None
-    """Rounds of the cross-entropy method."""
+    """Rounds of the search."""
     elites: int | None = None
     """Best candidates that the next round is fitted to."""
     termination_rule: TerminationRule | None = None
@@ -55,6 +55,10 @@ class PlannerOptions:
     """z of imagined states: mean of the prior, or a sample."""
     ensemble: Ensemble | None = None
     """Several heads of Q: mean, or min."""
+    optimiser: OptimiserName | None = None
+    """The search: cem, icem, mppi or shooting (docs/planner.md)."""
+    backend: BackendName | None = None
+    """Who computes: auto, eager, float32, bfloat16, int8 or compile (docs/planner.md)."""
 
     def apply(self, planner: PlannerConfig) -> PlannerConfig:
         """``planner`` with these changes.

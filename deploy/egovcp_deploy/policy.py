@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -20,8 +21,13 @@ class RolloutPolicy(Protocol):
         """Forget the past: every robot has just begun an episode."""
         ...
 
-    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
-        """Depth (E, 48, 64) mm and state (E, 74) -> plans."""
+    def act(
+        self,
+        depth: NDArray[np.uint16],
+        state: NDArray[np.floating],
+        remaining: Callable[[], float] | None = None,
+    ) -> PolicyStep:
+        """Depth (E, 48, 64) mm and state (E, 74) -> plans, within ``remaining`` s."""
         ...
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:

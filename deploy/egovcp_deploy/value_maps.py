@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from egovcp.log.tick import Hand, ValueMap
 from egovcp.plan import hand_grid, value_map
-from egovcp.plan.cem import Dynamics
+from egovcp.plan.objective import Dynamics
 from egovcp.plan.value_map import HAND_AXES
 from egovcp.spec import ACTION_BOX
 

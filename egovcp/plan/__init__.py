@@ -1,16 +1,24 @@
-"""Planning in a learned model: the cross-entropy method and the policy built on it."""
+"""Planning in a learned model: sampling searches, ways to judge plans, and the policy of both."""
 
-from egovcp.plan.cem import Plan, PlannerConfig, plan_cem
+from egovcp.plan.config import PlannerConfig
+from egovcp.plan.objective import Judge, StepByStep
+from egovcp.plan.optimisers import optimiser_of
 from egovcp.plan.policy import Policy, PolicyStep
+from egovcp.plan.search import Optimiser, Plan, make_plan, until
 from egovcp.plan.value_map import HandGrid, hand_grid, value_map
 
 __all__ = [
     "HandGrid",
+    "Judge",
+    "Optimiser",
     "Plan",
     "PlannerConfig",
     "Policy",
     "PolicyStep",
+    "StepByStep",
     "hand_grid",
-    "plan_cem",
+    "make_plan",
+    "optimiser_of",
+    "until",
     "value_map",
 ]

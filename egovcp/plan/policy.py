@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,12 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.model import Carry, WorldModel
-from egovcp.plan.cem import PlannerConfig, plan_cem, shift
+from egovcp.plan.backends import judge_of_model
+from egovcp.plan.config import PlannerConfig
+from egovcp.plan.objective import Judge
+from egovcp.plan.optimisers import optimiser_of
+from egovcp.plan.process import shift
+from egovcp.plan.search import make_plan
 
 type Array = NDArray[np.float32]
 
@@ -32,7 +38,8 @@ class Policy:
     """Filters and plans for E robots in step; call `act`, then `advance`, once a tick.
 
     The recurrence advances with the action that was actually sent, so `advance` must be
-    told what the safety layer made of the planned one.
+    told what the safety layer made of the planned one. The planner packs the model's weights
+    when they are first needed; later changes of them are not seen.
     """
 
     def __init__(
@@ -42,6 +49,7 @@ class Policy:
         self.config = config
         self.num_envs = num_envs
         self._seed = seed
+        self._judge: Judge[Carry] | None = None
         self.reset()
 
     def reset(self, rows: NDArray[np.intp] | None = None) -> None:
@@ -72,16 +80,31 @@ class Policy:
         self._first = torch.zeros_like(self._first)
 
     @torch.no_grad()
-    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
-        """Depth (E, 48, 64) mm and state (E, 74) -> the plan from here."""
+    def act(
+        self,
+        depth: NDArray[np.uint16],
+        state: NDArray[np.floating],
+        remaining: Callable[[], float] | None = None,
+    ) -> PolicyStep:
+        """Depth (E, 48, 64) mm and state (E, 74) -> the plan from here.
+
+        Args:
+            depth: as sensed.
+            state: as sensed.
+            remaining: seconds until the answer is due (`egovcp.plan.until`); the planner runs
+                as many iterations as fit, at least one. None: all of them, the same on every
+                machine that computes the same.
+        """
         self.observe(depth, state)
-        plan = plan_cem(
-            self.model,
+        plan = make_plan(
+            self.prepare(),
+            optimiser_of(self.config),
             self._carry,
             self._sent,
             self.config,
             self._generator,
             self._warm,
+            remaining,
         )
         self._warm = shift(plan.deltas)
         return PolicyStep(
@@ -93,6 +116,17 @@ class Policy:
             _numpy(plan.candidate_values),
             plan.iterations,
         )
+
+    def prepare(self) -> Judge[Carry]:
+        """Pack the planner now and not at the first observation: it may have to be compiled.
+
+        Raises:
+            UsageError: the backend does not go with the model.
+            EnvironmentFailure: the backend cannot be built here.
+        """
+        if self._judge is None:
+            self._judge = judge_of_model(self.model, self.config)
+        return self._judge
 
     def advance(self, sent: NDArray[np.floating]) -> None:
         """Tell the recurrence which action (E, 7) was really sent."""

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from egovcp.plan.cem import Dynamics
+from egovcp.plan.objective import Dynamics
 from egovcp.spec import ACTION_BOX
 
 #: Where x, y and z of each hand are in an action.

@@ -35,7 +35,12 @@ class Steady:
     def reset(self) -> None:
         pass
 
-    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+    def act(
+        self,
+        depth: NDArray[np.uint16],
+        state: NDArray[np.floating],
+        remaining: Callable[[], float] | None = None,
+    ) -> PolicyStep:
         level = self._broken(self._count)
         self._count += 1
         plan = np.full((1, 4, ACTION_DIM), self._level if level is None else level, np.float32)

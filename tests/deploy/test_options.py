@@ -67,6 +67,8 @@ def test_planner_options_change_only_what_they_name() -> None:
     assert PlannerOptions().apply(own) == own
     changed = PlannerOptions(samples=128).apply(own)
     assert (changed.samples, changed.horizon) == (128, 6)
+    other = PlannerOptions(optimiser="icem", backend="float32").apply(own)
+    assert (other.optimiser, other.backend, other.samples) == ("icem", "float32", 512)
     with pytest.raises(UsageError):
         PlannerOptions(samples=8).apply(own)  # fewer than the elites
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -31,7 +33,12 @@ class PlainPolicy:
         self.seen.clear()
         self.sent.clear()
 
-    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+    def act(
+        self,
+        depth: NDArray[np.uint16],
+        state: NDArray[np.floating],
+        remaining: Callable[[], float] | None = None,
+    ) -> PolicyStep:
         assert depth.shape == (1, 48, 64)
         assert state.shape == (1, STATE_DIM)
         self.seen.append(int(depth[0, 0, 0]))

@@ -128,7 +128,8 @@ class Session:
         last = reports[-1]
         self._begin_ns = reports[0].time_ns if self._begin_ns is None else self._begin_ns
         self._mode = last.mode
-        reply = self._thinker.think(reports, last.time_ns + round(BUDGET_S * _NS))
+        due_ns = last.time_ns + round(BUDGET_S * _NS)
+        reply = self._thinker.think(reports, lambda: (due_ns - self._clock.now_ns()) / _NS)
         self._link.send(encode_reply(reply))
         self._measure(last, reply)
         if self._clock.now_ns() - last.time_ns < _DECODE_BY_S * _NS:

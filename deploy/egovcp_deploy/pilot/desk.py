@@ -109,16 +109,22 @@ class Thinker:
         self._imagining = policy if imagine and isinstance(policy, ImaginingPolicy) else None
         self._next_tick: int | None = None
 
-    def think(self, reports: Sequence[Report], deadline_ns: int | None = None) -> Reply:
+    def think(
+        self, reports: Sequence[Report], remaining: Callable[[], float] | None = None
+    ) -> Reply:
         """Take ``reports`` in, in order; plan from the last. A gap between them starts afresh.
 
         Nothing is decoded yet: see `decode`.
+
+        Args:
+            reports: consecutive ticks, at least one.
+            remaining: seconds until the plan is due; None: there is no hurry.
         """
         begin = time.perf_counter()
         events = [event for report in reports[:-1] for event in self._take(report)]
         last = reports[-1]
         events += self._begin(last)
-        step = self._policy.act(last.depth[None], last.state[None])
+        step = self._policy.act(last.depth[None], last.state[None], remaining)
         plan_ms = (time.perf_counter() - begin) * 1e3
         return Reply(last.tick, step, plan_ms, events=tuple(events))
 

@@ -98,7 +98,12 @@ class Reaching:
     def reset(self) -> None:
         self.resets += 1
 
-    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+    def act(
+        self,
+        depth: NDArray[np.uint16],
+        state: NDArray[np.floating],
+        remaining: Callable[[], float] | None = None,
+    ) -> PolicyStep:
         self.observe(depth, state)
         plan = np.full((1, 4, ACTION_DIM), self.level, np.float32)
         plan[..., -1] = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,7 +44,12 @@ class Watched:
     def reset(self) -> None:
         self._policy.reset()
 
-    def act(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> PolicyStep:
+    def act(
+        self,
+        depth: NDArray[np.uint16],
+        state: NDArray[np.floating],
+        remaining: Callable[[], float] | None = None,
+    ) -> PolicyStep:
         step = self._policy.act(depth, state)
         self.carries.append(self._policy.carry.features.clone())
         self.values.append(float(step.value[0]))

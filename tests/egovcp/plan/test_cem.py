@@ -10,8 +10,10 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import Carry
-from egovcp.plan import Plan, PlannerConfig, plan_cem
-from egovcp.plan.cem import TerminationRule, evaluate, reflect, shift, walk
+from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
+from egovcp.plan.config import TerminationRule
+from egovcp.plan.objective import Dynamics, evaluate
+from egovcp.plan.process import reflect, shift, walk
 from egovcp.testing import Point, PointWorld, ScriptedWorld, toy_model
 
 ETA = spec.ACTION_ETA
@@ -20,6 +22,18 @@ SMALL = PlannerConfig(samples=256, elites=32, iterations=4)
 
 def _generator(seed: int = 0) -> torch.Generator:
     return torch.Generator().manual_seed(seed)
+
+
+def _search[L](
+    world: Dynamics[L],
+    carry: L,
+    executed: Tensor,
+    config: PlannerConfig,
+    generator: torch.Generator,
+    warm: Tensor | None = None,
+) -> Plan:
+    judge, optimiser = StepByStep(world, config), optimiser_of(config)
+    return make_plan(judge, optimiser, carry, executed, config, generator, warm)
 
 
 def _plan(
@@ -31,7 +45,7 @@ def _plan(
     seed: int = 0,
 ) -> Plan:
     world = world or PointWorld()
-    return plan_cem(world, world.start(executed, goal), executed, config, _generator(seed), warm)
+    return _search(world, world.start(executed, goal), executed, config, _generator(seed), warm)
 
 
 def _random(rows: int, seed: int, scale: float = 1.0) -> Tensor:
@@ -115,10 +129,10 @@ def test_a_robots_plan_in_a_world_model_does_not_depend_on_the_others() -> None:
         torch.randn(3, model.config.latent, generator=rng),
     )
     with torch.no_grad():
-        together = plan_cem(model, carry, executed, SMALL, _generator())
+        together = _search(model, carry, executed, SMALL, _generator())
         for e in range(3):
             row = Carry(carry.h[e : e + 1], carry.z[e : e + 1])
-            alone = plan_cem(model, row, executed[e : e + 1], SMALL, _generator())
+            alone = _search(model, row, executed[e : e + 1], SMALL, _generator())
             torch.testing.assert_close(
                 together.actions[e : e + 1], alone.actions, rtol=0, atol=0.02
             )

@@ -1,6 +1,7 @@
 """The policy: what the recurrence is told, what a reset forgets, what repeats."""
 
 import itertools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -11,8 +12,8 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.model import Carry, WorldModel
-from egovcp.plan import Plan, PlannerConfig, Policy, PolicyStep, plan_cem
-from egovcp.plan.cem import shift
+from egovcp.plan import Judge, Optimiser, Plan, PlannerConfig, Policy, PolicyStep, make_plan
+from egovcp.plan.process import shift
 from egovcp.testing import CountingModel, toy_model
 
 CONFIG = PlannerConfig(samples=64, elites=8, iterations=2)
@@ -121,18 +122,20 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[_Asked]:
     calls: list[_Asked] = []
 
     def record(
-        model: WorldModel,
+        judge: Judge[Carry],
+        optimiser: Optimiser,
         carry: Carry,
         executed: Tensor,
         config: PlannerConfig,
         generator: torch.Generator,
         warm: Tensor,
+        remaining: Callable[[], float] | None,
     ) -> Plan:
-        plan = plan_cem(model, carry, executed, config, generator, warm)
+        plan = make_plan(judge, optimiser, carry, executed, config, generator, warm, remaining)
         calls.append(_Asked(executed.clone(), warm.clone(), plan))
         return plan
 
-    monkeypatch.setattr("egovcp.plan.policy.plan_cem", record)
+    monkeypatch.setattr("egovcp.plan.policy.make_plan", record)
     return calls
 
 

@@ -1,0 +1,119 @@
+"""What a backend's arithmetic costs on recorded states, with a trained policy.
+
+From states that the model filters out of recorded episodes, every backend plans with the same draws
+as the step-by-step float32 reference. Two figures count: how far the first action moves, in the
+action's box of [-1, 1], and how much J is lost, as the reference sees it, in deviations of J among
+the candidates of a first round. Beside them the same of the reference itself with other random
+draws: what chance costs.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+import torch
+from report import publish
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.artefact import load_artefact
+from egovcp.data.arrays import open_dataset
+from egovcp.model import Carry, WorldModel
+from egovcp.plan import PlannerConfig, StepByStep, make_plan, optimiser_of
+from egovcp.plan.backends import judge_of_model
+from egovcp.plan.config import BackendName
+from egovcp.plan.process import walk
+
+BACKENDS: tuple[BackendName, ...] = ("float32", "bfloat16", "int8")
+BATCH = 8  # robots planned together
+
+
+def states(model: WorldModel, root: str, episodes: int, every: int) -> tuple[Carry, Tensor]:
+    """Filtered states of every ``every``-th row of the last episodes, and the actions before."""
+    reader = open_dataset(root)
+    h, z, before = [], [], []
+    for index in range(len(reader) - episodes, len(reader)):
+        episode = reader.read(index)
+        depth = torch.from_numpy(episode.depth.astype(np.int32))
+        action = torch.from_numpy(np.vstack([0 * episode.action[:1], episode.action[:-1]])).float()
+        carry = model.initial(1)
+        for t in range(len(depth)):
+            state = torch.tensor(episode.state[t : t + 1], dtype=torch.float32)
+            first = torch.tensor([t == 0])
+            carry = model.observe(carry, action[t : t + 1], depth[t : t + 1], state, first)
+            if t % every == every - 1:
+                h.append(carry.h)
+                z.append(carry.z)
+                before.append(action[t : t + 1])
+    return Carry(torch.cat(h), torch.cat(z)), torch.cat(before)
+
+
+class Trial:
+    """Plans from the same states, by several backends."""
+
+    def __init__(self, model: WorldModel, config: PlannerConfig, carry: Carry, executed: Tensor):
+        self._model, self._config, self._executed, self._carry = model, config, executed, carry
+        self._reference = StepByStep(model, config)
+
+    def plans(self, backend: BackendName, seed: int) -> Tensor:
+        """(S, N, 7)."""
+        judge = judge_of_model(self._model, PlannerConfig(backend=backend))
+        parts = []
+        for rows in torch.arange(len(self._executed)).split(BATCH):
+            carry = Carry(self._carry.h[rows], self._carry.z[rows])
+            search, rng = optimiser_of(self._config), torch.Generator().manual_seed(seed)
+            plan = make_plan(judge, search, carry, self._executed[rows], self._config, rng)
+            parts.append(plan.actions)
+        return torch.cat(parts)
+
+    def worth(self, plans: Tensor) -> Tensor:
+        """J (S, n) of plans (S, n, N, 7) by the reference."""
+        parts = []
+        for rows in torch.arange(len(plans)).split(BATCH):
+            carry = Carry(self._carry.h[rows], self._carry.z[rows])
+            parts.append(self._reference.at(carry)(plans[rows], None))
+        return torch.cat(parts)
+
+    def spread(self) -> Tensor:
+        """Deviation (S,) of J among plans of the data's own process."""
+        rng = torch.Generator().manual_seed(0)
+        steps = 2 * torch.rand(1, 256, self._config.horizon, spec.ACTION_DIM, generator=rng) - 1
+        every = steps.expand(len(self._executed), -1, -1, -1)
+        return self.worth(walk(self._executed[:, None], every, self._config.eta)).std(1)
+
+
+@torch.no_grad()
+def main() -> None:
+    p = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    p.add_argument("--policy", required=True, help="folder of the artefact")
+    p.add_argument("--dataset", required=True, help="folder of the dataset")
+    p.add_argument("--episodes", type=int, default=20, help="the last ones of the dataset")
+    p.add_argument("--every", type=int, default=4, help="a state of every so many rows")
+    p.add_argument("--samples", type=int, default=1024, help="M")
+    p.add_argument("--json", type=Path, help="also write the figures to this file")
+    args = p.parse_args()
+    model = load_artefact(args.policy).world_model.requires_grad_(False)
+    config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))
+    trial = Trial(model, config, *states(model, args.dataset, args.episodes, args.every))
+    reference = trial.plans("eager", 1)
+    best, spread = trial.worth(reference[:, None])[:, 0], trial.spread()
+    figures: dict[str, object] = {"states": len(reference), "samples": args.samples}
+    others = {name: trial.plans(name, 1) for name in BACKENDS}
+    for name, plans in {**others, "other_draws": trial.plans("eager", 2)}.items():
+        moved = (plans[:, 0] - reference[:, 0]).abs().mean(1)
+        lost = (best - trial.worth(plans[:, None])[:, 0]) / spread
+        figures |= {
+            f"{name}_action_moved_mean": float(moved.mean()),
+            f"{name}_action_moved_p95": float(moved.quantile(0.95)),
+            f"{name}_value_lost_mean": float(lost.mean()),
+            f"{name}_value_lost_p95": float(lost.quantile(0.95)),
+        }
+    publish(figures, args.json)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,49 @@
+"""Ways to compute what plans are worth, behind one switch; `objective` says what is right."""
+
+from __future__ import annotations
+
+import torch
+
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.model import Carry, WorldModel
+from egovcp.plan.backends import library
+from egovcp.plan.backends.floats import FloatArithmetic
+from egovcp.plan.backends.integers import IntegerArithmetic
+from egovcp.plan.backends.judges import FloatJudge, IntegerJudge
+from egovcp.plan.backends.network import PlanningNetwork
+from egovcp.plan.config import PlannerConfig
+from egovcp.plan.objective import Judge, StepByStep
+
+__all__ = ["judge_of_model"]
+
+
+def judge_of_model(model: WorldModel, config: PlannerConfig) -> Judge[Carry]:
+    """The judge that ``config.backend`` names, made from the model's weights as they are now.
+
+    A subclass of the world model may think differently from its networks: under ``auto`` it is
+    asked step by step.
+
+    Raises:
+        UsageError: int8 is asked for and the model is not on the processor, or has odd sizes.
+        EnvironmentFailure: int8 is asked for and the kernel cannot be built.
+    """
+    backend = config.backend
+    if backend == "eager" or (backend == "auto" and type(model) is not WorldModel):
+        return StepByStep(model, config)
+    if backend == "int8":
+        return _integers(model, config)
+    if backend == "auto" and model.state_mean.device.type == "cpu" and library.processor_is_fast():
+        try:
+            return _integers(model, config)
+        except (EnvironmentFailure, UsageError):
+            pass  # float32 does everywhere
+    dtype = torch.bfloat16 if backend == "bfloat16" else torch.float32
+    network = PlanningNetwork(model, config, FloatArithmetic(dtype))
+    return FloatJudge(network, compiled=backend == "compile")
+
+
+def _integers(model: WorldModel, config: PlannerConfig) -> IntegerJudge:
+    device = model.state_mean.device
+    if device.type != "cpu":
+        raise UsageError(f"backend=int8 runs on the processor, the model is on {device}")
+    return IntegerJudge(PlanningNetwork(model, config, IntegerArithmetic()))

@@ -1,0 +1,132 @@
+"""The C kernel, compiled for this processor on first use and kept in the user's cache folder."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shutil
+import subprocess
+import tempfile
+from functools import cache
+from pathlib import Path
+from typing import Final
+
+from egovcp.errors import EnvironmentFailure
+
+SOURCE: Final = Path(__file__).with_name("kernel.c")
+FLAGS: Final = (
+    "-O3",
+    "-march=native",
+    "-mprefer-vector-width=512",
+    "-std=gnu11",
+    "-ffp-contract=fast",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-shared",
+    "-fPIC",
+)
+OTHERWISE: Final = "plan with --planner.backend=float32"
+
+
+class Wide(ctypes.Structure):
+    """``Wide`` of the kernel."""
+
+    _fields_ = (
+        ("inputs", ctypes.c_int32),
+        ("weight", ctypes.c_void_p),
+        ("scale", ctypes.c_void_p),
+        ("start", ctypes.c_void_p),
+        ("shift", ctypes.c_void_p),
+    )
+
+
+class Layer(ctypes.Structure):
+    """``Layer`` of the kernel."""
+
+    _fields_ = (
+        ("outputs", ctypes.c_int32),
+        ("wide", Wide * 2),
+        ("narrow", ctypes.c_int32),
+        ("narrow_weight", ctypes.c_void_p),
+        ("gamma", ctypes.c_void_p),
+        ("beta", ctypes.c_void_p),
+        ("epsilon", ctypes.c_float),
+        ("last", ctypes.c_int32),
+        ("last_weight", ctypes.c_void_p),
+        ("last_bias", ctypes.c_void_p),
+    )
+
+
+def processor_is_fast() -> bool:
+    """Whether this processor multiplies 512-bit vectors of bytes (AVX-512 VNNI)."""
+    info = Path("/proc/cpuinfo")
+    return info.exists() and "avx512_vnni" in info.read_text(encoding="utf-8", errors="replace")
+
+
+def compiler() -> str | None:
+    """Path of a C compiler."""
+    names = (os.environ.get("CC", ""), "cc", "gcc", "clang")
+    return next((path for name in names if name and (path := shutil.which(name))), None)
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """The kernel; compiled, in some 2 s, unless this processor's is in the cache.
+
+    Raises:
+        EnvironmentFailure: there is no compiler, or it fails, or the cache cannot be written.
+    """
+    path = _folder() / f"planner-{_identity()}.so"
+    try:
+        if not path.exists():
+            _compile(path)
+        kernel = ctypes.CDLL(str(path))
+    except OSError as error:
+        raise EnvironmentFailure(f"cannot build or load {path}: {error}; {OTHERWISE}") from error
+    p, i, f = ctypes.c_void_p, ctypes.c_int32, ctypes.c_float
+    kernel.hidden.argtypes = [p, i, p, p, p, p, f, p, p, p]
+    kernel.recur.argtypes = [p, i, p, p, p, p, p, p, i, p, p, p]
+    kernel.linear.argtypes = [i, i, p, i, p, p, p]
+    for function in (kernel.hidden, kernel.recur, kernel.linear):
+        function.restype = None
+    return kernel
+
+
+def _folder() -> Path:
+    root = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(root) / "egovcp"
+
+
+def _identity() -> str:
+    """Changes with the source, the flags and the processor that ``-march=native`` means."""
+    digest = hashlib.sha256(SOURCE.read_bytes())
+    digest.update(repr((FLAGS, compiler(), platform.machine())).encode())
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text(errors="replace").splitlines() if info.exists() else []
+    for line in lines:
+        if line.startswith(("model name", "flags", "Features")):
+            digest.update(line.encode())
+        if not line:
+            break  # the first processor tells of all
+    return digest.hexdigest()[:16]
+
+
+def _compile(path: Path) -> None:
+    """Into a temporary file beside ``path``, then in one step to its place."""
+    command = compiler()
+    if command is None:
+        raise EnvironmentFailure(
+            "the int8 planner needs a C compiler (cc, gcc or clang, or $CC), and there is none; "
+            f"install one, or {OTHERWISE}"
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
+        made = Path(folder) / path.name
+        arguments = [command, *FLAGS, str(SOURCE), "-o", str(made), "-lm"]
+        done = subprocess.run(arguments, capture_output=True, text=True, check=False)
+        if done.returncode:
+            reason = " ".join(done.stderr.split())[:300]
+            raise EnvironmentFailure(f"{command} cannot compile {SOURCE}: {reason}; {OTHERWISE}")
+        os.replace(made, path)

@@ -1,0 +1,71 @@
+"""What can be chosen about a planner."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from egovcp import spec
+from egovcp.errors import UsageError
+from egovcp.plan.choices import Ensemble, Latent
+
+TerminationRule = Literal["paper", "shift", "survival"]
+OptimiserName = Literal["cem", "icem", "mppi", "shooting"]
+BackendName = Literal["auto", "eager", "float32", "bfloat16", "int8", "compile"]
+
+
+@dataclass(frozen=True)
+class PlannerConfig:
+    """The sampling MPC; the defaults are the paper's, 25 Hz."""
+
+    samples: int = 1024
+    """M, candidate plans per iteration."""
+    horizon: int = 4
+    """N, planner ticks."""
+    iterations: int = 3
+    """Rounds of the search; fewer where a deadline comes first."""
+    elites: int = 64
+    """Best candidates that the next round is fitted to."""
+    min_std: float = 0.1
+    """Floor of the sampling deviation, in units of delta."""
+    eta: float = spec.ACTION_ETA
+    """Step of the action process, box units per tick."""
+    termination_threshold: float = 0.9
+    """A candidate whose termination probability exceeds this loses its later values."""
+    termination_rule: TerminationRule = "shift"
+    """paper: later values are 0; shift: they are the data's worst return; survival: each
+    value above the worst return is weighted with the probability of being alive."""
+    latent: Latent = "mean"
+    """z of imagined states. mean: the prior's; sample: drawn from the prior, anew in each
+    iteration, with the same noise for all candidates."""
+    ensemble: Ensemble = "mean"
+    """What several heads of Q are worth together (`q_heads`): their mean, or the least of them."""
+    optimiser: OptimiserName = "cem"
+    """How candidates are drawn: cem (fitted to the elites), icem (with coloured noise, elites kept
+    and fewer samples each round), mppi (all weighted by their value), shooting (uniform)."""
+    temperature: float = 0.3
+    """mppi: a value this many deviations of all values below the best weighs 1/e of it."""
+    noise_exponent: float = 2.0
+    """icem: power of the noise over frequency, f^-x; 0: white, larger: steadier plans."""
+    kept_elites: float = 0.3
+    """icem: share of the elites that are candidates again in the next round."""
+    sample_decay: float = 1.25
+    """icem: each round draws this many times fewer samples than the one before."""
+    backend: BackendName = "auto"
+    """Who computes. eager: the world model itself; float32, bfloat16: its networks packed; int8: in
+    8-bit integers by a library compiled on first use (processors only); compile: float32 through
+    torch.compile, a minute at the start; auto: int8 where it is fast, else float32."""
+
+    def __post_init__(self) -> None:
+        if min(self.samples, self.horizon, self.iterations, self.elites) < 1:
+            raise UsageError("samples, horizon, iterations and elites must be at least 1")
+        if self.elites > self.samples:
+            raise UsageError(f"elites ({self.elites}) exceed samples ({self.samples})")
+        if not 0 < self.eta <= 2:
+            raise UsageError(f"eta is {self.eta}; expected more than 0 and at most 2, the box")
+        if self.temperature <= 0:
+            raise UsageError(f"temperature is {self.temperature}; expected more than 0")
+        if not 0 <= self.kept_elites <= 1:
+            raise UsageError(f"kept_elites is {self.kept_elites}; expected a share, 0 to 1")
+        if self.sample_decay < 1:
+            raise UsageError(f"sample_decay is {self.sample_decay}; expected at least 1")

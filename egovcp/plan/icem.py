@@ -1,0 +1,67 @@
+"""iCEM (Pinneri et al., CoRL 2020): the cross-entropy method for few samples.
+
+Noise is coloured along the plan, for steps that cancel each other explore little; some elites are
+candidates again; later rounds, which know more, draw fewer samples; the answer is the best plan
+seen, not a mean that nobody judged.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from egovcp.plan.cem import refit
+from egovcp.plan.config import PlannerConfig
+from egovcp.plan.search import Belief, best_of, draw
+
+
+@dataclass(frozen=True)
+class ImprovedCrossEntropy:
+    """``mean`` of the belief is the best plan so far; draws are made around the elites' mean."""
+
+    config: PlannerConfig
+
+    def propose(self, belief: Belief, iteration: int, generator: torch.Generator) -> Tensor:
+        """See `Optimiser`. From iteration 1 on, the best elites so far come first."""
+        c = self.config
+        samples = max(round(c.samples * c.sample_decay**-iteration), c.elites)
+        noise = coloured(belief.mean, samples, c.noise_exponent, generator)
+        if iteration == 0:
+            return draw(belief.mean, belief.std, noise)
+        usable = belief.values.isfinite()
+        centre, _ = refit(belief.elites, usable, belief)
+        kept = max(1, round(c.kept_elites * c.elites))
+        return torch.cat([belief.elites[:, :kept], draw(centre, belief.std, noise)], 1)
+
+    def learn(self, belief: Belief, deltas: Tensor, values: Tensor) -> Belief:
+        """See `Optimiser`."""
+        elites, top = best_of(deltas, values, self.config.elites)
+        _, std = refit(elites, top.isfinite(), belief)
+        return keep_best(belief._replace(std=std.clamp_min(self.config.min_std)), elites, top)
+
+
+def keep_best(belief: Belief, elites: Tensor, top: Tensor) -> Belief:
+    """The belief with these elites, whose first is the answer if it beats the one before."""
+    better = top[:, 0] > belief.value
+    mean = torch.where(better[:, None, None], elites[:, 0], belief.mean)
+    value = torch.where(better, top[:, 0], belief.value)
+    return belief._replace(mean=mean, elites=elites, values=top, value=value)
+
+
+def coloured(mean: Tensor, samples: int, exponent: float, generator: torch.Generator) -> Tensor:
+    """Noise (1, M, N, 7) of unit variance whose power falls as f^-exponent along the plan."""
+    horizon, actions = mean.shape[1:]
+    length = max(2 * horizon, 2)  # twice as long: a plan does not return to where it began
+    power = torch.fft.rfftfreq(length, device=mean.device).clamp_min(1.0 / length) ** -exponent
+    size = (1, samples, actions, len(power), 2)
+    parts = torch.randn(size, generator=generator, device=mean.device)
+    spectrum = torch.view_as_complex(parts) * power.sqrt()
+    noise = torch.fft.irfft(spectrum, length)[..., :horizon]
+    # The variance of the inverse transform: middle frequencies count twice, half of each part.
+    share = torch.full_like(power, 4.0)
+    share[0] = share[-1] = 1.0
+    deviation = (share * power).sum().sqrt() / length
+    unit: Tensor = (noise / deviation).transpose(2, 3)
+    return unit

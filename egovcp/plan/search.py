@@ -1,0 +1,151 @@
+"""Value-guided sampling MPC (paper section III-D): draw plans, judge them, draw better ones.
+
+Candidates live in the action process of the data, a_k = a_{k-1} + eta * delta_k with
+delta in [-1, 1]^7 starting at the last executed action: anything else would ask Q about
+actions it never saw. A search is pure: no I/O, no global state, and no clock but the one that
+it is given.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.plan.config import PlannerConfig
+from egovcp.plan.objective import Judge
+from egovcp.plan.process import walk
+
+
+class Belief(NamedTuple):
+    """What a search knows about good plans of E robots."""
+
+    mean: Tensor  # (E, N, 7) deltas; what it would answer now
+    std: Tensor  # (E, N, 7)
+    elites: Tensor  # (E, elites, N, 7) deltas, best first; of the last round
+    values: Tensor  # (E, elites); -inf where J was not a number
+    value: Tensor  # (E,) J of the answer, as far as it is known
+
+
+class Optimiser(Protocol):
+    """Draws candidates and learns from what they are worth."""
+
+    def propose(self, belief: Belief, iteration: int, generator: torch.Generator) -> Tensor:
+        """(E, M, N, 7) deltas; the first candidate is ``belief.mean`` in iteration 0."""
+        ...
+
+    def learn(self, belief: Belief, deltas: Tensor, values: Tensor) -> Belief:
+        """After the ``values`` (E, M) of these candidates; -inf where J was not a number."""
+        ...
+
+
+class Plan(NamedTuple):
+    """The planner's answer for E robots."""
+
+    actions: Tensor  # (E, N, 7) in [-1, 1]; the first is to be executed
+    deltas: Tensor  # (E, N, 7) its steps; shifted, the warm start of the next plan
+    value: (
+        Tensor  # (E,) J, or the mean of the last elites' (cem); -inf: no candidate had a finite J
+    )
+    candidates: Tensor  # (E, elites, N, 7) elites of the last round, best first
+    candidate_values: Tensor  # (E, elites); -inf where J was not a number
+    iterations: int
+
+
+class Pace:
+    """Says whether another iteration ends before the deadline, judged by the slowest so far.
+
+    Args:
+        remaining: seconds until the deadline; None: there is none, and no clock is read.
+    """
+
+    def __init__(self, remaining: Callable[[], float] | None) -> None:
+        self._remaining = remaining
+        self._slowest = 0.0
+        self._left = remaining() if remaining else 0.0
+
+    def goes_on(self) -> bool:
+        """Ask after each iteration."""
+        if self._remaining is None:
+            return True
+        left = self._remaining()
+        self._slowest = max(self._slowest, self._left - left)
+        self._left = left
+        return left > self._slowest
+
+
+def until(deadline_s: float) -> Callable[[], float]:
+    """Seconds left until ``deadline_s`` of `time.perf_counter`."""
+    return lambda: deadline_s - time.perf_counter()
+
+
+def make_plan[C](
+    judge: Judge[C],
+    optimiser: Optimiser,
+    carry: C,
+    executed: Tensor,
+    config: PlannerConfig,
+    generator: torch.Generator,
+    warm: Tensor | None = None,
+    remaining: Callable[[], float] | None = None,
+) -> Plan:
+    """Plan for E robots from ``carry`` (E, ...), a_{t-1} = ``executed`` (E, 7).
+
+    Args:
+        warm: (E, N, 7) deltas of the previous plan, already shifted; None starts at rest.
+        generator: its draws are shared by all robots, so that a robot's plan does not
+            depend on which others it is planned with.
+        remaining: seconds until an answer is due. The search stops where a further iteration,
+            were it as slow as the slowest so far, would end later; one is always made.
+    """
+    pace = Pace(remaining)
+    belief = _start(executed, config, warm)
+    worth = judge.at(carry)
+    start = executed[:, None]  # (E, 1, 7)
+    for iteration in range(config.iterations):
+        deltas = optimiser.propose(belief, iteration, generator)  # (E, M, N, 7)
+        values = worth(walk(start, deltas, config.eta), generator)
+        values = values.masked_fill(~values.isfinite(), -torch.inf)
+        belief = optimiser.learn(belief, deltas, values)
+        if not pace.goes_on():
+            break
+    best = walk(start.expand(-1, belief.elites.shape[1], -1), belief.elites, config.eta)
+    chosen = walk(executed, belief.mean, config.eta)
+    return Plan(chosen, belief.mean, belief.value, best, belief.values, iteration + 1)
+
+
+def _start(executed: Tensor, config: PlannerConfig, warm: Tensor | None) -> Belief:
+    robots = executed.shape[0]
+    shape = (robots, config.horizon, spec.ACTION_DIM)
+    mean = executed.new_zeros(shape) if warm is None else warm
+    nothing = executed.new_full((robots, config.elites), -torch.inf)
+    elites = mean[:, None].expand(-1, config.elites, -1, -1)
+    std = torch.full_like(mean, 3.0**-0.5)  # of U(-1, 1)
+    return Belief(mean, std, elites, nothing, nothing[:, 0])
+
+
+def draw(mean: Tensor, std: Tensor, noise: Tensor, still: bool = True) -> Tensor:
+    """(E, M, N, 7) deltas around a mean, from noise (1, M, N, 7).
+
+    The first candidate is the mean itself; the second, if ``still``, stands still.
+    """
+    deltas = mean[:, None] + std[:, None] * noise
+    deltas[:, 0] = mean
+    if still and deltas.shape[1] > 1:
+        deltas[:, 1] = 0.0
+    return deltas.clamp_(-1.0, 1.0)
+
+
+def white(mean: Tensor, samples: int, generator: torch.Generator) -> Tensor:
+    """Noise (1, M, N, 7) that all robots share."""
+    return torch.randn((1, samples, *mean.shape[1:]), generator=generator, device=mean.device)
+
+
+def best_of(deltas: Tensor, values: Tensor, count: int) -> tuple[Tensor, Tensor]:
+    """The ``count`` best of (E, M, N, 7) by their values (E, M), best first."""
+    top, index = values.topk(count, dim=1)
+    return deltas.take_along_dim(index[:, :, None, None], 1), top

@@ -1,0 +1,247 @@
+"""Every backend says what the world model itself says, as well as its numbers allow."""
+
+import dataclasses
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.model import PRESETS, Carry, WorldModel
+from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
+from egovcp.plan.backends import judge_of_model, library
+from egovcp.plan.backends.judges import FloatJudge, IntegerJudge
+from egovcp.plan.config import BackendName
+from egovcp.plan.process import walk
+from egovcp.testing import CountingModel, toy_model
+
+needs_compiler = pytest.mark.skipif(library.compiler() is None, reason="no C compiler")
+EXACT, BYTES = 1e-5, 0.1  # largest error, in deviations of J
+TOLERANCES = [
+    ("float32", EXACT),
+    ("bfloat16", BYTES),
+    pytest.param("int8", BYTES, marks=needs_compiler),
+]
+MODELS = [
+    {},
+    {"value_state": 0},
+    {"value_of_passing": False},
+    {"q_heads": 3},
+    {"value_loss": "two_hot"},
+    {"hidden": 48, "units": 64, "latent": 12},
+]
+QUESTIONS = [
+    {},
+    {"latent": "sample"},
+    {"ensemble": "min"},
+    {"termination_rule": "survival"},
+    {"termination_rule": "paper"},
+]
+
+
+def _model(**change: object) -> WorldModel:
+    model = toy_model(dataclasses.replace(PRESETS["debug"], **change))  # type: ignore[arg-type]
+    model.return_mean.fill_(0.3)
+    model.return_std.fill_(2.0)
+    model.return_floor.fill_(-4.0)
+    return model
+
+
+def _carry(model: WorldModel, robots: int = 3, seed: int = 0) -> Carry:
+    rng = torch.Generator().manual_seed(seed)
+    h = 2 * torch.rand(robots, model.config.hidden, generator=rng) - 1
+    return Carry(h, torch.randn(robots, model.config.latent, generator=rng))
+
+
+def _actions(robots: int = 3, plans: int = 65, horizon: int = 4, seed: int = 1) -> Tensor:
+    rng = torch.Generator().manual_seed(seed)
+    deltas = 2 * torch.rand(robots, plans, horizon, spec.ACTION_DIM, generator=rng) - 1
+    return walk(torch.zeros(robots, 1, spec.ACTION_DIM), deltas, spec.ACTION_ETA)
+
+
+def _values(model: WorldModel, config: PlannerConfig, carry: Carry, actions: Tensor) -> Tensor:
+    generator = torch.Generator().manual_seed(2)
+    with torch.no_grad():
+        return judge_of_model(model, config).at(carry)(actions, generator)
+
+
+def _plan(model: WorldModel, backend: BackendName, carry: Carry) -> Plan:
+    config = PlannerConfig(samples=256, elites=32, backend=backend)
+    executed = torch.zeros(len(carry.h), spec.ACTION_DIM)
+    generator = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        judge = judge_of_model(model, config)
+        return make_plan(judge, optimiser_of(config), carry, executed, config, generator)
+
+
+@pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
+@pytest.mark.parametrize("change", MODELS, ids=str)
+@pytest.mark.parametrize("question", QUESTIONS, ids=str)
+def test_plans_are_worth_the_same(
+    backend: BackendName, tolerance: float, change: dict[str, object], question: dict[str, str]
+) -> None:
+    model = _model(**change)
+    carry, actions = _carry(model), _actions()
+    eager = PlannerConfig(backend="eager", **question)  # type: ignore[arg-type]
+    expected = _values(model, eager, carry, actions)
+    found = _values(model, dataclasses.replace(eager, backend=backend), carry, actions)
+    error = (found - expected).abs()
+    if tolerance > EXACT:  # a candidate at the threshold may end on its other side
+        error = error.flatten().sort().values[: int(0.97 * error.numel())]
+    assert error.max() < tolerance * expected.std()
+
+
+@pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
+@pytest.mark.parametrize("horizon", [1, 2, 7])
+def test_any_horizon(backend: BackendName, tolerance: float, horizon: int) -> None:
+    model = _model()
+    carry, actions = _carry(model), _actions(horizon=horizon)
+    rule = PlannerConfig(backend="eager", termination_rule="survival")
+    expected = _values(model, rule, carry, actions)
+    found = _values(model, dataclasses.replace(rule, backend=backend), carry, actions)
+    assert (found - expected).abs().max() < tolerance * expected.std()
+
+
+@pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
+def test_the_same_action_is_chosen(backend: BackendName, tolerance: float) -> None:
+    """Within a tenth of a step, and as good as the reference's in the reference's own eyes."""
+    model = _model()
+    carry = _carry(model, robots=8)
+    expected, found = _plan(model, "eager", carry), _plan(model, backend, carry)
+    moved = (found.actions[:, 0] - expected.actions[:, 0]).abs()
+    assert moved.mean() < 0.1 * spec.ACTION_ETA
+    config = PlannerConfig(backend="eager")
+    worth = [_values(model, config, carry, p.actions[:, None])[:, 0] for p in (expected, found)]
+    spread = _values(model, config, carry, _actions(8)).std(1)
+    assert ((worth[0] - worth[1]) / spread).mean() < tolerance
+
+
+@pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
+def test_a_robot_is_judged_the_same_alone_and_in_a_crowd(
+    backend: BackendName, tolerance: float
+) -> None:
+    model = _model()
+    carry, actions, config = _carry(model), _actions(), PlannerConfig(backend=backend)
+    together = _values(model, config, carry, actions)
+    for e in range(3):
+        row = Carry(carry.h[e : e + 1], carry.z[e : e + 1])
+        alone = _values(model, config, row, actions[e : e + 1])
+        allowed = 0.0 if backend == "int8" else EXACT if backend == "float32" else BYTES
+        assert (together[e] - alone[0]).abs().max() <= allowed * together.std()
+
+
+@needs_compiler
+@pytest.mark.parametrize("threads", [2, 3])
+def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    model, config = _model(), PlannerConfig(backend="int8")
+    carry, actions = _carry(model), _actions()
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 1)
+    one = _values(model, config, carry, actions)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
+    assert torch.equal(one, _values(model, config, carry, actions))
+
+
+@pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
+def test_what_is_not_a_number_stays_so_and_harms_nobody_else(
+    backend: BackendName, tolerance: float
+) -> None:
+    model, config = _model(), PlannerConfig(backend=backend)
+    carry, actions = _carry(model), _actions()
+    sound = _values(model, config, carry, actions)
+    carry.h[1, 0] = torch.nan
+    actions[2, 5, 3, 0] = torch.nan
+    found = _values(model, config, carry, actions)
+    lost = torch.zeros_like(found, dtype=torch.bool)
+    lost[1], lost[2, 5] = True, True
+    assert found.isnan().equal(lost)
+    torch.testing.assert_close(found[~lost], sound[~lost], rtol=1e-3, atol=1e-3)
+
+
+@needs_compiler
+def test_the_kernel_says_the_same_where_there_are_no_wide_vectors(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    model, config = _model(), PlannerConfig(backend="int8")
+    carry, actions = _carry(model), _actions()
+    here = _values(model, config, carry, actions)
+    plain = tuple(flag for flag in library.FLAGS if not flag.startswith("-m"))
+    monkeypatch.setattr(library, "FLAGS", plain)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    library.library.cache_clear()
+    try:
+        elsewhere = _values(model, config, carry, actions)
+        assert len(list(tmp_path.rglob("*.so"))) == 1
+    finally:
+        library.library.cache_clear()
+    error = (here - elsewhere).abs().flatten().sort().values
+    assert error[: int(0.97 * len(error))].max() < 0.02 * here.std()
+
+
+def test_without_a_compiler_auto_takes_float32_and_int8_says_what_to_do(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(library, "compiler", lambda: None)
+    monkeypatch.setattr(library, "processor_is_fast", lambda: True)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    library.library.cache_clear()
+    assert isinstance(judge_of_model(toy_model(), PlannerConfig(backend="auto")), FloatJudge)
+    with pytest.raises(EnvironmentFailure, match=r"compiler.*--planner\.backend=float32"):
+        judge_of_model(toy_model(), PlannerConfig(backend="int8"))
+
+
+@needs_compiler
+def test_a_compiler_that_fails_is_quoted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(library, "FLAGS", ("--no-such-flag",))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    library.library.cache_clear()
+    with pytest.raises(EnvironmentFailure, match="no-such-flag"):
+        judge_of_model(toy_model(), PlannerConfig(backend="int8"))
+    assert not list(tmp_path.rglob("*.so"))
+
+
+@needs_compiler
+def test_odd_sizes_are_refused_by_int8_and_left_to_float32_by_auto() -> None:
+    model = _model(units=20)
+    with pytest.raises(UsageError, match=r"20 units.*float32"):
+        judge_of_model(model, PlannerConfig(backend="int8"))
+    assert isinstance(judge_of_model(model, PlannerConfig(backend="auto")), FloatJudge)
+
+
+@needs_compiler
+def test_auto_takes_int8_where_the_processor_is_made_for_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    for fast, kind in ((True, IntegerJudge), (False, FloatJudge)):
+        monkeypatch.setattr(library, "processor_is_fast", lambda fast=fast: fast)
+        assert isinstance(judge_of_model(toy_model(), PlannerConfig()), kind)
+
+
+def test_a_model_that_thinks_for_itself_is_asked_step_by_step() -> None:
+    assert isinstance(judge_of_model(CountingModel(), PlannerConfig()), StepByStep)
+
+
+@pytest.mark.slow
+def test_torch_compile_says_the_same() -> None:
+    model = _model()
+    carry, actions = _carry(model), _actions()
+    eager, compiled = (
+        _values(model, PlannerConfig(backend=name), carry, actions)  # type: ignore[arg-type]
+        for name in ("eager", "compile")
+    )
+    torch.testing.assert_close(compiled, eager, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize(("backend", "tolerance"), [("float32", 1e-3), ("bfloat16", BYTES)])
+def test_the_same_on_a_gpu(backend: BackendName, tolerance: float) -> None:
+    model = _model()
+    carry, actions = _carry(model), _actions()
+    expected = _values(model, PlannerConfig(backend="eager"), carry, actions)
+    there = Carry(carry.h.cuda(), carry.z.cuda())
+    with torch.no_grad():
+        judge = judge_of_model(model.cuda(), PlannerConfig(backend=backend))
+        found = judge.at(there)(actions.cuda(), None).cpu()
+    assert (found - expected).abs().median() < tolerance * expected.std()

@@ -1,0 +1,188 @@
+"""What every search must do, whatever its name."""
+
+import dataclasses
+import itertools
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.errors import UsageError
+from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
+from egovcp.plan.config import OptimiserName
+from egovcp.plan.icem import coloured
+from egovcp.plan.mppi import weights
+from egovcp.plan.objective import evaluate
+from egovcp.plan.optimisers import OPTIMISERS
+from egovcp.plan.search import Belief
+from egovcp.testing import Point, PointWorld
+
+ETA = spec.ACTION_ETA
+every = pytest.mark.parametrize("name", list(OPTIMISERS))
+
+
+def _plan(
+    name: OptimiserName,
+    executed: Tensor,
+    goal: Tensor,
+    warm: Tensor | None = None,
+    world: PointWorld | None = None,
+    seed: int = 0,
+    **change: object,
+) -> Plan:
+    settings = {"samples": 256, "elites": 32, "iterations": 4, **change}
+    config = PlannerConfig(optimiser=name, **settings)  # type: ignore[arg-type]
+    world = world or PointWorld()
+    judge, carry = StepByStep(world, config), world.start(executed, goal)
+    generator = torch.Generator().manual_seed(seed)
+    return make_plan(judge, optimiser_of(config), carry, executed, config, generator, warm)
+
+
+def _random(rows: int, seed: int, scale: float = 1.0) -> Tensor:
+    rng = torch.Generator().manual_seed(seed)
+    return scale * (2 * torch.rand(rows, spec.ACTION_DIM, generator=rng) - 1)
+
+
+def _worth(executed: Tensor, goal: Tensor, actions: Tensor) -> Tensor:
+    return evaluate(PointWorld(), Point(executed, goal), actions[:, None], PlannerConfig())[:, 0]
+
+
+@every
+def test_a_quadratics_optimum_is_found(name: OptimiserName) -> None:
+    """Better than all but the best of what chance finds; the refining searches come close."""
+    executed = _random(4, 0, scale=0.4)
+    goal = executed + 0.15
+    plan = _plan(name, executed, goal, samples=1024, elites=64, iterations=8)
+    ideal = _worth(executed, goal, goal[:, None].expand(-1, 4, -1))
+    still = _worth(executed, goal, executed[:, None].expand(-1, 4, -1))
+    regret = (ideal - _worth(executed, goal, plan.actions)) / (ideal - still)
+    assert (regret >= -1e-6).all()
+    assert regret.max() < (0.9 if name == "shooting" else 0.1)
+
+
+@every
+def test_a_robots_plan_does_not_depend_on_the_others(name: OptimiserName) -> None:
+    executed, goal = _random(4, 1), _random(4, 2)
+    together = _plan(name, executed, goal)
+    for e in range(4):
+        alone = _plan(name, executed[e : e + 1], goal[e : e + 1])
+        for field in ("actions", "deltas", "value", "candidates", "candidate_values"):
+            torch.testing.assert_close(
+                getattr(together, field)[e : e + 1], getattr(alone, field), rtol=0, atol=1e-5
+            )
+
+
+@every
+def test_a_seed_repeats_a_plan_and_another_gives_another(name: OptimiserName) -> None:
+    executed, goal = _random(2, 3), _random(2, 4)
+    assert torch.equal(_plan(name, executed, goal).actions, _plan(name, executed, goal).actions)
+    other = _plan(name, executed, goal, seed=1)
+    assert not torch.equal(_plan(name, executed, goal).actions, other.actions)
+
+
+@every
+def test_the_first_candidate_is_the_warm_start(name: OptimiserName) -> None:
+    config = PlannerConfig(samples=16, elites=4, optimiser=name)
+    warm = torch.full((2, 4, 7), 0.3)
+    nothing = torch.full((2, 4), -math.inf)
+    belief = Belief(warm, warm.abs(), warm[:, None].expand(-1, 4, -1, -1), nothing, nothing[:, 0])
+    first = optimiser_of(config).propose(belief, 0, torch.Generator().manual_seed(0))
+    assert first.shape == (2, 16, 4, 7)
+    assert torch.equal(first[:, 0], warm)
+    assert not first[:, 1].any()
+    assert first.abs().max() <= 1
+
+
+@every
+def test_replanning_keeps_a_good_plan(name: OptimiserName) -> None:
+    executed, goal = _random(4, 5), _random(4, 6)
+    good = _plan("cem", executed, goal, iterations=8)
+    again = _plan(name, executed, goal, good.deltas, samples=8, elites=1, iterations=1)
+    assert (again.candidate_values[:, 0] >= _worth(executed, goal, good.actions) - 1e-6).all()
+
+
+@every
+def test_actions_stay_in_the_box_and_steps_within_eta(name: OptimiserName) -> None:
+    executed, goal = _random(8, 7).sign() * 0.99, 3.0 * _random(8, 8).sign()
+    plan = _plan(name, executed, goal)
+    for actions in (plan.actions[:, None], plan.candidates):
+        assert actions.abs().max() <= 1
+        start = executed[:, None, None].expand(-1, actions.shape[1], 1, -1)
+        assert (actions - torch.cat([start, actions[:, :, :-1]], 2)).abs().max() <= ETA + 1e-6
+
+
+class _Broken(PointWorld):
+    """Q is not a number wherever the first coordinate is positive."""
+
+    def value(self, carry: Point, action: Tensor) -> Tensor:
+        return super().value(carry, action).masked_fill(action[..., 0] > 0, math.nan)
+
+
+@every
+def test_plans_without_a_finite_value_never_win(name: OptimiserName) -> None:
+    plan = _plan(name, torch.zeros(1, 7), torch.full((1, 7), 0.5), world=_Broken())
+    assert (plan.actions[..., 0] <= 1e-6).all()
+    assert plan.value.isfinite().all()
+
+
+@every
+def test_without_any_finite_value_the_plan_goes_on_as_before_and_says_so(
+    name: OptimiserName,
+) -> None:
+    class Nan(PointWorld):
+        def value(self, carry: Point, action: Tensor) -> Tensor:
+            return torch.full(action.shape[:-1], math.nan)
+
+    warm = torch.full((2, 4, 7), 0.25)
+    plan = _plan(name, torch.zeros(2, 7), torch.ones(2, 7), warm, Nan())
+    torch.testing.assert_close(plan.deltas, warm)
+    assert (plan.value == -math.inf).all()
+
+
+@pytest.mark.parametrize("name", ["icem", "shooting"])
+def test_searches_that_keep_the_best_never_lose_it(name: OptimiserName) -> None:
+    executed, goal = _random(4, 9), _random(4, 10)
+    values = [_plan(name, executed, goal, iterations=n).value for n in (1, 2, 4, 8)]
+    for before, after in itertools.pairwise(values):
+        assert (after >= before).all()
+
+
+def test_icem_draws_fewer_each_round_and_its_elites_again() -> None:
+    config = PlannerConfig(samples=100, elites=10, optimiser="icem", kept_elites=0.3)
+    elites = torch.rand(1, 10, 4, 7)
+    values = torch.arange(10.0, 0.0, -1.0)[None]
+    belief = Belief(elites[:, 0], torch.ones(1, 4, 7), elites, values, values[:, 0])
+    search, rng = optimiser_of(config), torch.Generator().manual_seed(0)
+    counts = [search.propose(belief, n, rng).shape[1] for n in range(4)]
+    assert counts[0] == 100
+    assert counts[1] == 80 + 3
+    assert counts[1] > counts[2] > counts[3]
+    assert torch.equal(search.propose(belief, 1, rng)[:, :3], elites[:, :3])
+
+
+@pytest.mark.parametrize("exponent", [0.0, 2.0])
+def test_coloured_noise_has_unit_variance_and_its_colour(exponent: float) -> None:
+    rng = torch.Generator().manual_seed(0)
+    noise = coloured(torch.zeros(1, 8, 7), 4000, exponent, rng)[0]  # (M, N, 7)
+    assert noise.std(0).sub(1).abs().max() < 0.05
+    alike = (noise[:, 1:] * noise[:, :-1]).mean()
+    assert (alike > 0.5) if exponent else (alike.abs() < 0.02)
+
+
+def test_mppi_weighs_by_value_whatever_the_unit() -> None:
+    values = torch.tensor([[1.0, 2.0, 3.0, -math.inf], [-math.inf] * 4])
+    one, thousand = weights(values, 0.5), weights(1000 * values, 0.5)
+    torch.testing.assert_close(one, thousand)
+    assert one[0].sum().item() == pytest.approx(1)
+    assert one[0, 2] > one[0, 1] > one[0, 0] > one[0, 3] == 0
+    assert not one[1].any()
+
+
+@pytest.mark.parametrize(
+    "change", [{"temperature": 0.0}, {"kept_elites": 1.1}, {"sample_decay": 0.9}]
+)
+def test_senseless_settings_are_refused(change: dict[str, float]) -> None:
+    with pytest.raises(UsageError):
+        dataclasses.replace(PlannerConfig(), **change)
