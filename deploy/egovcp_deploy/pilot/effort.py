@@ -1,4 +1,4 @@
-"""How many candidates to weigh when planning is too slow: half after three late plans."""
+"""How many candidates to weigh when planning is too slow: half, once plans are often late."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Final
 
 from egovcp.plan import PlannerConfig
 
-LATE_TO_HALVE: Final = 3  # late plans in a row
+LATE_TO_HALVE: Final = 3  # late plans; two that are in time make up for one
+_MADE_UP: Final = 0.5
 IN_TIME_TO_DOUBLE: Final = 50  # plans in time in a row, 2 s
 FEWEST_SAMPLES: Final = 64
 
@@ -23,11 +24,11 @@ class Effort:
         self._full = full
         self.config = full
         """What to plan with now."""
-        self._late = self._in_time = 0
+        self._late, self._in_time = 0.0, 0
 
     def record(self, late: bool) -> bool:
         """Count one plan; true if `config` has changed."""
-        self._late = self._late + 1 if late else 0
+        self._late = self._late + 1 if late else max(0.0, self._late - _MADE_UP)
         self._in_time = 0 if late else self._in_time + 1
         if self._late >= LATE_TO_HALVE:
             return self._scale(self.config.samples // 2)
@@ -36,7 +37,7 @@ class Effort:
         return False
 
     def _scale(self, samples: int) -> bool:
-        self._late = self._in_time = 0
+        self._late, self._in_time = 0.0, 0
         fewest = min(FEWEST_SAMPLES, self._full.samples)
         samples = min(max(samples, fewest), self._full.samples)
         changed = samples != self.config.samples

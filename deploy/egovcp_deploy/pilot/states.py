@@ -184,8 +184,11 @@ class Supervisor:
             self._recover(facts)
 
     def _recover(self, facts: Facts) -> None:
-        """Back to RUN once all has been well for a while: no flicker between the two."""
-        if facts.misses > 0:
+        """Back to RUN once all has been well for a while: no flicker between the two.
+
+        A single late plan is bridged by the one before and counts as well.
+        """
+        if facts.misses > 1:
             self._well_since_ns = None
             return
         if self._well_since_ns is None:

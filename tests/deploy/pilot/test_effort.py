@@ -6,13 +6,24 @@ from egovcp.plan import PlannerConfig
 from egovcp_deploy.pilot.effort import IN_TIME_TO_DOUBLE, LATE_TO_HALVE, Effort
 
 
-def test_three_late_plans_in_a_row_halve_the_samples() -> None:
+def test_a_plan_that_is_late_now_and_then_changes_nothing() -> None:
     effort = Effort(PlannerConfig(samples=1024, elites=64))
-    for _ in range(10):
-        effort.record(late=True)
+    for _ in range(50):
         effort.record(late=True)
         effort.record(late=False)
+        effort.record(late=False)
     assert effort.config.samples == 1024
+
+
+def test_every_second_plan_late_is_too_often() -> None:
+    effort = Effort(PlannerConfig(samples=1024, elites=64))
+    changed = [effort.record(late=k % 2 == 0) for k in range(20)]
+    assert any(changed)
+    assert effort.config.samples < 1024
+
+
+def test_three_late_plans_in_a_row_halve_the_samples() -> None:
+    effort = Effort(PlannerConfig(samples=1024, elites=64))
     changed = [effort.record(late=True) for _ in range(LATE_TO_HALVE)]
     assert changed == [False, False, True]
     assert (effort.config.samples, effort.config.elites) == (512, 32)
