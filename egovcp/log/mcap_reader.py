@@ -44,7 +44,9 @@ _TORN: Final = (
     zstandard.ZstdError,
 )
 #: What a row of a dataset needs of a tick.
-ROW_TOPICS: Final = frozenset({Topic.DEPTH, Topic.STATE, Topic.ACTION, Topic.REWARD})
+ROW_TOPICS: Final = frozenset(
+    {Topic.DEPTH, Topic.STATE, Topic.ACTION, Topic.REWARD, Topic.MODE, Topic.LOG}
+)
 
 
 @dataclass(frozen=True)

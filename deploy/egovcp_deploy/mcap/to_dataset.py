@@ -14,6 +14,7 @@ from egovcp.errors import DataError, EnvironmentFailure, UsageError
 from egovcp.log.info import RunInfo
 from egovcp.log.mcap_reader import ROW_TOPICS, RecordingReader
 from egovcp.log.tick import Tick
+from egovcp_deploy.pilot.states import State
 
 if TYPE_CHECKING:
     from egovcp.data import Episode, Provenance
@@ -114,7 +115,7 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
 
     reader = RecordingReader(path)
     try:
-        ticks = _until_over(moment.tick(ROW_TOPICS) for moment in reader.moments())
+        ticks = _until_over(_driven(moment.tick(ROW_TOPICS) for moment in reader.moments()))
         whole, why = _before_gap(ticks)
         if why and gaps == "refuse":
             raise DataError(
@@ -129,6 +130,19 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
     return episode, cut if reader.complete else f"{cut}; the file is torn there"
 
 
+def _driven(ticks: Iterator[Tick]) -> Iterator[Tick]:
+    """The ticks from the planner's first to its last; before, a robot on the wall clock stands
+    up, and after it is damped. A recording that knows no states is taken as it is."""
+    begun = False
+    for tick in ticks:
+        if tick.mode in ("", State.RUN):
+            begun = True
+        elif begun and tick.mode != State.HOLD:
+            return
+        if begun:
+            yield tick
+
+
 def _until_over(ticks: Iterator[Tick]) -> list[Tick]:
     """The ticks up to the one that ends the episode; the robot may have been recorded longer."""
     kept = []
@@ -139,12 +153,17 @@ def _until_over(ticks: Iterator[Tick]) -> list[Tick]:
     return kept
 
 
+def _is_first(tick: Tick) -> bool:
+    """Whether the planner took over at ``tick``."""
+    return tick.index == 0 or any(f"-> {State.RUN}" in event for event in tick.events)
+
+
 def _before_gap(ticks: Sequence[Tick]) -> tuple[list[Tick], str]:
     """The ticks before the first gap, and where that is; empty if there is none."""
     from egovcp.rollouts import follows
 
-    if ticks and ticks[0].index != 0:
-        return [], f"its first {ticks[0].index} ticks are missing"
+    if ticks and not _is_first(ticks[0]):
+        return [], "its first ticks are missing"
     for i in range(1, len(ticks)):
         before, tick = ticks[i - 1], ticks[i]
         if not follows(before, tick):

@@ -12,6 +12,7 @@ import pytest
 
 from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetReader, open_dataset
+from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import Tick
 from egovcp.rollouts import CONTROLLER
 from egovcp_deploy.mcap.cli import main
@@ -134,3 +135,29 @@ def test_it_trains(record: Record, tmp_path: Path) -> None:
     flags += ["--returns.steps=4", "--sampling.length=6"]
     assert train([f"--dataset.root={tmp_path / 'new'}", *flags]) == 0
     assert (tmp_path / "run/checkpoints/last/pretrained_model/model.safetensors").is_file()
+
+
+def live(tick: Tick) -> Tick:
+    modes = ["init", "stand", "armed", "run", "hold", "run", "damp", "damp"]
+    events = ("armed -> run: the operator asked for it",) if tick.index == 3 else ()
+    return replace(tick, mode=modes[tick.index], events=events)
+
+
+def test_of_a_run_on_the_wall_clock_the_part_that_the_planner_drove(
+    record: Record, tmp_path: Path
+) -> None:
+    path = record(keep=live)
+    assert main(["to-dataset", str(path), f"--dataset.root={tmp_path / 'out'}"]) == 0
+    episode = open_dataset(tmp_path / "out").read(0)
+    ticks = read_recording(path).ticks[3:6]
+    np.testing.assert_array_equal(episode.action, [tick.action_sent for tick in ticks])
+    assert episode.truncated.tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("missing", [(0, 1), (2, 3)])
+def test_a_run_whose_beginning_is_missing_is_refused(
+    missing: tuple[int, ...], record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = record(missing=missing, keep=live if 3 in missing else lambda tick: tick)
+    assert main(["to-dataset", str(path), f"--dataset.root={tmp_path / 'out'}"]) == 3
+    assert "its first ticks are missing" in capsys.readouterr().err

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egovcp.log.tick import BasePose, Candidates, SceneObject, Tick, ValueMap
+from egovcp.log.tick import MODES, BasePose, Candidates, SceneObject, Tick, ValueMap
 from egovcp.spec import STATE_DIM, STATE_SLICES
 
 MakeTick = Callable[..., Tick]
@@ -65,6 +65,7 @@ def _rest(index: int, rng: np.random.Generator) -> dict[str, object]:
             SceneObject("ball", "sphere", ball, (1.0, 0.0, 0.0, 0.0), (0.1, 0.1, 0.1)),
             SceneObject("wall", "box", (0.9, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), (0.05, 2.0, 1.0)),
         ),
+        "mode": MODES[index % len(MODES)],
         "events": ("ball thrown", "second line") if index == 1 else (),
     }
 
