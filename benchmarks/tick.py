@@ -10,10 +10,14 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 
 from report import parser, publish
+from tick_filter import filter_figures
 from tick_logging import logging_figures
 
 #: Part of a tick -> its figures, from the number of seconds to measure each case for.
-PARTS: Mapping[str, Callable[[int], dict[str, object]]] = {"logging": logging_figures}
+PARTS: Mapping[str, Callable[[int], dict[str, object]]] = {
+    "filter": filter_figures,
+    "logging": logging_figures,
+}
 
 
 def main() -> None:

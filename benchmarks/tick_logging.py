@@ -90,9 +90,9 @@ def logging_figures(rounds: int) -> dict[str, object]:
         spent = _measure(cases, rounds)
     figures: dict[str, object] = {"seconds_per_case": rounds}
     for name, times in spent.items():
-        figures |= _percentiles(f"tick_{name}", times.tick)
-        figures |= _percentiles(f"write_{name}", times.write)
-        figures |= _percentiles(f"write_{name}_cpu", times.write_cpu)
+        figures |= percentiles(f"tick_{name}", times.tick)
+        figures |= percentiles(f"write_{name}", times.write)
+        figures |= percentiles(f"write_{name}_cpu", times.write_cpu)
     for name in spent:
         if name != "none":
             base, own = spent["none"].tick, spent[name].tick
@@ -103,7 +103,8 @@ def logging_figures(rounds: int) -> dict[str, object]:
     return figures
 
 
-def _percentiles(name: str, seconds: list[float]) -> dict[str, object]:
+def percentiles(name: str, seconds: list[float]) -> dict[str, object]:
+    """p50 and p99 in ms."""
     return {f"{name}_ms_p{q}": float(1e3 * np.percentile(seconds, q)) for q in (50, 99)}
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from egovcp.artefact import Artefact
-from egovcp.log.background import BackgroundSink
+from egovcp.log.background import BackgroundFanout, BackgroundSink
 from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.live import LiveRerun
 from egovcp.log.mcap import McapSink
@@ -32,46 +32,50 @@ class LogOptions:
 
 @contextmanager
 def recording(
-    folder: Path, episode: int, info: RunInfo, options: LogOptions, lossless: bool
+    folder: Path, episode: int, info: RunInfo, options: LogOptions, waits: bool
 ) -> Iterator[Sink]:
-    """Sinks of one rollout, each in a process of its own; the first rollout leaves a picture too.
+    """Sinks of one rollout; the first rollout leaves a picture too.
 
     Args:
         folder: where the files go.
         episode: number of the rollout.
         info: the first record.
         options: which logs.
-        lossless: rather wait than drop ticks, as simulated time may.
+        waits: whether the loop may wait for the disk, as simulated time may. On the wall clock
+            each sink has a process of its own. A viewer always has: it may die or hang.
     """
     with ExitStack() as stack:
-        sinks = [
-            BackgroundSink(sink, name, lossless=lossless)
-            for name, sink in _sinks(folder / f"rollout-{episode}", episode, options, stack)
-        ]
-        for background in sinks:
-            background.start()
-        sink = stack.enter_context(Fanout(sinks))
+        files = _files(folder / f"rollout-{episode}", episode, options)
+        viewers = list(_viewers(options, stack))
+        sink: Sink
+        if waits:
+            sink = stack.enter_context(Fanout([*files.values(), *viewers]))
+        else:
+            writers = [BackgroundSink(file, name) for name, file in files.items()]
+            sink = stack.enter_context(BackgroundFanout([*writers, *viewers]))
         sink.open(info)
         yield sink
 
 
-def _sinks(
-    stem: Path, episode: int, options: LogOptions, stack: ExitStack
-) -> Iterator[tuple[str, Sink]]:
-    """Name and sink."""
+def _files(stem: Path, episode: int, options: LogOptions) -> dict[str, Sink]:
+    """File name -> what writes it."""
     mcap, rrd, png = (stem.with_suffix(suffix) for suffix in (".mcap", ".rrd", ".png"))
-    yield mcap.name, McapSink(mcap)
+    sinks: dict[str, Sink] = {mcap.name: McapSink(mcap)}
     if options.rrd:
-        yield rrd.name, RerunSink(rrd)
+        sinks[rrd.name] = RerunSink(rrd)
     if episode == 0 and importlib.util.find_spec("matplotlib") is not None:
         from egovcp.log.picture import PictureSink
 
-        yield png.name, PictureSink(png)
+        sinks[png.name] = PictureSink(png)
+    return sinks
+
+
+def _viewers(options: LogOptions, stack: ExitStack) -> Iterator[BackgroundSink]:
     if options.live:
         live = stack.enter_context(LiveRerun.of(options.live))
         if live.page:
             print(f"look at it: {live.page}")
-        yield "Rerun", RerunSink(live.viewer)
+        yield BackgroundSink(RerunSink(live.viewer), "Rerun")
 
 
 def run_info(

@@ -97,7 +97,7 @@ def _play(
             for episode in range(config.episodes):
                 robot.start(episode)
                 info = _info(config, artefact, robot, episode)
-                with recording(folder, episode, info, config.log, lossless=True) as sink:
+                with recording(folder, episode, info, config.log, waits=True) as sink:
                     summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))
                 bar.update(1)
     finally:

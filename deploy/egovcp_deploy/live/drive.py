@@ -91,7 +91,7 @@ def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetu
     thinker.warm_up()
     with (
         operator(options.type, options.velocity, options.duration) as who,
-        recording(folder, 0, info, config.log, lossless=False) as sink,
+        recording(folder, 0, info, config.log, waits=False) as sink,
         tqdm(unit="tick", desc="live") as bar,
     ):
         summary = run_live(setup, thinker, who, sink, lambda tick: _show(bar, tick))
