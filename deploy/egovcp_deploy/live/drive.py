@@ -20,8 +20,8 @@ from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import CAMERAS, HardwareOptions, open_eye
 from egovcp_deploy.live.operators import OPERATORS, operator
+from egovcp_deploy.live.planner import LiveSummary
 from egovcp_deploy.live.run import LiveSetup, run_live
-from egovcp_deploy.live.session import LiveSummary
 from egovcp_deploy.live.simulated import simulated
 from egovcp_deploy.options import check_choice, make_output_dir, versions, write_json
 from egovcp_deploy.pilot.desk import Thinker

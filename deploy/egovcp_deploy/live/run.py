@@ -20,8 +20,8 @@ from egovcp_deploy.live.guard import Guard
 from egovcp_deploy.live.hardware import HardwareOptions
 from egovcp_deploy.live.link import Link
 from egovcp_deploy.live.operators import Operator
+from egovcp_deploy.live.planner import LiveSummary, PlannerLoop
 from egovcp_deploy.live.process import ControlSetup, control_process
-from egovcp_deploy.live.session import LiveSummary, Session
 from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.robots.bridge import BridgeBody
@@ -61,12 +61,12 @@ def run_live(
         spare.connect()
         stack.callback(spare.close)
         process = stack.enter_context(started(setup, address))
-        session = Session(
+        planner = PlannerLoop(
             thinker, link, operator, sink, MonotonicClock(), process.is_alive, setup.stays
         )
-        guard = Guard(process, spare, lambda: session.quitting)
-        summary = session.run(on_tick)
-        _end(process, session)
+        guard = Guard(process, spare, lambda: planner.quitting)
+        summary = planner.run(on_tick)
+        _end(process, planner)
         guard.join()
         _explain(process, guard, summary)
         return summary
@@ -92,10 +92,10 @@ def started(setup: LiveSetup, address: str) -> Iterator[BaseProcess]:
             process.join()
 
 
-def _end(process: BaseProcess, session: Session) -> None:
+def _end(process: BaseProcess, planner: PlannerLoop) -> None:
     """Wait for the control process; one that does not end is made to."""
-    if not session.quitting and process.is_alive():
-        session.quitting = True  # it never came up: nobody needs to guard it
+    if not planner.quitting and process.is_alive():
+        planner.quitting = True  # it never came up: nobody needs to guard it
         process.terminate()
     process.join(_END_S)
     if process.is_alive():

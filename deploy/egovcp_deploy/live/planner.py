@@ -68,7 +68,7 @@ class Interrupts:
         self.count += 1
 
 
-class Session:
+class PlannerLoop:
     """One run.
 
     Args:
