@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any, Final
 
 import draccus
 import numpy as np
+import torch
 from tqdm import tqdm
 
 from egovcp.artefact import Artefact
@@ -87,6 +89,7 @@ def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetu
     info = run_info(
         config.task, config.seed, 0, CameraView(), draccus.encode(config), controller_id, artefact
     )
+    _leave_a_core()
     thinker = Thinker(artefact.make_policy(1, config.seed), config.imagine)
     thinker.warm_up()
     with (
@@ -102,6 +105,13 @@ def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetu
             f"the motors were damped: {summary.damped}. The log is in {folder}; "
             "find the cause before the next run"
         )
+
+
+def _leave_a_core() -> None:
+    """Plan on all cores but one, which the control process and the logs need: threads that wait
+    for one that was put aside plan slower than fewer threads."""
+    if "OMP_NUM_THREADS" not in os.environ:
+        torch.set_num_threads(max(1, len(os.sched_getaffinity(0)) - 1))
 
 
 def _show(bar: Any, tick: Tick) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
@@ -115,7 +116,9 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
 
     reader = RecordingReader(path)
     try:
-        ticks = _until_over(_driven(moment.tick(ROW_TOPICS) for moment in reader.moments()))
+        moments = reader.moments()
+        ticks = _until_over(_driven(moment.tick(ROW_TOPICS) for moment in moments))
+        deque(moments, maxlen=0)  # on to the end: is the file whole?
         whole, why = _before_gap(ticks)
         if why and gaps == "refuse":
             raise DataError(

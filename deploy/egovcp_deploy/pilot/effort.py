@@ -7,6 +7,7 @@ from typing import Final
 
 from egovcp.plan import PlannerConfig
 
+BUDGET_S: Final = 0.034  # from an observation to its plan; the rest of the tick carries it over
 LATE_TO_HALVE: Final = 3  # late plans; two that are in time make up for one
 _MADE_UP: Final = 0.5
 IN_TIME_TO_DOUBLE: Final = 50  # plans in time in a row, 2 s

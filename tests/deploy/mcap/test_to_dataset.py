@@ -144,10 +144,11 @@ def live(tick: Tick) -> Tick:
 
 
 def test_of_a_run_on_the_wall_clock_the_part_that_the_planner_drove(
-    record: Record, tmp_path: Path
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = record(keep=live)
     assert main(["to-dataset", str(path), f"--dataset.root={tmp_path / 'out'}"]) == 0
+    assert "torn" not in capsys.readouterr().out
     episode = open_dataset(tmp_path / "out").read(0)
     ticks = read_recording(path).ticks[3:6]
     np.testing.assert_array_equal(episode.action, [tick.action_sent for tick in ticks])
