@@ -58,7 +58,8 @@ class Pilot:
         self._proprioception, self._eye = Freshness(), Freshness()
         self._posture = _UPRIGHT
         self._unanswered: deque[Report] = deque(maxlen=64)
-        self._first = True
+        self._first = True  # the next report starts the recurrence
+        self._began = 0  # tick of that report; plans from before it are of another life
         self._events: list[str] = []
 
     # --- at every control tick -----------------------------------------------------------
@@ -117,6 +118,8 @@ class Pilot:
         """Hand o_t to the planner, and ``events`` with it for its log."""
         mode = self.supervisor.state
         sent = self.sent.copy()
+        if self._first:
+            self._began = self.tick
         report = Report(self.tick, now_ns, depth, state, sent, self._first, mode, events)
         self._first = False
         self._unanswered.append(report)
@@ -129,6 +132,8 @@ class Pilot:
             while self._unanswered and self._unanswered[0].tick <= reply.tick:
                 self._unanswered.popleft()
             self._events += reply.events
+            if self._first or reply.tick < self._began:
+                continue
             if not self._book.offer(reply.tick, _plan(reply)):
                 self._events.append(REJECTED)
             if reply.tick == self.tick:
@@ -144,7 +149,7 @@ class Pilot:
         """a_t (7,), once per tick; the next tick begins."""
         wanted = self._book.decide(self.tick)
         self.misses = self._book.misses
-        if self.supervisor.state is not State.RUN:
+        if self.supervisor.state is not State.RUN or self._first:
             self.sent = self._safety.ease()[0]
         elif wanted is None:
             self.sent = self._safety.repeat()[0]

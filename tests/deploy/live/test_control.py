@@ -68,9 +68,16 @@ def test_it_stands_on_its_own_feet_and_reaches_where_the_planner_says(make_rig: 
     assert_sane(rig.body.commands)
 
 
-def test_the_recurrence_begins_at_run_and_hears_what_was_sent(make_rig: Make) -> None:
-    rig = make_rig()
+@pytest.mark.parametrize("offset", [0.0, 0.02])
+@pytest.mark.parametrize("delay_ms", [10, 30, 90])
+def test_the_recurrence_begins_at_run_and_hears_what_was_sent(
+    make_rig: Make, delay_ms: int, offset: float
+) -> None:
+    slow = [10]
+    rig = make_rig(lambda tick: slow[0])
     rig.stand()
+    slow[0] = delay_ms
+    rig.run(offset)
     resets = rig.policy.resets
     seen = len(rig.policy.seen)
     rig.run(1.0, Request.RUN)
