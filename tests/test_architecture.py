@@ -68,3 +68,24 @@ def test_arrows_inside_the_library_point_one_way(part: str) -> None:
 def test_a_violation_would_be_found(tmp_path: Path) -> None:
     (tmp_path / "bad.py").write_text("def f():\n    from egovcp.sim import env\n")
     assert imports(tmp_path / "bad.py") == {"egovcp.sim.env"}
+
+
+def wall_clock_readings(path: Path) -> list[str]:
+    """Calls of functions whose answer jumps when somebody sets the clock."""
+    calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    names = {f"{path.name}: {ast.unparse(call.func)}" for call in calls}
+    jumping = ("time.time", "time.time_ns", "datetime.now", "datetime.utcnow", "time.localtime")
+    return sorted(name for name in names if name.endswith(jumping))
+
+
+def test_what_drives_a_robot_reads_no_clock_that_can_be_set() -> None:
+    folder = PACKAGES["egovcp_deploy"]
+    driving = [*folder.rglob("*.py"), ROOT / "egovcp" / "rate.py"]
+    driving += [*(ROOT / "egovcp" / "log").rglob("*.py"), *(ROOT / "egovcp" / "plan").rglob("*.py")]
+    assert len(driving) > 80
+    assert [reading for path in driving for reading in wall_clock_readings(path)] == []
+
+
+def test_a_reading_of_the_wall_clock_would_be_found(tmp_path: Path) -> None:
+    (tmp_path / "late.py").write_text("import time\nstart = time.time()\n")
+    assert wall_clock_readings(tmp_path / "late.py") == ["late.py: time.time"]

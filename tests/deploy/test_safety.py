@@ -14,7 +14,7 @@ SPECIALS = np.array([np.nan, np.inf, -np.inf, 1e308, -1e308, 0.0, 1.0, -1.0, 1.5
 def test_fuzzed_actions_never_leave_the_envelope() -> None:
     rng = np.random.default_rng(0)
     safety, last = SafetyFilter(rows=100), np.zeros((100, ACTION_DIM))
-    for _ in range(200):
+    for _ in range(1000):  # 100 000 actions
         planned = rng.normal(0, 2, last.shape)
         odd = rng.random(last.shape) < 0.1
         planned[odd] = rng.choice(SPECIALS, int(odd.sum()))
