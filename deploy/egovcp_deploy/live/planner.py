@@ -22,7 +22,7 @@ from egovcp_deploy.runner import thoughts
 
 _WAIT_S: Final = 0.01
 _AFTERMATH_S: Final = 1.0  # what is still recorded once the motors are damped
-_START_S: Final = 20.0  # for the control process to come up
+_START_S: Final = 60.0  # for the control process to come up
 _HOPE: Final = 0.98  # decoding that took too long once may be faster the next time
 _NS: Final = 1e9
 
