@@ -141,6 +141,8 @@ class Runner:
         pilot.sense(now, sensed.state, sensed.depth)
         before = pilot.supervisor.state
         state = pilot.judge(now, Request.RUN if index == 0 else self._operator(index))
+        if index == 0 and state is State.RUN:
+            pilot.events()  # a simulated robot is always handed over at once: no news
         if state is State.DAMP and before is not State.DAMP:
             self._robot.damp()
         pilot.report(now, sensed.depth, sensed.state)
