@@ -167,9 +167,7 @@ def recorded_run(path: Path) -> Recorded:
 
 def _take_over(ticks: Sequence[Tick]) -> int:
     """The tick at which the robot was handed to the planner; 0 if nothing tells of it."""
-    handed = f"{State.ARMED} -> {State.RUN}"
-    found = (i for i, t in enumerate(ticks) if any(e.startswith(handed) for e in t.events))
-    return next(found, 0)
+    return next((i for i, tick in enumerate(ticks) if tick.mode == State.RUN), 0)
 
 
 def _outcome(tick: Tick) -> Outcome:
