@@ -152,9 +152,11 @@ class PlannerLoop:
         late = latency > PLANNER_DT
         self.summary.planned += 1
         self.summary.late += late
-        if self._thinker.pace(late):
-            change = "late plans" if late else "time to spare"
-            self._told.append(f"{change}: {self._thinker.samples} candidates from now on")
+        before = self._thinker.samples
+        if self._thinker.pace(reply, late):
+            after = self._thinker.samples
+            why = "time to spare" if after > before else "too little time"
+            self._told.append(f"{why}: {after} candidates from now on")
         self.summary.plan_ms.append(reply.plan_ms)
         self.summary.latency_ms.append(latency * 1e3)
         self.summary.iterations.append(reply.step.iterations)

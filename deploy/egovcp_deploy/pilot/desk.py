@@ -128,9 +128,9 @@ class Thinker:
         plan_ms = (time.perf_counter() - begin) * 1e3
         return Reply(last.tick, step, plan_ms, events=tuple(events))
 
-    def pace(self, late: bool) -> bool:
+    def pace(self, reply: Reply, late: bool) -> bool:
         """Told of each plan whether it was late; true if less, or more, is now weighed."""
-        if self._effort is None or not self._effort.record(late):
+        if self._effort is None or not self._effort.record(late, reply.step.iterations):
             return False
         assert isinstance(self._policy, Adjustable)
         self._policy.config = self._effort.config

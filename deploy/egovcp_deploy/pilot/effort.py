@@ -1,4 +1,8 @@
-"""How many candidates to weigh when planning is too slow: half, once plans are often late."""
+"""How many candidates to weigh when time is short: half, once plans are often late or cut short.
+
+A plan that the deadline cut short has fewer rounds than it should; fewer candidates in all of the
+rounds are worth more than many in one (`docs/log.md`).
+"""
 
 from __future__ import annotations
 
@@ -8,14 +12,14 @@ from typing import Final
 from egovcp.plan import PlannerConfig
 
 BUDGET_S: Final = 0.034  # from an observation to its plan; the rest of the tick carries it over
-LATE_TO_HALVE: Final = 3  # late plans; two that are in time make up for one
+POOR_TO_HALVE: Final = 3  # late or short plans; two good ones make up for one
 _MADE_UP: Final = 0.5
-IN_TIME_TO_DOUBLE: Final = 50  # plans in time in a row, 2 s
+GOOD_TO_DOUBLE: Final = 50  # good plans in a row, 2 s
 FEWEST_SAMPLES: Final = 64
 
 
 class Effort:
-    """Halves the samples of a planner that is late, and doubles them again when it is not.
+    """Halves the samples of a planner that lacks time, and doubles them again when it does not.
 
     Args:
         full: the planner's own configuration, which is never exceeded.
@@ -25,20 +29,21 @@ class Effort:
         self._full = full
         self.config = full
         """What to plan with now."""
-        self._late, self._in_time = 0.0, 0
+        self._poor, self._good = 0.0, 0
 
-    def record(self, late: bool) -> bool:
-        """Count one plan; true if `config` has changed."""
-        self._late = self._late + 1 if late else max(0.0, self._late - _MADE_UP)
-        self._in_time = 0 if late else self._in_time + 1
-        if self._late >= LATE_TO_HALVE:
+    def record(self, late: bool, iterations: int) -> bool:
+        """Count one plan and its rounds; true if `config` has changed."""
+        poor = late or iterations < self.config.iterations
+        self._poor = self._poor + 1 if poor else max(0.0, self._poor - _MADE_UP)
+        self._good = 0 if poor else self._good + 1
+        if self._poor >= POOR_TO_HALVE:
             return self._scale(self.config.samples // 2)
-        if self._in_time >= IN_TIME_TO_DOUBLE:
+        if self._good >= GOOD_TO_DOUBLE:
             return self._scale(self.config.samples * 2)
         return False
 
     def _scale(self, samples: int) -> bool:
-        self._late, self._in_time = 0.0, 0
+        self._poor, self._good = 0.0, 0
         fewest = min(FEWEST_SAMPLES, self._full.samples)
         samples = min(max(samples, fewest), self._full.samples)
         changed = samples != self.config.samples

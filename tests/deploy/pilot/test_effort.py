@@ -1,47 +1,58 @@
-"""The planner thinks less while it is late, and as much as it may when it is not."""
+"""The planner weighs less while time is short, and as much as it may when it is not."""
 
 from __future__ import annotations
 
+import pytest
+
 from egovcp.plan import PlannerConfig
-from egovcp_deploy.pilot.effort import IN_TIME_TO_DOUBLE, LATE_TO_HALVE, Effort
+from egovcp_deploy.pilot.effort import GOOD_TO_DOUBLE, POOR_TO_HALVE, Effort
+
+FULL = PlannerConfig(samples=1024, elites=64, iterations=3)
+
+#: Late, or cut short: (late, rounds).
+POOR = [(True, 3), (False, 2), (False, 1), (True, 1)]
 
 
-def test_a_plan_that_is_late_now_and_then_changes_nothing() -> None:
-    effort = Effort(PlannerConfig(samples=1024, elites=64))
+@pytest.mark.parametrize(("late", "rounds"), POOR)
+def test_a_poor_plan_now_and_then_changes_nothing(late: bool, rounds: int) -> None:
+    effort = Effort(FULL)
     for _ in range(50):
-        effort.record(late=True)
-        effort.record(late=False)
-        effort.record(late=False)
-    assert effort.config.samples == 1024
+        effort.record(late, rounds)
+        effort.record(late=False, iterations=3)
+        effort.record(late=False, iterations=3)
+    assert effort.config == FULL
 
 
-def test_every_second_plan_late_is_too_often() -> None:
-    effort = Effort(PlannerConfig(samples=1024, elites=64))
-    changed = [effort.record(late=k % 2 == 0) for k in range(20)]
-    assert any(changed)
+@pytest.mark.parametrize(("late", "rounds"), POOR)
+def test_every_second_plan_poor_is_too_often(late: bool, rounds: int) -> None:
+    effort = Effort(FULL)
+    for _ in range(10):
+        effort.record(late, rounds)
+        effort.record(late=False, iterations=3)
     assert effort.config.samples < 1024
 
 
-def test_three_late_plans_in_a_row_halve_the_samples() -> None:
-    effort = Effort(PlannerConfig(samples=1024, elites=64))
-    changed = [effort.record(late=True) for _ in range(LATE_TO_HALVE)]
+@pytest.mark.parametrize(("late", "rounds"), POOR)
+def test_three_poor_plans_in_a_row_halve_the_samples(late: bool, rounds: int) -> None:
+    effort = Effort(FULL)
+    changed = [effort.record(late, rounds) for _ in range(POOR_TO_HALVE)]
     assert changed == [False, False, True]
     assert (effort.config.samples, effort.config.elites) == (512, 32)
+    assert effort.config.iterations == 3
 
 
 def test_there_is_a_floor_and_a_way_back_to_the_full_number_but_not_beyond() -> None:
-    full = PlannerConfig(samples=1024, elites=64)
-    effort = Effort(full)
+    effort = Effort(FULL)
     for _ in range(100):
-        effort.record(late=True)
+        effort.record(late=True, iterations=1)
     assert effort.config.samples == 64
     assert effort.config.elites == 4
-    for _ in range(10 * IN_TIME_TO_DOUBLE):
-        effort.record(late=False)
-    assert effort.config == full
+    for _ in range(10 * GOOD_TO_DOUBLE):
+        effort.record(late=False, iterations=3)
+    assert effort.config == FULL
 
 
 def test_a_planner_that_is_small_already_is_left_alone() -> None:
     effort = Effort(PlannerConfig(samples=16, elites=4))
-    assert not any(effort.record(late=True) for _ in range(20))
+    assert not any(effort.record(late=True, iterations=1) for _ in range(20))
     assert effort.config.samples == 16
