@@ -1,4 +1,4 @@
-"""Sinks that fail in the ways in which disks and viewers do."""
+"""Sinks for tests: one that keeps the ticks, one that fails as disks and viewers do."""
 
 from __future__ import annotations
 
@@ -41,3 +41,21 @@ class DiarySink:
     def _note(self, line: str) -> None:
         with self.path.open("a", encoding="utf-8") as file:
             file.write(f"{line}\n")
+
+
+class MemorySink:
+    """Keeps the ticks."""
+
+    def __init__(self) -> None:
+        self.ticks: list[Tick] = []
+        """In the order of writing."""
+
+    def open(self, info: RunInfo) -> None:
+        """Nothing to begin."""
+
+    def write(self, tick: Tick) -> None:
+        """One more."""
+        self.ticks.append(tick)
+
+    def close(self) -> None:
+        """They stay."""

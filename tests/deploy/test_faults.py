@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from egovcp.log.info import CameraView, RunInfo
+from egovcp.log.info import CameraView
 from egovcp.log.tick import Tick
 from egovcp.plan import PolicyStep
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
+from egovcp.testing.sinks import MemorySink
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.states import Request, State
 from egovcp_deploy.robots import Outcome, Sensed
@@ -91,20 +92,6 @@ class Disturbed:
         self._robot.close()
 
 
-class Memory:
-    def __init__(self) -> None:
-        self.ticks: list[Tick] = []
-
-    def open(self, info: RunInfo) -> None:
-        pass
-
-    def write(self, tick: Tick) -> None:
-        self.ticks.append(tick)
-
-    def close(self) -> None:
-        pass
-
-
 def untouched(tick: int, sensed: Sensed, robot: SimRobot) -> Sensed:
     return sensed
 
@@ -125,7 +112,7 @@ def play(
     delay_ms: Callable[[int], int] = lambda tick: 0,
     operator: Callable[[int], Request | None] = lambda tick: None,
 ) -> tuple[list[Tick], Disturbed]:
-    clock, robot, memory = LockstepClock(), Disturbed(sim, tamper), Memory()
+    clock, robot, memory = LockstepClock(), Disturbed(sim, tamper), MemorySink()
     desk = InlineDesk(Thinker(policy), clock, lambda tick: delay_ms(tick) * MS)
     robot.start(0)
     Runner(desk, robot, FixedRate(25, clock), max_ticks=75, operator=operator).run(memory)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from egovcp.log.info import CameraView, RunInfo
-from egovcp.log.tick import Tick
+from egovcp.log.info import CameraView
 from egovcp.plan import PolicyStep
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM, STATE_SLICES
+from egovcp.testing.sinks import MemorySink
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.pilot import REJECTED
 from egovcp_deploy.robots import Outcome, Sensed
@@ -104,22 +104,6 @@ class FakeRobot:
         pass
 
 
-class Memory:
-    """Keeps the ticks."""
-
-    def __init__(self) -> None:
-        self.ticks: list[Tick] = []
-
-    def open(self, info: RunInfo) -> None:
-        pass
-
-    def write(self, tick: Tick) -> None:
-        self.ticks.append(tick)
-
-    def close(self) -> None:
-        pass
-
-
 def runner(
     policy: PlainPolicy, robot: FakeRobot, imagine: int = 16, max_ticks: int | None = None
 ) -> Runner:
@@ -129,7 +113,7 @@ def runner(
 
 
 def test_a_tick_holds_the_observation_the_action_on_it_and_what_followed() -> None:
-    policy, robot, memory = FakePolicy([0.1, 0.2, 0.3, 0.2, 0.1]), FakeRobot(), Memory()
+    policy, robot, memory = FakePolicy([0.1, 0.2, 0.3, 0.2, 0.1]), FakeRobot(), MemorySink()
     summary = runner(policy, robot, imagine=3).run(memory)
     assert [tick.index for tick in memory.ticks] == [0, 1, 2, 3, 4]
     assert [tick.time_ns for tick in memory.ticks] == [40_000_000 * k for k in range(5)]
@@ -148,7 +132,7 @@ def test_a_tick_holds_the_observation_the_action_on_it_and_what_followed() -> No
 
 
 def test_the_recurrence_advances_with_what_was_really_sent() -> None:
-    policy, memory = FakePolicy([0.3] * 5), Memory()
+    policy, memory = FakePolicy([0.3] * 5), MemorySink()
     runner(policy, FakeRobot()).run(memory)
     assert len(policy.sent) == 4  # the last action has no observation after it
     for sent, tick in zip(policy.sent, memory.ticks, strict=False):
@@ -156,7 +140,7 @@ def test_the_recurrence_advances_with_what_was_really_sent() -> None:
 
 
 def test_actions_pass_the_safety_filter_before_the_robot() -> None:
-    policy, memory = FakePolicy([5.0, np.nan, 5.0, 5.0, 5.0]), Memory()
+    policy, memory = FakePolicy([5.0, np.nan, 5.0, 5.0, 5.0]), MemorySink()
     summary = runner(policy, FakeRobot()).run(memory)
     sent = [float(tick.action_sent[0]) * 2 for tick in memory.ticks]
     np.testing.assert_allclose(sent, [0.32, 0.64, 0.96, 1.0, 1.0])  # the plan before goes on
@@ -165,7 +149,7 @@ def test_actions_pass_the_safety_filter_before_the_robot() -> None:
 
 
 def test_a_robot_without_a_time_limit_is_stopped_by_the_runners() -> None:
-    memory = Memory()
+    memory = MemorySink()
     robot = FakeRobot(limit=10**9)
     summary = runner(FakePolicy([0.0] * 9), robot, max_ticks=7).run(memory)
     assert summary.steps == robot.count == len(memory.ticks) == 7
@@ -178,7 +162,7 @@ def test_every_rollout_starts_afresh() -> None:
     actions = []
     for episode in range(2):
         robot.start(episode)
-        memory = Memory()
+        memory = MemorySink()
         loop.run(memory)
         actions.append([tick.action_sent.tolist() for tick in memory.ticks])
         assert memory.ticks[0].time_ns == 0
@@ -187,7 +171,7 @@ def test_every_rollout_starts_afresh() -> None:
 
 
 def test_of_a_policy_that_cannot_imagine_nothing_is_decoded() -> None:
-    memory = Memory()
+    memory = MemorySink()
     runner(PlainPolicy([0.1] * 5), FakeRobot(), imagine=3).run(memory)
     assert len(memory.ticks) == 5
     for tick in memory.ticks:
@@ -197,7 +181,7 @@ def test_of_a_policy_that_cannot_imagine_nothing_is_decoded() -> None:
 
 
 def test_the_best_candidates_are_logged_as_hand_paths() -> None:
-    memory = Memory()
+    memory = MemorySink()
     runner(FakePolicy([0.0] * 5), FakeRobot(), imagine=0).run(memory)
     candidates = memory.ticks[0].candidates
     assert candidates is not None
@@ -219,4 +203,4 @@ def test_overruns_are_counted(late_ms: int) -> None:
 
     desk = InlineDesk(Thinker(FakePolicy([0.0] * 5)), clock)
     loop = Runner(desk, Slow(), FixedRate(25, clock))
-    assert loop.run(Memory()).overruns == (5 if late_ms else 0)
+    assert loop.run(MemorySink()).overruns == (5 if late_ms else 0)

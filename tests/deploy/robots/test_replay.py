@@ -23,6 +23,7 @@ from egovcp.plan import Policy, PolicyStep
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.testing import random_episode
+from egovcp.testing.sinks import MemorySink
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.robots import Robot
 from egovcp_deploy.robots.replay import ENDS, ReplayRobot, open_recordings, recorded_run
@@ -62,22 +63,6 @@ class Watched:
         self._policy.advance(sent)
 
 
-class Kept:
-    """A sink that keeps ticks."""
-
-    def __init__(self) -> None:
-        self.ticks: list[Tick] = []
-
-    def open(self, info: RunInfo) -> None:
-        pass
-
-    def write(self, tick: Tick) -> None:
-        self.ticks.append(tick)
-
-    def close(self) -> None:
-        pass
-
-
 def watched(artefact_dir: Path, askew: float = 0.0) -> Watched:
     return Watched(load_artefact(str(artefact_dir)).make_policy(1, seed=5), askew)
 
@@ -88,7 +73,7 @@ def run(policy: Watched, robot: Robot, sink: Sink) -> None:
 
 
 def play(policy: Watched, robot: ReplayRobot, episode: int = 0) -> list[Tick]:
-    sink = Kept()
+    sink = MemorySink()
     robot.start(episode)
     run(policy, robot, sink)
     return sink.ticks
