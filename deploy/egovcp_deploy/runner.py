@@ -104,7 +104,7 @@ class Runner:
             summary.add(tick)
             on_tick(tick)
             summary.overruns += self._rate.wait() > 0
-        if self._pilot.supervisor.stopped_for_safety:
+        if self._pilot.supervisor.state is State.DAMP:
             summary.damped = self._pilot.supervisor.reason
         return summary
 

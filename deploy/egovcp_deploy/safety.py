@@ -57,7 +57,7 @@ class SafetyFilter:
 
     def ease(self) -> Array:
         """(E, 7) the next action on every robot's way to the neutral pose, as sent."""
-        self._last = self._last - np.clip(self._last, -HOLD_RATE, HOLD_RATE)
+        self._last = self._eased()
         return self._last.copy()
 
     def repeat(self) -> Array:
@@ -72,6 +72,9 @@ class SafetyFilter:
 
     def _fallback(self) -> Array:
         """(E, 7) the last action, or from hold on a small step from it towards neutral."""
-        step = np.clip(-self._last, -HOLD_RATE, HOLD_RATE)
-        fallback: Array = self._last + np.where(self.holding[:, None], step, 0.0)
-        return fallback
+        return np.where(self.holding[:, None], self._eased(), self._last)
+
+    def _eased(self) -> Array:
+        """(E, 7) a small step from the last action towards neutral."""
+        eased: Array = self._last - np.clip(self._last, -HOLD_RATE, HOLD_RATE)
+        return eased

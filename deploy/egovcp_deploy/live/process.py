@@ -9,7 +9,6 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -92,7 +91,7 @@ class ControlProcess:
         self._remote = RemoteKeys()
         self._orphaned = 0
 
-    def run(self, quitting: Flag, alive: Callable[[], bool] | None = None) -> None:
+    def run(self, quitting: Flag) -> None:
         """Until told to quit."""
         rate = FixedRate(CONTROLLER_HZ, MonotonicClock())
         rate.start()
@@ -121,7 +120,7 @@ class ControlProcess:
 
 
 class RemoteKeys:
-    """The robot's own remote control: A arms, start runs, B holds, L1 + B stops at once."""
+    """The robot's own remote control: Y stands up, A arms, start runs, B holds, L1 + B damps."""
 
     def __init__(self) -> None:
         self._before: frozenset[str] = frozenset()

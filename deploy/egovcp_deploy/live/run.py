@@ -93,12 +93,16 @@ def started(setup: LiveSetup, address: str) -> Iterator[BaseProcess]:
 
 
 def _end(process: BaseProcess, planner: PlannerLoop) -> None:
-    """Wait for the control process; one that does not end is made to."""
-    if not planner.quitting and process.is_alive():
-        planner.quitting = True  # it never came up: nobody needs to guard it
-        process.terminate()
-    process.join(_END_S)
+    """Wait for the control process. One that did not hear that it should end is asked by a signal,
+    on which it damps too; one that has to be killed damps nothing, so the guard must."""
+    if planner.quitting:
+        process.join(_END_S)
     if process.is_alive():
+        planner.quitting = True
+        process.terminate()
+        process.join(_END_S)
+    if process.is_alive():
+        planner.quitting = False
         process.kill()
         process.join()
 

@@ -30,7 +30,3 @@ class Freshness:
         if self._changed_ns is None:
             return float("inf")
         return (now_ns - self._changed_ns) / 1e9
-
-    def reset(self) -> None:
-        """Forget what came."""
-        self._content = self._changed_ns = None

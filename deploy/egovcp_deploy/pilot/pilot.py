@@ -52,7 +52,6 @@ class Pilot:
         """The planner tick that is reported next, or that is being decided."""
         self.sent: Array = np.zeros(7)
         """a_{t-1}, (7,)."""
-        self.misses = 0
         self._safety = SafetyFilter()
         self._book = PlanBook()
         self._proprioception, self._eye = Freshness(), Freshness()
@@ -141,6 +140,11 @@ class Pilot:
         return fresh
 
     @property
+    def misses(self) -> int:
+        """Ticks in a row without a plan in time."""
+        return self._book.misses
+
+    @property
     def answered(self) -> bool:
         """Whether a usable plan for this tick is there."""
         return self._book.has(self.tick)
@@ -148,7 +152,6 @@ class Pilot:
     def decide(self) -> Array:
         """a_t (7,), once per tick; the next tick begins."""
         wanted = self._book.decide(self.tick)
-        self.misses = self._book.misses
         if self.supervisor.state is not State.RUN or self._first:
             self.sent = self._safety.ease()[0]
         elif wanted is None:

@@ -126,11 +126,6 @@ class Supervisor:
         """Since the state was entered, s."""
         return 0.0 if self._since_ns is None else (now_ns - self._since_ns) / 1e9
 
-    @property
-    def stopped_for_safety(self) -> bool:
-        """Whether the motors were damped."""
-        return self.state is State.DAMP
-
     def _judge(self, facts: Facts, request: Request | None) -> None:
         if request is Request.ESTOP:
             return self._enter(State.DAMP, "emergency stop", facts)

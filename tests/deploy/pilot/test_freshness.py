@@ -28,5 +28,3 @@ def test_numbers_that_are_not_finite_and_silence_are_nothing_new() -> None:
     fresh.update(100_000_000, np.array([1.0, math.nan, 0.0]))
     fresh.update(150_000_000, None)
     assert fresh.age_s(200_000_000) == 0.2
-    fresh.reset()
-    assert fresh.age_s(200_000_000) == math.inf

@@ -93,7 +93,6 @@ def test_what_standing_cannot_survive_damps_at_once_and_for_good(
     machine = at(state)
     machine.update(replace(WELL, **fault))
     assert machine.state is State.DAMP
-    assert machine.stopped_for_safety
     reason = machine.reason
     now = feed(machine, WELL, 5.0)
     for request in Request:

@@ -1,0 +1,46 @@
+"""However a control process is brought to its end, somebody damps the robot."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import pytest
+
+from egovcp_deploy.live.run import _end
+
+
+class Control:
+    """Ends on ``hears``, and keeps a record of what was tried."""
+
+    def __init__(self, hears: str, planner: SimpleNamespace) -> None:
+        self._hears, self._planner = hears, planner
+        self.tried: list[str] = []
+        self.guarded_when_killed = False
+
+    def is_alive(self) -> bool:
+        return self._hears not in self.tried
+
+    def join(self, timeout: float | None = None) -> None:
+        self.tried.append("order")
+
+    def terminate(self) -> None:
+        self.tried.append("signal")
+
+    def kill(self) -> None:
+        self.guarded_when_killed = not self._planner.quitting
+        self.tried.append("kill")
+
+
+@pytest.mark.parametrize("quitting", [True, False])
+@pytest.mark.parametrize("hears", ["order", "signal", "kill"])
+def test_a_process_is_asked_before_it_is_killed_and_then_the_guard_acts(
+    hears: str, quitting: bool
+) -> None:
+    planner = SimpleNamespace(quitting=quitting)
+    control = Control(hears, planner)
+    _end(control, planner)  # type: ignore[arg-type]
+    assert not control.is_alive()
+    assert ("kill" in control.tried) == (hears == "kill")
+    assert control.guarded_when_killed == (hears == "kill")
+    if hears == "kill":
+        assert control.tried.index("signal") < control.tried.index("kill")
