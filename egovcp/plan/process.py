@@ -8,8 +8,7 @@ from torch import Tensor
 
 def reflect(x: Tensor) -> Tensor:
     """Fold values within one box length outside [-1, 1] back inside, as the data does."""
-    x = torch.where(x > 1.0, 2.0 - x, x)
-    return torch.where(x < -1.0, -2.0 - x, x)
+    return 2.0 * x.clamp(-1.0, 1.0) - x
 
 
 def walk(start: Tensor, deltas: Tensor, eta: float) -> Tensor:

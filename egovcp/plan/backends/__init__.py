@@ -7,10 +7,7 @@ import torch
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.backends import library
-from egovcp.plan.backends.floats import FloatArithmetic
-from egovcp.plan.backends.integers import IntegerArithmetic
 from egovcp.plan.backends.judges import FloatJudge, IntegerJudge
-from egovcp.plan.backends.network import PlanningNetwork
 from egovcp.plan.config import PlannerConfig
 from egovcp.plan.objective import Judge, StepByStep
 
@@ -38,12 +35,11 @@ def judge_of_model(model: WorldModel, config: PlannerConfig) -> Judge[Carry]:
         except (EnvironmentFailure, UsageError):
             pass  # float32 does everywhere
     dtype = torch.bfloat16 if backend == "bfloat16" else torch.float32
-    network = PlanningNetwork(model, config, FloatArithmetic(dtype))
-    return FloatJudge(network, compiled=backend == "compile")
+    return FloatJudge(model, config, dtype, compiled=backend == "compile")
 
 
 def _integers(model: WorldModel, config: PlannerConfig) -> IntegerJudge:
     device = model.state_mean.device
     if device.type != "cpu":
         raise UsageError(f"backend=int8 runs on the processor, the model is on {device}")
-    return IntegerJudge(PlanningNetwork(model, config, IntegerArithmetic()))
+    return IntegerJudge(model, config)

@@ -1,8 +1,9 @@
-"""The planning network's layers in floating point, on any device; `R` is a tensor."""
+"""The planning network's layers in floating point, on any device.
+
+Products in ``dtype``; states, narrow inputs and sums in float32.
+"""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import torch
 import torch.nn.functional as F
@@ -11,27 +12,8 @@ from torch import Tensor
 from egovcp.plan.backends.layers import GruLayer, HiddenLayer
 
 
-@dataclass(frozen=True)
-class FloatArithmetic:
-    """Products in ``dtype``; states, narrow inputs and sums in float32."""
-
-    dtype: torch.dtype = torch.float32
-
-    def hidden(self, layer: HiddenLayer) -> FloatHidden:
-        """See `Arithmetic`."""
-        return FloatHidden(layer, self.dtype)
-
-    def recurrence(self, layer: GruLayer) -> FloatRecurrence:
-        """See `Arithmetic`."""
-        return FloatRecurrence(layer, self.dtype)
-
-    def linear(self, h: Tensor, z: Tensor) -> FloatLinear:
-        """See `Arithmetic`."""
-        return FloatLinear(h, z)
-
-
 class FloatHidden:
-    """See `Hidden`."""
+    """One hidden layer, and the linear layer on top if it is the last one."""
 
     def __init__(self, layer: HiddenLayer, dtype: torch.dtype) -> None:
         self._dtype = dtype
@@ -57,16 +39,16 @@ class FloatHidden:
         return F.silu(normal)
 
     def between(self, wide: Tensor | None, narrow: Tensor | None, add: Tensor | None) -> Tensor:
-        """See `Hidden`."""
+        """The layer's outputs, for a further layer; ``add`` is a sum that all rows share."""
         return self._outputs(wide, narrow, add).to(self._dtype)
 
     def last(self, wide: Tensor | None, narrow: Tensor | None, add: Tensor | None) -> Tensor:
-        """See `Hidden`."""
+        """(..., outputs) of the linear layer on top."""
         return F.linear(self._outputs(wide, narrow, add), self._last, self._bias)
 
 
 class FloatRecurrence:
-    """See `Recurrence`."""
+    """The GRU."""
 
     def __init__(self, layer: GruLayer, dtype: torch.dtype) -> None:
         self._dtype = dtype
@@ -77,7 +59,8 @@ class FloatRecurrence:
     def __call__(
         self, x: Tensor, wide_h: Tensor | None, add: Tensor | None, h: Tensor
     ) -> tuple[Tensor, Tensor]:
-        """See `Recurrence`."""
+        """The next h, in float32 and as a wide input; the part of h comes from ``wide_h`` or is
+        in ``add``."""
         total = (x @ self._x).float()
         if wide_h is not None:
             total = total + (wide_h @ self._h).float()
@@ -92,11 +75,11 @@ class FloatRecurrence:
 
 
 class FloatLinear:
-    """See `Linear`."""
+    """A linear layer of few outputs on h and z, from its weights (outputs, n) of each."""
 
     def __init__(self, h: Tensor, z: Tensor) -> None:
         self._h, self._z = h.t().contiguous(), z.t().contiguous()
 
     def __call__(self, h: Tensor, z: Tensor) -> Tensor:
-        """See `Linear`."""
+        """(..., outputs)."""
         return h @ self._h + z @ self._z

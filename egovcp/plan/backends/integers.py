@@ -1,4 +1,4 @@
-"""The planning network's layers in 8-bit integers, by `kernel.c`; one robot's rows on one thread.
+"""The planning network packed for `kernel.c`: wide products in 8-bit integers, all else in float32.
 
 Weights have a scale per output, inputs a scale per row: what a row gives does not depend on the
 rows beside it.
@@ -10,214 +10,252 @@ import ctypes
 from typing import Final, NamedTuple
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
+from egovcp import spec
 from egovcp.errors import UsageError
+from egovcp.model import WorldModel, value
+from egovcp.model.nets import SplitLinear, SplitMlp
+from egovcp.model.world_model import QHead
 from egovcp.plan.backends import library
-from egovcp.plan.backends.layers import GruLayer, HiddenLayer
+from egovcp.plan.backends.layers import first_outputs, gru_layer, linears_of, norms_of, weight_of
+from egovcp.plan.backends.root import Root
+from egovcp.plan.config import PlannerConfig
 
 LANES: Final = 16
 WIDEST: Final = 1024
+MOST_FEW: Final = 128
 LEAST_SILU: Final = -0.27846456
 """The least value of SiLU: bytes of hidden layers count from there."""
 LEVELS: Final = 127
 
 
-class Bytes(NamedTuple):
-    """Rows of a wide input."""
+class Shared(NamedTuple):
+    """What the candidates of one robot share, as the kernel reads it; keeps its tensors alive."""
 
-    values: Tensor  # (rows, K) uint8
-    scale: Tensor  # (rows,)
+    description: library.Root
+    tensors: tuple[object, ...]
 
 
-class IntegerArithmetic:
-    """See `Arithmetic`; compiles the kernel if need be.
+class IntegerNetwork:
+    """Packed from a world model's weights as they are now.
 
     Raises:
         EnvironmentFailure: the kernel cannot be built.
+        UsageError: the model has sizes that the kernel does not take.
     """
 
-    def __init__(self) -> None:
-        library.library()
+    def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
+        self._kernel = library.library()
+        self._heads = len(model.q_heads)
+        self._outputs = value.width(model.config.value_loss)
+        self._width = 1 if self._outputs == 1 else _whole(self._outputs)
+        self._packed = _Packed(model, drawn=config.latent == "sample")
 
-    def hidden(self, layer: HiddenLayer) -> IntegerHidden:
-        """See `Arithmetic`."""
-        return IntegerHidden(layer)
+    def shared(self, root: Root) -> Shared:
+        """Of one robot, from a root (1, 1, ...)."""
+        h, mix, gates = root.h.flatten().contiguous(), _centred(root.mix), _centred(root.gates)
+        values = [_centred(x) for x in root.values]
+        pointers = (ctypes.c_void_p * len(values))(*(x.data_ptr() for x in values))
+        addresses = (x.data_ptr() for x in (h, mix, gates))
+        description = library.Root(*addresses, ctypes.cast(pointers, ctypes.c_void_p))
+        return Shared(description, (h, mix, gates, values, pointers))
 
-    def recurrence(self, layer: GruLayer) -> IntegerRecurrence:
-        """See `Arithmetic`."""
-        return IntegerRecurrence(layer)
+    def outputs(
+        self, shared: Shared, actions: Tensor, noise: Tensor | None, threads: library.Threads
+    ) -> tuple[Tensor, Tensor]:
+        """Along plans (M, N, 7), by as many threads as there are.
 
-    def linear(self, h: Tensor, z: Tensor) -> IntegerLinear:
-        """See `Arithmetic`; these few products stay in float32."""
-        return IntegerLinear(h, z)
+        Returns:
+            Outputs of the heads of Q (M, N, heads, width), and log-odds of a failure (M, N), those
+            of the steps 1 to N - 2 only.
+        """
+        plans, steps, _ = actions.shape
+        q = torch.zeros(plans, steps, self._heads, self._width)
+        dead = torch.zeros(plans, steps)
+        following = ctypes.c_int32(0)
+        kept = (actions.contiguous(), None if noise is None else noise.contiguous())
+        arguments = (
+            self._packed.address,
+            ctypes.byref(shared.description),
+            plans,
+            steps,
+            kept[0].data_ptr(),
+            None if kept[1] is None else kept[1].data_ptr(),
+            self._width,
+            q.data_ptr(),
+            dead.data_ptr(),
+            ctypes.byref(following),
+        )
+        threads.each(self._kernel.judge, arguments)
+        return q[..., : self._outputs], dead
 
 
-class _Memory:
-    """A layer's description for the kernel, and the tensors that it points into."""
+def _centred(sums: Tensor) -> Tensor:
+    """(1, 1, n) -> (n,), less the mean, which LayerNorm would take away."""
+    return (sums - sums.mean()).flatten().contiguous()
 
-    def __init__(self, outputs: int, gamma: Tensor, beta: Tensor, epsilon: float) -> None:
+
+def _whole(count: int) -> int:
+    """Filled up to whole vectors."""
+    return -(-count // LANES) * LANES
+
+
+class _Packed:
+    """A network's description for the kernel, and the tensors that it points into."""
+
+    def __init__(self, model: WorldModel, drawn: bool) -> None:
+        self._kept: list[object] = []
+        c = model.config
+        if max(2 * c.latent, c.value_state) > MOST_FEW:
+            raise UsageError(
+                f"a latent of {c.latent} or value_state of {c.value_state}: the int8 planner takes "
+                f"up to {MOST_FEW // 2} and {MOST_FEW}; {library.OTHERWISE}"
+            )
+        self.network = n = library.Network()
+        n.hidden, n.latent, n.actions, n.heads = c.hidden, c.latent, spec.ACTION_DIM, c.q_heads
+        n.min_std = c.min_std
+        z, action = map(weight_of, model.mix.parts)
+        norm = model.mix_act[0]
+        assert isinstance(norm, nn.LayerNorm)
+        n.mix = self._layer(norm, beside=z, action=action)
+        n.gru = self._gru(model)
+        n.prior, top = self._one_hidden(model.prior)
+        self._prior_top(first_outputs(top, None if drawn else c.latent))
+        n.termination, top = self._one_hidden(model.termination_head)
+        n.termination_top = self._linear(top.weight, top.bias)
+        if model.passing_value_head is not None:
+            n.told, top = self._one_hidden(model.decode_passing)
+            n.told_top = self._linear(top.weight, top.bias)
+        heads = (library.Head * c.q_heads)(*map(self._head, model.q_heads))
+        n.head = ctypes.cast(heads, ctypes.c_void_p)
+        self._kept.append(heads)
+        self.address = ctypes.byref(n)
+
+    def _keep(self, tensor: Tensor, dtype: torch.dtype = torch.float32) -> int:
+        """The address of a copy."""
+        copy = tensor.detach().to("cpu", dtype).contiguous().clone()
+        self._kept.append(copy)
+        return copy.data_ptr()
+
+    def _head(self, head: QHead) -> library.Head:
+        packed = library.Head()
+        reduce = head.state.reduce
+        if reduce is not None:
+            packed.reduce_h, packed.reduce_z = self._reduced(reduce)
+        packed.state = self._mlp(head.state.mlp, wide=reduce is None)
+        if head.passing is not None:
+            packed.passing = self._mlp(head.passing, wide=False)
+        return packed
+
+    def _reduced(self, reduce: SplitLinear) -> list[library.Linear]:
+        """Two layers whose outputs add up."""
+        weights = map(weight_of, reduce.parts)
+        return [self._linear(w, w.new_zeros(len(w)), filled=True) for w in weights]
+
+    def _mlp(self, mlp: SplitMlp, wide: bool) -> library.Mlp:
+        """Two hidden layers, the first one of h and z if ``wide``, else of a few numbers."""
+        *state, action = map(weight_of, mlp.first.parts)
+        first, second = norms_of(mlp)
+        between, top = linears_of(mlp)
+        packed = library.Mlp()
+        if wide:
+            packed.first = self._layer(first, wide=state[0], beside=state[1], action=action)
+        else:
+            packed.first = self._layer(first, few=state[0], action=action)
+        packed.second = self._layer(second, wide=between.weight, wide_is_state=False)
+        packed.top = self._linear(top.weight, top.bias)
+        return packed
+
+    def _one_hidden(self, mlp: SplitMlp) -> tuple[library.Layer, nn.Linear]:
+        """One hidden layer of h, or of h and z; and the layer on top."""
+        weights = [weight_of(part) for part in mlp.first.parts]
+        (norm,), (top,) = norms_of(mlp), linears_of(mlp)
+        beside = weights[1] if len(weights) > 1 else None
+        return self._layer(norm, wide=weights[0], beside=beside), top
+
+    def _prior_top(self, top: nn.Linear) -> None:
+        weight, bias = _filled(top.weight, top.bias)
+        self.network.prior_outputs = len(bias)
+        self.network.prior_bias = self._keep(bias)
+        self.network.prior_top = self._wide(weight, state=False)
+
+    def _gru(self, model: WorldModel) -> library.Layer:
+        gru = gru_layer(model.gru)
+        layer = self._normalised(gru.gamma, gru.beta, gru.epsilon)
+        layer.wide = self._wide(_centred_columns(gru.wide_x), state=False)
+        layer.beside = self._wide(_centred_columns(gru.wide_h), state=True)
+        return layer
+
+    def _layer(
+        self,
+        norm: nn.LayerNorm,
+        wide: Tensor | None = None,
+        beside: Tensor | None = None,
+        few: Tensor | None = None,
+        action: Tensor | None = None,
+        wide_is_state: bool = True,
+    ) -> library.Layer:
+        layer = self._normalised(norm.weight, norm.bias, norm.eps)
+        if wide is not None:
+            layer.wide = self._wide(_centred_columns(wide), wide_is_state)
+        if beside is not None:
+            layer.beside = self._wide(_centred_columns(beside), state=True)
+        if few is not None:
+            layer.few = self._narrow(few)
+        if action is not None:
+            layer.action = self._narrow(action)
+        return layer
+
+    def _normalised(self, gamma: Tensor, beta: Tensor, epsilon: float) -> library.Layer:
+        outputs = len(gamma)
         if outputs % LANES or outputs > WIDEST:
             raise UsageError(
                 f"a layer of {outputs} units: the int8 planner takes multiples of {LANES} up to "
                 f"{WIDEST}; {library.OTHERWISE}"
             )
-        self._kept: list[Tensor] = []
-        self.layer = library.Layer()
-        self.layer.outputs, self.layer.epsilon = outputs, epsilon
-        self.layer.gamma, self.layer.beta = self.keep(gamma), self.keep(beta)
-        self.address = ctypes.byref(self.layer)
+        layer = library.Layer()
+        layer.outputs, layer.epsilon = outputs, epsilon
+        layer.gamma, layer.beta = self._keep(gamma), self._keep(beta)
+        return layer
 
-    def keep(self, tensor: Tensor, dtype: torch.dtype = torch.float32) -> int:
-        """The address of a copy."""
-        self._kept.append(tensor.detach().to("cpu", dtype).contiguous().clone())
-        return self._kept[-1].data_ptr()
+    def _narrow(self, weight: Tensor) -> library.Narrow:
+        return library.Narrow(weight.shape[1], self._keep(_centred_columns(weight).t()))
 
-    def wide(self, index: int, weight: Tensor, state: bool) -> None:
-        """Set a wide weight (N, K) for inputs of h (symmetric) or of a hidden layer."""
+    def _wide(self, weight: Tensor, state: bool) -> library.Wide:
+        """Of a weight (N, K) for inputs of h or z (symmetric), or of a hidden layer."""
         zero, offset = (128, 0.0) if state else (0, LEAST_SILU)
-        weight = weight.detach().float().cpu()
+        weight = torch.nn.functional.pad(weight.detach().float(), (0, -weight.shape[1] % 4))
         outputs, inputs = weight.shape
-        if inputs % 4 or inputs > WIDEST:
+        if inputs > WIDEST:
             raise UsageError(f"a layer of {inputs} inputs; {library.OTHERWISE}")
         scale = weight.abs().amax(1).clamp_min(1e-12) / LEVELS
         whole = (weight / scale[:, None]).round()
         total = whole.sum(1)
         blocks = whole.view(outputs // LANES, LANES, inputs // 4, 4).transpose(1, 2)
-        self.layer.wide[index] = library.Wide(
+        return library.Wide(
             inputs,
-            self.keep(blocks, torch.int8),
-            self.keep(scale),
-            self.keep(-zero * total, torch.int32),
-            self.keep(offset * scale * total),
+            self._keep(blocks, torch.int8),
+            self._keep(scale),
+            self._keep(-zero * total, torch.int32),
+            self._keep(offset * scale * total),
         )
 
-    def top(self, weight: Tensor, bias: Tensor) -> None:
-        """Set the linear layer on top, filled up to whole vectors."""
-        last = -(-len(bias) // LANES) * LANES
-        self.layer.last = last
-        self.layer.last_weight = self.keep(_filled(weight, last).t())
-        self.layer.last_bias = self.keep(_filled(bias[:, None], last)[:, 0])
+    def _linear(self, weight: Tensor, bias: Tensor, filled: bool = False) -> library.Linear:
+        """A layer in float32; its outputs, if they are several, filled up to whole vectors."""
+        if len(bias) > 1 or filled:
+            weight, bias = _filled(weight, bias)
+        inputs = weight.shape[1]
+        return library.Linear(inputs, len(bias), self._keep(weight.t()), self._keep(bias))
 
 
-def _filled(rows: Tensor, count: int) -> Tensor:
-    """(n, k) -> (count, k), zeros below."""
-    return torch.cat([rows.detach(), rows.new_zeros(count - len(rows), rows.shape[1])])
+def _filled(weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:
+    """(n, K), (n,) -> whole vectors of outputs, the further ones zero."""
+    more = (0, -len(bias) % LANES)
+    pad = torch.nn.functional.pad
+    return pad(weight.detach(), (0, 0, *more)), pad(bias.detach(), more)
 
 
-def _address(tensor: Tensor | None) -> int | None:
-    return None if tensor is None else tensor.data_ptr()
-
-
-class IntegerHidden:
-    """See `Hidden`; ``add`` is one row, (units,)."""
-
-    def __init__(self, layer: HiddenLayer) -> None:
-        self._units = len(layer.norm.weight)
-        memory = _Memory(self._units, layer.norm.weight, layer.norm.bias, layer.norm.eps)
-        if layer.wide is not None:
-            memory.wide(0, layer.wide, layer.wide_is_state)
-        if layer.narrow is not None:
-            memory.layer.narrow = layer.narrow.shape[1]
-            memory.layer.narrow_weight = memory.keep(layer.narrow.t())
-        if layer.last is not None:
-            memory.top(layer.last.weight, layer.last.bias)
-            self._outputs = layer.last.out_features
-        self._memory = memory
-
-    def between(self, wide: Bytes | None, narrow: Tensor | None, add: Tensor | None) -> Bytes:
-        """See `Hidden`."""
-        rows = _rows(wide, narrow)
-        out = Bytes(torch.empty(rows, self._units, dtype=torch.uint8), torch.empty(rows))
-        self._run(rows, wide, narrow, add, out, None)
-        return out
-
-    def last(self, wide: Bytes | None, narrow: Tensor | None, add: Tensor | None) -> Tensor:
-        """See `Hidden`."""
-        rows = _rows(wide, narrow)
-        out = torch.empty(rows, self._memory.layer.last)
-        self._run(rows, wide, narrow, add, None, out)
-        return out[:, : self._outputs]
-
-    def _run(
-        self,
-        rows: int,
-        wide: Bytes | None,
-        narrow: Tensor | None,
-        add: Tensor | None,
-        out: Bytes | None,
-        numbers: Tensor | None,
-    ) -> None:
-        narrow = None if narrow is None else narrow.contiguous()
-        library.library().hidden(
-            self._memory.address,
-            rows,
-            None if wide is None else wide.values.data_ptr(),
-            None if wide is None else wide.scale.data_ptr(),
-            _address(narrow),
-            _address(add),
-            LEAST_SILU,
-            None if out is None else out.values.data_ptr(),
-            None if out is None else out.scale.data_ptr(),
-            _address(numbers),
-        )
-
-
-def _rows(wide: Bytes | None, narrow: Tensor | None) -> int:
-    if wide is not None:
-        return len(wide.scale)
-    assert narrow is not None
-    return len(narrow)
-
-
-class IntegerRecurrence:
-    """See `Recurrence`; ``add`` is one row, and so is an h that all rows share."""
-
-    def __init__(self, layer: GruLayer) -> None:
-        self._memory = _Memory(len(layer.beta), layer.gamma, layer.beta, layer.epsilon)
-        self._memory.wide(0, layer.wide_x, state=False)
-        self._memory.wide(1, layer.wide_h, state=True)
-
-    def __call__(
-        self, x: Bytes, wide_h: Bytes | None, add: Tensor | None, h: Tensor
-    ) -> tuple[Tensor, Bytes]:
-        """See `Recurrence`."""
-        rows, size = len(x.scale), h.shape[-1]
-        after = torch.empty(rows, size)
-        out = Bytes(torch.empty(rows, size, dtype=torch.uint8), torch.empty(rows))
-        library.library().recur(
-            self._memory.address,
-            rows,
-            x.values.data_ptr(),
-            x.scale.data_ptr(),
-            None if wide_h is None else wide_h.values.data_ptr(),
-            None if wide_h is None else wide_h.scale.data_ptr(),
-            _address(add),
-            h.data_ptr(),
-            size if h.dim() > 1 else 0,
-            after.data_ptr(),
-            out.values.data_ptr(),
-            out.scale.data_ptr(),
-        )
-        return after, out
-
-
-class IntegerLinear:
-    """See `Linear`."""
-
-    def __init__(self, h: Tensor, z: Tensor) -> None:
-        self._outputs = len(h)
-        self._last = -(-self._outputs // LANES) * LANES
-        self._h = _filled(h.float().cpu(), self._last).t().contiguous()
-        self._z = _filled(z.float().cpu(), self._last).t().contiguous()
-        self._zero = torch.zeros(self._last)
-
-    def __call__(self, h: Tensor, z: Tensor) -> Tensor:
-        """See `Linear`."""
-        rows, z = len(h), z.contiguous()
-        out = torch.empty(rows, self._last)
-        linear = library.library().linear
-        zero = self._zero.data_ptr()
-        linear(rows, h.shape[1], h.data_ptr(), self._last, self._h.data_ptr(), zero, out.data_ptr())
-        linear(rows, z.shape[1], z.data_ptr(), self._last, self._z.data_ptr(), None, out.data_ptr())
-        return out[:, : self._outputs]
+def _centred_columns(weight: Tensor) -> Tensor:
+    """A weight (N, K) whose outputs have no mean: LayerNorm takes it away in any case."""
+    return weight - weight.mean(0)

@@ -1,93 +1,99 @@
-"""Judges of plans that compute with the packed planning network."""
+"""Judges of plans that compute with a packed planning network."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 
 import torch
 from torch import Tensor
 
-from egovcp.model import Carry
-from egovcp.plan.backends.integers import Bytes
-from egovcp.plan.backends.network import PlanningNetwork, Root
-from egovcp.plan.objective import Worth
+from egovcp.model import Carry, WorldModel
+from egovcp.plan.backends.integers import IntegerNetwork, Shared
+from egovcp.plan.backends.library import Threads
+from egovcp.plan.backends.network import PlanningNetwork
+from egovcp.plan.backends.reading import noise_of, q_of
+from egovcp.plan.backends.root import Root, root_of
+from egovcp.plan.config import PlannerConfig
+from egovcp.plan.objective import Tally, Worth
 
 
 class FloatJudge:
     """All candidates of all robots at once, on any device.
 
     Args:
-        network: in floating point.
+        model: is packed as it is now.
+        config: of the planner.
+        dtype: of the wide products.
         compiled: through torch.compile, which takes a minute at the first plan.
     """
 
-    def __init__(self, network: PlanningNetwork[Tensor], compiled: bool = False) -> None:
-        self._network = network
-        self._worth: Callable[[Root, Tensor, list[Tensor]], Tensor] = network.worth
+    def __init__(
+        self,
+        model: WorldModel,
+        config: PlannerConfig,
+        dtype: torch.dtype = torch.float32,
+        compiled: bool = False,
+    ) -> None:
+        self._model, self._config = model, config
+        self._worth: Callable[[Root, Tensor, Tensor | None], Tensor]
+        self._worth = PlanningNetwork(model, config, dtype).worth
         if compiled:
-            self._worth = torch.compile(network.worth, dynamic=False)
+            self._worth = torch.compile(self._worth, dynamic=False)
 
     @torch.no_grad()
     def at(self, carry: Carry) -> Worth:
         """See `Judge`."""
-        root = self._network.root(carry)
+        root = root_of(self._model, carry)
 
         @torch.no_grad()
         def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:
-            noise = self._network.noise(actions.shape[-2], generator)
+            noise = noise_of(self._model, self._config, actions.shape[-2], generator)
             return self._worth(root, actions, noise)
 
         return worth
 
 
 class IntegerJudge:
-    """A robot's candidates in as many parts as torch uses threads."""
+    """One robot after the other, its candidates shared by as many threads as torch uses.
 
-    def __init__(self, network: PlanningNetwork[Bytes]) -> None:
-        self._network = network
-        self._threads = torch.get_num_threads()
-        self._pool: ThreadPoolExecutor | None = None
+    Args:
+        model: is packed as it is now; on the processor.
+        config: of the planner.
+
+    Raises:
+        EnvironmentFailure: the kernel cannot be built.
+        UsageError: the model has sizes that the kernel does not take.
+    """
+
+    def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
+        self._model, self._config = model, config
+        self._network = IntegerNetwork(model, config)
+        self._threads = Threads(torch.get_num_threads())
 
     @torch.no_grad()
     def at(self, carry: Carry) -> Worth:
         """See `Judge`."""
-        network = self._network
-        roots = [_row(network.root(Carry(h, z))) for h, z in _each(carry)]
+        # One by one: what a robot's plans are worth does not depend on the robots beside it.
+        states = [Carry(h[None], z[None]) for h, z in zip(*carry, strict=True)]
+        robots = [self._network.shared(root_of(self._model, state)) for state in states]
         sound = carry.h.isfinite().all(1) & carry.z.isfinite().all(1)
 
+        @torch.no_grad()
         def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:
-            noise = network.noise(actions.shape[-2], generator)
-            finite = actions.isfinite().flatten(2).all(-1) & sound[:, None]
-            jobs = [
-                (root, part.contiguous(), noise)
-                for root, rows in zip(roots, actions, strict=True)
-                for part in rows.chunk(self._threads)
-            ]
-            values = torch.cat(self._run(jobs)).view(finite.shape)
-            return values.masked_fill(~finite, torch.nan)  # bytes know no NaN
+            noise = noise_of(self._model, self._config, actions.shape[-2], generator)
+            values = [self._one(*one, noise) for one in zip(robots, actions, strict=True)]
+            finite = actions.sum((2, 3)).isfinite() & sound[:, None]
+            return torch.stack(values).where(finite, torch.nan)  # bytes know no NaN
 
         return worth
 
-    def _run(self, jobs: list[tuple[Root, Tensor, list[Tensor]]]) -> list[Tensor]:
-        if self._threads == 1:
-            return [self._one(job) for job in jobs]
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(self._threads, "planner")
-        return list(self._pool.map(self._one, jobs))
-
-    def _one(self, job: tuple[Root, Tensor, list[Tensor]]) -> Tensor:
-        with torch.no_grad():  # a thread's own switch
-            return self._network.worth(*job)
-
-
-def _each(carry: Carry) -> list[tuple[Tensor, Tensor]]:
-    """The robots' states one by one, (1, ...) each."""
-    return [(carry.h[e : e + 1], carry.z[e : e + 1]) for e in range(len(carry.h))]
-
-
-def _row(root: Root) -> Root:
-    """One robot's root without its leading dimensions, (1, 1, n) -> (n,)."""
-    values = tuple(x.flatten().contiguous() for x in root.values)
-    h, mix, recurrence = (x.flatten().contiguous() for x in root[:3])
-    return Root(h, mix, recurrence, values)
+    def _one(self, robot: Shared, actions: Tensor, noise: Tensor | None) -> Tensor:
+        """J (M,) of plans (M, N, 7) of a robot."""
+        outputs, dead = self._network.outputs(robot, actions, noise, self._threads)
+        q, risk = q_of(self._model, self._config, outputs), torch.sigmoid(dead)
+        tally, horizon = Tally(self._config, self._model.return_floor), actions.shape[-2]
+        for k in range(horizon):
+            tally.value(q[:, k])
+            if 0 < k < horizon - 1:
+                tally.risk(risk[:, k])
+        return tally.mean(horizon)

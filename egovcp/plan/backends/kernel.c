@@ -1,9 +1,13 @@
-/* Layers of the planning network on rows of candidates, in 8-bit integers.
+/* Imagination and value of candidate plans, in 8-bit integers: the planning network of `network.py`.
+ *
+ * A block of ROWS candidates goes through all steps of the horizon before the next one starts, so that
+ * what they carry stays in the fastest cache; threads take blocks from a common counter.
  *
  * A wide input row x (K numbers) is kept as x = scale * (u - zero) + offset with u in 0..255: zero and
  * offset belong to its kind, scale to the row. Weights are w = weight_scale[n] * i, i in -127..127,
  * in blocks [N/16][K/4][16][4] of which one vector register holds the last two axes. Few, exact
- * inputs (the action above all) stay in float32. One thread, no state, no allocation. */
+ * inputs (the action above all) stay in float32. The weights of a normalised layer are centred (their
+ * mean over the outputs is zero), and so are its sums. No state, no allocation. */
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
@@ -11,7 +15,10 @@
 #include <immintrin.h>
 #endif
 
-enum { BLOCK = 8, LANES = 16, WIDEST = 1024 };
+enum { ROWS = 8, LANES = 16, WIDEST = 1024, MOST_FEW = 128 };
+
+typedef float Floats __attribute__((vector_size(4 * LANES)));
+typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
 
 typedef struct {
     int32_t inputs;       /* K, a multiple of 4; 0: there is no such input */
@@ -22,24 +29,60 @@ typedef struct {
 } Wide;
 
 typedef struct {
+    int32_t inputs;      /* K; 0: there is no such input */
+    const float *weight; /* [K][N] */
+} Narrow;
+
+typedef struct {
     int32_t outputs; /* N, a multiple of 16 */
-    Wide wide[2];
-    int32_t narrow;             /* inputs in float32 */
-    const float *narrow_weight; /* [narrow][N] */
-    const float *gamma, *beta;  /* [N] of the normalisation */
+    Wide wide, beside; /* h and z; or a hidden layer, and h */
+    Narrow few, action;
+    const float *gamma, *beta; /* [N] of the normalisation */
     float epsilon;
-    int32_t last;             /* outputs of a linear layer on top, a multiple of 16; 0: none */
-    const float *last_weight; /* [N][last] */
-    const float *last_bias;   /* [last] */
 } Layer;
 
 typedef struct {
-    const uint8_t *values; /* [rows][K] */
-    const float *scale;    /* [rows] */
+    int32_t inputs, outputs; /* outputs: 1 or a multiple of 16; 0: there is no such layer */
+    const float *weight;     /* [inputs][outputs] */
+    const float *bias;       /* [outputs] */
+} Linear;
+
+typedef struct {
+    Layer first, second;
+    Linear top;
+} Mlp;
+
+typedef struct {
+    Linear reduce_h, reduce_z; /* to what `state` reads in place of h and z, if there are any */
+    Mlp state, passing;        /* the second reads what is on its way, if its top has outputs */
+} Head;
+
+typedef struct {
+    int32_t hidden, latent, actions, heads;
+    Layer mix, gru, prior, termination, told;
+    Wide prior_top;         /* [outputs] means, then raw deviations if they are wanted */
+    const float *prior_bias; /* [MOST_FEW] */
+    int32_t prior_outputs;  /* a multiple of 16 */
+    Linear termination_top, told_top;
+    float min_std;
+    const Head *head; /* [heads] */
+} Network;
+
+typedef struct {
+    const float *h;      /* [hidden] */
+    const float *mix;    /* sums of the first layers that do not depend on the candidate */
+    const float *gates;
+    const float *const *values; /* of the heads, two for one that is told */
+} Root;
+
+typedef struct {
+    uint8_t values[ROWS][WIDEST];
+    float scale[ROWS];
 } Bytes;
 
-typedef float Floats __attribute__((vector_size(4 * LANES)));
-typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
+typedef struct {
+    float values[ROWS][MOST_FEW];
+} Few;
 
 static inline Floats load(const float *x) {
     Floats v;
@@ -58,14 +101,6 @@ static inline Floats larger(Floats a, Floats b) {
 #endif
 }
 
-static inline Floats smaller(Floats a, Floats b) {
-#if defined(__AVX512F__)
-    return (Floats)_mm512_min_ps((__m512)a, (__m512)b);
-#else
-    return -larger(-a, -b);
-#endif
-}
-
 static inline Floats absolute(Floats a) { return (Floats)((Ints)a & 0x7fffffff); }
 
 static inline float total(Floats v) {
@@ -78,164 +113,7 @@ static inline float total(Floats v) {
 #endif
 }
 
-/* 1 / x of normal numbers. */
-static inline Floats reciprocal(Floats x) {
-#if defined(__AVX512F__)
-    Floats guess = (Floats)_mm512_rcp14_ps((__m512)x);
-    return guess * (2.0f - x * guess); /* one Newton step: 28 bits */
-#else
-    return 1.0f / x;
-#endif
-}
-
-/* exp(x) within 5e-6 of its value; beyond what float32 holds, its least and largest powers of 2. */
-static inline Floats exponential(Floats x) {
-    Floats limit = (Floats){0} + 126.0f;
-    x = smaller(larger(x * 1.44269504f, -limit), limit);
-    Ints power = __builtin_convertvector(x + 127.5f, Ints); /* rounds x: it is positive here */
-    Floats t = (x - __builtin_convertvector(power - 127, Floats)) * 0.693147181f;
-    Floats series = 1.0f + t * (1.0f + t * (0.5f + t * (0.16666667f + t * (0.041666668f + t * 0.0083333338f))));
-    return series * (Floats)(power << 23);
-}
-
-static inline Floats sigmoid(Floats x) { return reciprocal(1.0f + exponential(-x)); }
-
-/* Dot products of a block of rows, its bytes in fours [K/4][BLOCK], with `columns` times 16 outputs. */
-static inline __attribute__((always_inline)) void dots(const Wide *w, int n, int columns,
-                                                       const int32_t *fours, Ints dot[][BLOCK]) {
-    const int quads = w->inputs / 4;
-    const int8_t *weight = w->weight + (int64_t)n * w->inputs;
-    for (int c = 0; c < columns; c++) {
-        Ints start;
-        memcpy(&start, w->start + n + c * LANES, sizeof start);
-        for (int r = 0; r < BLOCK; r++) dot[c][r] = start;
-    }
-    for (int q = 0; q < quads; q++)
-        for (int c = 0; c < columns; c++) {
-            const int8_t *four_by_lane = weight + ((int64_t)c * quads + q) * 4 * LANES;
-#if defined(__AVX512VNNI__)
-            const __m512i b = _mm512_loadu_si512(four_by_lane);
-            for (int r = 0; r < BLOCK; r++)
-                dot[c][r] = (Ints)_mm512_dpbusd_epi32(
-                    (__m512i)dot[c][r], _mm512_set1_epi32(fours[q * BLOCK + r]), b);
-#else
-            for (int r = 0; r < BLOCK; r++) {
-                const uint8_t *x = (const uint8_t *)(fours + q * BLOCK + r);
-                for (int i = 0; i < LANES; i++)
-                    for (int j = 0; j < 4; j++)
-                        dot[c][r][i] += (int32_t)x[j] * four_by_lane[4 * i + j];
-            }
-#endif
-        }
-}
-
-static inline __attribute__((always_inline)) void add_products(const Wide *w, int n, int columns,
-                                                               int n_outputs, const int32_t *fours,
-                                                               const float *scale, float *y) {
-    Ints dot[2][BLOCK];
-    dots(w, n, columns, fours, dot);
-    for (int c = 0; c < columns; c++, n += LANES) {
-        const Floats weight_scale = load(w->scale + n), shift = load(w->shift + n);
-        for (int r = 0; r < BLOCK; r++) {
-            float *out = y + (int64_t)r * n_outputs + n;
-            Floats product = __builtin_convertvector(dot[c][r], Floats) * weight_scale;
-            store(out, load(out) + scale[r] * product + shift);
-        }
-    }
-}
-
-/* y [BLOCK][N] += the product of `count` rows with one wide weight. */
-static void wide_product(const Wide *w, int n_outputs, Bytes in, int row, int count, float *y) {
-    int32_t fours[BLOCK * WIDEST / 4];
-    float scale[BLOCK];
-    for (int r = 0; r < BLOCK; r++) {
-        const int from = row + (r < count ? r : 0); /* rows beyond the last repeat the first */
-        const uint8_t *x = in.values + (int64_t)from * w->inputs;
-        scale[r] = in.scale[from];
-        for (int q = 0; q < w->inputs / 4; q++) memcpy(fours + q * BLOCK + r, x + 4 * q, 4);
-    }
-    int n = 0;
-    for (; n + 2 * LANES <= n_outputs; n += 2 * LANES)
-        add_products(w, n, 2, n_outputs, fours, scale, y);
-    for (; n < n_outputs; n += LANES) add_products(w, n, 1, n_outputs, fours, scale, y);
-}
-
-/* y [BLOCK][N] += the product of `count` rows with the narrow weight. */
-static void narrow_product(const Layer *l, const float *narrow, int row, int count, float *y) {
-    const int n_outputs = l->outputs;
-    const float *x[BLOCK];
-    for (int r = 0; r < BLOCK; r++) x[r] = narrow + (int64_t)(row + (r < count ? r : 0)) * l->narrow;
-    for (int n = 0; n < n_outputs; n += LANES) {
-        Floats acc[BLOCK];
-        for (int r = 0; r < BLOCK; r++) acc[r] = load(y + (int64_t)r * n_outputs + n);
-        for (int k = 0; k < l->narrow; k++) {
-            const Floats weight = load(l->narrow_weight + (int64_t)k * n_outputs + n);
-            for (int r = 0; r < BLOCK; r++) acc[r] += x[r][k] * weight;
-        }
-        for (int r = 0; r < BLOCK; r++) store(y + (int64_t)r * n_outputs + n, acc[r]);
-    }
-}
-
-/* y [BLOCK][N] = add + all products; rows from `count` on repeat the first. */
-static void sums(const Layer *l, const Bytes *in, const float *narrow, const float *add, int row,
-                 int count, float *y) {
-    for (int r = 0; r < BLOCK; r++) {
-        float *out = y + (int64_t)r * l->outputs;
-        if (add) memcpy(out, add, l->outputs * sizeof(float));
-        else memset(out, 0, l->outputs * sizeof(float));
-    }
-    for (int i = 0; i < 2; i++)
-        if (l->wide[i].inputs && in[i].values)
-            wide_product(&l->wide[i], l->outputs, in[i], row, count, y);
-    if (l->narrow) narrow_product(l, narrow, row, count, y);
-}
-
-/* Means and reciprocal deviations of a block of rows of sums, as the layer normalises them. */
-static void moments(const Layer *l, const float *y, float *mean, float *rate) {
-    for (int r = 0; r < BLOCK; r++) {
-        const float *from = y + (int64_t)r * l->outputs;
-        Floats even = {0}, odd = {0};
-        int i = 0;
-        for (; i + 2 * LANES <= l->outputs; i += 2 * LANES) {
-            even += load(from + i);
-            odd += load(from + i + LANES);
-        }
-        if (i < l->outputs) even += load(from + i);
-        mean[r] = total(even + odd) / (float)l->outputs;
-    }
-    for (int r = 0; r < BLOCK; r++) {
-        const float *from = y + (int64_t)r * l->outputs;
-        Floats squares = {0};
-        for (int i = 0; i < l->outputs; i += LANES) {
-            const Floats beside = load(from + i) - mean[r];
-            squares += beside * beside;
-        }
-        rate[r] = 1.0f / sqrtf(total(squares) / (float)l->outputs + l->epsilon);
-    }
-}
-
-static inline Floats normal(const Layer *l, const float *y, int i, float mean, float rate) {
-    return (load(y + i) - mean) * rate * load(l->gamma + i) + load(l->beta + i);
-}
-
-/* One row as bytes, x = scale * (u - zero) + offset; `most` bounds x - offset, or |x| if zero > 0. */
-static float to_bytes(const float *x, int count, float most, float zero, float offset, uint8_t *u) {
-    most = most > 1e-6f ? most : 1e-6f;
-    const float scale = most / (255.0f - zero), rate = 1.0f / scale;
-    for (int n = 0; n < count; n += LANES) {
-        Floats v = (load(x + n) - offset) * rate + (zero + 0.5f);
-        v = smaller(larger(v, (Floats){0}), (Floats){0} + 255.0f);
-        Ints whole = __builtin_convertvector(v, Ints);
-#if defined(__AVX512F__)
-        _mm_storeu_si128((__m128i *)(u + n), _mm512_cvtepi32_epi8((__m512i)whole));
-#else
-        for (int i = 0; i < LANES; i++) u[n + i] = (uint8_t)whole[i];
-#endif
-    }
-    return scale;
-}
-
-static float highest(Floats v) {
+static inline float highest(Floats v) {
 #if defined(__AVX512F__)
     return _mm512_reduce_max_ps((__m512)v);
 #else
@@ -245,99 +123,354 @@ static float highest(Floats v) {
 #endif
 }
 
-/* A block of rows y [BLOCK][N] through the layer on top. */
-static void last_layer(const Layer *l, const float *y, int row, int count, float *numbers) {
-    for (int j = 0; j < l->last; j += LANES) {
-        Floats acc[BLOCK];
-        for (int r = 0; r < BLOCK; r++) acc[r] = load(l->last_bias + j);
-        for (int n = 0; n < l->outputs; n++) {
-            const Floats weight = load(l->last_weight + (int64_t)n * l->last + j);
-            for (int r = 0; r < BLOCK; r++) acc[r] += y[r * l->outputs + n] * weight;
+/* 1 / (1 + exp(-x)) within 2e-4 of its value: a byte tells no more than 4e-3. */
+static inline Floats sigmoid(Floats x) {
+    x *= -1.44269504f;
+#if defined(__AVX512F__)
+    const Floats whole = (Floats)_mm512_roundscale_ps((__m512)x, 0);
+#else
+    const Floats most = (Floats){0} + 126.0f;
+    x = -larger(-larger(x, -most), -most);
+    const Ints power = __builtin_convertvector(x + 127.5f, Ints); /* rounds x: it is positive here */
+    const Floats whole = __builtin_convertvector(power - 127, Floats);
+#endif
+    const Floats t = x - whole;
+    Floats series = 1.0f + t * (0.6932829f + t * (0.24221037f + t * 0.05500858f)); /* 2^t */
+#if defined(__AVX512F__)
+    series = (Floats)_mm512_scalef_ps((__m512)series, (__m512)whole);
+    return (Floats)_mm512_rcp14_ps((__m512)(1.0f + series));
+#else
+    return 1.0f / (1.0f + series * (Floats)(power << 23));
+#endif
+}
+
+static inline float one_sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
+
+/* Dot products of a block of rows with `columns` times 16 outputs from `n` on. */
+static inline __attribute__((always_inline)) void dots(const Wide *w, int n, int columns,
+                                                       const Bytes *in, Ints dot[][ROWS]) {
+    const int quads = w->inputs / 4;
+    const int8_t *weight = w->weight + (int64_t)n * w->inputs;
+    for (int c = 0; c < columns; c++) {
+        Ints start;
+        memcpy(&start, w->start + n + c * LANES, sizeof start);
+        for (int r = 0; r < ROWS; r++) dot[c][r] = start;
+    }
+    for (int q = 0; q < quads; q++) {
+#if defined(__AVX512VNNI__)
+        __m512i b[3];
+        for (int c = 0; c < columns; c++)
+            b[c] = _mm512_loadu_si512(weight + ((int64_t)c * quads + q) * 4 * LANES);
+        for (int r = 0; r < ROWS; r++) {
+            int32_t four;
+            memcpy(&four, in->values[r] + 4 * q, sizeof four);
+            const __m512i x = _mm512_set1_epi32(four);
+            for (int c = 0; c < columns; c++)
+                dot[c][r] = (Ints)_mm512_dpbusd_epi32((__m512i)dot[c][r], x, b[c]);
         }
-        for (int r = 0; r < count; r++)
-            store(numbers + (int64_t)(row + r) * l->last + j, acc[r]);
+#else
+        for (int c = 0; c < columns; c++) {
+            const int8_t *four_by_lane = weight + ((int64_t)c * quads + q) * 4 * LANES;
+            for (int r = 0; r < ROWS; r++)
+                for (int i = 0; i < LANES; i++)
+                    for (int j = 0; j < 4; j++)
+                        dot[c][r][i] += (int32_t)in->values[r][4 * q + j] * four_by_lane[4 * i + j];
+        }
+#endif
     }
 }
 
-/* Linear, LayerNorm, SiLU on rows; the result as bytes (`bytes`, `scale`) or, a linear layer further,
- * as numbers (`numbers` [rows][last]); either may be null. */
-void hidden(const Layer *l, int rows, const uint8_t *values, const float *scales,
-            const float *narrow, const float *add, float offset, uint8_t *bytes, float *scale,
-            float *numbers) {
-    float y[BLOCK * WIDEST] __attribute__((aligned(64)));
-    float mean[BLOCK], rate[BLOCK];
-    const Bytes in[2] = {{values, scales}, {0, 0}};
-    for (int row = 0; row < rows; row += BLOCK) {
-        const int count = rows - row < BLOCK ? rows - row : BLOCK;
-        sums(l, in, narrow, add, row, count, y);
-        moments(l, y, mean, rate);
-        for (int r = 0; r < count; r++) {
-            float *out = y + (int64_t)r * l->outputs;
-            Floats most = {0};
-            for (int i = 0; i < l->outputs; i += LANES) {
-                Floats v = normal(l, out, i, mean[r], rate[r]);
-                v *= sigmoid(v);
-                store(out + i, v);
-                most = larger(most, v);
-            }
-            if (bytes)
-                scale[row + r] = to_bytes(out, l->outputs, highest(most) - offset, 0.0f, offset,
-                                          bytes + (int64_t)(row + r) * l->outputs);
+static inline __attribute__((always_inline)) void columns_of_product(const Wide *w, int n, int columns,
+                                                                     const Bytes *in, const float *from,
+                                                                     int from_stride, float *y,
+                                                                     int stride) {
+    Ints dot[3][ROWS];
+    dots(w, n, columns, in, dot);
+    for (int c = 0; c < columns; c++, n += LANES) {
+        const Floats weight_scale = load(w->scale + n), shift = load(w->shift + n);
+        for (int r = 0; r < ROWS; r++) {
+            const Floats product = __builtin_convertvector(dot[c][r], Floats) * weight_scale;
+            store(y + r * stride + n, load(from + r * from_stride + n) + shift + in->scale[r] * product);
         }
-        if (numbers) last_layer(l, y, row, count, numbers);
     }
 }
 
-/* The recurrence: gates from the layer's normalised sums (reset, candidate, update), h [rows][N/3]
- * (`stride` 0: one row for all) -> `next`, also as bytes. */
-void recur(const Layer *l, int rows, const uint8_t *x, const float *x_scale, const uint8_t *hb,
-           const float *h_scale, const float *add, const float *h, int stride, float *next,
-           uint8_t *bytes, float *scale) {
-    float y[BLOCK * WIDEST] __attribute__((aligned(64)));
-    float mean[BLOCK], rate[BLOCK];
-    const Bytes in[2] = {{x, x_scale}, {hb, h_scale}};
+/* y [ROWS][N] = from + the product with a wide weight. */
+static void wide_product(const Wide *w, int outputs, const Bytes *in, const float *from, int from_stride,
+                         float *y) {
+    int n = 0;
+    for (; n + 3 * LANES <= outputs; n += 3 * LANES)
+        columns_of_product(w, n, 3, in, from, from_stride, y, outputs);
+    for (; n < outputs; n += LANES) columns_of_product(w, n, 1, in, from, from_stride, y, outputs);
+}
+
+/* y [ROWS][N] = from + x [ROWS][x_stride] weight. */
+static void narrow_product(const float *weight, int inputs, int outputs, const float *x, int x_stride,
+                           const float *from, int from_stride, float *y) {
+    for (int n = 0; n < outputs; n += LANES) {
+        Floats acc[ROWS];
+        for (int r = 0; r < ROWS; r++) acc[r] = load(from + r * from_stride + n);
+        for (int k = 0; k < inputs; k++) {
+            const Floats w = load(weight + (int64_t)k * outputs + n);
+            for (int r = 0; r < ROWS; r++) acc[r] += x[r * x_stride + k] * w;
+        }
+        for (int r = 0; r < ROWS; r++) store(y + r * outputs + n, acc[r]);
+    }
+}
+
+typedef struct { /* of a layer; null: not there, or in the sums that it starts from */
+    const Bytes *wide, *beside;
+    const Few *few;
+    const float *action; /* [ROWS][actions] */
+    const float *from;   /* [N], shared by all rows */
+} Inputs;
+
+static const float ZEROS[WIDEST];
+
+/* y [ROWS][N] = the sum of the products with all inputs. */
+static void sums(const Layer *l, Inputs in, float *y) {
+    const float *from = in.from ? in.from : ZEROS;
+    int stride = 0;
+    if (in.action && l->action.inputs) {
+        narrow_product(l->action.weight, l->action.inputs, l->outputs, in.action, l->action.inputs, from,
+                       stride, y);
+        from = y, stride = l->outputs;
+    }
+    if (in.few && l->few.inputs) {
+        narrow_product(l->few.weight, l->few.inputs, l->outputs, in.few->values[0], MOST_FEW, from, stride,
+                       y);
+        from = y, stride = l->outputs;
+    }
+    if (in.beside && l->beside.inputs) {
+        wide_product(&l->beside, l->outputs, in.beside, from, stride, y);
+        from = y, stride = l->outputs;
+    }
+    if (in.wide && l->wide.inputs) wide_product(&l->wide, l->outputs, in.wide, from, stride, y);
+}
+
+/* Reciprocal deviations of a block of centred sums, as the layer normalises them. */
+static inline void rates(const Layer *l, const float *y, float *rate) {
+    Floats squares[ROWS] = {{0}};
+    for (int i = 0; i < l->outputs; i += LANES)
+        for (int r = 0; r < ROWS; r++) {
+            const Floats v = load(y + r * l->outputs + i);
+            squares[r] += v * v;
+        }
+    for (int r = 0; r < ROWS; r++) rate[r] = total(squares[r]);
+    for (int r = 0; r < ROWS; r++) rate[r] = 1.0f / sqrtf(rate[r] / (float)l->outputs + l->epsilon);
+}
+
+/* One row as bytes, x = scale * (u - zero) + offset; `most` bounds x - offset, or |x| if zero > 0. */
+static inline float to_bytes(const float *x, int count, float most, float zero, float offset, uint8_t *u) {
+    most = most > 1e-6f ? most : 1e-6f;
+    const float scale = most / (255.0f - zero), rate = 1.0f / scale, shift = zero - offset * rate;
+    for (int n = 0; n < count; n += LANES) {
+        const Floats v = load(x + n) * rate + shift;
+#if defined(__AVX512F__)
+        const __m512i whole = _mm512_cvtps_epi32((__m512)larger(v, (Floats){0}));
+        _mm_storeu_si128((__m128i *)(u + n), _mm512_cvtusepi32_epi8(whole));
+#else
+        for (int i = 0; i < LANES; i++) {
+            const float rounded = v[i] + 0.5f;
+            u[n + i] = rounded <= 0.0f ? 0 : rounded >= 255.0f ? 255 : (uint8_t)rounded;
+        }
+#endif
+    }
+    return scale;
+}
+
+static const float LEAST_SILU = -0.27846456f; /* bytes of hidden layers count from there */
+
+/* Linear, LayerNorm, SiLU: y [ROWS][N], and as bytes if they are wanted. */
+static void hidden(const Layer *l, Inputs in, float *y, Bytes *bytes) {
+    const int n = l->outputs;
+    float rate[ROWS];
+    Floats most[ROWS] = {{0}};
+    sums(l, in, y);
+    rates(l, y, rate);
+    for (int i = 0; i < n; i += LANES) {
+        const Floats gamma = load(l->gamma + i), beta = load(l->beta + i);
+        for (int r = 0; r < ROWS; r++) {
+            Floats v = load(y + r * n + i) * rate[r] * gamma + beta;
+            v *= sigmoid(v);
+            store(y + r * n + i, v);
+            most[r] = larger(most[r], v);
+        }
+    }
+    for (int r = 0; bytes && r < ROWS; r++)
+        bytes->scale[r] = to_bytes(y + r * n, n, highest(most[r]) - LEAST_SILU, 0.0f, LEAST_SILU,
+                                   bytes->values[r]);
+}
+
+/* The recurrence: gates (reset, candidate, update) from the layer's normalised sums; h [ROWS][N/3]
+ * from `before` (stride 0: one row for all), also as bytes. */
+static void recur(const Layer *l, Inputs in, const float *before, int stride, float *h, Bytes *bytes) {
+    float y[ROWS * WIDEST] __attribute__((aligned(64))), rate[ROWS];
     const int size = l->outputs / 3;
-    for (int row = 0; row < rows; row += BLOCK) {
-        const int count = rows - row < BLOCK ? rows - row : BLOCK;
-        sums(l, in, 0, add, row, count, y);
-        moments(l, y, mean, rate);
-        for (int r = 0; r < count; r++) {
-            float *out = y + (int64_t)r * l->outputs, *to = next + (int64_t)(row + r) * size;
-            const float *from = h + (int64_t)(row + r) * stride;
-            Floats most = {0};
-            for (int i = 0; i < size; i += LANES) {
-                Floats reset = sigmoid(normal(l, out, i, mean[r], rate[r]));
-                Floats candidate = normal(l, out, size + i, mean[r], rate[r]);
-                Floats update = sigmoid(normal(l, out, 2 * size + i, mean[r], rate[r]));
-                candidate = 2.0f * sigmoid(2.0f * reset * candidate) - 1.0f; /* tanh */
-                Floats old = load(from + i), v = old + update * (candidate - old);
-                store(to + i, v);
-                most = larger(most, absolute(v));
-            }
-            scale[row + r] = to_bytes(to, size, highest(most), 128.0f, 0.0f, bytes + (int64_t)(row + r) * size);
+    Floats most[ROWS] = {{0}};
+    sums(l, in, y);
+    rates(l, y, rate);
+    for (int i = 0; i < size; i += LANES) {
+        Floats gamma[3], beta[3];
+        for (int g = 0; g < 3; g++)
+            gamma[g] = load(l->gamma + g * size + i), beta[g] = load(l->beta + g * size + i);
+        for (int r = 0; r < ROWS; r++) {
+            Floats gate[3];
+            for (int g = 0; g < 3; g++)
+                gate[g] = load(y + r * l->outputs + g * size + i) * rate[r] * gamma[g] + beta[g];
+            const Floats new = 2.0f * sigmoid(2.0f * sigmoid(gate[0]) * gate[1]) - 1.0f; /* tanh */
+            const Floats old = load(before + r * stride + i), v = old + sigmoid(gate[2]) * (new - old);
+            store(h + r * size + i, v);
+            most[r] = larger(most[r], absolute(v));
         }
+    }
+    for (int r = 0; r < ROWS; r++)
+        bytes->scale[r] = to_bytes(h + r * size, size, highest(most[r]), 128.0f, 0.0f, bytes->values[r]);
+}
+
+/* out [ROWS][out_stride] += x [ROWS][inputs] weight + bias. */
+static void linear(const Linear *l, const float *x, float *out, int out_stride) {
+    if (l->outputs == 1) {
+        for (int r = 0; r < ROWS; r++) {
+            Floats sum = {0};
+            for (int n = 0; n < l->inputs; n += LANES)
+                sum += load(x + r * l->inputs + n) * load(l->weight + n);
+            out[r * out_stride] += total(sum) + l->bias[0];
+        }
+        return;
+    }
+    for (int j = 0; j < l->outputs; j += LANES) {
+        Floats acc[ROWS];
+        for (int r = 0; r < ROWS; r++) acc[r] = load(out + r * out_stride + j) + load(l->bias + j);
+        for (int n = 0; n < l->inputs; n++) {
+            const Floats weight = load(l->weight + (int64_t)n * l->outputs + j);
+            for (int r = 0; r < ROWS; r++) acc[r] += x[r * l->inputs + n] * weight;
+        }
+        for (int r = 0; r < ROWS; r++) store(out + r * out_stride + j, acc[r]);
     }
 }
 
-/* out [rows][last] = add + x [rows][inputs] weight; add is one row for all, or null: what is in `out`. */
-void linear(int rows, int inputs, const float *x, int last, const float *weight, const float *add,
-            float *out) {
-    for (int row = 0; row < rows; row += BLOCK) {
-        const int count = rows - row < BLOCK ? rows - row : BLOCK;
-        for (int j = 0; j < last; j += LANES) {
-            Floats acc[BLOCK];
-            const float *from[BLOCK];
-            for (int r = 0; r < BLOCK; r++) {
-                const int here = row + (r < count ? r : 0);
-                acc[r] = load(add ? add + j : out + (int64_t)here * last + j);
-                from[r] = x + (int64_t)here * inputs;
+/* z [ROWS][latent] of the prior, with noise [latent] or (null) its mean; also as bytes. */
+static void next_z(const Network *net, const Bytes *h, const float *noise, float *z, Bytes *bytes) {
+    float y[ROWS * WIDEST] __attribute__((aligned(64))), out[ROWS * MOST_FEW];
+    const int latent = net->latent, outputs = net->prior_outputs;
+    Bytes between;
+    hidden(&net->prior, (Inputs){.wide = h}, y, &between);
+    wide_product(&net->prior_top, outputs, &between, net->prior_bias, 0, out);
+    for (int r = 0; r < ROWS; r++) {
+        float padded[MOST_FEW] = {0}, most = 0.0f;
+        for (int i = 0; i < latent; i++) {
+            float v = out[r * outputs + i];
+            if (noise) {
+                const float raw = out[r * outputs + latent + i] + 0.54f;
+                v += (log1pf(expf(-fabsf(raw))) + (raw > 0.0f ? raw : 0.0f) + net->min_std) * noise[i];
             }
-            for (int k = 0; k < inputs; k++) {
-                const Floats w = load(weight + (int64_t)k * last + j);
-                for (int r = 0; r < BLOCK; r++) acc[r] += from[r][k] * w;
-            }
-            for (int r = 0; r < count; r++)
-                store(out + (int64_t)(row + r) * last + j, acc[r]);
+            z[r * latent + i] = padded[i] = v;
+            most = fabsf(v) > most ? fabsf(v) : most;
         }
+        bytes->scale[r] = to_bytes(padded, latent, most, 128.0f, 0.0f, bytes->values[r]);
+    }
+}
+
+/* What is on its way: its probability, and that times where and when. */
+static void tell(const Network *net, const Bytes *h, const Bytes *z, Few *told) {
+    float y[ROWS * WIDEST] __attribute__((aligned(64)));
+    Few out = {{{0}}};
+    hidden(&net->told, (Inputs){.wide = h, .beside = z}, y, 0);
+    linear(&net->told_top, y, out.values[0], MOST_FEW);
+    for (int r = 0; r < ROWS; r++) {
+        const float coming = one_sigmoid(out.values[r][3]);
+        told->values[r][0] = coming;
+        for (int i = 0; i < 3; i++) told->values[r][1 + i] = coming * out.values[r][i];
+    }
+}
+
+/* q [ROWS][stride] += the outputs of a network of two hidden layers. */
+static void mlp(const Mlp *m, Inputs in, float *q, int stride) {
+    float y[ROWS * WIDEST] __attribute__((aligned(64)));
+    Bytes bytes;
+    hidden(&m->first, in, y, &bytes);
+    hidden(&m->second, (Inputs){.wide = &bytes}, y, 0);
+    linear(&m->top, y, q, stride);
+}
+
+/* Everything of a block: actions [ROWS][steps][actions] -> q [ROWS][steps][heads][width], zero before,
+ * and the log-odds of a failure, dead [ROWS][steps]. */
+static void block(const Network *net, const Root *root, int steps, const float *actions, const float *noise,
+                  float *q, int width, float *dead) {
+    float h[ROWS * WIDEST] __attribute__((aligned(64))), y[ROWS * WIDEST] __attribute__((aligned(64)));
+    float z[ROWS * MOST_FEW], action[ROWS * MOST_FEW];
+    Bytes h_bytes, z_bytes, x;
+    Few told;
+    const int per_step = net->heads * width, q_stride = steps * per_step;
+    for (int k = 0; k < steps; k++) {
+        for (int r = 0; r < ROWS; r++)
+            memcpy(action + r * net->actions, actions + (r * steps + k) * net->actions,
+                   net->actions * sizeof(float));
+        if (k > 0) { /* x was made from the action before */
+            if (k == 1)
+                recur(&net->gru, (Inputs){.wide = &x, .from = root->gates}, root->h, 0, h, &h_bytes);
+            else
+                recur(&net->gru, (Inputs){.wide = &x, .beside = &h_bytes}, h, net->hidden, h, &h_bytes);
+            next_z(net, &h_bytes, noise ? noise + (k - 1) * net->latent : 0, z, &z_bytes);
+            if (net->told_top.outputs) tell(net, &h_bytes, &z_bytes, &told);
+        }
+        const float *const *add = root->values;
+        for (int i = 0; i < net->heads; i++) {
+            const Head *head = net->head + i;
+            float *to = q + k * per_step + i * width;
+            Inputs in = {.action = action};
+            Few reduced = {{{0}}};
+            if (k == 0) {
+                in.from = *add++;
+            } else if (head->reduce_h.outputs) {
+                linear(&head->reduce_h, h, reduced.values[0], MOST_FEW);
+                linear(&head->reduce_z, z, reduced.values[0], MOST_FEW);
+                in.few = &reduced;
+            } else {
+                in.wide = &h_bytes, in.beside = &z_bytes;
+            }
+            mlp(&head->state, in, to, q_stride);
+            if (head->passing.top.outputs) {
+                in = (Inputs){.action = action};
+                if (k == 0) in.from = *add++;
+                else in.few = &told;
+                mlp(&head->passing, in, to, q_stride);
+            }
+        }
+        if (k == steps - 1) break; /* nothing follows the last step */
+        if (k > 0) {
+            hidden(&net->termination, (Inputs){.wide = &h_bytes, .beside = &z_bytes}, y, 0);
+            linear(&net->termination_top, y, dead + k, steps);
+        }
+        const Inputs in = {.action = action, .beside = k > 0 ? &z_bytes : 0, .from = k > 0 ? 0 : root->mix};
+        hidden(&net->mix, in, y, &x);
+    }
+}
+
+/* Plans of one robot: actions [rows][steps][actions], noise [steps - 1][latent] or null -> q
+ * [rows][steps][heads][width] and dead [rows][steps] (of steps 1 to steps - 2), both zero before.
+ * Threads that share `next` share the blocks. */
+void judge(const Network *net, const Root *root, int rows, int steps, const float *actions,
+           const float *noise, int width, float *q, float *dead, int32_t *next) {
+    const int per_row = steps * net->actions, q_row = steps * net->heads * width;
+    for (;;) {
+        const int row = __atomic_fetch_add(next, ROWS, __ATOMIC_RELAXED);
+        if (row >= rows) return;
+        if (row + ROWS <= rows) {
+            block(net, root, steps, actions + (int64_t)row * per_row, noise, q + (int64_t)row * q_row, width,
+                  dead + (int64_t)row * steps);
+            continue;
+        }
+        float some[ROWS * per_row], some_q[ROWS * q_row], some_dead[ROWS * steps];
+        const int count = rows - row;
+        memset(some_q, 0, sizeof some_q);
+        memset(some_dead, 0, sizeof some_dead);
+        for (int r = 0; r < ROWS; r++) /* rows beyond the last repeat the first */
+            memcpy(some + r * per_row, actions + (int64_t)(row + (r < count ? r : 0)) * per_row,
+                   per_row * sizeof(float));
+        block(net, root, steps, some, noise, some_q, width, some_dead);
+        memcpy(q + (int64_t)row * q_row, some_q, count * q_row * sizeof(float));
+        memcpy(dead + (int64_t)row * steps, some_dead, count * steps * sizeof(float));
     }
 }

@@ -1,16 +1,13 @@
-"""The layers that a planning network is made of, as any arithmetic must provide them.
+"""The layers that a planning network is made of, taken out of a world model.
 
 A layer's inputs are of two kinds. *Wide* ones (h, and what a hidden layer gives to the next) carry
-nearly all of the arithmetic, in whatever form the arithmetic likes best: `R`, made by it and read
-by nobody else. *Narrow* ones (z, the action, and what is told of a ball) are few and stay float32:
-between two actions that are worth comparing there may be less than a byte can tell.
-
-What all candidates share is a sum that is ready when they come: ``add``.
+nearly all of the arithmetic. *Narrow* ones (z, the action, and what is told of a ball) are few.
+What all candidates share is a sum that is ready when they come (`egovcp.plan.backends.root`).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -22,7 +19,6 @@ class HiddenLayer(NamedTuple):
     """Weights of Linear + LayerNorm + SiLU, and of the Linear on top if it is the last one."""
 
     wide: Tensor | None  # (units, K)
-    wide_is_state: bool  # h, or else a hidden layer
     narrow: Tensor | None  # (units, k)
     norm: nn.LayerNorm
     last: nn.Linear | None
@@ -36,47 +32,6 @@ class GruLayer(NamedTuple):
     gamma: Tensor  # (3 hidden,)
     beta: Tensor  # (3 hidden,) with the bias of the update gate
     epsilon: float
-
-
-class Hidden[R](Protocol):
-    """One hidden layer."""
-
-    def between(self, wide: R | None, narrow: Tensor | None, add: Tensor | None) -> R:
-        """The layer's outputs, for a further layer."""
-        ...
-
-    def last(self, wide: R | None, narrow: Tensor | None, add: Tensor | None) -> Tensor:
-        """(..., outputs) of the linear layer on top."""
-        ...
-
-
-class Recurrence[R](Protocol):
-    """The GRU."""
-
-    def __call__(self, x: R, wide_h: R | None, add: Tensor | None, h: Tensor) -> tuple[Tensor, R]:
-        """The next h, as numbers and as a wide input; the part of h comes from ``wide_h`` or is
-        in ``add``."""
-        ...
-
-
-class Linear(Protocol):
-    """A linear layer of few outputs on numbers."""
-
-    def __call__(self, h: Tensor, z: Tensor) -> Tensor:
-        """(..., outputs)."""
-        ...
-
-
-class Arithmetic[R](Protocol):
-    """Makes layers."""
-
-    def hidden(self, layer: HiddenLayer) -> Hidden[R]: ...
-
-    def recurrence(self, layer: GruLayer) -> Recurrence[R]: ...
-
-    def linear(self, h: Tensor, z: Tensor) -> Linear:
-        """From the weights (outputs, hidden) and (outputs, latent)."""
-        ...
 
 
 def weight_of(linear: nn.Module) -> Tensor:
@@ -93,6 +48,16 @@ def gru_layer(cell: GruCell) -> GruLayer:
     return GruLayer(x, h, cell.norm.weight.detach(), beta, cell.norm.eps)
 
 
+def norms_of(mlp: SplitMlp) -> list[nn.LayerNorm]:
+    """The normalisation of each hidden layer."""
+    return [m for m in mlp.rest if isinstance(m, nn.LayerNorm)]
+
+
+def linears_of(mlp: SplitMlp) -> list[nn.Linear]:
+    """The linear layers after the first one; the last is the one on top."""
+    return [m for m in mlp.rest if isinstance(m, nn.Linear)]
+
+
 def hidden_layers(
     mlp: SplitMlp, first_is_state: bool, outputs: int | None = None
 ) -> list[HiddenLayer]:
@@ -106,12 +71,12 @@ def hidden_layers(
     weights = [weight_of(part) for part in mlp.first.parts]
     wide = weights.pop(0) if first_is_state else None
     narrow = torch.cat(weights, 1) if weights else None
-    *between, last = (m for m in mlp.rest if isinstance(m, nn.Linear))
-    norms = [m for m in mlp.rest if isinstance(m, nn.LayerNorm)]
+    *between, last = linears_of(mlp)
+    norms = norms_of(mlp)
     tops = [None] * len(between) + [first_outputs(last, outputs)]
-    layers = [HiddenLayer(wide, True, narrow, norms[0], tops[0])]
+    layers = [HiddenLayer(wide, narrow, norms[0], tops[0])]
     for linear, norm, top in zip(between, norms[1:], tops[1:], strict=True):
-        layers.append(HiddenLayer(linear.weight.detach(), False, None, norm, top))
+        layers.append(HiddenLayer(linear.weight.detach(), None, norm, top))
     return layers
 
 

@@ -9,6 +9,8 @@ import platform
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -31,7 +33,7 @@ OTHERWISE: Final = "plan with --planner.backend=float32"
 
 
 class Wide(ctypes.Structure):
-    """``Wide`` of the kernel."""
+    """``Wide`` of the kernel; so are the structures below."""
 
     _fields_ = (
         ("inputs", ctypes.c_int32),
@@ -42,21 +44,73 @@ class Wide(ctypes.Structure):
     )
 
 
-class Layer(ctypes.Structure):
-    """``Layer`` of the kernel."""
+class Narrow(ctypes.Structure):
+    _fields_ = (("inputs", ctypes.c_int32), ("weight", ctypes.c_void_p))
 
+
+class Layer(ctypes.Structure):
     _fields_ = (
         ("outputs", ctypes.c_int32),
-        ("wide", Wide * 2),
-        ("narrow", ctypes.c_int32),
-        ("narrow_weight", ctypes.c_void_p),
+        ("wide", Wide),
+        ("beside", Wide),
+        ("few", Narrow),
+        ("action", Narrow),
         ("gamma", ctypes.c_void_p),
         ("beta", ctypes.c_void_p),
         ("epsilon", ctypes.c_float),
-        ("last", ctypes.c_int32),
-        ("last_weight", ctypes.c_void_p),
-        ("last_bias", ctypes.c_void_p),
     )
+
+
+class Linear(ctypes.Structure):
+    _fields_ = (
+        ("inputs", ctypes.c_int32),
+        ("outputs", ctypes.c_int32),
+        ("weight", ctypes.c_void_p),
+        ("bias", ctypes.c_void_p),
+    )
+
+
+class Mlp(ctypes.Structure):
+    _fields_ = (("first", Layer), ("second", Layer), ("top", Linear))
+
+
+class Head(ctypes.Structure):
+    _fields_ = (("reduce_h", Linear), ("reduce_z", Linear), ("state", Mlp), ("passing", Mlp))
+
+
+class Network(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int32) for name in ("hidden", "latent", "actions", "heads")),
+        *((name, Layer) for name in ("mix", "gru", "prior", "termination", "told")),
+        ("prior_top", Wide),
+        ("prior_bias", ctypes.c_void_p),
+        ("prior_outputs", ctypes.c_int32),
+        *((name, Linear) for name in ("termination_top", "told_top")),
+        ("min_std", ctypes.c_float),
+        ("head", ctypes.c_void_p),
+    )
+
+
+class Root(ctypes.Structure):
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("h", "mix", "gates", "values"))
+
+
+class Threads:
+    """Runs a function of the kernel on several threads at once, this one among them."""
+
+    def __init__(self, count: int) -> None:
+        self._others = ThreadPoolExecutor(count - 1, "planner") if count > 1 else None
+        self._count = count
+
+    def each(self, function: Callable[..., None], arguments: Sequence[object]) -> None:
+        """Call it with the same arguments on each thread; returns when all have ended."""
+        if self._others is None:
+            function(*arguments)
+            return
+        running = [self._others.submit(function, *arguments) for _ in range(self._count - 1)]
+        function(*arguments)
+        for other in running:
+            other.result()
 
 
 def processor_is_fast() -> bool:
@@ -85,12 +139,9 @@ def library() -> ctypes.CDLL:
         kernel = ctypes.CDLL(str(path))
     except OSError as error:
         raise EnvironmentFailure(f"cannot build or load {path}: {error}; {OTHERWISE}") from error
-    p, i, f = ctypes.c_void_p, ctypes.c_int32, ctypes.c_float
-    kernel.hidden.argtypes = [p, i, p, p, p, p, f, p, p, p]
-    kernel.recur.argtypes = [p, i, p, p, p, p, p, p, i, p, p, p]
-    kernel.linear.argtypes = [i, i, p, i, p, p, p]
-    for function in (kernel.hidden, kernel.recur, kernel.linear):
-        function.restype = None
+    p, i = ctypes.c_void_p, ctypes.c_int32
+    kernel.judge.argtypes = [p, p, i, i, p, p, i, p, p, p]
+    kernel.judge.restype = None
     return kernel
 
 
