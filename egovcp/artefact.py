@@ -30,7 +30,7 @@ from egovcp import spec
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.hub import Patience, snapshot
 from egovcp.model import WorldModel, WorldModelConfig
-from egovcp.plan import PlannerConfig, Policy
+from egovcp.plan import PlannerConfig, Policy, require_answers
 from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
 
 SCHEMA_VERSION = 2
@@ -194,6 +194,7 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
     try:
         model = WorldModel(_decode(WorldModelConfig, config, "world_model"))
         planner = _decode(PlannerConfig, config, "planner")
+        require_answers(model.config, planner)
         model.load_state_dict(load_file(folder / WEIGHTS))
     except (
         KeyError,

@@ -12,9 +12,9 @@ from typing import Any, Final
 
 from egovcp.artefact import Artefact, load_artefact
 from egovcp.errors import EnvironmentFailure, UsageError, suggest
-from egovcp.plan import PlannerConfig
+from egovcp.plan import PlannerConfig, require_answers
 from egovcp.plan.choices import Ensemble, Latent
-from egovcp.plan.config import BackendName, OptimiserName, TerminationRule
+from egovcp.plan.config import BackendName, Objective, OptimiserName, TerminationRule
 
 PLANNER: Final = "planner"
 REFERENCES: Final = ("hold", "random", "oracle")
@@ -44,6 +44,9 @@ class PlannerOptions:
     """M, candidate plans per iteration."""
     horizon: int | None = None
     """N, planner ticks of 40 ms."""
+    objective: Objective | None = None
+    """J of a plan: value (mean of Q), reward (sum of predicted rewards), td (the same and Q at the
+    end). The last two need a model trained with loss.reward, and compute step by step."""
     iterations: int | None = None
     """Rounds of the search."""
     elites: int | None = None
@@ -75,10 +78,13 @@ def load_policy(policy: PolicyOptions, planner: PlannerOptions) -> Artefact:
     Raises:
         ArtefactError: missing, tampered with, or made for another feature spec.
         EnvironmentFailure: the Hub cannot be reached.
-        UsageError: the planner's numbers do not go together.
+        UsageError: the planner's numbers do not go together, or it asks what the model never
+            learned.
     """
     artefact = load_artefact(policy.path, policy.revision)
-    return replace(artefact, planner=planner.apply(artefact.planner))
+    changed = planner.apply(artefact.planner)
+    require_answers(artefact.world_model.config, changed)
+    return replace(artefact, planner=changed)
 
 
 def check_choice(flag: str, value: str, valid: Iterable[str]) -> None:

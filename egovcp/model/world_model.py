@@ -16,7 +16,8 @@ on the robot and replay; `imagine` advances it without an observation.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -73,6 +74,11 @@ class QHead(NamedTuple):
     """Reads what is on its way and the action."""
 
 
+def _fill_discount(model: nn.Module, state: dict[str, Any], prefix: str, *unused: object) -> None:
+    """Weights that were saved before the discount was kept with them have the default's."""
+    state.setdefault(f"{prefix}discount", torch.tensor(spec.GAMMA))
+
+
 class WorldModel(nn.Module):
     """Networks, normalisation and the recurrence; the losses are in `egovcp.model.losses`."""
 
@@ -81,6 +87,7 @@ class WorldModel(nn.Module):
     return_mean: Tensor
     return_std: Tensor
     return_floor: Tensor
+    discount: Tensor
 
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
@@ -115,6 +122,8 @@ class WorldModel(nn.Module):
         self.register_buffer("return_mean", torch.zeros(()))
         self.register_buffer("return_std", torch.ones(()))
         self.register_buffer("return_floor", torch.zeros(()))
+        self.register_buffer("discount", torch.tensor(spec.GAMMA))
+        self.register_load_state_dict_pre_hook(_fill_discount)  # type: ignore[no-untyped-call]
 
     def _new_value_head(self) -> ValueHead:
         c = self.config
@@ -222,6 +231,11 @@ class WorldModel(nn.Module):
         """Q(h, z, a) in units of return, (...,); equation 5."""
         return self.standardised_value(carry, action) * self.return_std + self.return_mean
 
+    def value_by(self, heads: Sequence[QHead], carry: Carry, action: Tensor) -> Tensor:
+        """The same by other heads than the model's own."""
+        q = self._read_values(self._value_outputs(carry, action, heads)).mean(0)
+        return q * self.return_std + self.return_mean
+
     def standardised_value(self, carry: Carry, action: Tensor) -> Tensor:
         """Q in units of the return's deviation from its mean, (...,).
 
@@ -239,7 +253,7 @@ class WorldModel(nn.Module):
     def value_error(self, carry: Carry, action: Tensor, target: Tensor) -> Tensor:
         """Loss of Q beside the standardised return (...,), mean over the heads, (...,)."""
         kind = self.config.value_loss
-        outputs = self._value_outputs(carry, action)
+        outputs = self._value_outputs(carry, action, self.q_heads)
         return torch.stack([value.error(q, target, kind) for q in outputs]).mean(0)
 
     @property
@@ -253,14 +267,16 @@ class WorldModel(nn.Module):
 
     def _all_values(self, carry: Carry, action: Tensor) -> Tensor:
         """Of each head, in units of the return's deviation from its mean, (heads, ...)."""
-        outputs = self._value_outputs(carry, action)
+        return self._read_values(self._value_outputs(carry, action, self.q_heads))
+
+    def _read_values(self, outputs: Sequence[Tensor]) -> Tensor:
         return torch.stack([value.read(q, self.config.value_loss) for q in outputs])
 
-    def _value_outputs(self, carry: Carry, action: Tensor) -> list[Tensor]:
+    def _value_outputs(self, carry: Carry, action: Tensor, heads: Sequence[QHead]) -> list[Tensor]:
         """Of each head, (..., width of `egovcp.model.value`)."""
         told = None if self.passing_value_head is None else self.passing(carry)
         outputs = []
-        for head in self.q_heads:
+        for head in heads:
             q: Tensor = head.state(carry.h, carry.z, action)
             if head.passing is not None:
                 q = q + head.passing(told, action)

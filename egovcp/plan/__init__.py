@@ -1,5 +1,6 @@
 """Planning in a learned model: sampling searches, ways to judge plans, and the policy of both."""
 
+from egovcp.plan.choices import require_answers
 from egovcp.plan.config import PlannerConfig
 from egovcp.plan.objective import Judge, StepByStep
 from egovcp.plan.optimisers import optimiser_of
@@ -19,6 +20,7 @@ __all__ = [
     "hand_grid",
     "make_plan",
     "optimiser_of",
+    "require_answers",
     "until",
     "value_map",
 ]

@@ -9,6 +9,7 @@ from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.plan.choices import Ensemble, Latent
 
+Objective = Literal["value", "reward", "td"]
 TerminationRule = Literal["paper", "shift", "survival"]
 OptimiserName = Literal["cem", "icem", "mppi", "shooting"]
 BackendName = Literal["auto", "eager", "float32", "bfloat16", "int8", "compile"]
@@ -22,6 +23,10 @@ class PlannerConfig:
     """M, candidate plans per iteration."""
     horizon: int = 4
     """N, planner ticks."""
+    objective: Objective = "value"
+    """J of a candidate. value: the mean of Q over its N ticks, the paper's; reward: the sum of the
+    N predicted rewards, discounted (Rew-MPC); td: the same and gamma^N Q after them, of one more
+    action (TD-MPC). The last two need a model trained with loss.reward."""
     iterations: int = 3
     """Rounds of the search; fewer where a deadline comes first."""
     elites: int = 64
@@ -34,7 +39,8 @@ class PlannerConfig:
     """A candidate whose termination probability exceeds this loses its later values."""
     termination_rule: TerminationRule = "shift"
     """paper: later values are 0; shift: they are the data's worst return; survival: each
-    value above the worst return is weighted with the probability of being alive."""
+    value above the worst return is weighted with the probability of being alive. Rewards likewise,
+    in the place of the worst return those that add up to it."""
     latent: Latent = "mean"
     """z of imagined states. mean: the prior's; sample: drawn from the prior, anew in each
     iteration, with the same noise for all candidates."""
@@ -69,3 +75,18 @@ class PlannerConfig:
             raise UsageError(f"kept_elites is {self.kept_elites}; expected a share, 0 to 1")
         if self.sample_decay < 1:
             raise UsageError(f"sample_decay is {self.sample_decay}; expected at least 1")
+        if self.objective != "value" and self.backend not in ("auto", "eager"):
+            raise UsageError(
+                f"backend={self.backend} computes objective=value only; for objective="
+                f"{self.objective} choose auto or eager"
+            )
+        if self.objective == "reward" and self.ensemble != "mean":
+            raise UsageError(
+                f"ensemble={self.ensemble} says how heads of Q are read, and objective=reward asks "
+                "no Q; drop the one or the other"
+            )
+
+    @property
+    def actions(self) -> int:
+        """Actions of a candidate: N, and under ``objective=td`` that which Q is asked about."""
+        return self.horizon + (self.objective == "td")

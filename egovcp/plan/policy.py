@@ -59,7 +59,7 @@ class Policy:
             self._carry = self.model.initial(envs)
             self._sent = torch.zeros(envs, spec.ACTION_DIM, device=device)
             self._first = torch.ones(envs, dtype=torch.bool, device=device)
-            self._warm = torch.zeros(envs, self.config.horizon, spec.ACTION_DIM, device=device)
+            self._warm = torch.zeros(envs, self.config.actions, spec.ACTION_DIM, device=device)
             self._generator = torch.Generator(device).manual_seed(self._seed)
             return
         index = torch.as_tensor(rows, device=self._device)

@@ -120,7 +120,7 @@ def make_plan[C](
 
 def _start(executed: Tensor, config: PlannerConfig, warm: Tensor | None) -> Belief:
     robots = executed.shape[0]
-    shape = (robots, config.horizon, spec.ACTION_DIM)
+    shape = (robots, config.actions, spec.ACTION_DIM)
     mean = executed.new_zeros(shape) if warm is None else warm
     nothing = executed.new_full((robots, config.elites), -torch.inf)
     elites = mean[:, None].expand(-1, config.elites, -1, -1)

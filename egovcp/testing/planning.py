@@ -9,6 +9,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from egovcp import spec
+
 
 class Point(NamedTuple):
     """State of `PointWorld`."""
@@ -47,15 +49,22 @@ class PointWorld:
 
 
 class ScriptedWorld:
-    """Q and D read from a script, whatever the actions: tick k has ``values[k]``, ``deaths[k]``.
+    """Q, D and rewards read from a script, whatever the actions: tick k has ``values[k]``,
+    ``deaths[k]`` and ``rewards[k]``.
 
     The carry is the tick, so a value or a termination asked for at the wrong time shows.
     """
 
     def __init__(
-        self, values: Sequence[float], deaths: Sequence[float], floor: float = 0.0
+        self,
+        values: Sequence[float],
+        deaths: Sequence[float],
+        floor: float = 0.0,
+        rewards: Sequence[float] = (),
+        gamma: float = spec.GAMMA,
     ) -> None:
         self.values, self.deaths = torch.tensor(values), torch.tensor(deaths)
+        self.rewards, self.discount = torch.tensor(rewards), torch.tensor(gamma)
         self.return_floor = torch.tensor(floor)
 
     def start(self, robots: int = 1) -> Tensor:
@@ -70,6 +79,9 @@ class ScriptedWorld:
 
     def value(self, carry: Tensor, action: Tensor) -> Tensor:
         return self.values[carry].expand(action.shape[:-1])
+
+    def reward(self, carry: Tensor, action: Tensor) -> Tensor:
+        return self.rewards[carry].expand(action.shape[:-1])
 
     def termination(self, carry: Tensor) -> Tensor:
         return self.deaths[carry]

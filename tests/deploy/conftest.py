@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 from egovcp.artefact import save_artefact
+from egovcp.model import PRESETS
 from egovcp.plan import PlannerConfig
 from egovcp.robot.stance import StanceController
 from egovcp.testing import toy_model
@@ -25,6 +27,16 @@ def foreign_artefact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same for a robot with another low-level controller."""
     path = tmp_path_factory.mktemp("foreign") / "policy"
     save_artefact(path, toy_model(), _PLANNER, {"controller_id": "another-controller"})
+    return path
+
+
+@pytest.fixture(scope="session")
+def earning_artefact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The same with a world model that foresees rewards."""
+    path = tmp_path_factory.mktemp("earning") / "policy"
+    loss = replace(PRESETS["debug"].loss, reward=1.0)
+    model = toy_model(replace(PRESETS["debug"], loss=loss))
+    save_artefact(path, model, _PLANNER, {"controller_id": StanceController().id})
     return path
 
 

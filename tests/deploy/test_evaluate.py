@@ -125,6 +125,24 @@ def test_bad_input_ends_with_one_line_before_any_work(
     assert not out.exists()
 
 
+@pytest.mark.parametrize("objective", ["reward", "td"])
+def test_one_artefact_is_played_by_every_objective(
+    tmp_path: Path, earning_artefact_dir: Path, short: list[str], objective: str
+) -> None:
+    flags = ["--controllers=planner", "--episodes=2", *short, f"--planner.objective={objective}"]
+    assert run(tmp_path / "out", f"--policy.path={earning_artefact_dir}", *flags) == 0
+    assert len(played(tmp_path / "out")["ball"]["planner"]) == 2
+
+
+def test_rewards_that_a_model_does_not_foresee_are_not_added_up(
+    tmp_path: Path, artefact_dir: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flags = ["--controllers=planner", "--env.controller=stance", "--planner.objective=td"]
+    assert run(tmp_path / "out", f"--policy.path={artefact_dir}", *flags) == 2
+    assert "train it with --policy.loss.reward=1" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_results_are_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "eval.json").write_text("precious")
     assert run(tmp_path, "--controllers=hold") == 2

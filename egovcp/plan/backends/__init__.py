@@ -8,6 +8,7 @@ from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.backends import library
 from egovcp.plan.backends.judges import FloatJudge, IntegerJudge
+from egovcp.plan.choices import require_answers
 from egovcp.plan.config import PlannerConfig
 from egovcp.plan.objective import Judge, StepByStep
 
@@ -17,15 +18,18 @@ __all__ = ["judge_of_model"]
 def judge_of_model(model: WorldModel, config: PlannerConfig) -> Judge[Carry]:
     """The judge that ``config.backend`` names, made from the model's weights as they are now.
 
-    A subclass of the world model may think differently from its networks: under ``auto`` it is
-    asked step by step.
+    A subclass of the world model may think differently from its networks, and the networks are
+    packed for ``objective=value``: under ``auto`` anything else is asked step by step.
 
     Raises:
-        UsageError: int8 is asked for and the model is not on the processor, or has odd sizes.
+        UsageError: the model does not know what the planner asks; int8 is asked for and the model
+            is not on the processor, or has odd sizes.
         EnvironmentFailure: int8 is asked for and the kernel cannot be built.
     """
+    require_answers(model.config, config)
     backend = config.backend
-    if backend == "eager" or (backend == "auto" and type(model) is not WorldModel):
+    plain = type(model) is WorldModel and config.objective == "value"
+    if backend == "eager" or (backend == "auto" and not plain):
         return StepByStep(model, config)
     if backend == "int8":
         return _integers(model, config)

@@ -1,0 +1,220 @@
+"""What plans are worth by rewards (Rew-MPC) and by rewards and a value at the end (TD-MPC)."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.errors import UsageError
+from egovcp.model import PRESETS, Carry, WorldModel
+from egovcp.plan import PlannerConfig, Policy, StepByStep, make_plan, optimiser_of
+from egovcp.plan.backends import judge_of_model
+from egovcp.plan.choices import require_answers
+from egovcp.plan.objective import evaluate
+from egovcp.testing import Point, PointWorld, ScriptedWorld, toy_model
+
+OBJECTIVES = ("value", "reward", "td")
+RULES = ("paper", "shift", "survival")
+DEBUG = PRESETS["debug"]
+EARNING = dataclasses.replace(DEBUG, loss=dataclasses.replace(DEBUG.loss, reward=1.0))
+REWARDS, VALUES = [1.0, 2.0, 4.0, 8.0], [5.0, 6.0, 7.0, 9.0]
+ALIVE = [0.0, 0.0, 0.0, 0.0]
+
+
+def _scripted(deaths: list[float], gamma: float, floor: float = -10.0) -> ScriptedWorld:
+    return ScriptedWorld(VALUES, deaths, floor, REWARDS, gamma)
+
+
+def _worth(world: ScriptedWorld, horizon: int, **config: Any) -> float:
+    planner = PlannerConfig(horizon=horizon, **config)
+    actions = torch.zeros(1, 1, planner.actions, spec.ACTION_DIM)
+    return evaluate(world, world.start(), actions, planner).item()
+
+
+# --- by hand --------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("objective", "horizon", "expected"),
+    [
+        ("reward", 1, 1.0),
+        ("reward", 3, 1.0 + 0.5 * 2.0 + 0.25 * 4.0),
+        ("td", 1, 1.0 + 0.5 * 6.0),
+        ("td", 3, 1.0 + 0.5 * 2.0 + 0.25 * 4.0 + 0.125 * 9.0),
+    ],
+)
+def test_rewards_are_discounted_and_the_value_comes_after_the_last(
+    objective: str, horizon: int, expected: float
+) -> None:
+    worth = _worth(_scripted(ALIVE, 0.5), horizon, objective=objective)
+    assert worth == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(
+    ("rule", "expected"),
+    [
+        ("paper", 1.0 + 0.5 * 2.0),
+        ("shift", 1.0 + 0.5 * 2.0 + 0.25 * -10.0),
+        ("survival", 1.0 + 0.5 * 2.0 + 0.25 * -10.0),
+    ],
+)
+def test_a_failed_plan_earns_what_failing_for_ever_is_worth(rule: str, expected: float) -> None:
+    """It fails at tick 1, whose own reward counts; rewards and value after it do not."""
+    world = _scripted([0.0, 1.0, 0.0, 0.0], 0.5)
+    assert _worth(world, 3, objective="td", termination_rule=rule) == pytest.approx(expected)
+
+
+def test_half_a_failure_costs_half_of_what_comes_next() -> None:
+    world = _scripted([0.0, 0.5, 0.0, 0.0], 0.5)
+    worth = _worth(world, 2, objective="td", termination_rule="survival")
+    assert worth == pytest.approx(1.0 + 0.5 * 2.0 + 0.25 * (0.5 * 7.0 + 0.5 * -10.0))
+
+
+# --- against a loop ------------------------------------------------------------------------
+def _model() -> WorldModel:
+    model = toy_model(EARNING)
+    model.return_mean.fill_(0.3)
+    model.return_std.fill_(2.0)
+    model.return_floor.fill_(-4.0)
+    model.discount.fill_(0.8)
+    return model
+
+
+def _carry(robots: int) -> Carry:
+    rng = torch.Generator().manual_seed(0)
+    h = 2 * torch.rand(robots, DEBUG.hidden, generator=rng) - 1
+    return Carry(h, torch.randn(robots, DEBUG.latent, generator=rng))
+
+
+def _plans(robots: int, plans: int, length: int) -> Tensor:
+    rng = torch.Generator().manual_seed(1)
+    return 2 * torch.rand(robots, plans, length, spec.ACTION_DIM, generator=rng) - 1
+
+
+def _by_loop(model: WorldModel, carry: Carry, plan: Tensor, config: PlannerConfig) -> float:
+    """J of one plan (A, 7) of one robot, one number at a time."""
+    n, gamma = config.horizon, float(model.discount)
+    floor = 0.0 if config.termination_rule == "paper" else float(model.return_floor)
+    total, share = 0.0, 1.0
+    ends = n if config.objective == "td" else n - 1
+    for k in range(ends + 1):
+        action = plan[k : k + 1]
+        if k == n or config.objective == "value":
+            worth, worst = float(model.value(carry, action)), floor
+        else:
+            worth, worst = float(model.reward(carry, action)), (1 - gamma) * floor
+        weight = 1 / n if config.objective == "value" else gamma**k
+        total += weight * (share * worth + (1 - share) * worst)
+        dead = float(model.termination(carry))
+        if 0 < k < ends:
+            share *= 1 - dead if config.termination_rule == "survival" else float(dead <= 0.5)
+        carry = model.imagine(carry, action)
+    return total
+
+
+@pytest.mark.parametrize("rule", RULES)
+@pytest.mark.parametrize("objective", OBJECTIVES)
+@pytest.mark.parametrize("horizon", range(1, 7))
+def test_all_plans_at_once_are_worth_what_each_is_alone(
+    objective: Any, horizon: int, rule: Any
+) -> None:
+    model, robots, plans = _model(), 2, 5
+    config = PlannerConfig(
+        horizon=horizon, objective=objective, termination_rule=rule, termination_threshold=0.5
+    )
+    carry, actions = _carry(robots), _plans(robots, plans, config.actions)
+    with torch.no_grad():
+        found = evaluate(model, carry, actions, config)
+        for e in range(robots):
+            start = Carry(carry.h[e : e + 1], carry.z[e : e + 1])
+            for m in range(plans):
+                expected = _by_loop(model, start, actions[e, m], config)
+                assert found[e, m].item() == pytest.approx(expected, abs=1e-4)
+
+
+def test_the_loop_has_met_failures_and_survivals() -> None:
+    """Else the comparison above would say nothing of the rules."""
+    model, actions = _model(), _plans(2, 5, 6)
+    with torch.no_grad():
+        carry = model.spread(_carry(2))
+        dead = []
+        for action in actions.unbind(-2):
+            carry = model.imagine(carry, action)
+            dead.append(model.termination(carry) > 0.5)
+    share = torch.stack(dead).float().mean()
+    assert 0.05 < share < 0.95
+
+
+# --- the search ---------------------------------------------------------------------------
+class _Earning(PointWorld):
+    """A point that earns its negative squared distance from the goal; Q is told separately."""
+
+    discount = torch.tensor(0.9)
+
+    def reward(self, carry: Point, action: Tensor) -> Tensor:
+        return -(action - carry.goal).square().sum(-1)
+
+    def value(self, carry: Point, action: Tensor) -> Tensor:
+        return -(action - 0.5 * carry.goal).square().sum(-1)
+
+
+def test_the_search_finds_the_plan_that_earns_most() -> None:
+    executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.5)
+    for objective, expected in (("reward", [0.32, 0.5]), ("td", [0.32, 0.5, 0.25])):
+        config = PlannerConfig(horizon=2, objective=objective, iterations=10)  # type: ignore[arg-type]
+        judge, rng = StepByStep(_Earning(), config), torch.Generator().manual_seed(0)
+        search = optimiser_of(config)
+        plan = make_plan(judge, search, Point(executed, goal), executed, config, rng)
+        best = torch.tensor(expected)[None, :, None].expand(1, -1, 7)
+        torch.testing.assert_close(plan.actions, best, atol=0.06, rtol=0)
+
+
+@pytest.mark.parametrize("objective", OBJECTIVES)
+@pytest.mark.parametrize("horizon", [1, 6])
+def test_a_policy_acts_by_every_objective_and_horizon(objective: Any, horizon: int) -> None:
+    config = PlannerConfig(samples=16, elites=4, iterations=2, horizon=horizon, objective=objective)
+    policy = Policy(_model(), config, num_envs=2)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        depth = rng.integers(300, 5000, (2, spec.DEPTH_ROWS, spec.DEPTH_COLS)).astype(np.uint16)
+        step = policy.act(depth, rng.normal(size=(2, spec.STATE_DIM)).astype(np.float32))
+        assert step.plan.shape == (2, config.actions, spec.ACTION_DIM)
+        np.testing.assert_array_equal(step.action, step.plan[:, 0])
+        assert np.isfinite(step.value).all()
+        policy.advance(step.action)
+    assert config.actions == horizon + (objective == "td")
+
+
+# --- refusals -----------------------------------------------------------------------------
+@pytest.mark.parametrize("objective", ["reward", "td"])
+def test_auto_asks_step_by_step_and_other_backends_are_refused(objective: Any) -> None:
+    judge = judge_of_model(_model(), PlannerConfig(objective=objective))
+    assert isinstance(judge, StepByStep)
+    for backend in ("float32", "bfloat16", "int8", "compile"):
+        with pytest.raises(UsageError, match=f"backend={backend} computes objective=value only"):
+            PlannerConfig(objective=objective, backend=backend)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("objective", ["reward", "td"])
+def test_a_model_that_foresees_no_rewards_is_refused(objective: Any) -> None:
+    config = PlannerConfig(objective=objective)
+    with pytest.raises(UsageError, match=r"--policy\.loss\.reward=1"):
+        judge_of_model(toy_model(), config)
+    start = PointWorld().start(torch.zeros(1, 7), torch.zeros(1, 7))
+    with pytest.raises(UsageError, match="PointWorld has no reward and discount"):
+        evaluate(PointWorld(), start, torch.zeros(1, 2, config.actions, 7), config)
+
+
+def test_a_sum_of_rewards_asks_no_heads_of_q() -> None:
+    with pytest.raises(UsageError, match="objective=reward asks no Q"):
+        PlannerConfig(objective="reward", ensemble="min")
+
+
+def test_draws_from_a_prior_that_was_only_trained_in_its_mean_are_refused() -> None:
+    autoregressive = dataclasses.replace(DEBUG, dynamics="autoregressive")
+    with pytest.raises(UsageError, match="plan with latent=mean"):
+        require_answers(autoregressive, PlannerConfig(latent="sample"))
+    require_answers(autoregressive, PlannerConfig())
+    require_answers(DEBUG, PlannerConfig(latent="sample"))
