@@ -31,6 +31,8 @@ TRAINING: Final[Mapping[str, tuple[str, ...]]] = {
     "five_q_heads": ("--policy.q_heads=5",),
     "q_of_posterior_only": ("--policy.loss.imagined_steps=0",),
     "reward_head": ("--policy.loss.reward=1",),
+    "arwm": ("--policy.dynamics=autoregressive",),
+    "td": ("--policy.loss.q_target=td",),
     "burn_in": ("--sampling.burn_in=8",),
     "long_windows": ("--sampling.length=40", "--batch_size=8"),  # as many rows per step
     "per_task_returns": ("--returns.scale=per_task",),

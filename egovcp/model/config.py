@@ -10,6 +10,8 @@ from egovcp.errors import UsageError
 
 ValueLoss = Literal["mse", "two_hot"]
 FreeNatsPer = Literal["step", "dimension"]
+Dynamics = Literal["joint", "autoregressive"]
+QTarget = Literal["mc", "td"]
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,14 @@ class LossConfig:
     termination: float = 1.0
     """Weight of the termination cross entropy."""
     value: float = 1.0
-    """Weight of (Q - Monte Carlo return)^2, in units of the return's standard deviation (see
+    """Weight of (Q - its target)^2, in units of the return's standard deviation (see
     `value_loss`)."""
+    q_target: QTarget = "mc"
+    """Target of Q. mc: the Monte Carlo return; td: r + gamma Q'(h', z', a') of the next row, with
+    the action that the data took there, and 0 in the place of Q' after a failure."""
+    td_decay: float = 0.98
+    """td: Q' is a copy of Q's heads that follows them with this decay per step; 0: the heads as
+    they are, without gradient."""
     imagined_steps: int = 1
     """Also regress Q on states imagined this many steps ahead of the posterior; 0: never."""
     imagined_value: float = 1.0
@@ -68,9 +76,20 @@ class LossConfig:
     """Ticks ahead at which they are compared with what was recorded."""
     foresight_every: int = 4
     """Imagine from every n-th row of a window only, the first one drawn at random."""
+    autoregressive_steps: int = 8
+    """`dynamics` autoregressive: ticks over which predictions are fed back, all of them compared
+    with what was recorded; from the rows that `foresight_every` says."""
     reward: float = 0.0
     """Weight of the reward predicted from (h, z, a), mean squared error in units of the return's
     standard deviation, on the states that Q is trained on; 0: there is no such head."""
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.td_decay < 1:
+            raise UsageError(f"loss.td_decay is {self.td_decay}; expected 0 or more, and below 1")
+        if self.autoregressive_steps < 1:
+            raise UsageError(
+                f"loss.autoregressive_steps is {self.autoregressive_steps}; expected at least 1"
+            )
 
 
 @dataclass(frozen=True)
@@ -91,6 +110,10 @@ class WorldModelConfig:
     paint_flight: bool = True
     """What flies is painted as a disc where the state says that it is (`loss.motion` teaches it),
     over the picture that the decoder paints."""
+    dynamics: Dynamics = "joint"
+    """How the dynamics are learned. joint: equation 8, prior and posterior are pulled to each
+    other; autoregressive: predictions are fed back for several ticks and compared with the
+    recorded observations instead (the baseline ARWM), with no KL at all."""
     value_state: int = 8
     """Numbers to which (h, z) is reduced for Q; 0: Q reads all of it."""
     value_of_passing: bool = True
@@ -127,6 +150,16 @@ class WorldModelConfig:
                 f"motion_ahead {list(self.motion_ahead)}: with paint_flight the first must be 0, "
                 "the place that is painted; put it there, or set --policy.paint_flight=false"
             )
+
+
+def require_longer(window: int, steps: int, flag: str) -> None:
+    """Raise `UsageError`, which names the ``flag`` of the window, if predictions would be fed back
+    beyond every window of so many ticks."""
+    if window <= steps:
+        raise UsageError(
+            f"{flag}={window}: autoregressive training compares predictions up to "
+            f"{steps} ticks ahead (loss.autoregressive_steps); give longer windows, or fewer steps"
+        )
 
 
 #: The paper's plain sum: likelihoods summed over pixels and joints, unit variances, nothing added.

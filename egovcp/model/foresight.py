@@ -3,15 +3,43 @@
 Equation 8 asks the prior to be right one tick ahead. An error of the path that is nothing after
 one tick is a ball's width after eight. So states are also imagined over many ticks, from some
 rows of a window and with the recorded actions, and the decoders are asked about those.
+
+The same, at every tick and in the place of equation 8, is autoregressive training: from filtered
+states the model goes on with nothing but its own predictions,
+
+    h_{k+1} = f(h_k, z^_k, a_k)
+    z^_{k+1} = mean of p(z | h_{k+1})
+    o^_{k+1} = mean of p(o | h_{k+1}, z^_{k+1})
+
+and the gradient of every o^ goes back through all predictions before it.
 """
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from egovcp.model.losses import Batch, Rollout, masked_mean, motion_error, motion_target, unbroken
 from egovcp.model.world_model import Carry, WorldModel
+
+
+class Imagined(NamedTuple):
+    """States imagined from several rows, S in all."""
+
+    carry: Carry  # (B, S, ...)
+    rows: Tensor  # (S,) the row that each stands for
+    known: Tensor  # (B, S) bool: there is such a row, of the same episode
+
+
+class Weights(NamedTuple):
+    """Of what is compared."""
+
+    depth: float
+    state: float
+    motion: float
 
 
 def foresight_losses(
@@ -31,16 +59,46 @@ def foresight_losses(
         generator: draws the first row from which is imagined.
     """
     config = model.config.loss
-    length = batch.valid.shape[1]
-    ahead = [k for k in config.foresight_ahead if k < length]
-    weights = (config.foresight_depth, config.foresight_state, config.foresight_motion)
-    if not (ahead and any(weights)):
+    weights = Weights(config.foresight_depth, config.foresight_state, config.foresight_motion)
+    if not any(weights):
         return {}
+    seen = imagine_ahead(model, rollout.carry, batch, config.foresight_ahead, generator)
+    return _compare("foresight", model, seen, rollout, batch, weight, weights)
+
+
+def autoregressive_losses(
+    model: WorldModel,
+    rollout: Rollout,
+    batch: Batch,
+    weight: Tensor,
+    generator: torch.Generator | None = None,
+) -> dict[str, Tensor]:
+    """The same at each of ``autoregressive_steps`` ticks, weighted as the reconstruction is."""
+    config = model.config.loss
+    weights = Weights(config.depth, config.state, config.motion)
+    ahead = range(1, config.autoregressive_steps + 1)
+    seen = imagine_ahead(model, rollout.carry, batch, ahead, generator)
+    return _compare("autoregressive", model, seen, rollout, batch, weight, weights)
+
+
+def imagine_ahead(
+    model: WorldModel,
+    carry: Carry,
+    batch: Batch,
+    ahead: Sequence[int],
+    generator: torch.Generator | None = None,
+) -> Imagined | None:
+    """Imagine ``ahead`` ticks from every n-th filtered state (B, T, ...) with the recorded actions;
+    None if the window is too short for any."""
+    length = batch.valid.shape[1]
+    ahead = [k for k in ahead if k < length]
+    if not ahead:
+        return None
     device = batch.state.device
-    every = min(config.foresight_every, length - min(ahead))
+    every = min(model.config.loss.foresight_every, length - min(ahead))
     first = int(torch.randint(every, (), generator=generator, device=device))
     start = torch.arange(first, length - min(ahead), every, device=device)
-    carry = Carry(rollout.carry.h[:, start], rollout.carry.z[:, start])
+    carry = Carry(carry.h[:, start], carry.z[:, start])
     carries: list[Carry] = []
     rows: list[Tensor] = []
     known: list[Tensor] = []
@@ -53,30 +111,32 @@ def foresight_losses(
             rows.append(start + k)
             known.append(unbroken(batch, k)[:, start])
     seen = Carry(*(torch.cat(parts, 1) for parts in zip(*carries, strict=True)))
-    at = torch.cat(rows)
-    losses = _compare(model, seen, rollout, weight, at, torch.cat(known, 1))
-    if config.foresight_motion:
-        target = motion_target(batch, model.config.depth_max_m)[:, at]
-        error = motion_error(model.motion(seen)[..., 0, :], target, torch.cat(known, 1))
-        losses["foresight_motion"] = config.foresight_motion * error
-    return losses
+    return Imagined(seen, torch.cat(rows), torch.cat(known, 1))
 
 
 def _compare(
+    name: str,
     model: WorldModel,
-    seen: Carry,
+    seen: Imagined | None,
     rollout: Rollout,
+    batch: Batch,
     weight: Tensor,
-    rows: Tensor,
-    known: Tensor,
+    weights: Weights,
 ) -> dict[str, Tensor]:
-    """Errors of imagined states (B, S, ...) against the rows (S,) that they stand for."""
-    config = model.config.loss
+    """Errors of imagined states against the rows that they stand for, as terms ``NAME_...``."""
+    if seen is None:
+        return {}
+    carry, rows, known = seen
     near = rollout.near[:, rows]
-    image = model.decode_depth(seen.features.flatten(0, 1)).float().view_as(near)
+    image = model.decode_depth(carry.features.flatten(0, 1)).float().view_as(near)
     picture = (0.5 * weight[:, rows] * (image - near).square()).mean((-2, -1))
-    state = 0.5 * (model.decode_state(*seen).float() - rollout.state[:, rows]).square().mean(-1)
-    return {
-        "foresight_depth": config.foresight_depth * masked_mean(picture, known),
-        "foresight_state": config.foresight_state * masked_mean(state, known),
+    state = 0.5 * (model.decode_state(*carry).float() - rollout.state[:, rows]).square().mean(-1)
+    terms = {
+        f"{name}_depth": weights.depth * masked_mean(picture, known),
+        f"{name}_state": weights.state * masked_mean(state, known),
     }
+    if weights.motion:
+        target = motion_target(batch, model.config.depth_max_m)[:, rows]
+        error = motion_error(model.motion(carry)[..., 0, :], target, known)
+        terms[f"{name}_motion"] = weights.motion * error
+    return terms

@@ -241,59 +241,6 @@ def _beyond_free(kl: Tensor, config: LossConfig) -> Tensor:
     return kl.sum(-1).clamp_min(config.free_nats)
 
 
-def value_and_termination_losses(
-    model: WorldModel, rollout: Rollout, batch: Batch, config: LossConfig
-) -> dict[str, Tensor]:
-    """Equations 9 and 7b, on the posterior and on states imagined from it.
-
-    The planner asks Q about imagined states, so Q learns on them as well: k steps after
-    row t the model has imagined (h_{t+k}, z^_{t+k}) from the recorded actions, and its
-    value is regressed on the return of row t + k. The reward, if it is predicted at all,
-    is asked of the same states.
-    """
-    target = (batch.mc_return - model.return_mean) / model.return_std
-    usable = batch.valid & batch.mc_valid
-    error = model.value_error(rollout.carry, batch.action, target)
-    losses = {"value": config.value * masked_mean(error, usable)}
-    predicts_reward = model.reward_head is not None
-    rewards: list[Tensor] = []
-    if predicts_reward:
-        rewards.append(_reward_error(model, rollout.carry, batch, batch.valid))
-
-    carry = rollout.carry
-    length = batch.valid.shape[1]
-    imagined: list[Tensor] = []
-    for k in range(1, max(1, config.imagined_steps) + 1):
-        if k > length:
-            break
-        carry = model.imagine(carry, batch.action[:, k - 1 :])
-        if k == 1:
-            logit = model.termination_logit(carry)
-            bce = F.binary_cross_entropy_with_logits(
-                logit, batch.terminal_next.float(), reduction="none"
-            )
-            losses["termination"] = config.termination * masked_mean(bce, batch.valid)
-        carry = Carry(carry.h[:, :-1], carry.z[:, :-1])  # (B, T - k): the rows that exist
-        if config.imagined_steps and k < length:
-            same_episode = unbroken(batch, k)
-            error = model.value_error(carry, batch.action[:, k:], target[:, k:])
-            imagined.append(masked_mean(error, usable[:, k:] & same_episode))
-            if predicts_reward:
-                rewards.append(_reward_error(model, carry, batch, same_episode))
-    if imagined:
-        losses["imagined_value"] = config.imagined_value * torch.stack(imagined).mean()
-    if rewards:
-        losses["reward"] = config.reward * torch.stack(rewards).mean()
-    return losses
-
-
-def _reward_error(model: WorldModel, carry: Carry, batch: Batch, mask: Tensor) -> Tensor:
-    """Mean squared error of the reward at the last rows of a window, as many as ``mask`` has."""
-    rows = slice(batch.valid.shape[1] - mask.shape[1], None)
-    target = batch.reward[:, rows] / model.return_std
-    return masked_mean((model.scaled_reward(carry, batch.action[:, rows]) - target).square(), mask)
-
-
 def unbroken(batch: Batch, k: int) -> Tensor:
     """(B, T - k): row t and row t + k are valid and of the same episode."""
     start = batch.is_first.long().cumsum(1)

@@ -1,5 +1,6 @@
 """LeRobot's windows become the batches that egovcp-train learns from."""
 
+import dataclasses
 import shutil
 from pathlib import Path
 
@@ -217,3 +218,40 @@ def test_senseless_options_are_refused(options: dict[str, int]) -> None:
 def test_normalising_twice_is_refused() -> None:
     with pytest.raises(UsageError, match="normalises by itself"):
         EgovcpConfig(device="cpu", normalization_mapping={"STATE": "MEAN_STD"})
+
+
+# --- the variants of the paper's table I ---------------------------------------------------
+def _variant(config: EgovcpConfig, **loss: object) -> EgovcpConfig:
+    """An autoregressive model with rewards, and a planner that adds them up."""
+    losses = dataclasses.replace(config.world_model.loss, reward=1.0, **loss)  # type: ignore[arg-type]
+    world = dataclasses.replace(config.world_model, dynamics="autoregressive", loss=losses)
+    planner = dataclasses.replace(config.planner, objective="td", horizon=2)
+    return dataclasses.replace(config, world_model=world, planner=planner)
+
+
+def test_a_variant_is_trained_saved_and_acts(
+    config: EgovcpConfig, meta: LeRobotDatasetMetadata, tmp_path: Path
+) -> None:
+    chosen = _variant(config, q_target="td", td_decay=0.0, autoregressive_steps=3)
+    policy: EgovcpPolicy = make_policy(chosen, ds_meta=meta)
+    loss, terms = policy.forward(_windows(chosen, meta, ROWS))
+    loss.backward()  # type: ignore[no-untyped-call]
+    assert {"autoregressive_depth", "value", "reward"} <= terms.keys()
+    assert not {"kl_prior", "kl_posterior"} & terms.keys()
+    policy.save_pretrained(tmp_path / "policy")
+    loaded = EgovcpPolicy.from_pretrained(tmp_path / "policy")
+    batch = {
+        "observation.images.ego_depth": torch.full((2, 1, 48, 64), 2000.0),
+        "observation.state": torch.zeros(2, 74),
+    }
+    assert loaded.predict_action_chunk(batch).shape == (2, 3, 7)
+
+
+def test_a_slow_copy_of_q_is_not_for_lerobot(config: EgovcpConfig) -> None:
+    with pytest.raises(UsageError, match=r"td_decay=0"):
+        _variant(config, q_target="td", autoregressive_steps=3)
+
+
+def test_windows_that_are_too_short_to_feed_back_are_refused(config: EgovcpConfig) -> None:
+    with pytest.raises(UsageError, match=r"--policy\.sequence_length=6"):
+        _variant(config, autoregressive_steps=6)

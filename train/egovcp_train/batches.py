@@ -9,13 +9,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from egovcp.data import EpisodeStore
+from egovcp.data import EpisodeStore, ReturnConfig
 from egovcp.data.windows import gather, mirror_rows
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
 from egovcp.model.statistics import set_statistics
 
 EPISODES_AT_ONCE = 32
+DEFAULT_RETURNS = ReturnConfig()
 
 
 def to_tensors(arrays: Mapping[str, NDArray[Any]], device: torch.device) -> Batch:
@@ -47,18 +48,20 @@ def whole_episodes(
             yield to_tensors(arrays, device)
 
 
-def set_normalisation(model: WorldModel, store: EpisodeStore, scaled: bool = True) -> None:
+def set_normalisation(
+    model: WorldModel, store: EpisodeStore, config: ReturnConfig = DEFAULT_RETURNS
+) -> None:
     """Fix the model's statistics from the training episodes: state, return, worst return.
 
     Args:
-        scaled: see `egovcp.model.statistics.set_statistics`.
+        config: what the store's returns are.
 
     Raises:
         DataError: no return is usable, because the episodes are too short.
     """
     state = store.state.astype(np.float64)
     returns = store.mc_return[store.mc_valid]
-    fix_normalisation(model, state.mean(0), state.std(0), returns, int(store.length.max()), scaled)
+    fix_normalisation(model, state.mean(0), state.std(0), returns, int(store.length.max()), config)
 
 
 def fix_normalisation(
@@ -67,7 +70,7 @@ def fix_normalisation(
     state_std: NDArray[np.float64],
     returns: NDArray[np.float32],
     longest: int,
-    scaled: bool = True,
+    config: ReturnConfig = DEFAULT_RETURNS,
 ) -> None:
     """Fix the model's statistics: state (74,) each, complete returns (N,), longest episode.
 
@@ -79,4 +82,5 @@ def fix_normalisation(
             f"no row has a complete Monte Carlo return: the episodes (at most {longest} ticks) "
             "are not longer than --returns.steps; lower it, or collect longer episodes"
         )
-    set_statistics(model, state_mean, state_std, returns, scaled)
+    scaled = config.scale != "none"
+    set_statistics(model, state_mean, state_std, returns, scaled, config.gamma)

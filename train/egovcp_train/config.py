@@ -11,7 +11,8 @@ from egovcp.data.source import is_repo_id
 from egovcp.errors import UsageError
 from egovcp.hub import Patience
 from egovcp.model import WorldModelConfig
-from egovcp.plan import PlannerConfig
+from egovcp.model.config import require_longer
+from egovcp.plan import PlannerConfig, require_answers
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.value_fit import ValueFitConfig
 from egovcp_train.wandb_records import WandbConfig
@@ -161,6 +162,17 @@ class TrainConfig:
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
     wandb: WandbConfig = field(default_factory=WandbConfig)
     """Weights & Biases."""
+
+    def __post_init__(self) -> None:
+        require_answers(self.policy, self.planner)
+        loss = self.policy.loss
+        if loss.q_target == "td" and self.returns.scale == "per_task":
+            raise UsageError(
+                "--policy.loss.q_target=td adds rewards to values, and --returns.scale=per_task "
+                "has no common unit for them; choose --returns.scale=dataset"
+            )
+        if self.policy.dynamics == "autoregressive":
+            require_longer(self.sampling.length, loss.autoregressive_steps, "--sampling.length")
 
 
 #: What a preset says beyond the world model itself (`egovcp.model.PRESETS`). The paper knows no

@@ -204,7 +204,7 @@ def _in_memory(
     if config.returns.scale == "per_task":
         scales = task_scales(learning)
         learning, heldout = (on_task_scales(store, scales) for store in (learning, heldout))
-    set_normalisation(model, learning, config.returns.scale != "none")
+    set_normalisation(model, learning, config.returns)
     heldout = label(heldout, config.passing)
     if needs_labels(config):
         learning = label(learning, config.passing)
@@ -240,8 +240,8 @@ def _on_disk(
     else:
         facts = survey(learning, config.returns, sampling.event_quantile)
     longest = int(learning.length.max())
-    scaled = config.returns.scale != "none"
-    fix_normalisation(model, facts.state_mean, facts.state_std, facts.returns, longest, scaled)
+    state = facts.state_mean, facts.state_std
+    fix_normalisation(model, *state, facts.returns, longest, config.returns)
     labelling = None
     if needs_labels(config):
         labelling = partial(label_episode, config=config.passing)

@@ -206,6 +206,7 @@ def _report(artefact: Artefact, folder: Path, golden: dict[str, torch.Tensor]) -
         },
         "golden": {"file": GOLDEN, "sha256": _sha256(folder / GOLDEN), "tolerance": TOLERANCE},
         "return_floor": float(artefact.world_model.return_floor),
+        "discount": float(artefact.world_model.discount),
         "planner": draccus.encode(artefact.planner),
         "controller_id": artefact.controller_id,
         "features": artefact.manifest["features"],

@@ -13,13 +13,15 @@ from torch import Tensor
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel, world_model_loss
 from egovcp.model.shared import sharing
+from egovcp.model.td import SlowHeads
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.device import precision
 from egovcp_train.ranks import ALONE, Ranks
 
 
 class Learner:
-    """Model, averaged model, optimiser and the random stream of the latent noise."""
+    """Model, averaged model, optimiser, the random stream of the latent noise, and under
+    ``q_target=td`` the slow heads of Q."""
 
     def __init__(
         self,
@@ -35,6 +37,7 @@ class Learner:
         self.ranks = ranks
         self.bf16 = bf16
         self.averaged = copy.deepcopy(model).requires_grad_(False)
+        self.slow = SlowHeads(model) if model.config.loss.q_target == "td" else None
         self.optimizer = torch.optim.AdamW(
             model.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True
         )
@@ -49,7 +52,8 @@ class Learner:
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(progress)
         with sharing(self.ranks.share), precision(batch.state.device, self.bf16):
-            loss, metrics = world_model_loss(self.model, batch, self.generator)
+            heads = self.slow.heads if self.slow else None
+            loss, metrics = world_model_loss(self.model, batch, self.generator, heads)
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()  # type: ignore[no-untyped-call]
         terms = {**metrics, "loss/total": loss.detach()}
@@ -58,6 +62,8 @@ class Learner:
         if self._finite(norm + terms["loss/total"]):
             self.optimizer.step()
             self._average()
+            if self.slow:
+                self.slow.follow(self.model, self.model.config.loss.td_decay)
         self.step += 1
         return {**terms, "grad_norm": norm}
 
@@ -104,6 +110,7 @@ class Learner:
             "averaged": self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
+            **({"slow": self.slow.state_dict()} if self.slow else {}),
         }
 
     def load_state_dict(self, state: dict[str, object]) -> None:
@@ -112,6 +119,8 @@ class Learner:
         self.averaged.load_state_dict(state["averaged"])  # type: ignore[arg-type]
         self.optimizer.load_state_dict(state["optimizer"])  # type: ignore[arg-type]
         self.generator.set_state(state["generator"])  # type: ignore[arg-type]
+        if self.slow:
+            self.slow.load_state_dict(state["slow"])  # type: ignore[arg-type]
 
 
 class Budget:

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from egovcp.model import Batch, Carry, WorldModel, value
 from egovcp.model.losses import filter_sequence
 from egovcp.model.nets import SplitMlp, ValueHead
+from egovcp.model.outcomes import value_target
 from egovcp.model.world_model import QHead
 
 
@@ -47,14 +48,17 @@ class Rows(NamedTuple):
     h: Tensor  # (R, hidden)
     z: Tensor  # (R, latent)
     action: Tensor  # (R, 7)
-    target: Tensor  # (R,) standardised return
+    target: Tensor  # (R,) of Q, standardised
     reward: Tensor  # (R,) in deviations of the return
 
 
 def fit_value(
     model: WorldModel, episodes: Iterable[Batch], config: ValueFitConfig, seed: int
 ) -> None:
-    """Fit the heads of Q in place, from scratch, to the Monte Carlo returns of whole episodes.
+    """Fit the heads of Q in place, from scratch, to their target on the rows of whole episodes.
+
+    Under ``q_target=td`` the targets are what the Q that training has found says of the next
+    rows: one more round of fitted Q evaluation.
 
     First the part that sees only what is on its way, then the part that sees the whole state,
     to what the first leaves unexplained. Fitted together, the second, which sees where the
@@ -166,7 +170,7 @@ def collect_rows(
     imagined_steps: int,
     generator: torch.Generator,
 ) -> Rows:
-    """Every row with a complete return, as the planner would meet it.
+    """Every row whose target is known, as the planner would meet it.
 
     The planner judges filtered states (k = 0) and states imagined k < N steps ahead, so
     each row is reached by a k drawn from 0 .. ``imagined_steps``.
@@ -180,9 +184,8 @@ def _rows_of(
 ) -> Rows:
     """States of one batch of episodes, each imagined a random number of steps ahead."""
     carry = filter_sequence(model, batch, sample=False).carry
-    target = (batch.mc_return - model.return_mean) / model.return_std
+    target, usable = value_target(model, carry, batch)
     reward = batch.reward / model.return_std
-    usable = batch.valid & batch.mc_valid
     length = batch.valid.shape[1]
     depth = min(imagined_steps, length - 1)
     steps = torch.randint(depth + 1, usable.shape, generator=generator).to(usable.device)

@@ -11,7 +11,8 @@ from egovcp import spec
 from egovcp.data import ReturnConfig
 from egovcp.errors import DataError, UsageError
 from egovcp.model import LossConfig, WorldModelConfig
-from egovcp.plan import PlannerConfig
+from egovcp.model.config import require_longer
+from egovcp.plan import PlannerConfig, require_answers
 
 FEATURE_SHAPES = {
     spec.DEPTH_KEY: (1, spec.DEPTH_ROWS, spec.DEPTH_COLS),
@@ -79,10 +80,23 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
                 "--policy.returns.scale=per_task is an ablation of egovcp-train; choose dataset or "
                 "none"
             )
+        require_answers(self.world_model, self.planner)
+        self._check_losses()
         if any(mode is not NormalizationMode.IDENTITY for mode in self._modes()):
             raise UsageError(
                 "the world model normalises by itself; leave --policy.normalization_mapping alone"
             )
+
+    def _check_losses(self) -> None:
+        loss = self.world_model.loss
+        if loss.q_target == "td" and loss.td_decay > 0:
+            raise UsageError(
+                "lerobot-train has no place for a slow copy of Q; give "
+                "--policy.world_model.loss.td_decay=0, or train with egovcp-train"
+            )
+        if self.world_model.dynamics == "autoregressive":
+            steps = loss.autoregressive_steps
+            require_longer(self.sequence_length, steps, "--policy.sequence_length")
 
     def _modes(self) -> list[NormalizationMode]:
         return [NormalizationMode(mode) for mode in self.normalization_mapping.values()]

@@ -78,6 +78,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
                 np.asarray(state["std"]),
                 returns,
                 scaled=config.returns.scale != "none",
+                gamma=config.returns.gamma,
             )
 
     @classmethod

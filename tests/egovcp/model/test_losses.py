@@ -14,8 +14,8 @@ from egovcp.model.losses import (
     filter_sequence,
     kl_losses,
     moving_pixels,
-    value_and_termination_losses,
 )
+from egovcp.model.outcomes import value_and_termination_losses
 from egovcp.testing import CountingModel, random_batch, toy_model
 
 

@@ -22,8 +22,8 @@ from egovcp.model.losses import (
     filter_sequence,
     kl_losses,
     pixel_weights,
-    value_and_termination_losses,
 )
+from egovcp.model.outcomes import value_and_termination_losses
 from egovcp.testing import random_batch, toy_model
 
 DEBUG = PRESETS["debug"]
@@ -43,6 +43,8 @@ OPTIONS: dict[str, dict[str, object]] = {
     "heads": {"q_heads": 3},
     "heads without what is on its way": {"q_heads": 2, "value_of_passing": False},
     "reward": {"loss__reward": 2.0},
+    "autoregressive": {"dynamics": "autoregressive", "loss__autoregressive_steps": 3},
+    "td": {"loss__q_target": "td", "q_heads": 2},
     "all": {"value_loss": "two_hot", "q_heads": 2, "loss__reward": 1.0, "value_state": 0},
 }
 
