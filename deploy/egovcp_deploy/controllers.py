@@ -21,6 +21,7 @@ from egovcp_deploy.robots.sim import SimRobot
 Array = NDArray[np.float64]
 
 CONTROLLERS: Final = (PLANNER, "hold", "constant", "random", "oracle")
+PPO: Final = "ppo"
 
 
 class Controller(Protocol):
@@ -40,7 +41,7 @@ class Controller(Protocol):
 
 
 class Planned:
-    """The world model's policy; it sees the observation and nothing else."""
+    """A policy that was learned; it sees the observation and nothing else."""
 
     def __init__(self, policy: RolloutPolicy) -> None:
         self._policy = policy

@@ -10,6 +10,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.synchronize import Event
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -17,11 +18,12 @@ from numpy.typing import NDArray
 
 from egovcp.artefact import Artefact
 from egovcp.errors import EnvironmentFailure
+from egovcp.reactive import ReactiveNetwork, ReactivePolicy
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
-from egovcp_deploy.controllers import Constants, Controller, Planned, reference
+from egovcp_deploy.controllers import PPO, Constants, Controller, Planned, reference
 from egovcp_deploy.options import PlannerOptions, PolicyOptions, load_policy
 from egovcp_deploy.safety import SafetyFilter
 from egovcp_deploy.scores import EpisodeScore
@@ -36,6 +38,8 @@ class Setup:
     """Names nothing when no planner plays."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     seed: int = 0
+    ppo: str = ""
+    """File of the controller `ppo`."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +74,9 @@ class Player:
     def _controller(self, group: Group) -> Controller:
         if group.controller == "constant":
             return Constants(np.array(group.actions))
+        if group.controller == PPO:
+            network = ReactiveNetwork.load(Path(self._setup.ppo))
+            return Planned(ReactivePolicy(network, len(group.scenarios)))
         if group.controller != "planner":
             return reference(group.controller)
         setup = self._setup

@@ -15,13 +15,14 @@ from tqdm import tqdm
 from egovcp.artefact import Artefact
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
+from egovcp.reactive import ReactiveNetwork
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.env import decided
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import TASKS
 from egovcp_deploy.constant_search import Action, BestConstant, load_constants, search_constant
-from egovcp_deploy.controllers import CONTROLLERS
+from egovcp_deploy.controllers import CONTROLLERS, PPO
 from egovcp_deploy.episodes import Group, Setup, Stage
 from egovcp_deploy.options import (
     PlannerOptions,
@@ -62,6 +63,14 @@ class ConstantOptions:
 
 
 @dataclass(frozen=True)
+class PpoOptions:
+    """The baseline `ppo`."""
+
+    path: str = ""
+    """ppo.safetensors of egovcp-train-ppo."""
+
+
+@dataclass(frozen=True)
 class EvalConfig:
     """Play held-out scenarios with the planner and with references; print and save figures."""
 
@@ -77,9 +86,11 @@ class EvalConfig:
     """Which held-out scenarios."""
     controllers: str = ",".join(CONTROLLERS)
     """Who plays, separated by commas: planner, hold (neutral pose), constant (best fixed action),
-    random (the data's walk), oracle (scripted, sees the truth)."""
+    random (the data's walk), oracle (scripted, sees the truth), ppo (learned without a model)."""
     constant: ConstantOptions = field(default_factory=ConstantOptions)
     """The reference `constant`."""
+    ppo: PpoOptions = field(default_factory=PpoOptions)
+    """The baseline `ppo`."""
     output_dir: str = ""
     """New folder for the results."""
     num_envs: int = 8
@@ -104,7 +115,7 @@ class EvalConfig:
         """Raise `UsageError` for values that make no sense."""
         check_choice("--task", self.task, (*TASKS, _ALL))
         for name in self.players:
-            check_choice("--controllers", name, CONTROLLERS)
+            check_choice("--controllers", name, (*CONTROLLERS, PPO))
         for flag in ("episodes", "num_envs"):
             check_positive(f"--{flag}", getattr(self, flag))
         if self.num_workers < 0:
@@ -112,6 +123,11 @@ class EvalConfig:
         held_out(self.tasks[0], self.seed, 0)
         if "planner" in self.players:
             self.policy.require("leave planner out of --controllers")
+        if PPO in self.players and not self.ppo.path:
+            raise UsageError(
+                "--ppo.path is missing; name the file of egovcp-train-ppo, or leave ppo out of "
+                "--controllers"
+            )
         check_output_dir(self.output_dir)
 
 
@@ -126,21 +142,23 @@ def evaluate(config: EvalConfig) -> None:
     Raises:
         UsageError: an option makes no sense, or the folder holds results.
         DataError: ``--constant.path`` cannot be used.
-        ArtefactError: the artefact is missing, damaged, or of another controller.
+        ArtefactError: the artefact, or the policy of --ppo.path, is missing, damaged, or of another
+            low-level controller.
     """
     config.check()
     config = replace(config, env=decided(config.env))
     constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
     artefact = _load_policy(config)
+    ppo = _load_ppo(config)
     folder = make_output_dir(config.output_dir)
-    setup = Setup(config.env, config.policy, config.planner, config.seed)
+    setup = Setup(config.env, config.policy, config.planner, config.seed, config.ppo.path)
     with closing(Stage(setup, config.num_workers, artefact)) as stage:
         if "constant" in config.players:
             constants = _find_constants(config, stage, constants)
             write_json(folder / "constant.json", {k: asdict(v) for k, v in constants.items()})
         scores = _play(config, stage, constants)
     figures = summary(scores)
-    write_json(folder / "eval_run.json", _record(config, artefact, constants, scores))
+    write_json(folder / "eval_run.json", _record(config, artefact, ppo, constants, scores))
     write_json(folder / "eval.json", figures)
     print(table(figures))
     print(f"figures: {folder / 'eval.json'}")
@@ -152,6 +170,14 @@ def _load_policy(config: EvalConfig) -> Artefact | None:
     artefact = load_policy(config.policy, config.planner)
     artefact.require_controller(make_controller(config.env.controller).id)
     return artefact
+
+
+def _load_ppo(config: EvalConfig) -> ReactiveNetwork | None:
+    if PPO not in config.players:
+        return None
+    network = ReactiveNetwork.load(Path(config.ppo.path))
+    network.require_controller(make_controller(config.env.controller).id)
+    return network
 
 
 def _find_constants(
@@ -226,6 +252,7 @@ def _so_far(scores: Scores) -> str:
 def _record(
     config: EvalConfig,
     artefact: Artefact | None,
+    ppo: ReactiveNetwork | None,
     constants: dict[str, BestConstant],
     scores: Scores,
 ) -> dict[str, Any]:
@@ -233,6 +260,7 @@ def _record(
     return {
         "config": draccus.encode(config),
         "artefact": artefact.manifest if artefact else None,
+        "ppo": dict(ppo.provenance) if ppo else None,
         "low_level_controller": make_controller(config.env.controller).id,
         "versions": versions(),
         "constants": {task: asdict(best) for task, best in constants.items()},

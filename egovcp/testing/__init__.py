@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from egovcp.testing.batches import memory_batch, random_batch
     from egovcp.testing.environments import CountingEnv, ToyObservation, ToyStep
     from egovcp.testing.episodes import random_episode
-    from egovcp.testing.models import CountingModel, toy_model
+    from egovcp.testing.models import CountingModel, toy_model, toy_reactive
     from egovcp.testing.planning import Point, PointWorld, ScriptedWorld
 
 __all__ = [
@@ -27,6 +27,7 @@ __all__ = [
     "random_batch",
     "random_episode",
     "toy_model",
+    "toy_reactive",
 ]
 
 _HOME = {
@@ -38,6 +39,7 @@ _HOME = {
     "random_episode": "episodes",
     "CountingModel": "models",
     "toy_model": "models",
+    "toy_reactive": "models",
     "Point": "planning",
     "PointWorld": "planning",
     "ScriptedWorld": "planning",

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from egovcp import spec
 from egovcp.model import PRESETS, Carry, WorldModel, WorldModelConfig
 from egovcp.model.nets import ValueHead
+from egovcp.reactive import ReactiveConfig, ReactiveNetwork, tensor_shapes
 
 
 def toy_model(preset: str | WorldModelConfig = "debug", seed: int = 0) -> WorldModel:
@@ -27,6 +28,19 @@ def toy_model(preset: str | WorldModelConfig = "debug", seed: int = 0) -> WorldM
             assert isinstance(last, nn.Linear)
             nn.init.normal_(last.weight, std=0.3)
     return model.eval()
+
+
+def toy_reactive(controller_id: str, seed: int = 0) -> ReactiveNetwork:
+    """A policy without a world model, untrained and small, that answers differently to different
+    observations."""
+    config = ReactiveConfig(frames=2, channels=(2, 4, 4), hidden=(16,))
+    rng = torch.Generator().manual_seed(seed)
+    tensors = {
+        name: 0.3 * torch.randn(shape, generator=rng)
+        for name, shape in tensor_shapes(config).items()
+    }
+    tensors["std"] = torch.ones_like(tensors["std"])
+    return ReactiveNetwork.of(tensors, config, controller_id, {"steps": 0})
 
 
 class CountingModel(WorldModel):

@@ -8,7 +8,9 @@ from typing import Any
 
 import pytest
 
+from egovcp.robot.stance import StanceController
 from egovcp.spec import ACTION_DIM
+from egovcp.testing import toy_reactive
 from egovcp_deploy.evaluate import main
 
 KEYS = {
@@ -110,6 +112,8 @@ def test_worker_processes_give_the_same_scores(tmp_path: Path, short: list[str])
         (["--controllers=planner"], 2, "--policy.path is missing"),
         (["--policy.path=/nowhere/policy"], 4, "/nowhere/policy"),
         (["--controllers=constant", "--constant.path=/nowhere.json"], 3, "/nowhere.json"),
+        (["--controllers=ppo"], 2, "--ppo.path is missing"),
+        (["--controllers=ppo", "--ppo.path=/nowhere.safetensors"], 4, "/nowhere.safetensors"),
         (["--seed=-3"], 2, "--seed=-3"),
         (["--env.ball.radiu=1"], 2, "unknown option"),
     ],
@@ -140,6 +144,33 @@ def test_rewards_that_a_model_does_not_foresee_are_not_added_up(
     flags = ["--controllers=planner", "--env.controller=stance", "--planner.objective=td"]
     assert run(tmp_path / "out", f"--policy.path={artefact_dir}", *flags) == 2
     assert "train it with --policy.loss.reward=1" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_policy_without_a_model_plays_the_same_scenarios(
+    tmp_path: Path, short: list[str]
+) -> None:
+    toy_reactive(StanceController().id).save(tmp_path / "ppo.safetensors")
+    flags = ["--controllers=hold,ppo", "--episodes=3", *short]
+    for size in (1, 3):
+        named = [f"--ppo.path={tmp_path / 'ppo.safetensors'}", f"--num_envs={size}"]
+        assert run(tmp_path / str(size), *named, *flags) == 0
+    one, three = (played(tmp_path / size)["ball"]["ppo"] for size in ("1", "3"))
+    assert [score["episode"] for score in one] == [0, 1, 2]
+    rewards = [score["reward"] for score in three]
+    assert [score["reward"] for score in one] == pytest.approx(rewards, rel=1e-4)
+    figures = json.loads((tmp_path / "1" / "eval.json").read_text())
+    assert set(figures["ball"]["ppo"]) == KEYS
+    assert figures["ball"]["ppo"]["reward_mean"] != figures["ball"]["hold"]["reward_mean"]
+
+
+def test_a_policy_of_another_controller_is_not_played(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    toy_reactive("another-controller").save(tmp_path / "ppo.safetensors")
+    named = f"--ppo.path={tmp_path / 'ppo.safetensors'}"
+    assert run(tmp_path / "out", "--controllers=ppo", named) == 4
+    assert "another-controller" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

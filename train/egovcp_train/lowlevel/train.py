@@ -12,7 +12,6 @@ from typing import Any, Literal
 
 import draccus
 import torch
-from tqdm import tqdm
 
 from egovcp.cli import run_command, save_config
 from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
@@ -25,6 +24,7 @@ from egovcp_train.checkpoint import (
     finish_checkpoint,
     load_training_state,
 )
+from egovcp_train.iterations import run_iterations
 from egovcp_train.loop import Budget
 from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig, PpoConfig
 from egovcp_train.lowlevel.task import LowLevelTask
@@ -32,7 +32,6 @@ from egovcp_train.output import (
     CONFIG_FILE,
     prepare_output,
     resumed_options,
-    stop_on_signal,
 )
 from egovcp_train.records import Recorder
 
@@ -156,35 +155,17 @@ class _Run:
 
     def execute(self) -> None:
         """Learn until the budget or a signal ends it; the last state is always saved."""
-        config, learner, start = self.config, self.learner, self.learner.iteration
+        config, learner = self.config, self.learner
         budget = Budget(config.steps, config.max_minutes)
-        with (
-            stop_on_signal() as stopped,
-            tqdm(
-                total=config.steps,
-                initial=learner.steps,
-                unit="step",
-                unit_scale=True,
-                desc="ppo",
-                mininterval=2.0,
-            ) as bar,
-        ):
-            while budget.progress(learner.steps) < 1.0 and not stopped:
-                scalars = learner.iterate()
-                self.recorder.scalars(learner.steps, scalars)
-                bar.set_postfix(_summary(scalars), refresh=False)
-                bar.update(learner.steps - bar.n)
-                if learner.iteration % config.save_freq == 0:
-                    self.save()
-        if learner.iteration > start and learner.iteration % config.save_freq:
-            self.save()
-        self.recorder.close()
+        finished = run_iterations(
+            learner, budget, self.recorder, self.save, config.save_freq, _summary
+        )
         final = checkpoint_dir(self.output, learner.iteration) / "pretrained_model" / POLICY_FILE
-        state = "done" if budget.progress(learner.steps) >= 1.0 else "stopped early"
+        state = "done" if finished else "stopped early"
         print(f"{PROG}: {state} after {learner.steps} steps, difficulty {self._difficulty:.2f}")
         print(f"controller: {final}")
         print(f"next: egovcp-eval-lowlevel --controller={final} --output_dir=...")
-        if state != "done":
+        if not finished:
             raise KeyboardInterrupt
 
     @property

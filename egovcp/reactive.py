@@ -1,0 +1,262 @@
+"""A policy without a world model: the last pictures and proprioception in, an action out.
+
+What ``egovcp-train-ppo`` learns and ``egovcp-eval --controllers=ppo`` plays. Its file holds
+``mean`` and ``std`` of the state, ``cnn.I`` and ``mlp.I`` with ``.weight`` and ``.bias``; its
+metadata, as JSON, the schema's version, the `ReactiveConfig`, the low-level controller and where
+it comes from.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Final
+
+import draccus
+import numpy as np
+import torch
+import torch.nn.functional as F
+from draccus.utils import DraccusException
+from numpy.typing import NDArray
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.errors import ArtefactError, UsageError
+from egovcp.model.depth import nearness
+from egovcp.plan import PolicyStep
+
+SCHEMA: Final = "egovcp-reactive-1"
+KERNELS: Final = (8, 3, 3)
+STRIDES: Final = (4, 2, 2)
+
+type Layer = tuple[Tensor, Tensor]  # weight, bias
+
+
+@dataclass(frozen=True)
+class ReactiveConfig:
+    """Sizes of the networks, and how much of the past they see."""
+
+    frames: int = 3
+    """Pictures seen at once, the present one and those of the ticks before: one alone does not show
+    where a ball is going."""
+    channels: tuple[int, int, int] = (16, 32, 32)
+    """Channels of the three layers of the depth CNN; actor and critic have one each."""
+    hidden: tuple[int, ...] = (256, 128)
+    """Hidden layers of actor and critic, after the CNN."""
+    depth_max_m: float = spec.DEPTH_MAX_M
+    """Depth, in metres, at which nearness is 0."""
+
+    def __post_init__(self) -> None:
+        if min(self.frames, *self.channels, *self.hidden) < 1:
+            raise UsageError("frames, channels and hidden layers count from 1")
+
+
+class Eyes:
+    """The last pictures of E robots; training and playing see through the same ones."""
+
+    def __init__(self, robots: int, config: ReactiveConfig) -> None:
+        self._max_m = config.depth_max_m
+        shape = (robots, config.frames, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+        self._pictures = torch.zeros(shape)
+
+    def look(self, depth: NDArray[np.uint16], fresh: NDArray[np.bool_]) -> Tensor:
+        """Depth (E, 48, 64) mm -> nearness (E, frames, 48, 64), the present one first.
+
+        Rows that are ``fresh`` (E,) have just begun an episode: their past is the present.
+        """
+        near = nearness(torch.from_numpy(depth.astype(np.int32)), self._max_m)[:, None]
+        self._pictures = torch.cat([near, self._pictures[:, :-1]], 1)
+        rows = torch.from_numpy(np.asarray(fresh))
+        self._pictures[rows] = near[rows].expand(-1, self._pictures.shape[1], -1, -1)
+        return self._pictures
+
+
+@dataclass(frozen=True)
+class ReactiveNetwork:
+    """The actor: convolutions and an MLP with ELU between them, on the standardised state."""
+
+    mean: Tensor  # (74,)
+    std: Tensor  # (74,)
+    cnn: tuple[Layer, ...]
+    mlp: tuple[Layer, ...]
+    config: ReactiveConfig
+    """Sizes."""
+    controller_id: str
+    """Low-level controller that it was trained with."""
+    provenance: Mapping[str, Any]
+    """Command, seed and steps of its training."""
+
+    @torch.no_grad()
+    def __call__(self, pictures: Tensor, state: Tensor) -> Tensor:
+        """Pictures (E, frames, 48, 64) and state (E, 74) -> actions (E, 7) in [-1, 1]."""
+        x = pictures
+        for (weight, bias), stride in zip(self.cnn, STRIDES, strict=True):
+            x = F.elu(F.conv2d(x, weight, bias, stride))
+        x = torch.cat([(state - self.mean) / self.std, x.flatten(1)], -1)
+        for weight, bias in self.mlp[:-1]:
+            x = F.elu(F.linear(x, weight, bias))
+        return F.linear(x, *self.mlp[-1]).clamp(-1.0, 1.0)
+
+    def save(self, path: Path) -> None:
+        """Write the file."""
+        content = {
+            "config": draccus.encode(self.config),
+            "controller_id": self.controller_id,
+            "provenance": dict(self.provenance),
+        }
+        save_file(
+            {name: tensor.contiguous() for name, tensor in self._tensors().items()},
+            path,
+            metadata={"schema": SCHEMA, "content": json.dumps(content)},
+        )
+
+    @classmethod
+    def load(cls, path: Path) -> ReactiveNetwork:
+        """Read and check a file.
+
+        Raises:
+            ArtefactError: missing, damaged, or of another schema.
+        """
+        if not path.is_file():
+            raise ArtefactError(
+                f"{path}: no such policy; expected a .safetensors file that egovcp-train-ppo wrote"
+            )
+        try:
+            with safe_open(path, framework="pt") as file:
+                metadata = file.metadata() or {}
+                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return cls._from(tensors, metadata)
+        except (
+            SafetensorError,
+            KeyError,
+            TypeError,
+            ValueError,
+            UsageError,
+            DraccusException,
+        ) as error:
+            reason = " ".join(str(error).split())[:200]
+            raise ArtefactError(
+                f"{path}: not a policy of schema {SCHEMA} ({reason}); train one with "
+                "egovcp-train-ppo"
+            ) from error
+
+    def require_controller(self, controller_id: str) -> None:
+        """Raise `ArtefactError` unless the robot has the controller it was trained with."""
+        if controller_id != self.controller_id:
+            raise ArtefactError(
+                f"this policy was trained with the low-level controller {self.controller_id}, the "
+                f"robot has {controller_id}; choose its --env.controller, or train again"
+            )
+
+    @classmethod
+    def _from(cls, tensors: dict[str, Tensor], metadata: Mapping[str, str]) -> ReactiveNetwork:
+        if metadata.get("schema") != SCHEMA:
+            raise ValueError(f"its schema is {metadata.get('schema')!r}")
+        content = json.loads(metadata["content"])
+        config = draccus.decode(ReactiveConfig, content["config"])
+        return cls.of(tensors, config, str(content["controller_id"]), content["provenance"])
+
+    @classmethod
+    def of(
+        cls,
+        tensors: Mapping[str, Tensor],
+        config: ReactiveConfig,
+        controller_id: str,
+        provenance: Mapping[str, Any],
+    ) -> ReactiveNetwork:
+        """From tensors by the names of `tensor_shapes`.
+
+        Raises:
+            KeyError: one is missing.
+            ValueError: one is not of its shape, or not finite.
+        """
+        network = cls(
+            tensors["mean"],
+            tensors["std"],
+            _layers(tensors, "cnn", len(KERNELS)),
+            _layers(tensors, "mlp", len(config.hidden) + 1),
+            config,
+            controller_id,
+            provenance,
+        )
+        network.check()
+        return network
+
+    def check(self) -> None:
+        """Raise ValueError unless shapes and numbers are those of its configuration."""
+        expected = tensor_shapes(self.config)
+        for name, tensor in self._tensors().items():
+            if tuple(tensor.shape) != expected[name]:
+                shape = tuple(tensor.shape)
+                raise ValueError(f"{name} has shape {shape}, expected {expected[name]}")
+            if tensor.dtype != torch.float32 or not tensor.isfinite().all():
+                raise ValueError(f"{name}: expected finite numbers of type float32")
+        if (self.std <= 0).any():
+            raise ValueError("a standard deviation is not positive")
+
+    def _tensors(self) -> dict[str, Tensor]:
+        tensors = {"mean": self.mean, "std": self.std}
+        for part, layers in (("cnn", self.cnn), ("mlp", self.mlp)):
+            for i, (weight, bias) in enumerate(layers):
+                tensors |= {f"{part}.{i}.weight": weight, f"{part}.{i}.bias": bias}
+        return tensors
+
+
+def _layers(tensors: Mapping[str, Tensor], part: str, count: int) -> tuple[Layer, ...]:
+    return tuple((tensors[f"{part}.{i}.weight"], tensors[f"{part}.{i}.bias"]) for i in range(count))
+
+
+def tensor_shapes(config: ReactiveConfig) -> dict[str, tuple[int, ...]]:
+    """Name -> shape of every tensor in the file."""
+    shapes: dict[str, tuple[int, ...]] = {"mean": (spec.STATE_DIM,), "std": (spec.STATE_DIM,)}
+    rows, cols = spec.DEPTH_ROWS, spec.DEPTH_COLS
+    ends = pairwise((config.frames, *config.channels))
+    for i, ((before, after), k, stride) in enumerate(zip(ends, KERNELS, STRIDES, strict=True)):
+        shapes |= {f"cnn.{i}.weight": (after, before, k, k), f"cnn.{i}.bias": (after,)}
+        rows, cols = (rows - k) // stride + 1, (cols - k) // stride + 1
+    inputs = spec.STATE_DIM + config.channels[-1] * rows * cols
+    for i, (before, after) in enumerate(pairwise((inputs, *config.hidden, spec.ACTION_DIM))):
+        shapes |= {f"mlp.{i}.weight": (after, before), f"mlp.{i}.bias": (after,)}
+    return shapes
+
+
+class ReactivePolicy:
+    """The network and its pictures, for E robots in step; call `act` once a tick."""
+
+    def __init__(self, network: ReactiveNetwork, robots: int) -> None:
+        self._network, self._robots = network, robots
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the past: every robot has just begun an episode."""
+        self._eyes = Eyes(self._robots, self._network.config)
+        self._fresh = np.ones(self._robots, dtype=np.bool_)
+
+    def act(
+        self,
+        depth: NDArray[np.uint16],
+        state: NDArray[np.floating],
+        remaining: Callable[[], float] | None = None,
+    ) -> PolicyStep:
+        """Depth (E, 48, 64) mm and state (E, 74) -> actions and no plan, in no time."""
+        pictures = self._look(depth)
+        action = self._network(pictures, torch.as_tensor(state, dtype=torch.float32)).numpy()
+        none = np.zeros(0, np.float32)
+        return PolicyStep(action, none, none, none, none, none, 0)
+
+    def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
+        """See a picture without acting."""
+        self._look(depth)
+
+    def advance(self, sent: NDArray[np.floating]) -> None:
+        """What was sent is in the next state."""
+
+    def _look(self, depth: NDArray[np.uint16]) -> Tensor:
+        pictures = self._eyes.look(depth, self._fresh)
+        self._fresh = np.zeros(self._robots, dtype=np.bool_)
+        return pictures

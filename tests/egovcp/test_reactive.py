@@ -1,0 +1,110 @@
+"""Policies without a world model: what they see, what they say, and their file."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from egovcp import spec
+from egovcp.errors import ArtefactError, UsageError
+from egovcp.reactive import SCHEMA, Eyes, ReactiveConfig, ReactiveNetwork, ReactivePolicy
+from egovcp.testing import toy_reactive
+
+ROWS, COLS = spec.DEPTH_ROWS, spec.DEPTH_COLS
+
+
+def _flat(metres: list[float]) -> np.ndarray:
+    """One flat picture for each robot."""
+    depth = np.array(metres, dtype=np.float64)[:, None, None] * 1e3
+    return np.broadcast_to(depth, (len(metres), ROWS, COLS)).astype(np.uint16)
+
+
+def _seen(eyes: Eyes, metres: list[float], fresh: list[bool]) -> list[list[float]]:
+    pictures = eyes.look(_flat(metres), np.array(fresh))
+    return [[round(float(x.mean()), 3) for x in robot] for robot in pictures]
+
+
+def test_the_present_comes_first_and_a_new_episode_has_no_past() -> None:
+    eyes = Eyes(2, ReactiveConfig(frames=3, depth_max_m=5.0))
+    assert _seen(eyes, [1.0, 2.0], [True, True]) == [[0.8] * 3, [0.6] * 3]
+    assert _seen(eyes, [2.0, 3.0], [False, False]) == [[0.6, 0.8, 0.8], [0.4, 0.6, 0.6]]
+    assert _seen(eyes, [3.0, 4.0], [False, True]) == [[0.4, 0.6, 0.8], [0.2] * 3]
+
+
+def test_what_was_seen_does_not_change_afterwards() -> None:
+    eyes = Eyes(1, ReactiveConfig(frames=2))
+    first = eyes.look(_flat([1.0]), np.array([True]))
+    before = first.clone()
+    eyes.look(_flat([3.0]), np.array([True]))
+    assert torch.equal(first, before)
+
+
+def test_a_policy_sees_what_came_before_and_forgets_it_at_a_reset() -> None:
+    policy, state = ReactivePolicy(toy_reactive("c"), 1), np.zeros((1, spec.STATE_DIM))
+    alone = policy.act(_flat([1.0]), state).action
+    policy.observe(_flat([3.0]), state)
+    later = policy.act(_flat([1.0]), state).action
+    assert not np.allclose(alone, later)
+    policy.reset()
+    np.testing.assert_array_equal(policy.act(_flat([1.0]), state).action, alone)
+    assert alone.shape == (1, spec.ACTION_DIM)
+    assert np.abs(alone).max() <= 1.0
+
+
+def test_a_file_holds_all_of_it(tmp_path: Path) -> None:
+    network = toy_reactive("walk-1")
+    network.save(tmp_path / "ppo.safetensors")
+    loaded = ReactiveNetwork.load(tmp_path / "ppo.safetensors")
+    pictures = torch.rand(3, 2, ROWS, COLS)
+    state = torch.randn(3, spec.STATE_DIM)
+    assert torch.equal(network(pictures, state), loaded(pictures, state))
+    assert (loaded.config, loaded.controller_id) == (network.config, "walk-1")
+    assert loaded.provenance == {"steps": 0}
+    loaded.require_controller("walk-1")
+    with pytest.raises(ArtefactError, match="walk-1, the robot has walk-2"):
+        loaded.require_controller("walk-2")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"mean": torch.zeros(3)}, r"mean has shape \(3,\)"),
+        ({"std": torch.zeros(spec.STATE_DIM)}, "not positive"),
+        ({"mlp.1.bias": torch.full((7,), torch.nan)}, "finite"),
+        ({"cnn.0.bias": None}, "cnn.0.bias"),
+    ],
+)
+def test_a_file_that_is_none_is_refused(
+    tmp_path: Path, change: dict[str, torch.Tensor | None], message: str
+) -> None:
+    path = tmp_path / "ppo.safetensors"
+    toy_reactive("c").save(path)
+    tensors = {k: v for k, v in (load_file(path) | change).items() if v is not None}
+    content = {
+        "config": {"frames": 2, "channels": [2, 4, 4], "hidden": [16]},
+        "controller_id": "c",
+        "provenance": {},
+    }
+    save_file(tensors, path, {"schema": SCHEMA, "content": json.dumps(content)})
+    with pytest.raises(ArtefactError, match=message):
+        ReactiveNetwork.load(path)
+
+
+def test_other_files_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match="no such policy"):
+        ReactiveNetwork.load(tmp_path / "missing.safetensors")
+    (tmp_path / "text.safetensors").write_text("text")
+    with pytest.raises(ArtefactError, match="not a policy of schema"):
+        ReactiveNetwork.load(tmp_path / "text.safetensors")
+    save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
+    with pytest.raises(ArtefactError, match="its schema is None"):
+        ReactiveNetwork.load(tmp_path / "other.safetensors")
+
+
+@pytest.mark.parametrize("change", [{"frames": 0}, {"hidden": (0,)}, {"channels": (1, 0, 1)}])
+def test_sizes_count_from_one(change: dict[str, object]) -> None:
+    with pytest.raises(UsageError, match="count from 1"):
+        ReactiveConfig(**change)  # type: ignore[arg-type]

@@ -1,0 +1,77 @@
+"""``egovcp-train-ppo`` on the simulator: runs, resumes, refuses."""
+
+from pathlib import Path
+
+import pytest
+
+from egovcp.reactive import ReactiveNetwork
+from egovcp.robot.stance import StanceController
+from egovcp_train.checkpoint import load_training_state
+from egovcp_train.ppo.train import main
+
+SMALL = [
+    "--robots=2",
+    "--threads=1",
+    "--ppo.num_steps_per_env=6",
+    "--ppo.num_mini_batches=2",
+    "--save_freq=1",
+    "--env.controller=stance",
+    "--env.ball_episode.ticks=5",
+    "--env.ball_episode.event_ticks=[1,1]",
+    "--tensorboard=false",
+]
+LAST = Path("checkpoints/last/pretrained_model/ppo.safetensors")
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("ppo") / "run"
+    assert main([f"--output_dir={folder}", "--steps=24", *SMALL]) == 0
+    return folder
+
+
+def test_a_run_leaves_a_policy_and_goes_on_where_it_stopped(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    policy = ReactiveNetwork.load(run / LAST)
+    assert policy.controller_id == StanceController().id
+    assert (policy.provenance["steps"], policy.provenance["tasks"]) == (24, ["ball"])
+    before = load_training_state(run)
+    assert before["episodes"] == 6  # two robots, twelve ticks, episodes of five
+    assert main([f"--output_dir={run}", "--resume", "--steps=36"]) == 0
+    assert "done after 36 steps" in capsys.readouterr().out
+    after = load_training_state(run)
+    assert (after["iteration"], before["iteration"]) == (3, 2)
+    assert after["episodes"] == 10  # new ones: two at the start, and two that followed
+    assert after["seconds"] > before["seconds"]
+    assert ReactiveNetwork.load(run / LAST).provenance["steps"] == 36
+
+
+def test_another_network_does_not_continue_the_run(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([f"--output_dir={run}", "--resume", "--network.hidden=[8]"]) == 4
+    assert "does not fit" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("flags", "code", "message"),
+    [
+        (["--robots=0"], 2, "--robots"),
+        (["--task=bal"], 2, "did you mean 'ball'"),
+        (["--seed=1000000000"], 2, "are for evaluation"),
+        (["--initial_std=0"], 2, "--initial_std"),
+        (["--network.frames=0"], 2, "count from 1"),
+        (["--resume"], 4, "no checkpoint to resume from"),
+    ],
+)
+def test_bad_options_are_refused(
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    flags: list[str],
+    code: int,
+    message: str,
+) -> None:
+    assert main([f"--output_dir={tmp_path / 'new'}", *flags]) == code
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()

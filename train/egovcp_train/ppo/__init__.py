@@ -1,0 +1,1 @@
+"""The model-free baseline: PPO on the observation and the actions of the planner."""

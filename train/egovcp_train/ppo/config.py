@@ -1,0 +1,97 @@
+"""The options of ``egovcp-train-ppo``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Final
+
+from egovcp.errors import UsageError, suggest
+from egovcp.reactive import ReactiveConfig
+from egovcp.sim.config import EnvConfig
+from egovcp.spec import GAMMA, TASKS
+
+HELD_OUT: Final = 1_000_000_000  # seeds from here on are those of egovcp-eval
+ALL: Final = "all"
+
+
+@dataclass(frozen=True)
+class ContactPpoConfig:
+    """Proximal policy optimisation; the names are rsl-rl's."""
+
+    num_steps_per_env: int = 50
+    """Ticks per robot and iteration."""
+    num_learning_epochs: int = 4
+    """Passes over the data of an iteration."""
+    num_mini_batches: int = 4
+    """Mini-batches per pass."""
+    learning_rate: float = 1e-3
+    """At the start; then it follows desired_kl."""
+    desired_kl: float = 0.01
+    """Change of the policy per update that the learning rate aims at."""
+    gamma: float = GAMMA
+    """Discount per tick of 40 ms; that of the world model's returns."""
+    lam: float = 0.95
+    """Of generalised advantage estimation."""
+    clip_param: float = 0.2
+    """Clipping of the probability ratio."""
+    entropy_coef: float = 0.002
+    """Weight of the entropy."""
+
+
+@dataclass(frozen=True)
+class PpoTrainConfig:
+    """Train a policy without a world model with PPO (rsl-rl), on depth and proprioception.
+
+    The baseline of the paper's figure 5. The result,
+    OUTPUT_DIR/checkpoints/last/pretrained_model/ppo.safetensors, is played by
+    egovcp-eval --controllers=ppo --ppo.path=FILE. Stop it at any time (Ctrl-C) and go on with
+    --resume.
+    """
+
+    output_dir: str
+    """Folder of the run; must not exist unless --resume."""
+    task: str = "ball"
+    """ball, wall, arch, or all in turn."""
+    env: EnvConfig = field(default_factory=EnvConfig)
+    """Scenes, sensors, delays and randomisation; the defaults are those of egovcp-collect."""
+    network: ReactiveConfig = field(default_factory=ReactiveConfig)
+    """Policy and critic."""
+    initial_std: float = 0.4
+    """Standard deviation of the actions at the start, box units."""
+    ppo: ContactPpoConfig = field(default_factory=ContactPpoConfig)
+    """Proximal policy optimisation."""
+    robots: int = 32
+    """Robots simulated side by side."""
+    steps: int = 1_000_000
+    """Planner ticks of 40 ms, over all robots: transitions."""
+    max_minutes: float = 0.0
+    """Wall-clock limit in minutes, over all resumes; 0: none."""
+    seed: int = 0
+    """Seed of scenarios, networks and actions."""
+    threads: int = 0
+    """CPU threads of the networks; 0: all cores. Those of the simulator are --env.threads."""
+    resume: bool = False
+    """Continue the run in output_dir from its last checkpoint, with its options unless given."""
+    save_freq: int = 20
+    """Iterations between checkpoints; one is always written at the end."""
+    tensorboard: bool = True
+    """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
+
+    def __post_init__(self) -> None:
+        if min(self.robots, self.steps, self.save_freq) < 1:
+            raise UsageError("--robots, --steps and --save_freq must be at least 1")
+        if self.task not in (*TASKS, ALL):
+            known = suggest(self.task, (*TASKS, ALL))
+            raise UsageError(f"unknown value --task={self.task}{known}")
+        if self.initial_std <= 0:
+            raise UsageError(f"--initial_std={self.initial_std}: expected more than 0")
+        if not 0 <= self.seed < HELD_OUT:
+            raise UsageError(
+                f"--seed={self.seed}: expected a number from 0 to {HELD_OUT - 1}; the scenarios "
+                "beyond are for evaluation"
+            )
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The tasks to learn."""
+        return TASKS if self.task == ALL else (self.task,)

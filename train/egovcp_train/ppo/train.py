@@ -1,0 +1,121 @@
+"""``egovcp-train-ppo``: the model-free baseline."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import draccus
+import torch
+
+from egovcp.cli import run_command, save_config
+from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp_train.checkpoint import (
+    begin_checkpoint,
+    checkpoint_dir,
+    finish_checkpoint,
+    load_training_state,
+)
+from egovcp_train.iterations import run_iterations
+from egovcp_train.loop import Budget
+from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options
+from egovcp_train.ppo.config import PpoTrainConfig
+from egovcp_train.records import Recorder
+
+PROG = "egovcp-train-ppo"
+POLICY_FILE = "ppo.safetensors"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run_command(PpoTrainConfig, train, argv, prog=PROG, defaults=resumed_options)
+
+
+def train(config: PpoTrainConfig) -> None:
+    """Run PPO to its end, or to the first SIGINT or SIGTERM, and write the policy.
+
+    Raises:
+        KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
+    """
+    output = prepare_output(config.output_dir, config.resume)
+    torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
+    torch.manual_seed(config.seed)
+    state = load_training_state(output) if config.resume else {}
+    learner = _build(config, int(state.get("episodes", 0)))
+    try:
+        if config.resume:
+            _restore(output, learner, state)
+        output.mkdir(parents=True, exist_ok=True)
+        save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
+        _run(config, output, learner, float(state.get("seconds", 0.0)))
+    finally:
+        learner.env.close()
+
+
+def _build(config: PpoTrainConfig, first: int) -> Any:
+    """The simulator and PPO; imported here, so that --help needs neither."""
+    try:
+        from egovcp_train.ppo.learn import ContactLearner
+    except ImportError as error:
+        raise EnvironmentFailure(
+            f"{PROG} needs the package {error.name}, which is not installed here: "
+            "pip install 'egovcp-train[lowlevel]'"
+        ) from error
+    return ContactLearner(config, first)
+
+
+def _restore(output: Path, learner: Any, state: dict[str, Any]) -> None:
+    try:
+        learner.load_state_dict(state)
+    except (KeyError, RuntimeError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ArtefactError(
+            f"{output}: its checkpoint does not fit the options given ({reason}); resume "
+            "without them, or start a new run"
+        ) from error
+
+
+def _run(config: PpoTrainConfig, output: Path, learner: Any, spent: float) -> None:
+    """Iterations, records and checkpoints of one run."""
+    budget = Budget(config.steps, config.max_minutes, spent=spent)
+
+    def save() -> None:
+        """The policy's file, and the training state."""
+        partial = begin_checkpoint(output, learner.iteration)
+        folder = partial / "pretrained_model"
+        folder.mkdir(parents=True)
+        learner.policy(_provenance(config, learner)).save(folder / POLICY_FILE)
+        finish_checkpoint(partial, learner.state_dict() | {"seconds": budget.spent})
+
+    recorder = Recorder(output, enabled=config.tensorboard)
+    finished = run_iterations(learner, budget, recorder, save, config.save_freq, _summary)
+    final = checkpoint_dir(output, learner.iteration) / "pretrained_model" / POLICY_FILE
+    print(f"{PROG}: {'done' if finished else 'stopped early'} after {learner.steps} steps")
+    print(f"policy: {final}")
+    print(f"next: egovcp-eval --controllers=ppo --ppo.path={final} --task=... --output_dir=...")
+    if not finished:
+        raise KeyboardInterrupt
+
+
+def _provenance(config: PpoTrainConfig, learner: Any) -> dict[str, Any]:
+    return {
+        "command": [PROG, *sys.argv[1:]],
+        "seed": config.seed,
+        "tasks": list(config.tasks),
+        "steps": learner.steps,
+        "episodes": learner.env.episodes,
+        "train_config": draccus.encode(config),
+    }
+
+
+def _summary(scalars: dict[str, float]) -> dict[str, str]:
+    ended = {k: f"{v:.2f}" for k, v in scalars.items() if k.endswith(("/return", "/success"))}
+    return {"reward": f"{scalars['reward']:.4f}", **ended}
+
+
+if __name__ == "__main__":
+    sys.exit(main())
