@@ -74,9 +74,9 @@ class QHead(NamedTuple):
     """Reads what is on its way and the action."""
 
 
-def _fill_discount(model: nn.Module, state: dict[str, Any], prefix: str, *unused: object) -> None:
-    """Weights that were saved before the discount was kept with them have the default's."""
-    state.setdefault(f"{prefix}discount", torch.tensor(spec.GAMMA))
+def _fill_discount(model: WorldModel, state: dict[str, Any], prefix: str, *unused: object) -> None:
+    """Weights that were saved before the discount was kept with them leave it as it is."""
+    state.setdefault(f"{prefix}discount", model.discount)
 
 
 class WorldModel(nn.Module):
