@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -12,6 +13,7 @@ ValueLoss = Literal["mse", "two_hot"]
 FreeNatsPer = Literal["step", "dimension"]
 Dynamics = Literal["joint", "autoregressive"]
 QTarget = Literal["mc", "td"]
+AxisPrior = tuple[float, float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,59 @@ class LossConfig:
 
 
 @dataclass(frozen=True)
+class CameraGeometry:
+    """Where the camera sits, as far as the robot knows."""
+
+    position: tuple[float, float, float] = (0.058, 0.0, 0.42)
+    """Mount in the torso frame, m (the simulator's default)."""
+    pitch: float = math.radians(-2.5)
+    """Tilt below the torso's horizontal, rad (the middle of the simulator's range)."""
+    vertical_fov: float = math.radians(58.0)
+    """Vertical field of view, rad; pixels are square."""
+
+    @property
+    def half_height(self) -> float:
+        """Of the picture, in focal lengths."""
+        return math.tan(self.vertical_fov / 2)
+
+
+@dataclass(frozen=True)
+class FlightConfig:
+    """The filter that follows what is thrown (`egovcp.model.flight`)."""
+
+    enabled: bool = True
+    """Q is told the path that the filter follows; else what the state says of it."""
+    camera: CameraGeometry = field(default_factory=CameraGeometry)
+    """Of the recordings."""
+    plane: float = 0.32
+    """The plane, before the pelvis, whose crossing is told, m."""
+    picture_age: float = 0.05
+    """How much older than the state beside it a picture is on average, s."""
+    radius: float = 0.10
+    """What is added to the depth of a surface to reach the middle of the thing, m."""
+    search: float = 0.25
+    """Pixels this near the place that the encoder sees, across and in depth, are its own, m."""
+    deviation: float = 0.01
+    """Deviation of a sighting, m per m of distance."""
+    prior: tuple[AxisPrior, AxisPrior, AxisPrior] = (
+        (2.9, -3.5, 7.8, 1.2, 2.4),
+        (0.0, 0.0, 5.6, 1.1, 0.5),
+        (0.4, 3.5, 8.7, -0.3, 1.6),
+    )
+    """Of place and velocity at the first sighting, forward, left and up: mean place (m), mean speed
+    (m/s), and the precision's (place, place), (place, speed), (speed, speed); of 254 throws of the
+    default task."""
+    aim: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.24), (0.45, 0.18))
+    """Mean and deviation of y and z where throws cross the plane, m."""
+    doubt: float = 4.0
+    """The variance of a crossing is this many times what independent sightings would give."""
+    gate: float = 0.5
+    """A sighting farther than this from the path of three or more is not its own, m."""
+    forget: float = 0.5
+    """A path whose thing has not been seen for so long is forgotten, s."""
+
+
+@dataclass(frozen=True)
 class WorldModelConfig:
     """Sizes of the networks (paper III-C) and the losses they are trained with."""
 
@@ -123,6 +178,8 @@ class WorldModelConfig:
     symlog returns, fitted by cross entropy, whose mean is the number."""
     q_heads: int = 1
     """Heads of Q that differ in their start; Q is their mean unless the planner wants the least."""
+    flight: FlightConfig = field(default_factory=FlightConfig)
+    """Follows what is thrown at the robot; only where `value_of_passing`."""
     min_std: float = 0.1
     """Floor of the latent standard deviation."""
     update_bias: float = -1.0
@@ -145,11 +202,21 @@ class WorldModelConfig:
                 "paint_flight needs loss.motion above 0: nothing else teaches the place of what "
                 "flies; set --policy.paint_flight=false, or a weight"
             )
+        if self.follows_flight and self.loss.motion <= 0:
+            raise UsageError(
+                "flight.enabled needs loss.motion above 0: nothing else teaches the encoder to see "
+                "what flies; set --policy.flight.enabled=false, or a weight"
+            )
         if self.paint_flight and self.motion_ahead[:1] != (0,):
             raise UsageError(
                 f"motion_ahead {list(self.motion_ahead)}: with paint_flight the first must be 0, "
                 "the place that is painted; put it there, or set --policy.paint_flight=false"
             )
+
+    @property
+    def follows_flight(self) -> bool:
+        """Whether there is a filter."""
+        return self.flight.enabled and self.value_of_passing
 
 
 def require_longer(window: int, steps: int, flag: str) -> None:
@@ -183,7 +250,11 @@ PAPER_LOSS = LossConfig(
 PRESETS = {
     "default": WorldModelConfig(),
     "paper": WorldModelConfig(
-        value_state=0, value_of_passing=False, paint_flight=False, loss=PAPER_LOSS
+        value_state=0,
+        value_of_passing=False,
+        paint_flight=False,
+        flight=FlightConfig(enabled=False),
+        loss=PAPER_LOSS,
     ),
     "debug": WorldModelConfig(hidden=32, latent=8, units=32, channels=(4, 8, 8)),
 }

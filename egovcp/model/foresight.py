@@ -98,20 +98,24 @@ def imagine_ahead(
     every = min(model.config.loss.foresight_every, length - min(ahead))
     first = int(torch.randint(every, (), generator=generator, device=device))
     start = torch.arange(first, length - min(ahead), every, device=device)
-    carry = Carry(carry.h[:, start], carry.z[:, start])
+    carry = carry.map(lambda x: x[:, start])
     carries: list[Carry] = []
     rows: list[Tensor] = []
     known: list[Tensor] = []
     for k in range(1, max(ahead) + 1):
         start = start[start + k < length]
-        carry = Carry(carry.h[:, : len(start)], carry.z[:, : len(start)])
+        carry = _first(carry, len(start))
         carry = model.imagine(carry, batch.action[:, start + k - 1])
         if k in ahead:
             carries.append(carry)
             rows.append(start + k)
             known.append(unbroken(batch, k)[:, start])
-    seen = Carry(*(torch.cat(parts, 1) for parts in zip(*carries, strict=True)))
+    seen = Carry.join(carries, lambda parts: torch.cat(parts, 1))
     return Imagined(seen, torch.cat(rows), torch.cat(known, 1))
+
+
+def _first(carry: Carry, rows: int) -> Carry:
+    return carry.map(lambda x: x[:, :rows])
 
 
 def _compare(
@@ -130,7 +134,8 @@ def _compare(
     near = rollout.near[:, rows]
     image = model.decode_depth(carry.features.flatten(0, 1)).float().view_as(near)
     picture = (0.5 * weight[:, rows] * (image - near).square()).mean((-2, -1))
-    state = 0.5 * (model.decode_state(*carry).float() - rollout.state[:, rows]).square().mean(-1)
+    foreseen = model.decode_state(carry.h, carry.z).float()
+    state = 0.5 * (foreseen - rollout.state[:, rows]).square().mean(-1)
     terms = {
         f"{name}_depth": weights.depth * masked_mean(picture, known),
         f"{name}_state": weights.state * masked_mean(state, known),

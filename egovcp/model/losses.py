@@ -14,11 +14,13 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from egovcp import spec
+from egovcp.model.camera_pose import CameraPose
 from egovcp.model.config import LossConfig
 from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, within
+from egovcp.model.flight import Sighting
 from egovcp.model.gaussian import Gaussian, kl_divergence
 from egovcp.model.shared import over_all_rows
-from egovcp.model.world_model import PASSING_UNIT, Carry, WorldModel
+from egovcp.model.world_model import PASSING_UNIT, Carry, Look, WorldModel
 
 
 class Batch(NamedTuple):
@@ -68,6 +70,7 @@ def filter_sequence(
     hs: list[Tensor] = []
     zs: list[Tensor] = []
     posteriors: list[Gaussian] = []
+    followed = _followed(model, batch, near, embedding, carry)
     for t in range(length):
         h = model.advance(carry, batch.prev_action[:, t], batch.is_first[:, t])
         posterior = model.infer(h, embedding[:, t])
@@ -78,13 +81,36 @@ def filter_sequence(
     h_seq = torch.stack(hs, 1)
     means, stds = (torch.stack(s, 1) for s in zip(*posteriors, strict=True))
     return Rollout(
-        Carry(h_seq, torch.stack(zs, 1)),
+        Carry(h_seq, torch.stack(zs, 1), followed),
         Gaussian(means, stds),
         model.predict(h_seq),
         near.view(size, length, *near.shape[1:]),
         state,
         embedding,
     )
+
+
+def _followed(
+    model: WorldModel, batch: Batch, near: Tensor, embedding: Tensor, start: Carry
+) -> Tensor | None:
+    """What is remembered of a flight at every row, (B, T, ...)."""
+    memory = start.flight
+    if memory is None:
+        return None
+    size, length = batch.valid.shape
+    look = model.look(near, batch.state.flatten(0, 1), embedding.flatten(0, 1))
+    point, weight, axes, position, rate = (
+        x.view(size, length, *x.shape[1:]) for part in look for x in part
+    )
+    found = []
+    for t in range(length):
+        seen, pose = (
+            Sighting(point[:, t], weight[:, t]),
+            CameraPose(axes[:, t], position[:, t], rate[:, t]),
+        )
+        memory = model.follow(memory, Look(seen, pose), batch.is_first[:, t])
+        found.append(memory)
+    return torch.stack(found, 1)
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:

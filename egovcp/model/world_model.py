@@ -16,7 +16,7 @@ on the robot and replay; `imagine` advances it without an observation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -24,7 +24,8 @@ from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.errors import UsageError
-from egovcp.model import value
+from egovcp.model import flight, value
+from egovcp.model.camera_pose import CameraPose, camera_pose
 from egovcp.model.config import WorldModelConfig
 from egovcp.model.depth import nearness, network_image, paint_ball, to_metres
 from egovcp.model.gaussian import Gaussian
@@ -42,10 +43,26 @@ PASSING_UNIT = (0.25, 0.25, 0.25)
 
 
 class Carry(NamedTuple):
-    """The model's memory: h (..., hidden) and z (..., latent)."""
+    """The model's memory: h (..., hidden) and z (..., latent); and what it remembers of a flight.
+
+    Without the latter Q is told of it what h and z say.
+    """
 
     h: Tensor
     z: Tensor
+    flight: Tensor | None = None  # (..., `egovcp.model.flight.SIZE`), or its first four numbers
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Carry:
+        """Every part changed in the same way."""
+        flight = None if self.flight is None else change(self.flight)
+        return Carry(change(self.h), change(self.z), flight)
+
+    @staticmethod
+    def join(carries: Sequence[Carry], how: Callable[[list[Tensor]], Tensor]) -> Carry:
+        """Equal parts of several joined in the same way."""
+        flights = [c.flight for c in carries if c.flight is not None]
+        joined = how(flights) if flights else None
+        return Carry(how([c.h for c in carries]), how([c.z for c in carries]), joined)
 
     @property
     def features(self) -> Tensor:
@@ -63,6 +80,17 @@ class PosteriorHead(nn.Module):
     def forward(self, h: Tensor, embedding: Tensor) -> Tensor:
         logits: Tensor = self.rest(self.project_h(h) + embedding)
         return logits
+
+
+class Look(NamedTuple):
+    """What N pictures show of a flight, and from where."""
+
+    sighting: flight.Sighting
+    pose: CameraPose
+
+
+def _later(carry: Carry) -> Tensor | None:
+    return None if carry.flight is None else flight.later(carry.flight)
 
 
 class QHead(NamedTuple):
@@ -163,6 +191,7 @@ class WorldModel(nn.Module):
         return Carry(
             reference.new_zeros(batch, self.config.hidden),
             reference.new_zeros(batch, self.config.latent),
+            reference.new_zeros(batch, flight.SIZE) if self.config.follows_flight else None,
         )
 
     def transition(self, carry: Carry, action: Tensor) -> Tensor:
@@ -194,7 +223,26 @@ class WorldModel(nn.Module):
         posterior mean.
         """
         h = self.advance(carry, action, is_first)
-        return Carry(h, self.infer(h, self.embed(depth, state)).mean)
+        near = nearness(depth, self.config.depth_max_m)
+        embedding = self.embed_near(near, self.standardise(state))
+        z, followed = self.infer(h, embedding).mean, carry.flight
+        if followed is not None:
+            seen = self.look(near, state, embedding)
+            followed = self.follow(followed, seen, is_first)
+        return Carry(h, z, followed)
+
+    @torch.no_grad()
+    def look(self, near: Tensor, state: Tensor, embedding: Tensor) -> Look:
+        """What pictures (N, 48, 64) of nearness show of a flight, and from where: raw state (N, 74)
+        and the embedding (N, units) of both."""
+        c = self.config
+        seen = flight.sighting(near, self.sight(embedding), c.depth_max_m, c.flight)
+        return Look(seen, camera_pose(state, c.flight.camera))
+
+    @torch.no_grad()
+    def follow(self, memory: Tensor, seen: Look, is_first: Tensor) -> Tensor:
+        """What is remembered of a flight (N, ...) after N pictures."""
+        return flight.follow(memory, seen.pose, seen.sighting, is_first, self.config.flight)
 
     def advance(self, carry: Carry, action: Tensor, is_first: Tensor) -> Tensor:
         """h_t of equation 1, restarting from zeros where ``is_first`` (B,).
@@ -202,13 +250,13 @@ class WorldModel(nn.Module):
         The old memory is replaced, not multiplied by zero: a reset heals NaN, too.
         """
         first = is_first[:, None]
-        h, z, action = (x.masked_fill(first, 0.0) for x in (*carry, action))
+        h, z, action = (x.masked_fill(first, 0.0) for x in (carry.h, carry.z, action))
         return self.transition(Carry(h, z), action)
 
     def imagine(self, carry: Carry, action: Tensor) -> Carry:
         """Advance by one tick without an observation; z is the prior mean."""
         h = self.transition(carry, action)
-        return Carry(h, self.predict(h).mean)
+        return Carry(h, self.predict(h).mean, _later(carry))
 
     def imagine_sample(
         self, carry: Carry, action: Tensor, generator: torch.Generator | None = None
@@ -219,12 +267,12 @@ class WorldModel(nn.Module):
         prior = self.predict(h)
         size = (self.config.latent,)
         noise = torch.randn(size, generator=generator, device=prior.mean.device)
-        return Carry(h, prior.mean + prior.std * noise)
+        return Carry(h, prior.mean + prior.std * noise, _later(carry))
 
     @staticmethod
     def spread(carry: Carry) -> Carry:
         """(E, ...) -> (E, 1, ...): one state that broadcasts over candidate actions."""
-        return Carry(carry.h[:, None], carry.z[:, None])
+        return carry.map(lambda x: x[:, None])
 
     # --- heads -----------------------------------------------------------------------
     def value(self, carry: Carry, action: Tensor) -> Tensor:
@@ -306,6 +354,8 @@ class WorldModel(nn.Module):
         The probability p, and p times y, z and time left in `PASSING_UNIT`: a smooth summary
         that is zero where nothing comes.
         """
+        if carry.flight is not None:
+            return flight.told(carry.flight, PASSING_UNIT)
         out: Tensor = self.decode_passing(carry.h, carry.z)
         out = out.detach()  # what is on its way is learned from labels, not from returns
         coming = torch.sigmoid(out[..., 3:])

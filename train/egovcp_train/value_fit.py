@@ -47,6 +47,7 @@ class Rows(NamedTuple):
 
     h: Tensor  # (R, hidden)
     z: Tensor  # (R, latent)
+    told: Tensor  # (R, 4) what is on its way
     action: Tensor  # (R, 7)
     target: Tensor  # (R,) of Q, standardised
     reward: Tensor  # (R,) in deviations of the return
@@ -106,7 +107,7 @@ def _fit_q(
     if (passing := head.passing) is not None:
 
         def told(x: Rows) -> Tensor:
-            q: Tensor = passing(model.passing(Carry(x.h, x.z)), x.action)
+            q: Tensor = passing(x.told, x.action)
             return q
 
         def told_error(x: Rows, known: Tensor | None) -> Tensor:
@@ -192,10 +193,15 @@ def _rows_of(
     found: list[tuple[Tensor, ...]] = []
     for k in range(depth + 1):
         if k > 0:
-            carry = Carry(carry.h[:, : length - k], carry.z[:, : length - k])
-            carry = model.imagine(carry, batch.action[:, k - 1 : length - 1])
+            carry = model.imagine(_before(carry, length - k), batch.action[:, k - 1 : length - 1])
         mask = usable[:, k:] & (steps[:, k:] == k)
         ahead = (x[:, k:][mask] for x in (batch.action, target, reward))
-        found.append((carry.h[mask], carry.z[mask], *ahead))
-    h, z, action, *targets = (torch.cat(column).cpu() for column in zip(*found, strict=True))
-    return Rows(h.half(), z.half(), action.half(), *targets)
+        told = model.passing(carry)
+        found.append((carry.h[mask], carry.z[mask], told[mask], *ahead))
+    columns = (torch.cat(column).cpu() for column in zip(*found, strict=True))
+    h, z, told, action, *targets = columns
+    return Rows(h.half(), z.half(), told, action.half(), *targets)
+
+
+def _before(carry: Carry, rows: int) -> Carry:
+    return carry.map(lambda x: x[:, :rows])

@@ -35,6 +35,7 @@ class Shared(NamedTuple):
 
     description: library.Root
     tensors: tuple[object, ...]
+    root: Root
 
 
 class IntegerNetwork:
@@ -58,8 +59,8 @@ class IntegerNetwork:
         values = [_centred(x) for x in root.values]
         pointers = (ctypes.c_void_p * len(values))(*(x.data_ptr() for x in values))
         addresses = (x.data_ptr() for x in (h, mix, gates))
-        description = library.Root(*addresses, ctypes.cast(pointers, ctypes.c_void_p))
-        return Shared(description, (h, mix, gates, values, pointers))
+        description = library.Root(*addresses, ctypes.cast(pointers, ctypes.c_void_p), None)
+        return Shared(description, (h, mix, gates, values, pointers), root)
 
     def outputs(
         self, shared: Shared, actions: Tensor, noise: Tensor | None, threads: library.Threads
@@ -74,6 +75,8 @@ class IntegerNetwork:
         q = torch.zeros(plans, steps, self._heads, self._width)
         dead = torch.zeros(plans, steps)
         following = ctypes.c_int32(0)
+        told = _told(shared.root, steps)
+        shared.description.told = None if told is None else told.data_ptr()
         kept = (actions.contiguous(), None if noise is None else noise.contiguous())
         arguments = (
             self._packed.address,
@@ -89,6 +92,12 @@ class IntegerNetwork:
         )
         threads.each(self._kernel.judge, arguments)
         return q[..., : self._outputs], dead
+
+
+def _told(root: Root, steps: int) -> Tensor | None:
+    """(N, 4) what is on its way at each step, if it is followed."""
+    each = [told for k in range(steps) if (told := root.told(k)) is not None]
+    return torch.cat(each).view(steps, -1).contiguous() if each else None
 
 
 def _centred(sums: Tensor) -> Tensor:

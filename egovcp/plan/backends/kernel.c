@@ -15,7 +15,7 @@
 #include <immintrin.h>
 #endif
 
-enum { ROWS = 8, LANES = 16, WIDEST = 1024, MOST_FEW = 128 };
+enum { ROWS = 8, LANES = 16, WIDEST = 1024, MOST_FEW = 128, TOLD = 4 };
 
 typedef float Floats __attribute__((vector_size(4 * LANES)));
 typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
@@ -73,6 +73,7 @@ typedef struct {
     const float *mix;    /* sums of the first layers that do not depend on the candidate */
     const float *gates;
     const float *const *values; /* of the heads, two for one that is told */
+    const float *told;          /* [steps][TOLD] what is on its way, if it is followed; else null */
 } Root;
 
 typedef struct {
@@ -413,7 +414,11 @@ static void block(const Network *net, const Root *root, int steps, const float *
             else
                 recur(&net->gru, (Inputs){.wide = &x, .beside = &h_bytes}, h, net->hidden, h, &h_bytes);
             next_z(net, &h_bytes, noise ? noise + (k - 1) * net->latent : 0, z, &z_bytes);
-            if (net->told_top.outputs) tell(net, &h_bytes, &z_bytes, &told);
+            if (root->told)
+                for (int r = 0; r < ROWS; r++)
+                    memcpy(told.values[r], root->told + k * TOLD, TOLD * sizeof(float));
+            else if (net->told_top.outputs)
+                tell(net, &h_bytes, &z_bytes, &told);
         }
         const float *const *add = root->values;
         for (int i = 0; i < net->heads; i++) {

@@ -92,7 +92,7 @@ class Network(ctypes.Structure):
 
 
 class Root(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in ("h", "mix", "gates", "values"))
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("h", "mix", "gates", "values", "told"))
 
 
 class Threads:

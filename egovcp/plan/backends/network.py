@@ -66,6 +66,7 @@ class _Head:
             q = self._state.later(None, torch.cat([self._reduced(h, z), action], -1))
         if self._passing is None or told is None:
             return q
+        told = told.expand(*action.shape[:-1], -1)
         return q + self._passing.later(None, torch.cat([told, action], -1))
 
 
@@ -101,7 +102,7 @@ class PlanningNetwork:
         for k in range(1, len(each)):
             h, wide_h = self._recur(x, wide_h, add if k == 1 else None, h)
             z = self._next_z(wide_h, None if noise is None else noise[k - 1])
-            told = self._told(wide_h, z)
+            told = self._told(wide_h, z) if root.flight is None else root.told(k)
             q = [head.later(wide_h, h, z, told, each[k]) for head in self._heads]
             tally.value(self._read(q))
             if k == len(each) - 1:

@@ -7,8 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from egovcp.model import Carry, WorldModel
+from egovcp.model import Carry, WorldModel, flight
 from egovcp.model.nets import SplitMlp
+from egovcp.model.world_model import PASSING_UNIT
 
 
 class Root(NamedTuple):
@@ -18,6 +19,13 @@ class Root(NamedTuple):
     mix: Tensor  # sums of the first layer that leads to the GRU
     gates: Tensor  # sums of the GRU's gates
     values: tuple[Tensor, ...]  # sums of the first layers of Q, two for a head that is told
+    flight: Tensor | None  # what is remembered of a flight
+
+    def told(self, k: int) -> Tensor | None:
+        """(E, 1, 4) what Q is told of it at step k, whatever the robot does meanwhile."""
+        if self.flight is None:
+            return None
+        return flight.told(flight.later(self.flight, k), PASSING_UNIT)
 
 
 def root_of(model: WorldModel, carry: Carry) -> Root:
@@ -25,13 +33,15 @@ def root_of(model: WorldModel, carry: Carry) -> Root:
     carry = model.spread(carry)
     told = None if model.passing_value_head is None else model.passing(carry)
     values: list[Tensor] = []
+    state = (carry.h, carry.z)
     for head in model.q_heads:
         reduce = head.state.reduce
-        values.append(_but_action(head.state.mlp, *(carry if reduce is None else [reduce(*carry)])))
+        values.append(_but_action(head.state.mlp, *(state if reduce is None else [reduce(*state)])))
         if head.passing is not None and told is not None:
             values.append(_but_action(head.passing, told))
     mix, gates = model.mix.parts[0](carry.z), model.gru.project.parts[1](carry.h)
-    return Root(carry.h, mix, gates, tuple(values))
+    followed = carry.flight if model.passing_value_head is not None else None
+    return Root(carry.h, mix, gates, tuple(values), followed)
 
 
 def _but_action(mlp: SplitMlp, *state: Tensor) -> Tensor:

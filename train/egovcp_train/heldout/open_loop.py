@@ -61,7 +61,7 @@ class OpenLoop:
         if len(s) == 0:
             return
         regions = _regions(episodes, rollout.near, model.config.depth_max_m)
-        carry = Carry(rollout.carry.h[:, s], rollout.carry.z[:, s])
+        carry = rollout.carry.map(lambda x: x[:, s])
         last = batch.valid.shape[1] - 1
         for k in range(1, max(HORIZONS) + 1):
             carry = model.imagine(carry, batch.action[:, (s + k - 1).clamp_max(last)])

@@ -74,11 +74,11 @@ def _starts(episodes: Recorded, near: Tensor) -> tuple[Tensor, Tensor]:
 def _strip(
     model: WorldModel, episodes: Recorded, rollout: Rollout, b: int, s: int, interest: float
 ) -> Strip:
-    carry = Carry(rollout.carry.h[b, s][None], rollout.carry.z[b, s][None])
+    carry = rollout.carry.map(lambda x: x[b, s][None])
     states = [carry]
     for k in range(max(HORIZONS)):
         states.append(model.imagine(states[-1], episodes.batch.action[b, s + k][None]))
-    shown = Carry(*(torch.cat(parts) for parts in zip(*(states[k] for k in STRIP), strict=True)))
+    shown = Carry.join([states[k] for k in STRIP], torch.cat)
     foreseen = model.picture(shown).clamp(0.0, 1.0)
     seen = rollout.near[b, [s + k for k in STRIP]]
     return Strip(interest, s, seen.cpu().numpy(), foreseen.cpu().numpy())

@@ -1,0 +1,213 @@
+"""The path of what is thrown at the robot, followed from picture to picture.
+
+What flies free moves as x(t) = p + v t + g t^2 / 2. A recurrent network has to learn this, and to
+take the robot's own turning and swaying out of what it sees; it does so slowly (docs/log.md). Here
+both are written down. The encoder says where in each picture the thing is
+(`WorldModel.sight`); the pixels around that place say it to a fraction of a pixel; proprioception
+says where the camera was (`egovcp.model.camera_pose`); and the sums of a weighted least-squares fit
+with a prior are the memory:
+
+    argmin_{p, v}  sum_i w_i |p + v t_i - (x_i - g t_i^2 / 2)|^2  +  prior(p, v)
+
+one axis at a time. Nothing here is trained but the prior's statistics; nothing passes gradients.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import torch
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.model.camera_pose import CameraPose
+from egovcp.model.config import FlightConfig
+
+GRAVITY: Final = 9.81  # m/s^2
+TOLD: Final = slice(0, 4)
+"""What a memory (..., `SIZE`) tells: how sure its path is (0: nothing is on its way; 1: quite);
+y and z (m) where it will cross the plane before the pelvis, heading frame, z from the neutral
+height of the pelvis; time left (s). What is unsure lies near the mean of all throws."""
+_SEEN, _SINCE, _LOST, _YAW = range(4, 8)  # sightings; s since the first and last; rad
+_AXES, _POSITION = slice(8, 17), slice(17, 20)  # of the camera at the last tick
+_SUMS, _PLACES, _MOMENTS = slice(20, 23), slice(23, 26), slice(26, 29)
+SIZE: Final = 29
+_DT: Final = spec.PLANNER_DT
+_MIN_PIXELS: Final = 2
+_LEAST_SPEED: Final = 1.0  # m/s towards the robot
+_BEHIND: Final = -0.08  # s, the time left at which it has passed
+
+
+class Sighting(NamedTuple):
+    """What N pictures show."""
+
+    point: Tensor  # (N, 3) m, camera frame (forward, left, up), the middle of the thing
+    weight: Tensor  # (N,) 1 / m^2; 0: nothing is seen
+
+
+def sighting(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) -> Sighting:
+    """Where a thing is, from where the encoder sees it and the pixels around that place.
+
+    Args:
+        near: (N, H, W) nearness.
+        sight: (N, 4), see `WorldModel.sight`.
+        max_m: depth at which nearness is 0, m.
+        config: of the filter.
+    """
+    height, width = near.shape[-2:]
+    focal = height / 2 / config.camera.half_height
+    row = (torch.arange(height, device=near.device)[:, None] - (height - 1) / 2) / focal
+    col = (torch.arange(width, device=near.device) - (width - 1) / 2) / focal
+    x = (1 - sight[:, 2]).clamp(0.05, 1.0) * max_m + config.radius
+    left = -sight[:, 0] * (width - 1) / 2 / focal * x
+    up = -sight[:, 1] * (height - 1) / 2 / focal * x
+    guess = torch.stack([x, left, up], -1)
+    x, left, up = (v[:, None, None] for v in (x, left, up))
+    z = (1 - near) * max_m + config.radius
+    away = (col * x + left).square() + (row * x + up).square()
+    own = (near > 0) & ((z - x).abs() < config.search) & (away < config.search**2)
+    own = own.to(near.dtype)
+    count = own.sum((1, 2))
+    mean = [(own * v).sum((1, 2)) / count.clamp_min(1) for v in (z, -z * col, -z * row)]
+    cut = own[:, [0, -1]].sum((1, 2)) + own[:, :, [0, -1]].sum((1, 2))  # its middle is lost
+    found = (count >= _MIN_PIXELS) & (cut == 0)
+    point = torch.where(found[:, None], torch.stack(mean, -1), guess)
+    deviation = config.deviation * point[:, 0].clamp_min(1.0) * torch.where(found, 1.0, 2.5)
+    likely = torch.sigmoid(sight[:, 3])
+    weight = torch.where(likely > 0.5, likely, 0.0) / deviation.square()
+    return Sighting(point, weight)
+
+
+def follow(
+    memory: Tensor,
+    pose: CameraPose,
+    seen: Sighting,
+    first: Tensor,
+    config: FlightConfig,
+) -> Tensor:
+    """One tick: the memory (N, `SIZE`) after a picture.
+
+    Args:
+        memory: of the tick before.
+        pose: of the camera now; the picture is `FlightConfig.picture_age` older.
+        seen: what the picture shows.
+        first: (N,) bool, an episode begins: nothing is remembered.
+        config: of the filter.
+    """
+    prior = memory.new_tensor(config.prior)  # (3, 5)
+    memory = memory.masked_fill(first[:, None], 0.0)
+    yaw = torch.where(first, 0.0, memory[:, _YAW] + pose.yaw_rate * _DT)
+    turn = _about_vertical(yaw)
+    axes = (turn @ pose.axes).flatten(1)
+    position = (turn @ pose.position[..., None])[..., 0]
+    before = [
+        torch.where(first[:, None], now, memory[:, part])
+        for now, part in ((axes, _AXES), (position, _POSITION))
+    ]
+    age = config.picture_age / _DT
+    then_axes = (axes + age * (before[0] - axes)).view(-1, 3, 3)
+    then_position = position + age * (before[1] - position)
+    place = (then_axes @ seen.point[..., None])[..., 0] + then_position
+
+    lost, left = memory[:, _LOST] + _DT, memory[:, 3] - _DT
+    over = (memory[:, _SEEN] > 0) & ((left < 1.5 * _BEHIND) | (lost > config.forget))
+    memory = memory.masked_fill(over[:, None], 0.0)
+    flies = memory[:, _SEEN] > 0
+    since = torch.where(flies, memory[:, _SINCE] + _DT, 0.0)
+    weight = seen.weight * _agrees(memory, since, place, prior, config)
+    sums, places, moments = _added(memory, weight, since, place)
+    path = _solve(sums, places, moments, prior)
+    age_now = since + config.picture_age
+    crossing = _crossing(*path, age_now, yaw, config.plane)
+    told = _believed(crossing, _variance(sums, prior, age_now + crossing[:, 2]), config)
+
+    count = memory[:, _SEEN] + (weight > 0)
+    on = (count > 0) & (told[:, 3] > _BEHIND)
+    told = torch.where(on[:, None], told, 0.0)
+    since_last = torch.where(weight > 0, 0.0, torch.where(over, 0.0, lost))
+    parts = [told, *(x[:, None] for x in (count, since, since_last, yaw))]
+    return torch.cat([*parts, axes, position, sums, places, moments], -1)
+
+
+def _agrees(
+    memory: Tensor, since: Tensor, place: Tensor, prior: Tensor, config: FlightConfig
+) -> Tensor:
+    """(N,) 1 where a sighting lies near the path so far, or there is none yet."""
+    p, v = _solve(memory[:, _SUMS], memory[:, _PLACES], memory[:, _MOMENTS], prior)
+    expected = _fallen(p + v * since[:, None], since, -1.0)
+    near = (place - expected).norm(dim=-1) < config.gate
+    agrees: Tensor = near | (memory[:, _SEEN] < 3)
+    return agrees.to(place.dtype)
+
+
+def _added(
+    memory: Tensor, weight: Tensor, since: Tensor, place: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    straight = _fallen(place, since, 1.0) * weight[:, None]
+    sums = memory[:, _SUMS] + torch.stack([weight, weight * since, weight * since * since], -1)
+    return sums, memory[:, _PLACES] + straight, memory[:, _MOMENTS] + straight * since[:, None]
+
+
+def _fallen(place: Tensor, t: Tensor, sign: float) -> Tensor:
+    """(N, 3) with (``sign`` 1) the fall of (N,) s taken out, or (-1) put in."""
+    fall = sign * 0.5 * GRAVITY * t * t
+    return torch.cat([place[:, :2], place[:, 2:] + fall[:, None]], -1)
+
+
+def _solve(sums: Tensor, places: Tensor, moments: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
+    """Place and velocity (N, 3) at the first sighting."""
+    place, speed, a, b, c = prior.unbind(-1)  # (3,) each
+    m00, m01, m11 = (s[:, None] + x for s, x in zip(sums.unbind(-1), (a, b, c), strict=True))
+    r0, r1 = places + a * place + b * speed, moments + b * place + c * speed
+    det = m00 * m11 - m01 * m01
+    return (m11 * r0 - m01 * r1) / det, (m00 * r1 - m01 * r0) / det
+
+
+def _crossing(p: Tensor, v: Tensor, t: Tensor, yaw: Tensor, plane: float) -> Tensor:
+    """(N, 3): y and z (m) and time left (s) of the path at time ``t``."""
+    back = _about_vertical(-yaw)
+    now = (back @ _fallen(p + v * t[:, None], t, -1.0)[..., None])[..., 0]
+    speed = (back @ v[..., None])[..., 0]
+    left = (plane - now[:, 0]) / speed[:, 0].clamp_max(-_LEAST_SPEED)
+    left = left.clamp(-1.0, 1.5)
+    y = now[:, 1] + speed[:, 1] * left
+    z = now[:, 2] + (speed[:, 2] - GRAVITY * t) * left - 0.5 * GRAVITY * left * left
+    return torch.stack([y, z, left], -1)
+
+
+def _variance(sums: Tensor, prior: Tensor, t: Tensor) -> Tensor:
+    """(N, 2) m^2 of y and z at (N,) s after the first sighting."""
+    m00, m01, m11 = (
+        s[:, None] + x for s, x in zip(sums.unbind(-1), prior[1:, 2:].unbind(-1), strict=True)
+    )
+    t = t[:, None]
+    variance: Tensor = (m11 - 2 * t * m01 + t * t * m00) / (m00 * m11 - m01 * m01)
+    return variance
+
+
+def _believed(crossing: Tensor, variance: Tensor, config: FlightConfig) -> Tensor:
+    """(N, 4) what is told: the crossing, drawn towards the mean of all throws."""
+    mean, deviation = crossing.new_tensor(config.aim).unbind(-1)
+    sure = 1.0 / (1.0 + config.doubt * variance / deviation.square())
+    place = mean + sure * (crossing[:, :2] - mean).clamp(-1.0, 1.0)
+    return torch.cat([sure[:, :1], place, crossing[:, 2:]], -1)
+
+
+def _about_vertical(angle: Tensor) -> Tensor:
+    """(N,) rad -> (N, 3, 3)."""
+    c, s, zero, one = angle.cos(), angle.sin(), torch.zeros_like(angle), torch.ones_like(angle)
+    rows = ((c, -s, zero), (s, c, zero), (zero, zero, one))
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def later(memory: Tensor, ticks: int = 1) -> Tensor:
+    """The memory (..., n) that many ticks later, if nothing is seen meanwhile."""
+    left = memory[..., 3:4] - ticks * _DT
+    told = torch.cat([memory[..., :3], left], -1)
+    told = torch.where((memory[..., :1] > 0) & (left > _BEHIND), told, 0.0)
+    return torch.cat([told, memory[..., 4:]], -1)
+
+
+def told(memory: Tensor, unit: tuple[float, float, float]) -> Tensor:
+    """`TOLD` (..., 4) of a memory (..., n), in units."""
+    return torch.cat([memory[..., :1], memory[..., 1:4] / memory.new_tensor(unit)], -1)
