@@ -68,7 +68,7 @@ def value_and_termination_losses(
                 logit, batch.terminal_next.float(), reduction="none"
             )
             losses["termination"] = config.termination * masked_mean(bce, batch.valid)
-        carry = Carry(carry.h[:, :-1], carry.z[:, :-1])  # (B, T - k): the rows that exist
+        carry = carry.map(lambda x: x[:, :-1])  # (B, T - k): the rows that exist
         if config.imagined_steps and k < length:
             same_episode = unbroken(batch, k)
             error = model.value_error(carry, batch.action[:, k:], target[:, k:])
