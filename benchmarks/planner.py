@@ -40,7 +40,7 @@ def plain_plan(
         deltas = mean + std * noise
         deltas[0], deltas[1] = mean, 0.0
         deltas = deltas.clamp(-1, 1)
-        state = Carry(carry.h.repeat(m, 1), carry.z.repeat(m, 1))
+        state = carry.map(lambda x: x.repeat(m, 1))
         action = executed.repeat(m, 1)
         values, alive = [], torch.ones(m)
         for k in range(n):
@@ -67,7 +67,8 @@ def needed_gflop(model: WorldModel, config: PlannerConfig) -> float:
 
     heads = [part for head in model.q_heads for part in head if part is not None]
     mlps = [getattr(part, "mlp", part) for part in heads]
-    told = model.decode_passing if model.passing_value_head is not None else None
+    asked = model.passing_value_head is not None and not model.config.follows_flight
+    told = model.decode_passing if asked else None
     q_start = sum(macs(mlp) - state_parts(mlp.first) for mlp in mlps)
     q_later = macs(*heads, told)
     prior = macs(model.prior) - model.config.latent * model.config.units
@@ -106,7 +107,8 @@ def main() -> None:
     model = WorldModel(WorldModelConfig()).eval().requires_grad_(False)
     torch.nn.init.normal_(model.value_head.mlp.rest[-1].weight, std=0.1)
     config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))
-    carry = Carry(torch.randn(1, model.config.hidden).tanh(), torch.randn(1, model.config.latent))
+    h, z = torch.randn(1, model.config.hidden).tanh(), torch.randn(1, model.config.latent)
+    carry = Carry(h, z, model.initial(1).flight)
     executed = torch.zeros(1, spec.ACTION_DIM)
 
     def planned(judge: Judge[Carry]) -> Callable[[], Tensor]:

@@ -33,7 +33,7 @@ BATCH = 8  # robots planned together
 def states(model: WorldModel, root: str, episodes: int, every: int) -> tuple[Carry, Tensor]:
     """Filtered states of every ``every``-th row of the last episodes, and the actions before."""
     reader = open_dataset(root)
-    h, z, before = [], [], []
+    carries, before = list[Carry](), []
     for index in range(len(reader) - episodes, len(reader)):
         episode = reader.read(index)
         depth = torch.from_numpy(episode.depth.astype(np.int32))
@@ -44,10 +44,9 @@ def states(model: WorldModel, root: str, episodes: int, every: int) -> tuple[Car
             first = torch.tensor([t == 0])
             carry = model.observe(carry, action[t : t + 1], depth[t : t + 1], state, first)
             if t % every == every - 1:
-                h.append(carry.h)
-                z.append(carry.z)
+                carries.append(carry)
                 before.append(action[t : t + 1])
-    return Carry(torch.cat(h), torch.cat(z)), torch.cat(before)
+    return Carry.join(carries, torch.cat), torch.cat(before)
 
 
 class Trial:
@@ -62,7 +61,7 @@ class Trial:
         judge = judge_of_model(self._model, PlannerConfig(backend=backend))
         parts = []
         for rows in torch.arange(len(self._executed)).split(BATCH):
-            carry = Carry(self._carry.h[rows], self._carry.z[rows])
+            carry = self._carry.map(lambda x, rows=rows: x[rows])
             search, rng = optimiser_of(self._config), torch.Generator().manual_seed(seed)
             plan = make_plan(judge, search, carry, self._executed[rows], self._config, rng)
             parts.append(plan.actions)
@@ -72,7 +71,7 @@ class Trial:
         """J (S, n) of plans (S, n, N, 7) by the reference."""
         parts = []
         for rows in torch.arange(len(plans)).split(BATCH):
-            carry = Carry(self._carry.h[rows], self._carry.z[rows])
+            carry = self._carry.map(lambda x, rows=rows: x[rows])
             parts.append(self._reference.at(carry)(plans[rows], None))
         return torch.cat(parts)
 

@@ -215,6 +215,8 @@ def _decode[C](config_class: type[C], config: dict[str, Any], key: str) -> C:
     values = config[key]
     if not isinstance(values, dict):
         raise TypeError(f"{key} is {type(values).__name__}, expected an object")
+    if config_class is WorldModelConfig:  # made before flights were followed: it does not
+        values = {"flight": {"enabled": False}} | values
     decoded: C = draccus.decode(config_class, values)
     return decoded
 

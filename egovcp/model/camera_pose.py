@@ -55,7 +55,8 @@ def _end(chain: _Chain, joint_position: Tensor) -> tuple[Tensor, Tensor]:
     """(N, 29) rad -> position (N, K, 3) and rotation (N, K, 3, 3) of the last links."""
     q = joint_position[:, chain.joints][..., None, None]  # (N, K, J, 1, 1)
     local = chain.rest + torch.sin(q) * chain.sine + (1.0 - torch.cos(q)) * chain.cosine
-    position, rotation = chain.offset[:, 0].expand(len(q), -1, -1), local[:, :, 0]
+    start = torch.zeros_like(joint_position[:, :1, None])  # a length would be fixed in a graph
+    position, rotation = start + chain.offset[:, 0], local[:, :, 0]
     for j in range(1, chain.joints.shape[1]):
         position = position + (rotation @ chain.offset[:, j, :, None])[..., 0]
         rotation = rotation @ local[:, :, j]
@@ -88,7 +89,7 @@ def heading_rotation(gravity: Tensor) -> Tensor:
     """`egovcp.robot.kinematics.heading_rotation` of (N, 3), in torch."""
     up = -gravity / gravity.norm(dim=-1, keepdim=True).clamp_min(1e-9)
     x, y, z = up.unbind(-1)
-    norm = torch.hypot(y, z).clamp_min(1e-6)
+    norm = (y * y + z * z).sqrt().clamp_min(1e-6)
     first = torch.stack([norm, -x * y / norm, -x * z / norm], -1)
     second = torch.stack([torch.zeros_like(x), z / norm, -y / norm], -1)
     return torch.stack([first, second, up], -2)

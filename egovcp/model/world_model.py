@@ -222,8 +222,14 @@ class WorldModel(nn.Module):
         Rows with ``is_first`` start from zeros and the neutral action. z is the
         posterior mean.
         """
-        h = self.advance(carry, action, is_first)
         near = nearness(depth, self.config.depth_max_m)
+        return self.observe_near(carry, action, near, state, is_first)
+
+    def observe_near(
+        self, carry: Carry, action: Tensor, near: Tensor, state: Tensor, is_first: Tensor
+    ) -> Carry:
+        """The same from nearness (B, 48, 64)."""
+        h = self.advance(carry, action, is_first)
         embedding = self.embed_near(near, self.standardise(state))
         z, followed = self.infer(h, embedding).mean, carry.flight
         if followed is not None:

@@ -132,6 +132,13 @@ def test_an_artefact_without_the_younger_options_loads_as_what_it_was(folder: Pa
     )
 
 
+def test_a_model_from_before_flights_were_followed_does_not_follow_them(folder: Path) -> None:
+    assert load_artefact(str(folder)).world_model.config.follows_flight
+    _edit(folder / CONFIG, lambda config: config["world_model"].pop("flight"))
+    _sign(folder)
+    assert not load_artefact(str(folder)).world_model.config.follows_flight
+
+
 def test_options_that_the_weights_contradict_are_refused(folder: Path) -> None:
     _edit(folder / CONFIG, lambda config: config["world_model"].update(q_heads=2))
     _sign(folder)

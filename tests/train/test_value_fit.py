@@ -115,10 +115,11 @@ def test_what_an_action_earns_is_not_credited_to_the_state_that_goes_with_it() -
     action = torch.rand((count, 7), generator=rng) * 2 - 1
     h[:, 0] = action[:, 0]
     with torch.no_grad():
-        place = model.passing(Carry(h, z))[:, 1]
+        told = model.passing(Carry(h, z))
+    place = told[:, 1]
     target = -((action[:, 0] - place) ** 2)
     standardised = (target - target.mean()) / target.std()
-    rows = Rows(h, z, action, standardised, torch.zeros(count))
+    rows = Rows(h, z, told, action, standardised, torch.zeros(count))
     _fit_heads(model, rows, ValueFitConfig(steps=300, rows=512, lr=3e-3), rng)
     with torch.no_grad():
         good, bad = action.clone(), action.clone()

@@ -11,7 +11,7 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -29,7 +29,6 @@ from egovcp_train.onnx_networks import (
     NETWORKS,
     OPSET,
     REWARD,
-    Network,
     golden_inputs,
     networks_of,
     reference,
@@ -149,10 +148,8 @@ def verify(folder: Path) -> dict[str, float]:
     golden = load_file(folder / GOLDEN)
     errors: dict[str, float] = {}
     present = REWARD if (folder / "reward.onnx").exists() else {}
-    for name, network in {**NETWORKS, **present}.items():
-        inputs = {key: golden[f"inputs/{key}"].numpy() for key in network.inputs}
-        expected = [golden[f"outputs/{name}/{key}"].numpy() for key in network.outputs]
-        errors[name] = _largest_error(folder / f"{name}.onnx", network, inputs, expected)
+    for name in {**NETWORKS, **present}:
+        errors[name] = _largest_error(folder, name, golden)
         if not errors[name] <= TOLERANCE:  # NaN is more, too
             raise ArtefactError(
                 f"{folder / name}.onnx differs from the original by {errors[name]:.1e}, more than "
@@ -161,15 +158,18 @@ def verify(folder: Path) -> dict[str, float]:
     return errors
 
 
-def _largest_error(
-    path: Path, network: type[Network], inputs: dict[str, Any], expected: list[Any]
-) -> float:
+def _largest_error(folder: Path, name: str, golden: Mapping[str, torch.Tensor]) -> float:
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])
-    names, rows = list(network.outputs), len(expected[0])
+    session = onnxruntime.InferenceSession(
+        str(folder / f"{name}.onnx"), options, providers=["CPUExecutionProvider"]
+    )
+    names = [output.name for output in session.get_outputs()]
+    inputs = {x.name: golden[f"inputs/{x.name}"].numpy() for x in session.get_inputs()}
+    expected = [golden[f"outputs/{name}/{key}"].numpy() for key in names]
+    rows = len(expected[0])
     whole = session.run(names, inputs)
     single = [session.run(names, {k: v[i : i + 1] for k, v in inputs.items()}) for i in range(rows)]
     found = [whole, [np.concatenate(parts) for parts in zip(*single, strict=True)]]
@@ -187,6 +187,9 @@ def _largest_error(
 def _report(artefact: Artefact, folder: Path, golden: dict[str, torch.Tensor]) -> dict[str, Any]:
     """What another runtime must know besides the graphs."""
 
+    model = artefact.world_model
+    networks = {name: network(model) for name, network in networks_of(model).items()}
+
     def described(key: str) -> dict[str, Any]:
         tensor = golden[key]
         kind = str(tensor.dtype).removeprefix("torch.")
@@ -202,7 +205,7 @@ def _report(artefact: Artefact, folder: Path, golden: dict[str, torch.Tensor]) -
                 "inputs": {key: described(f"inputs/{key}") for key in network.inputs},
                 "outputs": {key: described(f"outputs/{name}/{key}") for key in network.outputs},
             }
-            for name, network in networks_of(artefact.world_model).items()
+            for name, network in networks.items()
         },
         "golden": {"file": GOLDEN, "sha256": _sha256(folder / GOLDEN), "tolerance": TOLERANCE},
         "return_floor": float(artefact.world_model.return_floor),

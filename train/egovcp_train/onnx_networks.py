@@ -6,6 +6,9 @@
     termination  h, z                                  ->  termination
     reward       h, z, action                          ->  reward         if it is predicted
 
+A model that follows flights (`egovcp.model.flight`) has a third part of its memory, `flight`, which
+observe, imagine and value read and the first two hand on.
+
 Normalisation is inside: depth comes in millimetres, proprioception in SI units, and values go out
 in units of return. A planner repeats the row of a robot for each of its candidates.
 """
@@ -23,7 +26,8 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from egovcp import spec
-from egovcp.model import Carry, WorldModel
+from egovcp.model import Carry, WorldModel, flight
+from egovcp.model.camera_pose import camera_pose
 
 OPSET: Final = 17
 
@@ -41,41 +45,63 @@ class Network(nn.Module):
         self.model = model
 
 
-class Observe(Network):
+class Following(Network):
+    """A graph whose last input, if the model follows flights, is ``flight``."""
+
+    def __init__(self, model: WorldModel) -> None:
+        super().__init__(model)
+        if model.config.follows_flight:
+            self.inputs = (*self.inputs, "flight")
+
+
+class Advancing(Following):
+    """One that hands it on, too."""
+
+    def __init__(self, model: WorldModel) -> None:
+        super().__init__(model)
+        if model.config.follows_flight:
+            self.outputs = (*self.outputs, "flight_next")
+
+
+class Observe(Advancing):
     """`WorldModel.observe`: depth (B, 48, 64) mm as float32, whole numbers, 0 = not measured."""
 
     inputs = ("h", "z", "action", "depth", "state", "is_first")
     outputs = ("h_next", "z_next")
 
     def forward(
-        self, h: Tensor, z: Tensor, action: Tensor, depth: Tensor, state: Tensor, is_first: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        model = self.model
-        h = model.advance(Carry(h, z), action, is_first)
-        near = pooled_nearness(depth, model.config.depth_max_m)
-        embedding = model.embed_near(near, model.standardise(state))
-        return h, model.infer(h, embedding).mean
+        self,
+        h: Tensor,
+        z: Tensor,
+        action: Tensor,
+        depth: Tensor,
+        state: Tensor,
+        is_first: Tensor,
+        *flight: Tensor,
+    ) -> tuple[Tensor, ...]:
+        near = pooled_nearness(depth, self.model.config.depth_max_m)
+        carry = Carry(h, z, *flight)
+        return _parts(self.model.observe_near(carry, action, near, state, is_first))
 
 
-class Imagine(Network):
+class Imagine(Advancing):
     """`WorldModel.imagine`."""
 
     inputs = ("h", "z", "action")
     outputs = ("h_next", "z_next")
 
-    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        carry = self.model.imagine(Carry(h, z), action)
-        return carry.h, carry.z
+    def forward(self, h: Tensor, z: Tensor, action: Tensor, *flight: Tensor) -> tuple[Tensor, ...]:
+        return _parts(self.model.imagine(Carry(h, z, *flight), action))
 
 
-class Value(Network):
+class Value(Following):
     """`WorldModel.value`, (B,)."""
 
     inputs = ("h", "z", "action")
     outputs = ("value",)
 
-    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
-        return self.model.value(Carry(h, z), action)
+    def forward(self, h: Tensor, z: Tensor, action: Tensor, *flight: Tensor) -> Tensor:
+        return self.model.value(Carry(h, z, *flight), action)
 
 
 class Termination(Network):
@@ -96,6 +122,10 @@ class Reward(Network):
 
     def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
         return self.model.reward(Carry(h, z), action)
+
+
+def _parts(carry: Carry) -> tuple[Tensor, ...]:
+    return tuple(part for part in carry if part is not None)
 
 
 NETWORKS: Final[Mapping[str, type[Network]]] = {
@@ -133,7 +163,7 @@ def golden_inputs(model: WorldModel, batch: int, seed: int = 0) -> Tensors:
 
     image = (spec.DEPTH_ROWS, spec.DEPTH_COLS)
     depth = (uniform(*image) * 1.2e3 * model.config.depth_max_m).floor()
-    return {
+    inputs = {
         "h": normal(model.config.hidden).tanh(),
         "z": normal(model.config.latent),
         "action": 2.0 * uniform(spec.ACTION_DIM) - 1.0,
@@ -141,25 +171,48 @@ def golden_inputs(model: WorldModel, batch: int, seed: int = 0) -> Tensors:
         "state": model.state_mean + 3.0 * model.state_std * normal(spec.STATE_DIM),
         "is_first": torch.arange(batch) % 3 == 0,
     }
+    if model.config.follows_flight:
+        inputs["flight"] = _golden_memory(model, batch, seed)
+    return inputs
+
+
+@torch.no_grad()
+def _golden_memory(model: WorldModel, batch: int, seed: int) -> Tensor:
+    """What is remembered after some sightings of things at random places."""
+    generator = torch.Generator().manual_seed(seed + 1)
+    memory = torch.zeros(batch, flight.SIZE)
+    pose = camera_pose(model.state_mean.expand(batch, -1), model.config.flight.camera)
+    for tick in range(4):
+        place = torch.tensor([3.0 - 0.16 * tick, 0.0, 0.5])
+        point = place + 0.3 * torch.randn(batch, 3, generator=generator)
+        seen = flight.Sighting(point, torch.full((batch,), 1e3))
+        first = torch.full((batch,), tick == 0)
+        memory = flight.follow(memory, pose, seen, first, model.config.flight)
+    return memory
 
 
 @torch.no_grad()
 def reference(model: WorldModel, inputs: Tensors) -> dict[str, Tensors]:
     """Network -> its outputs, computed by the world model itself, not by what is exported."""
-    carry = Carry(inputs["h"], inputs["z"])
+    carry = Carry(inputs["h"], inputs["z"], inputs.get("flight"))
     depth = inputs["depth"].to(torch.int32)  # as on the robot
     action, state, is_first = inputs["action"], inputs["state"], inputs["is_first"]
     observed = model.observe(carry, action, depth, state, is_first)
     imagined = model.imagine(carry, action)
     answers = {
-        "observe": {"h_next": observed.h, "z_next": observed.z},
-        "imagine": {"h_next": imagined.h, "z_next": imagined.z},
+        "observe": _named(observed),
+        "imagine": _named(imagined),
         "value": {"value": model.value(carry, action)},
         "termination": {"termination": model.termination(carry)},
     }
     if model.reward_head is not None:
         answers["reward"] = {"reward": model.reward(carry, action)}
     return answers
+
+
+def _named(carry: Carry) -> Tensors:
+    named = zip(("h_next", "z_next", "flight_next"), carry, strict=True)
+    return {name: part for name, part in named if part is not None}
 
 
 def write_graph(network: Network, inputs: Tensors, path: Path) -> None:

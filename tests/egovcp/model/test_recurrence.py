@@ -24,7 +24,7 @@ def _step_by_step(model: WorldModel, batch: Batch) -> Carry:
             batch.is_first[:, t],
         )
         carries.append(carry)
-    return Carry(*(torch.stack(parts, 1) for parts in zip(*carries, strict=True)))
+    return Carry.join(carries, lambda parts: torch.stack(parts, 1))
 
 
 def _restart(batch: Batch, t: int) -> Batch:
@@ -158,7 +158,7 @@ def test_each_row_is_filtered_as_if_it_were_alone(model: WorldModel, batch: Batc
         together = filter_sequence(model, batch, sample=False).carry
         for b in range(len(batch.valid)):
             alone = filter_sequence(model, Batch(*(x[b : b + 1] for x in batch)), sample=False)
-            _close(Carry(together.h[b : b + 1], together.z[b : b + 1]), alone.carry)
+            _close(together.map(lambda x, b=b: x[b : b + 1]), alone.carry)  # type: ignore[misc]
 
 
 def test_the_carry_counts_ticks_and_holds_the_action_that_led_to_it() -> None:

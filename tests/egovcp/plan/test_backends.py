@@ -9,7 +9,8 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.model import PRESETS, Carry, WorldModel
+from egovcp.model import PRESETS, Carry, WorldModel, flight
+from egovcp.model.config import FlightConfig
 from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
 from egovcp.plan.backends import judge_of_model, library
 from egovcp.plan.backends.judges import FloatJudge, IntegerJudge
@@ -28,6 +29,7 @@ MODELS = [
     {},
     {"value_state": 0},
     {"value_of_passing": False},
+    {"flight": FlightConfig(enabled=False)},
     {"q_heads": 3},
     {"value_loss": "two_hot"},
     {"hidden": 48, "units": 64, "latent": 12},
@@ -52,7 +54,12 @@ def _model(**change: object) -> WorldModel:
 def _carry(model: WorldModel, robots: int = 3, seed: int = 0) -> Carry:
     rng = torch.Generator().manual_seed(seed)
     h = 2 * torch.rand(robots, model.config.hidden, generator=rng) - 1
-    return Carry(h, torch.randn(robots, model.config.latent, generator=rng))
+    z = torch.randn(robots, model.config.latent, generator=rng)
+    if not model.config.follows_flight:
+        return Carry(h, z)
+    memory = torch.rand(robots, flight.SIZE, generator=rng)
+    memory[:, 3] *= 0.3  # s: some of it passes within the plan
+    return Carry(h, z, memory)
 
 
 def _actions(robots: int = 3, plans: int = 65, horizon: int = 4, seed: int = 1) -> Tensor:
@@ -94,6 +101,18 @@ def test_plans_are_worth_the_same(
 
 
 @pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
+def test_a_memory_without_a_flight_is_asked_what_the_state_says(
+    backend: BackendName, tolerance: float
+) -> None:
+    model, config = _model(), PlannerConfig(backend="eager")
+    carry, actions = _carry(model)._replace(flight=None), _actions()
+    expected = _values(model, config, carry, actions)
+    found = _values(model, dataclasses.replace(config, backend=backend), carry, actions)
+    error = (found - expected).abs().flatten().sort().values
+    assert error[: int(0.97 * len(error))].max() < tolerance * expected.std()
+
+
+@pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
 @pytest.mark.parametrize("horizon", [1, 2, 7])
 def test_any_horizon(backend: BackendName, tolerance: float, horizon: int) -> None:
     model = _model()
@@ -126,7 +145,7 @@ def test_a_robot_is_judged_the_same_alone_and_in_a_crowd(
     carry, actions, config = _carry(model), _actions(), PlannerConfig(backend=backend)
     together = _values(model, config, carry, actions)
     for e in range(3):
-        row = Carry(carry.h[e : e + 1], carry.z[e : e + 1])
+        row = carry.map(lambda x, e=e: x[e : e + 1])  # type: ignore[misc]
         alone = _values(model, config, row, actions[e : e + 1])
         allowed = 0.0 if backend == "int8" else EXACT if backend == "float32" else BYTES
         assert (together[e] - alone[0]).abs().max() <= allowed * together.std()
@@ -240,7 +259,7 @@ def test_the_same_on_a_gpu(backend: BackendName, tolerance: float) -> None:
     model = _model()
     carry, actions = _carry(model), _actions()
     expected = _values(model, PlannerConfig(backend="eager"), carry, actions)
-    there = Carry(carry.h.cuda(), carry.z.cuda())
+    there = carry.map(lambda x: x.cuda())
     with torch.no_grad():
         judge = judge_of_model(model.cuda(), PlannerConfig(backend=backend))
         found = judge.at(there)(actions.cuda(), None).cpu()

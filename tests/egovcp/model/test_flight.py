@@ -1,0 +1,235 @@
+"""The filter that follows what is thrown: it finds the path, whatever the robot does meanwhile."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.data.mirror import mirror_state
+from egovcp.model import flight
+from egovcp.model.camera_pose import CameraPose, camera_pose
+from egovcp.model.config import FlightConfig
+from egovcp.robot.kinematics import LINK_NAMES, heading_rotation, link_transforms
+
+CONFIG = FlightConfig()
+DT = spec.PLANNER_DT
+GRAVITY = torch.tensor([0.0, 0.0, -9.81])
+
+
+class Throw(NamedTuple):
+    """From `start` (m) at `velocity` (m/s), in the heading frame of a robot that never turns."""
+
+    start: tuple[float, float, float] = (3.0, 0.3, 0.5)
+    velocity: tuple[float, float, float] = (-3.6, -0.2, 3.4)
+
+    def at(self, t: float) -> Tensor:
+        s, v = torch.tensor(self.start), torch.tensor(self.velocity)
+        return s + v * t + 0.5 * GRAVITY * t * t
+
+    @property
+    def crossing(self) -> tuple[float, float, float]:
+        """y, z (m) and time (s)."""
+        t = (CONFIG.plane - self.start[0]) / self.velocity[0]
+        y, z = self.at(t)[1:].tolist()
+        return y, z, t
+
+
+def _standing(rng: np.random.Generator, sway: float) -> Tensor:
+    """A state (1, 74) of somebody who sways: gravity, waist and knees."""
+    state = np.zeros((1, spec.STATE_DIM), np.float32)
+    tilt = rng.normal(0, sway, 2)
+    down = np.array([-math.sin(tilt[0]), -math.sin(tilt[1]), -1.0])
+    state[0, spec.STATE_SLICES["projected_gravity"]] = down / np.linalg.norm(down)
+    joints = state[0, spec.STATE_SLICES["joint_position"]]
+    joints[12:15] = rng.normal(0, sway, 3)
+    joints[[3, 9]] = abs(rng.normal(0, 3 * sway))
+    return torch.from_numpy(state)
+
+
+def _turned(pose: CameraPose, angle: float) -> CameraPose:
+    """The same camera seen from a frame that stays put."""
+    c, s = math.cos(angle), math.sin(angle)
+    turn = torch.tensor([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return CameraPose(turn @ pose.axes, pose.position @ turn.T, pose.yaw_rate)
+
+
+def _follow(throw: Throw, ticks: int, sway: float = 0.0, yaw_rate: float = 0.0) -> Tensor:
+    """The memory (1, ...) after so many pictures of a throw that begins at the first one."""
+    rng = np.random.default_rng(0)
+    states = [_standing(rng, 0.0), *(_standing(rng, sway) for _ in range(ticks))]
+    poses = [
+        camera_pose(s, CONFIG.camera)._replace(yaw_rate=torch.tensor([yaw_rate])) for s in states
+    ]
+    ground = [_turned(pose, yaw_rate * DT * (k - 1)) for k, pose in enumerate(poses)]
+    memory = torch.zeros(1, flight.SIZE)
+    age = CONFIG.picture_age / DT
+    for k in range(1, ticks + 1):
+        before = ground[k - 1] if k > 1 else ground[k]
+        axes = ground[k].axes + age * (before.axes - ground[k].axes)
+        position = ground[k].position + age * (before.position - ground[k].position)
+        place = throw.at((k - 1) * DT) - position
+        point = torch.linalg.solve(axes, place[..., None])[..., 0]
+        seen = flight.Sighting(point, torch.tensor([1e3]))
+        memory = flight.follow(memory, poses[k], seen, torch.tensor([k == 1]), CONFIG)
+    return memory
+
+
+@pytest.mark.parametrize("sway", [0.0, 0.05])
+@pytest.mark.parametrize("yaw_rate", [0.0, 0.4])
+def test_the_crossing_is_found_whatever_the_robot_does(sway: float, yaw_rate: float) -> None:
+    throw, ticks = Throw(), 12
+    told = _follow(throw, ticks, sway, yaw_rate)[0, flight.TOLD]
+    angle = yaw_rate * DT * (ticks - 1)  # the plane turns with the robot
+    c, s = math.cos(angle), math.sin(angle)
+    now = (ticks - 1) * DT + CONFIG.picture_age
+    t = torch.linspace(0, 1.5, 15001)
+    path = torch.stack([throw.at(float(x)) for x in t])
+    k = int((c * path[:, 0] + s * path[:, 1] - CONFIG.plane).abs().argmin())
+    y = float(-s * path[k, 0] + c * path[k, 1])
+    assert told[0] > 0.9
+    assert abs(float(told[1]) - y) < 0.05
+    assert abs(float(told[2]) - float(path[k, 2])) < 0.05
+    assert abs(float(told[3]) - (float(t[k]) - now)) < 0.02
+
+
+def test_more_pictures_make_it_surer() -> None:
+    sure = [float(_follow(Throw(), ticks)[0, 0]) for ticks in (1, 3, 6, 12)]
+    assert sure == sorted(sure)
+    assert 0 < sure[0] < 0.2
+    assert sure[-1] > 0.9
+
+
+def test_one_picture_tells_little_more_than_the_mean_of_all_throws() -> None:
+    told = _follow(Throw(velocity=(-3.6, 1.0, 3.4)), 1)[0]
+    (y, _), (z, _) = CONFIG.aim
+    assert abs(float(told[1]) - y) < 0.1
+    assert abs(float(told[2]) - z) < 0.1
+
+
+def test_in_a_mirror_it_passes_on_the_other_side() -> None:
+    here, there = _follow(Throw(), 8), _follow(Throw((3.0, -0.3, 0.5), (-3.6, 0.2, 3.4)), 8)
+    torch.testing.assert_close(here[0, 1], -there[0, 1], atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(here[0, [0, 2, 3]], there[0, [0, 2, 3]], atol=1e-4, rtol=1e-4)
+
+
+def _nothing(memory: Tensor, ticks: int) -> Tensor:
+    pose = camera_pose(_standing(np.random.default_rng(0), 0.0), CONFIG.camera)
+    unseen = flight.Sighting(torch.ones(1, 3), torch.zeros(1))
+    for _ in range(ticks):
+        memory = flight.follow(memory, pose, unseen, torch.tensor([False]), CONFIG)
+    return memory
+
+
+def test_where_nothing_flies_nothing_is_told() -> None:
+    assert not _nothing(torch.zeros(1, flight.SIZE), 20)[:, flight.TOLD].any()
+
+
+def test_a_path_is_remembered_while_its_thing_is_out_of_sight_and_forgotten_after() -> None:
+    memory = _follow(Throw(), 8)
+    unseen = _nothing(memory, 4)
+    assert abs(float(unseen[0, 3]) - (float(memory[0, 3]) - 4 * DT)) < 1e-4
+    torch.testing.assert_close(unseen[0, :3], memory[0, :3], atol=0.05, rtol=0)
+    gone = _nothing(memory, 30)
+    assert not gone[:, flight.TOLD].any()
+    assert not gone[:, 20:].any()
+
+
+def test_a_flicker_beside_the_path_is_none_of_it() -> None:
+    memory = _follow(Throw(), 8)
+    pose = camera_pose(_standing(np.random.default_rng(0), 0.0), CONFIG.camera)
+    flicker = flight.Sighting(torch.tensor([[2.0, -1.5, 0.0]]), torch.tensor([1e3]))
+    after = flight.follow(memory, pose, flicker, torch.tensor([False]), CONFIG)
+    torch.testing.assert_close(after, _nothing(memory, 1))
+
+
+def test_an_episode_begins_with_nothing_even_after_what_is_no_number() -> None:
+    pose = camera_pose(_standing(np.random.default_rng(0), 0.0), CONFIG.camera)
+    seen = flight.Sighting(torch.tensor([[3.0, 0.0, 0.0]]), torch.tensor([1e3]))
+    first = torch.tensor([True])
+    memories = (torch.zeros(1, flight.SIZE), torch.full((1, flight.SIZE), torch.nan))
+    fresh, healed = (flight.follow(m, pose, seen, first, CONFIG) for m in memories)
+    assert torch.equal(fresh, healed)
+
+
+def test_later_is_what_nothing_seen_meanwhile_tells() -> None:
+    memory = _follow(Throw(), 8)
+    torch.testing.assert_close(
+        flight.later(memory, 3)[0, flight.TOLD],
+        _nothing(memory, 3)[0, flight.TOLD],
+        atol=0.02,
+        rtol=0,
+    )
+    assert not flight.later(memory, 50)[0, flight.TOLD].any()
+    assert torch.equal(flight.later(memory[:, :4]), flight.later(memory)[:, :4])
+
+
+@pytest.mark.parametrize("off", [(0.0, 0.0), (1.5, -1.0)])
+def test_the_pixels_say_where_it_is_better_than_the_encoder(off: tuple[float, float]) -> None:
+    """A ball of 0.1 m, 2 m ahead, 0.3 m to the left and 0.2 m up, before a far wall."""
+    focal = spec.DEPTH_ROWS / 2 / CONFIG.camera.half_height
+    column = (spec.DEPTH_COLS - 1) / 2 - 0.3 / 2.0 * focal
+    row = (spec.DEPTH_ROWS - 1) / 2 - 0.2 / 2.0 * focal
+    rows, cols = torch.meshgrid(
+        torch.arange(float(spec.DEPTH_ROWS)), torch.arange(float(spec.DEPTH_COLS)), indexing="ij"
+    )
+    away = torch.hypot(rows - row, cols - column) / focal * 2.0
+    depth = torch.where(away < 0.1, 1.9, 4.5)
+    near = (1 - depth / spec.DEPTH_MAX_M)[None]
+    sight = torch.tensor(
+        [
+            [
+                2 * (column + off[0]) / (spec.DEPTH_COLS - 1) - 1,
+                2 * (row + off[1]) / (spec.DEPTH_ROWS - 1) - 1,
+                1 - 1.85 / spec.DEPTH_MAX_M,
+                4.0,
+            ]
+        ]
+    )
+    seen = flight.sighting(near, sight, spec.DEPTH_MAX_M, CONFIG)
+    torch.testing.assert_close(seen.point[0], torch.tensor([2.0, 0.3, 0.2]), atol=0.02, rtol=0)
+    unsure = flight.sighting(
+        near, sight - torch.tensor([0.0, 0.0, 0.0, 5.0]), spec.DEPTH_MAX_M, CONFIG
+    )
+    assert seen.weight > 0
+    assert unsure.weight == 0
+
+
+def test_the_camera_is_where_kinematics_says() -> None:
+    rng = np.random.default_rng(1)
+    state = torch.cat([_standing(rng, 0.2) for _ in range(5)])
+    pose = camera_pose(state, CONFIG.camera)
+    numbers = state.numpy().astype(np.float64)
+    position, rotation = link_transforms(numbers[:, spec.STATE_SLICES["joint_position"]])
+    level = heading_rotation(numbers[:, spec.STATE_SLICES["projected_gravity"]])
+    torso = LINK_NAMES.index("torso_link")
+    mount = position[:, torso] + rotation[:, torso] @ np.array(CONFIG.camera.position)
+    seen = np.einsum("nij,nj->ni", level, mount)
+    np.testing.assert_allclose(pose.position[:, :2], seen[:, :2], atol=1e-5)
+    forward = np.einsum("nij,njk->nik", level, rotation[:, torso])[..., 0]
+    c, s = math.cos(CONFIG.camera.pitch), math.sin(CONFIG.camera.pitch)
+    up = np.einsum("nij,njk->nik", level, rotation[:, torso])[..., 2]
+    np.testing.assert_allclose(pose.axes[..., 0], c * forward - s * up, atol=1e-5)
+
+
+def test_who_squats_has_a_lower_camera() -> None:
+    upright, squat = (torch.zeros(1, spec.STATE_DIM) for _ in range(2))
+    for state in (upright, squat):
+        state[:, spec.STATE_SLICES["projected_gravity"]] = torch.tensor([0.0, 0.0, -1.0])
+    joints = squat[:, spec.STATE_SLICES["joint_position"]]
+    for hip, knee, ankle in ((0, 3, 4), (6, 9, 10)):
+        joints[:, hip], joints[:, knee], joints[:, ankle] = -0.5, 1.0, -0.5
+    high, low = (camera_pose(s, CONFIG.camera).position[0, 2] for s in (upright, squat))
+    assert 0.05 < float(high - low) < 0.15
+
+
+def test_the_camera_of_the_mirrored_robot_is_mirrored() -> None:
+    state = torch.cat([_standing(np.random.default_rng(3), 0.2) for _ in range(4)])
+    there = torch.from_numpy(mirror_state(state.numpy()).astype(np.float32))
+    a, b = camera_pose(state, CONFIG.camera), camera_pose(there, CONFIG.camera)
+    flip = torch.tensor([1.0, -1.0, 1.0])
+    torch.testing.assert_close(a.position * flip, b.position, atol=1e-4, rtol=1e-4)
+    torch.testing.assert_close(a.axes * flip[:, None] * flip, b.axes, atol=1e-4, rtol=1e-4)
