@@ -143,6 +143,8 @@ class FlightConfig:
     """The variance of a crossing is this many times what independent sightings would give."""
     gate: float = 0.5
     """A sighting farther than this from the path of three or more is not its own, m."""
+    painted: float = 0.5
+    """A path at least so sure says where it is painted (`paint_flight`); else `motion` does."""
     forget: float = 0.5
     """A path whose thing has not been seen for so long is forgotten, s."""
 

@@ -205,7 +205,35 @@ def later(memory: Tensor, ticks: int = 1) -> Tensor:
     left = memory[..., 3:4] - ticks * _DT
     told = torch.cat([memory[..., :3], left], -1)
     told = torch.where((memory[..., :1] > 0) & (left > _BEHIND), told, 0.0)
-    return torch.cat([told, memory[..., 4:]], -1)
+    passed = memory[..., _SINCE : _LOST + 1] + ticks * _DT
+    return torch.cat([told, memory[..., 4:_SINCE], passed, memory[..., _LOST + 1 :]], -1)
+
+
+def in_picture(memory: Tensor, pose: CameraPose, max_m: float, config: FlightConfig) -> Tensor:
+    """Where a camera sees it, if the robot has not turned since the last picture.
+
+    Args:
+        memory: (N, `SIZE`).
+        pose: of the camera when the picture is taken.
+        max_m: depth at which nearness is 0, m.
+        config: of the filter.
+
+    Returns:
+        (N, 4) as `WorldModel.motion`: column and row in half pictures from the middle, nearness of
+        its surface, log-odds that it is there; below 0 where its path is not known.
+    """
+    prior = memory.new_tensor(config.prior)
+    since, turn = memory[:, _SINCE], _about_vertical(memory[:, _YAW])
+    p, v = _solve(memory[:, _SUMS], memory[:, _PLACES], memory[:, _MOMENTS], prior)
+    place = _fallen(p + v * since[:, None], since, -1.0)
+    from_camera = place - (turn @ pose.position[..., None])[..., 0]
+    x, left, up = ((turn @ pose.axes).mT @ from_camera[..., None])[..., 0].unbind(-1)
+    half_width = config.camera.half_height * spec.DEPTH_COLS / spec.DEPTH_ROWS
+    x = x.clamp_min(config.radius)
+    column, row = -left / (x * half_width), -up / (x * config.camera.half_height)
+    inside = (x > 2 * config.radius) & (column.abs() < 1) & (row.abs() < 1)
+    known = inside & (memory[:, 0] > config.painted)
+    return torch.stack([column, row, 1 - (x - config.radius) / max_m, known * 40.0 - 20.0], -1)
 
 
 def told(memory: Tensor, unit: tuple[float, float, float]) -> Tensor:

@@ -396,7 +396,18 @@ class WorldModel(nn.Module):
         image: Tensor = self.decode_depth(carry.features).float()
         if not self.config.paint_flight:
             return image
-        return paint_ball(image, self.motion(carry)[..., 0, :], self.config.depth_max_m)
+        return paint_ball(image, self._place(carry), self.config.depth_max_m)
+
+    def _place(self, carry: Carry) -> Tensor:
+        """Where what flies is painted, (B, 4) as `motion`."""
+        place = self.motion(carry)[..., 0, :]
+        if carry.flight is None or carry.flight.shape[-1] < flight.SIZE:
+            return place
+        c = self.config
+        state = self.decode_state(carry.h, carry.z).float() * self.state_std + self.state_mean
+        pose = camera_pose(state, c.flight.camera)
+        followed = flight.in_picture(carry.flight, pose, c.depth_max_m, c.flight)
+        return torch.where(followed[:, 3:] > 0, followed, place)
 
     def decode(self, carry: Carry) -> tuple[Tensor, Tensor]:
         """Carry (B, ...) -> depth (B, 48, 64) in metres, 0 = nothing in range; state (B, 74)."""

@@ -233,3 +233,20 @@ def test_the_camera_of_the_mirrored_robot_is_mirrored() -> None:
     flip = torch.tensor([1.0, -1.0, 1.0])
     torch.testing.assert_close(a.position * flip, b.position, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(a.axes * flip[:, None] * flip, b.axes, atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.parametrize("ahead", [0, 4])
+def test_it_is_painted_where_the_camera_will_see_it(ahead: int) -> None:
+    throw, ticks = Throw(), 8
+    memory = flight.later(_follow(throw, ticks), ahead)
+    pose = camera_pose(_standing(np.random.default_rng(0), 0.0), CONFIG.camera)
+    place = throw.at((ticks - 1 + ahead) * DT) - pose.position[0]
+    x, left, up = (pose.axes[0].T @ place).tolist()
+    seen = flight.in_picture(memory, pose, spec.DEPTH_MAX_M, CONFIG)[0]
+    half = CONFIG.camera.half_height
+    assert abs(float(seen[0]) * half * 4 / 3 * x + left) < 0.03
+    assert abs(float(seen[1]) * half * x + up) < 0.03
+    assert abs((1 - float(seen[2])) * spec.DEPTH_MAX_M - (x - CONFIG.radius)) < 0.03
+    assert seen[3] > 0
+    unsure = flight.in_picture(_follow(throw, 1), pose, spec.DEPTH_MAX_M, CONFIG)
+    assert unsure[0, 3] < 0

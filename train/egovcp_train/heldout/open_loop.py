@@ -82,16 +82,16 @@ class OpenLoop:
         i: Tensor,
     ) -> None:
         """Add the errors of starts ``i`` of episodes ``b`` at horizon ``k``."""
-        h, z, then = carry.h[b, i], carry.z[b, i], starts.rows[i] + k
+        found, then = carry.map(lambda x: x[b, i]), starts.rows[i] + k
         truth, before = rollout.state[b, then], rollout.state[b, starts.rows[i]]
-        foreseen = model.decode_state(h, z).float()
+        foreseen = model.decode_state(found.h, found.z).float()
         errors = torch.stack([(foreseen - truth).abs().sum(0), (before - truth).abs().sum(0)])
         self._state[k] += errors.double().cpu()
         self._rows[k] += len(b)
         watched = starts.watched[b, i]
         for some in torch.split(torch.arange(len(b), device=b.device), _IMAGES_AT_ONCE):
             bs, ts = b[some], then[some]
-            image = model.picture(Carry(h[some], z[some])).clamp(0.0, 1.0)
+            image = model.picture(_some(found, some)).clamp(0.0, 1.0)
             truth = rollout.near[bs, ts]
             wrong = (image - truth).abs()
             still = (rollout.near[bs, ts - k] - truth).abs()
@@ -126,6 +126,10 @@ class OpenLoop:
                     "rows": n,
                 }
         return out
+
+
+def _some(carry: Carry, rows: Tensor) -> Carry:
+    return carry.map(lambda x: x[rows])
 
 
 def _starts(episodes: Recorded, stride: int) -> Starts:
