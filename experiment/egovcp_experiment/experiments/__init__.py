@@ -1,0 +1,14 @@
+"""The experiments, one module each."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+from egovcp_experiment.experiment import Experiment
+from egovcp_experiment.experiments import ablations, planners
+
+EXPERIMENTS: Final[Mapping[str, Experiment]] = {
+    "ablations": ablations.EXPERIMENT,
+    "planners": planners.EXPERIMENT,
+}
