@@ -17,11 +17,11 @@ from egovcp_experiment.config import (
 #: Episodes of a second or two, for robots that stand by the cheap controller.
 _BRIEF: Final = (
     "--env.controller=stance",
-    "--env.ball_episode.ticks=20",
+    "--env.ball_episode.ticks=30",
     "--env.ball_episode.event_ticks=[2,4]",
-    "--env.wall_episode.ticks=20",
+    "--env.wall_episode.ticks=30",
     "--env.wall_episode.event_ticks=[2,4]",
-    "--env.arch_episode.ticks=20",
+    "--env.arch_episode.ticks=50",
     "--env.arch_episode.event_ticks=[2,4]",
 )
 

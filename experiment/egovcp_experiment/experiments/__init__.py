@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from typing import Final
 
 from egovcp_experiment.experiment import Experiment
-from egovcp_experiment.experiments import ablations, planners
+from egovcp_experiment.experiments import ablations, interpret, planners
 
 EXPERIMENTS: Final[Mapping[str, Experiment]] = {
     "ablations": ablations.EXPERIMENT,
+    "interpret": interpret.EXPERIMENT,
     "planners": planners.EXPERIMENT,
 }
