@@ -91,6 +91,8 @@ class ExperimentConfig:
     """Tasks to learn and play."""
     only: tuple[str, ...] = ()
     """Names of the variants to run; empty: all."""
+    most: int = 0
+    """Of all, only so many variants; 0: no limit."""
     scenes: tuple[str, ...] = ()
     """--env.* flags of both collection and play, '[--env.controller=stance]'."""
     data: DataConfig = field(default_factory=DataConfig)
@@ -114,7 +116,7 @@ class ExperimentConfig:
                 raise UsageError(f"--scenes holds {flag}; expected --env.NAME=value")
 
     def chosen[T](self, variants: dict[str, T]) -> dict[str, T]:
-        """Those of the variants that `only` names.
+        """Those of the variants that `only` names, or the first `most`.
 
         Raises:
             UsageError: one of the names is unknown.
@@ -122,4 +124,5 @@ class ExperimentConfig:
         for name in self.only:
             if name not in variants:
                 raise UsageError(f"unknown variant --only={name}{suggest(name, variants)}")
-        return {k: v for k, v in variants.items() if not self.only or k in self.only}
+        names = self.only or tuple(variants)[: self.most or None]
+        return {name: variants[name] for name in variants if name in names}

@@ -8,6 +8,7 @@ references-TASK            hold, constant, random and oracle on the same scenari
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -17,6 +18,8 @@ from egovcp_experiment.tools import ARTEFACT, COLLECT, PLAY, TRAIN
 
 #: The task of a model that learns all tasks, as egovcp-collect and egovcp-eval call them together.
 ALL: Final = "all"
+#: Controllers of egovcp-eval that need no model.
+REFERENCES: Final = ("hold", "constant", "random", "oracle")
 
 
 @dataclass(frozen=True)
@@ -93,14 +96,7 @@ class Grid:
         )
         return self.add(cell)
 
-    def play(
-        self,
-        task: str,
-        seed: int,
-        variant: Variant,
-        learned_from: str = "",
-        scene: Flags | None = None,
-    ) -> Cell:
+    def play(self, task: str, seed: int, variant: Variant, learned_from: str = "") -> Cell:
         """The planner in closed loop.
 
         Args:
@@ -108,19 +104,31 @@ class Grid:
             seed: of the training.
             variant: the model and its use.
             learned_from: the task, or `ALL`, that the model was trained on; empty: the one played.
-            scene: --env.* flags that differ from the configuration's.
         """
         policy = self.model(learned_from or task, seed, variant.model)
-        flags = {**self._common(task, scene), "controllers": "planner", "policy.path": policy}
+        flags = {**self._common(task), "controllers": "planner", "policy.path": policy}
         name = f"play-{task}-{variant.name}-s{seed}"
         return self.add(Cell(name, PLAY, {**flags, **variant.play}))
 
-    def references(self, task: str, name: str = "", scene: Flags | None = None) -> Cell:
-        """Who needs no model, on the same scenarios as the planner."""
-        flags = {**self._common(task, scene), "controllers": "hold,constant,random,oracle"}
+    def references(
+        self,
+        task: str,
+        name: str = "",
+        scene: Flags | None = None,
+        who: Sequence[str] = REFERENCES,
+    ) -> Cell:
+        """Who needs no model, on the same scenarios as the planner.
+
+        Args:
+            task: what is played.
+            name: of the cell; empty: references-TASK.
+            scene: --env.* flags that differ from the configuration's.
+            who: controllers of egovcp-eval.
+        """
+        flags = {**self._common(task), "controllers": ",".join(who), **(scene or {})}
         return self.add(Cell(name or f"references-{task}", PLAY, flags))
 
-    def _common(self, task: str, scene: Flags | None) -> Flags:
+    def _common(self, task: str) -> Flags:
         config = self.config.play
         named = (*self.config.scenes, *config.flags)
         given = dict(flag.removeprefix("--").split("=", 1) for flag in named)
@@ -129,5 +137,4 @@ class Grid:
             "episodes": config.episodes,
             "seed": config.seed,
             **given,
-            **(scene or {}),
         }

@@ -30,6 +30,7 @@ def smoke() -> ExperimentConfig:
     """Every command of an experiment once, in minutes; the figures mean nothing."""
     return ExperimentConfig(
         scale="smoke",
+        most=3,
         scenes=_BRIEF,
         data=DataConfig(EpisodesConfig(ball=24, wall=24, arch=24)),
         train=TrainingConfig(

@@ -6,10 +6,11 @@ from collections.abc import Mapping
 from typing import Final
 
 from egovcp_experiment.experiment import Experiment
-from egovcp_experiment.experiments import ablations, interpret, planners
+from egovcp_experiment.experiments import ablations, generalise, interpret, planners
 
 EXPERIMENTS: Final[Mapping[str, Experiment]] = {
     "ablations": ablations.EXPERIMENT,
+    "generalise": generalise.EXPERIMENT,
     "interpret": interpret.EXPERIMENT,
     "planners": planners.EXPERIMENT,
 }
