@@ -31,6 +31,9 @@ class DataConfig:
     """Episodes to collect."""
     seed: int = 0
     """Seed of the collection."""
+    parts: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0)
+    """Shares of the episodes that models are trained on in sample-efficiency, ascending; above 1,
+    more are collected for it."""
     roots: dict[str, str] = field(default_factory=dict)
     """Datasets that are there already, '{ball: data/ball}'; they are not collected again."""
     flags: tuple[str, ...] = ()
@@ -66,6 +69,8 @@ class PlayConfig:
     """Scenarios of each task; all variants play the same."""
     seed: int = 0
     """Which held-out scenarios."""
+    branches: int = 12
+    """Random walks from each step of a plan, whose mean return is what the step is worth."""
     budget_ms: float = 40.0
     """Time for a plan, where searches are compared on equal time, ms."""
     flags: tuple[str, ...] = ()
@@ -111,6 +116,8 @@ class ExperimentConfig:
                 raise UsageError(f"unknown task --tasks={task}{suggest(task, TASKS)}")
         if not self.tasks or not self.train.seeds:
             raise UsageError("--tasks and --train.seeds must name at least one each")
+        if not self.data.parts or min(self.data.parts) <= 0:
+            raise UsageError(f"--data.parts={list(self.data.parts)}: expected shares above 0")
         for flag in self.scenes:
             if not flag.startswith("--env."):
                 raise UsageError(f"--scenes holds {flag}; expected --env.NAME=value")

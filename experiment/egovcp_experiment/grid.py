@@ -1,6 +1,6 @@
 """A table of training flags x playing flags x tasks x seeds, as cells that share what they can.
 
-collect-TASK
+collect-TASK-COUNT
 train-TASK-MODEL-sSEED     from the data of a task, or under the task `all` from that of all
 play-TASK-VARIANT-sSEED    the planner with that model
 references-TASK            hold, constant, random and oracle on the same scenarios
@@ -69,7 +69,7 @@ class Grid:
         episodes = getattr(config.episodes, task)
         flags = {"task": task, "episodes": episodes, "seed": config.seed}
         extra = (*self.config.scenes, *config.flags)
-        return Output(self.add(Cell(f"collect-{task}", COLLECT, flags, extra)).name)
+        return Output(self.add(Cell(f"collect-{task}-{episodes}", COLLECT, flags, extra)).name)
 
     def model(self, task: str, seed: int, model: Model | None = None) -> Output | Given:
         """The artefact of a model that was trained on a task, or on `ALL` of them."""

@@ -32,7 +32,7 @@ def smoke() -> ExperimentConfig:
         scale="smoke",
         most=3,
         scenes=_BRIEF,
-        data=DataConfig(EpisodesConfig(ball=24, wall=24, arch=24)),
+        data=DataConfig(EpisodesConfig(ball=24, wall=24, arch=24), parts=(0.5, 1.0)),
         train=TrainingConfig(
             preset="debug",
             steps=4,
@@ -50,7 +50,9 @@ def smoke() -> ExperimentConfig:
                 "--threads=1",
             ),
         ),
-        play=PlayConfig(episodes=4, budget_ms=5.0, flags=("--num_workers=1", "--num_envs=4")),
+        play=PlayConfig(
+            episodes=4, branches=2, budget_ms=5.0, flags=("--num_workers=1", "--num_envs=4")
+        ),
     )
 
 
@@ -69,7 +71,9 @@ def paper() -> ExperimentConfig:
     """The paper's scale: half a million steps of each task, three training seeds; for a GPU."""
     return ExperimentConfig(
         scale="paper",
-        data=DataConfig(EpisodesConfig(ball=3334, wall=3334, arch=2174)),
+        data=DataConfig(
+            EpisodesConfig(ball=3334, wall=3334, arch=2174), parts=(0.1, 0.2, 0.5, 1.0, 2.0)
+        ),
         train=TrainingConfig(
             steps=100_000, compared_steps=100_000, seeds=(0, 1, 2), flags=("--eval_freq=0",)
         ),

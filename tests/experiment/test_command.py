@@ -52,9 +52,9 @@ def test_an_experiment_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFix
     argv += ["--only=[two_hot]", "--data.episodes.ball=10", "--data.flags=[--num_workers=1]"]
     assert main(argv) == 0
     content = json.loads((out / "ablations.json").read_text())
-    assert list(content["cells"]) == ["collect-ball", "ablate-ball-two_hot-s0"]
+    assert list(content["cells"]) == ["collect-ball-10", "ablate-ball-two_hot-s0"]
     assert content["missing"] == []
-    assert content["cells"]["collect-ball"]["figures"]["episodes"] == 10
+    assert content["cells"]["collect-ball-10"]["figures"]["episodes"] == 10
     assert "policy.value_loss=two_hot" in (out / "ablations.md").read_text()
     model = out / "work" / "ablate-ball-two_hot-s0" / "checkpoints" / "last" / "pretrained_model"
     assert json.loads((model / "config.json").read_text())["world_model"]["value_loss"] == "two_hot"

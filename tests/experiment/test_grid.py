@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import product
 from typing import Any
 
 import pytest
@@ -58,9 +59,8 @@ def test_a_model_of_all_tasks_reads_all_of_their_data() -> None:
     grid = Grid(ExperimentConfig())
     grid.play("ball", 0, Variant("mixed"), learned_from=ALL)
     train = next(cell for cell in grid.cells if cell.tool is TRAIN)
-    assert train.flags["datasets"] == [
-        {"root": Output(f"collect-{task}")} for task in ("ball", "wall", "arch")
-    ]
+    names = ("collect-ball-1334", "collect-wall-1334", "collect-arch-870")
+    assert train.flags["datasets"] == [{"root": Output(name)} for name in names]
 
 
 def test_unknown_variants_and_tasks_are_named() -> None:
@@ -70,14 +70,31 @@ def test_unknown_variants_and_tasks_are_named() -> None:
         ExperimentConfig(output_dir="x", tasks=("bal",)).check()
 
 
-@pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_every_cell_has_flags_that_its_command_takes(name: str, scale: Any) -> None:
-    cells = in_order(EXPERIMENTS[name].cells(SCALES[scale]()))
-    assert cells
-    for cell in cells:
-        argv = [f"--{cell.tool.output}=x", *written(filled(cell.flags, _any)), *cell.extra]
-        parse_config(_config(cell), argv, "cell", "", _defaults(cell))
+def test_every_cell_has_flags_that_its_command_takes() -> None:
+    """Each distinct value of each flag is parsed once, several flags at a time; of a training all
+    together, for its options depend on each other."""
+    values: dict[str, dict[str, list[str]]] = {}
+    trainings: dict[frozenset[str], list[str]] = {}
+    tools: dict[str, Cell] = {}
+    for make, experiment in product(SCALES.values(), EXPERIMENTS.values()):
+        for cell in in_order(experiment.cells(make())):
+            tools[cell.tool.module] = cell
+            argv = [*written(filled(cell.flags, _any)), *cell.extra]
+            if cell.tool is TRAIN:
+                chosen = frozenset(a for a in argv if not a.startswith(("--seed", "--dataset")))
+                trainings[chosen] = argv
+                continue
+            for name, _, value in (arg.partition("=") for arg in argv):
+                known = values.setdefault(cell.tool.module, {}).setdefault(name, [])
+                if value not in known:
+                    known.append(value)
+    for module, flags in values.items():
+        for k in range(max(map(len, flags.values()))):
+            argv = [f"{name}={known[k]}" for name, known in flags.items() if k < len(known)]
+            parse_config(_config(tools[module]), argv, "cell")
+    train = tools[TRAIN.module]
+    for argv in trainings.values():
+        parse_config(_config(train), ["--output_dir=x", *argv], "train", "", _option_defaults())
 
 
 def _any(reference: Output | Found | Given) -> object:
@@ -94,7 +111,14 @@ def _config(cell: Cell) -> type[Any]:
     return found
 
 
-def _defaults(cell: Cell) -> Any:
-    if cell.tool is TRAIN:
-        return importlib.import_module("egovcp_train.train").option_defaults
-    return None
+def _option_defaults() -> Any:
+    return importlib.import_module("egovcp_train.train").option_defaults
+
+
+def test_parts_are_prefixes_of_one_dataset_as_large_as_the_largest() -> None:
+    data = DataConfig(parts=(0.5, 2.0))
+    config = ExperimentConfig(tasks=("ball",), data=data)
+    cells = {c.name: c for c in EXPERIMENTS["sample-efficiency"].cells(config)}
+    assert cells["collect-ball-2668"].flags["episodes"] == 2668
+    parts = [c.flags["dataset.episodes"] for c in cells.values() if c.tool is TRAIN]
+    assert parts == ["0:667", "0:2668"]

@@ -17,7 +17,11 @@ def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A policy artefact with random weights and a tiny planner."""
     path = tmp_path_factory.mktemp("policy") / "policy"
     planner = PlannerConfig(samples=16, horizon=2, iterations=1, elites=4)
-    save_artefact(path, toy_model(), planner, {"controller_id": StanceController().id})
+    provenance = {
+        "controller_id": StanceController().id,
+        "train_config": {"returns": {"gamma": 0.97, "steps": 8}},
+    }
+    save_artefact(path, toy_model(), planner, provenance)
     return path
 
 
