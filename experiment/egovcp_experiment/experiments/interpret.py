@@ -127,7 +127,7 @@ def _map_plot(found: Mapping[str, Any]) -> Plot:
         f"Q over the x-z plane of the {maps[0]['hand']} hand, before the throw and at shares of "
         "the flight, one colour scale; cross: best; dotted: the height at which the ball was aimed",
         paint,
-        (9.0, 2.6),
+        (9.0, 3.0),
     )
 
 
@@ -164,13 +164,13 @@ def _strip_plot(task: str, strips: list[Mapping[str, Any]]) -> Plot:
     def paint(figure: Any) -> None:
         rows = [(kind, strip[kind]) for strip in strips for kind in ("seen", "foreseen")]
         axes = figure.subplots(len(rows), len(HORIZONS), squeeze=False)
+        for at, k in zip(axes[0], HORIZONS, strict=True):
+            at.set_title("filtered" if k == 0 else f"+{k}", fontsize=8)
         for line, (kind, pictures) in zip(axes, rows, strict=True):
-            for at, picture, k in zip(line, pictures, HORIZONS, strict=True):
+            for at, picture in zip(line, pictures, strict=True):
                 depth = np.array(picture, float) / 100
                 at.imshow(np.where(depth > 0, depth, np.nan), cmap="viridis_r", vmin=0.3, vmax=4.0)
                 at.set(xticks=[], yticks=[])
-                if line is axes[0]:
-                    at.set_title("filtered" if k == 0 else f"+{k}", fontsize=8)
             line[0].set_ylabel(kind, fontsize=8)
 
     caption = (

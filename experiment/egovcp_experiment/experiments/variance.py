@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -114,7 +115,7 @@ def _shows(
     lines = []
     for kind, row in plans.items():
         one, four = row["horizons"][0], row["horizons"][3]
-        share = four["variance"] / one["variance"] if one["variance"] else float("nan")
+        share = four["variance"] / one["variance"] if one["variance"] > 0 else math.nan
         lines.append(
             f"{task}, {_PLANS[kind]}: errors of neighbouring steps correlate by "
             f"{row['rho_next']:.2f} (largest {row['rho_max']:.2f}); averaging over N = 4 leaves "
@@ -128,10 +129,15 @@ def _shows(
         lines.append(
             f"{task}: the mean square error is least at N = {predicted}; reward in closed loop is "
             f"best at N = {best}, by {gain:+.5f} a step (95 % {low:+.5f} to {high:+.5f}) beside "
-            f"N = {predicted}: "
-            + ("as predicted" if best == predicted or low <= 0 else "not as predicted")
+            f"N = {predicted}: " + _verdict(best == predicted, low)
         )
     return lines
+
+
+def _verdict(same: bool, low: float) -> str:
+    if same:
+        return "as predicted"
+    return "not as predicted" if low > 0 else "no more than chance, so no contradiction"
 
 
 def _plot(task: str, plans: Mapping[str, Mapping[str, Any]], played: Mapping[int, Outcome]) -> Plot:
@@ -157,7 +163,7 @@ def _plot(task: str, plans: Mapping[str, Mapping[str, Any]], played: Mapping[int
         right.set(xlabel="N", ylabel="reward per step, closed loop")
 
     caption = f"{task}: measured variance between its bounds (shaded), and reward against N"
-    return drawn(f"variance-{task}", caption, paint)
+    return drawn(f"bounds-{task}", caption, paint)
 
 
 EXPERIMENT: Final = Experiment(
