@@ -67,8 +67,9 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
             if (o := outcome(records, [f"references-{task}"], task, r)) is not None
         }
         figures[task] = {name: o.figures() for name, o in {**found, **others}.items()}
-        if len(found) == 2:
+        if found:
             parts.append(comparison(task, {**found, **others}, SINGLE))
+        if len(found) == 2:
             shows.append(_line(task, found))
         if "oracle" in others and "random" in others:
             levels[task] = {name: _level(o, others) for name, o in found.items()}
