@@ -21,6 +21,7 @@ from egovcp_experiment.store import Record, Store
 
 _POLL_S: Final = 0.05
 _MINUTE: Final = 60.0
+_INTERRUPTED: Final = 130  # exit code
 
 
 @dataclass
@@ -61,6 +62,7 @@ class Schedule:
         self.records: dict[str, Record] = {}
         self.failed: dict[str, str] = {}
         self._running: list[_Running] = []
+        self._stopping = False
         self._machine = {k: v for k, v in hardware().items() if k.startswith("hardware")}
         for cell in self._cells:  # before anything runs: all that can be refused
             if all(name in self.records for name in cell.needs):
@@ -141,6 +143,9 @@ class Schedule:
             running.process.stdin.close()
             minutes = (time.monotonic() - running.start) / _MINUTE
             cell = running.cell
+            if code == _INTERRUPTED and self._stopping:
+                self._progress(cell, f"stopped after {minutes:.1f} min")
+                continue
             if code != 0:
                 self.failed[cell.name] = _last_line(self._store.log(cell)) or f"exit code {code}"
                 self._progress(cell, f"failed after {minutes:.1f} min: {self.failed[cell.name]}")
@@ -158,6 +163,7 @@ class Schedule:
 
     def _stop(self, stopped: Sequence[int]) -> None:
         """Interrupt all processes and wait for them; a second signal kills them."""
+        self._stopping = True
         self._say(f"stopping {len(self._running)} processes; once more to kill them")
         for running in self._running:
             assert running.process.stdin is not None

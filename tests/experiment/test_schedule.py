@@ -6,8 +6,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,11 +20,16 @@ from egovcp_experiment.store import Store
 from .conftest import MakeCell
 
 
-def run(cells: Sequence[Cell], folder: Path, jobs: int = 1) -> Schedule:
+def run(
+    cells: Sequence[Cell],
+    folder: Path,
+    jobs: int = 1,
+    say: Callable[[str], None] = lambda line: None,
+) -> Schedule:
     """Run cells, or raise what running them raises."""
     store = Store(folder)
     with store.locked():
-        schedule = Schedule(cells, store, jobs, say=lambda line: None)
+        schedule = Schedule(cells, store, jobs, say)
         schedule.run()
     return schedule
 
@@ -90,15 +96,17 @@ def test_an_interrupt_stops_cleanly_and_the_same_cells_go_on(
     cell: MakeCell, tmp_path: Path, diary: Path
 ) -> None:
     out = tmp_path / "out"
+    said: list[str] = []
     with pytest.raises(KeyboardInterrupt):
-        interrupted([cell("a", wait=60)], out)
+        interrupted([cell("a", wait=60)], out, say=said.append)
+    assert "a: stopped after" in said[-1]
     assert (out / "work" / "a" / "checkpoint").exists()
     assert not (out / "cells" / "a.json").exists()
     run([cell("a", wait=0.01)], out)
     assert diary.read_text().splitlines() == ["a ", "a true"]
 
 
-def interrupted(cells: Sequence[Cell], folder: Path, jobs: int = 1) -> None:
+def interrupted(cells: Sequence[Cell], folder: Path, jobs: int = 1, **options: Any) -> None:
     """Run cells, and interrupt this process when all of them have begun."""
 
     def press() -> None:
@@ -107,7 +115,7 @@ def interrupted(cells: Sequence[Cell], folder: Path, jobs: int = 1) -> None:
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=press, daemon=True).start()
-    run(cells, folder, jobs)
+    run(cells, folder, jobs, **options)
 
 
 def test_what_an_attempt_left_without_a_checkpoint_is_removed(
