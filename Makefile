@@ -20,7 +20,7 @@ help:
 
 install: .venv/installed
 
-.venv/installed: pyproject.toml uv.lock collect/pyproject.toml train/pyproject.toml deploy/pyproject.toml $(wildcard plugins/*/pyproject.toml)
+.venv/installed: pyproject.toml uv.lock collect/pyproject.toml train/pyproject.toml deploy/pyproject.toml experiment/pyproject.toml $(wildcard plugins/*/pyproject.toml)
 	./install.sh
 	@touch $@
 

@@ -13,6 +13,7 @@ PACKAGES = {
     "egovcp_collect": ROOT / "collect" / "egovcp_collect",
     "egovcp_train": ROOT / "train" / "egovcp_train",
     "egovcp_deploy": ROOT / "deploy" / "egovcp_deploy",
+    "egovcp_experiment": ROOT / "experiment" / "egovcp_experiment",
     "lerobot_env_egovcp": ROOT / "plugins" / "lerobot_env_egovcp" / "lerobot_env_egovcp",
     "lerobot_policy_egovcp": ROOT / "plugins" / "lerobot_policy_egovcp" / "lerobot_policy_egovcp",
     "lerobot_robot_egovcp": ROOT / "plugins" / "lerobot_robot_egovcp" / "lerobot_robot_egovcp",

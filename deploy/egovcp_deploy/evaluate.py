@@ -13,6 +13,7 @@ import draccus
 from tqdm import tqdm
 
 from egovcp.artefact import Artefact
+from egovcp.atomic import write_json
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.reactive import ReactiveNetwork
@@ -33,7 +34,6 @@ from egovcp_deploy.options import (
     load_policy,
     make_output_dir,
     versions,
-    write_json,
 )
 from egovcp_deploy.report import gains, summary, table
 from egovcp_deploy.scenarios import held_out

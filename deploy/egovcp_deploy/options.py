@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from egovcp.artefact import Artefact, load_artefact
 from egovcp.errors import EnvironmentFailure, UsageError, suggest
@@ -140,17 +139,6 @@ def make_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
     if not os.access(folder, os.W_OK | os.X_OK):
         raise EnvironmentFailure(f"cannot write to {path}: permission denied")
     return folder
-
-
-def write_json(path: Path, content: Any) -> None:
-    """Write ``content`` atomically: the file is complete or absent, also after a crash."""
-    temporary = path.with_name(f".{path.name}.partial")
-    with temporary.open("w", encoding="utf-8") as file:
-        json.dump(content, file, indent=2, allow_nan=False)
-        file.write("\n")
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
 
 
 def versions() -> dict[str, str]:

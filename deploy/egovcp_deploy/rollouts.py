@@ -12,13 +12,14 @@ import numpy as np
 from tqdm import tqdm
 
 from egovcp.artefact import Artefact
+from egovcp.atomic import write_json
 from egovcp.errors import EnvironmentFailure
 from egovcp.log.info import RunInfo
 from egovcp.log.tick import Tick
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import PLANNER_HZ
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.options import make_output_dir, versions, write_json
+from egovcp_deploy.options import make_output_dir, versions
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.policy import RolloutPolicy
 from egovcp_deploy.recording import recording, run_info

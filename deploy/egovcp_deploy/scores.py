@@ -4,13 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Final
 
 import numpy as np
 
-from egovcp.intervals import Interval, wilson
-
-_RESAMPLES: Final = 4000
+from egovcp.intervals import Interval, bootstrap, wilson
 
 
 @dataclass(frozen=True)
@@ -35,22 +32,17 @@ def reward_per_step(scores: Sequence[EpisodeScore]) -> float:
 
 
 def reward_interval(scores: Sequence[EpisodeScore]) -> Interval:
-    """Bootstrap interval of `reward_per_step` over episodes; the draws are fixed."""
+    """Bootstrap interval of `reward_per_step` over episodes."""
     rewards = np.array([score.reward for score in scores])
     steps = np.array([score.steps for score in scores])
-    picks = np.random.default_rng(0).integers(len(scores), size=(_RESAMPLES, len(scores)))
-    means = rewards[picks].sum(axis=1) / steps[picks].sum(axis=1)
-    low, high = np.percentile(means, [2.5, 97.5])
-    return float(low), float(high)
+    return bootstrap(lambda i: rewards[i].sum(axis=1) / steps[i].sum(axis=1), len(scores))
 
 
 def success_gain(scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]) -> Interval:
     """Bootstrap interval of the difference in success rate on the *same* scenarios."""
     theirs = {score.episode: score.success for score in others}
     gains = np.array([float(s.success) - float(theirs[s.episode]) for s in scores])
-    picks = np.random.default_rng(0).integers(len(gains), size=(_RESAMPLES, len(gains)))
-    low, high = np.percentile(gains[picks].mean(axis=1), [2.5, 97.5])
-    return float(low), float(high)
+    return bootstrap(lambda i: gains[i].mean(axis=1), len(gains))
 
 
 def summarise(scores: Sequence[EpisodeScore]) -> dict[str, float | int | list[float]]:

@@ -43,6 +43,8 @@ class EpisodeConfig:
 class BallConfig:
     """A ball thrown at the upper body; a first contact with hand or wrist blocks it."""
 
+    shape: Literal["sphere", "box"] = "sphere"
+    """What is thrown: a ball, or a cube of the same volume that starts at any angle and tumbles."""
     radius_range: Range = (0.09, 0.12)
     """Radius of the ball, m."""
     mass_range: Range = (0.15, 0.35)

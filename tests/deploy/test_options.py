@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,6 @@ from egovcp_deploy.options import (
     check_choice,
     check_output_dir,
     make_output_dir,
-    write_json,
 )
 from egovcp_deploy.scenarios import for_search, held_out
 
@@ -45,15 +43,6 @@ def test_missing_flag_and_file_in_the_way_are_refused(tmp_path: Path) -> None:
         make_output_dir(str(tmp_path / "file" / "below"))
     with pytest.raises(UsageError, match="missing"):
         make_output_dir("")
-
-
-def test_json_is_complete_or_absent(tmp_path: Path) -> None:
-    path = tmp_path / "a.json"
-    write_json(path, {"a": 1})
-    assert json.loads(path.read_text()) == {"a": 1}
-    with pytest.raises(ValueError, match="JSON compliant"):
-        write_json(path, {"a": float("nan")})
-    assert json.loads(path.read_text()) == {"a": 1}
 
 
 def test_unknown_choices_name_the_near_one() -> None:

@@ -14,6 +14,7 @@ import torch
 from tqdm import tqdm
 
 from egovcp.artefact import Artefact
+from egovcp.atomic import write_json
 from egovcp.errors import EnvironmentFailure, SafetyStop, UsageError
 from egovcp.log.info import CameraView
 from egovcp.log.tick import Tick
@@ -25,7 +26,7 @@ from egovcp_deploy.live.operators import OPERATORS, operator
 from egovcp_deploy.live.planner import LiveSummary
 from egovcp_deploy.live.run import LiveSetup, run_live
 from egovcp_deploy.live.simulated import simulated
-from egovcp_deploy.options import check_choice, make_output_dir, versions, write_json
+from egovcp_deploy.options import check_choice, make_output_dir, versions
 from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.recording import recording, run_info

@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import ClassVar, Final
 
+import mujoco
 import numpy as np
 
 from egovcp.sim.config import EnvConfig
@@ -21,6 +22,8 @@ from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
 _PARKED: Final = np.array([-20.0, 0.0, 1.0, 1.0, 0.0, 0.0, 0.0])  # behind the robot, unseen
 _AT_REST: Final = np.zeros(6)
 _GRAVITY: Final = np.array([0.0, 0.0, -9.81])  # m/s^2
+_HALF_EDGE: Final = (math.pi / 6) ** (1 / 3)  # of a cube, in radii of the ball of its volume
+_TUMBLE: Final = 6.0  # rad/s, the most that a box turns about each axis
 
 
 class BallTask(Task):
@@ -42,6 +45,7 @@ class BallTask(Task):
         self._aim_b = np.array(
             [c.aim_forward, rng.uniform(*c.aim_lateral_range), rng.uniform(*c.aim_height_range)]
         )
+        self._turned, self._turning = self._attitude(scenario)
         self._thrown = False
         self._dead = False  # has met the floor: can neither be blocked nor hit any more
         self._blocked_at: float | None = None
@@ -64,11 +68,33 @@ class BallTask(Task):
             "aim_height": float(self._aim_b[2]),
         }
 
+    def _attitude(self, scenario: Scenario) -> tuple[Array, Array]:
+        """Quaternion and angular velocity (rad/s) at the release; a ball looks the same anyhow."""
+        if not self._is_box:
+            return np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
+        rng = scenario.rng("attitude")
+        quaternion = rng.normal(size=4)
+        return quaternion / np.linalg.norm(quaternion), rng.uniform(-_TUMBLE, _TUMBLE, 3)
+
+    @property
+    def _is_box(self) -> bool:
+        return self.config.shape == "box"
+
+    @property
+    def _half_sizes(self) -> tuple[float, float, float]:
+        """Half edges of a box, or the radius three times, m."""
+        half = self.radius * _HALF_EDGE if self._is_box else self.radius
+        return (half, half, half)
+
     def _shape_ball(self) -> None:
         model, body = self.robot.model, self.robot.index.object_body
-        self.robot.shape_geom(int(model.body_geomadr[body]), [self.radius], [0.0, 0.0, 0.0])
+        geom, size = int(model.body_geomadr[body]), self._half_sizes
+        kinds = mujoco.mjtGeom
+        model.geom_type[geom] = kinds.mjGEOM_BOX if self._is_box else kinds.mjGEOM_SPHERE
+        self.robot.shape_geom(geom, size if self._is_box else size[:1], [0.0, 0.0, 0.0])
         model.body_mass[body] = self._mass
-        model.body_inertia[body] = 0.4 * self._mass * self.radius**2
+        share = 2 / 3 if self._is_box else 2 / 5
+        model.body_inertia[body] = share * self._mass * size[0] ** 2
 
     def place(self) -> None:
         """Park the ball out of sight."""
@@ -87,7 +113,7 @@ class BallTask(Task):
             return
         self._thrown = True
         start, velocity = self._throw()
-        self._set_ball(np.append(start, [1.0, 0, 0, 0]), np.append(velocity, [0.0, 0, 0]))
+        self._set_ball(np.append(start, self._turned), np.append(velocity, self._turning))
 
     def _throw(self) -> tuple[Array, Array]:
         """Release point and velocity, world, aimed at the robot as it stands now."""
@@ -161,4 +187,4 @@ class BallTask(Task):
         if not self._thrown:
             return ()
         pose = self.robot.data.qpos[-7:].copy()
-        return (Solid(BALL, "sphere", (self.radius,) * 3, pose[:3], pose[3:]),)
+        return (Solid(BALL, self.config.shape, self._half_sizes, pose[:3], pose[3:]),)

@@ -51,6 +51,40 @@ def test_the_ball_is_out_of_sight_and_of_truth_before_the_throw(env: VectorEnv) 
     assert not truth.object_active.any()
 
 
+def test_a_box_flies_as_the_ball_of_its_volume_would(config: EnvConfig) -> None:
+    """Nothing but shape and attitude differs, so that episodes can be compared one by one."""
+    ball, box = (
+        VectorEnv(replace(config, ball=BallConfig(shape=shape)), 4) for shape in ("sphere", "box")
+    )
+    begin(ball, "ball")
+    begin(box, "ball")
+    assert ball.parameters == box.parameters
+    for _ in range(14):
+        seen = ball.step(HOLD).observation.depth, box.step(HOLD).observation.depth
+    balls, boxes = ball.snapshot(), box.snapshot()
+    assert balls.object_active.all()
+    np.testing.assert_allclose(balls.object_w, boxes.object_w, atol=0.002)
+    sizes = [(a.size, b.size) for (a,), (b,) in zip(balls.solids, boxes.solids, strict=True)]
+    for (radius, _, _), (half, _, _) in sizes:
+        assert (2 * half) ** 3 == pytest.approx(4 / 3 * np.pi * radius**3)
+    thing = [(depth > 0) & (depth < 2600) for depth in seen]
+    area = thing[1].sum() / thing[0].sum()
+    assert 0.8 < area < 1.6  # a cube shows at least its face, at most its hexagon
+    assert (thing[0] != thing[1]).any()
+    solid = boxes.solids[0][0]
+    assert solid.shape == "box"
+    assert abs(solid.quaternion_w[0]) < 0.999
+
+
+def test_a_box_hits_and_falls(config: EnvConfig) -> None:
+    middle = BallConfig(shape="box", aim_lateral_range=(0.0, 0.0), aim_height_range=(0.3, 0.3))
+    env = VectorEnv(replace(config, ball=middle), 4)
+    begin(env, "ball")
+    hits = sum(env.step(HOLD).reward_terms["hit"] for _ in range(40))
+    assert (hits < 0).any()
+    assert (env.snapshot().object_w[:, 2] < 1.0).all()
+
+
 def thrown(env: VectorEnv) -> BallTask:
     begin(env, "ball")
     for _ in range(8):

@@ -1,0 +1,113 @@
+"""`egovcp-experiment NAME --output_dir=... [--flags]`: one of the paper's experiments."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import draccus
+
+from egovcp.cli import run_command
+from egovcp.errors import UsageError, suggest
+from egovcp_experiment.cell import in_order
+from egovcp_experiment.config import ExperimentConfig
+from egovcp_experiment.experiments import EXPERIMENTS
+from egovcp_experiment.report.publish import publish
+from egovcp_experiment.scales import SCALES
+from egovcp_experiment.schedule import Schedule
+from egovcp_experiment.store import Store
+
+PROG: Final = "egovcp-experiment"
+_EPILOG: Final = (
+    "Writes NAME.json, NAME.md and NAME.html beside cells/ (results), work/ (datasets, models) and "
+    "logs/. Ctrl-C stops all cells cleanly; the same command goes on."
+)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    args = list(sys.argv[1:] if argv is None else argv)
+    if not args or args[0] in ("-h", "--help"):
+        print(_help())
+        return 0 if args else UsageError.exit_code
+    name, *flags = args
+    if name not in EXPERIMENTS:
+        print(
+            f"{PROG}: error: unknown experiment {name!r}{suggest(name, EXPERIMENTS)}",
+            file=sys.stderr,
+        )
+        return UsageError.exit_code
+    run = partial(execute, name=name, command=shlex.join([PROG, *args]))
+    prog = f"{PROG} {name}"
+    return run_command(ExperimentConfig, run, flags, prog=prog, epilog=_EPILOG, defaults=scale_of)
+
+
+def scale_of(argv: Sequence[str]) -> Mapping[str, Any]:
+    """What stands where no flag says otherwise: the configuration of the scale.
+
+    Raises:
+        UsageError: a config file, which says everything itself, would hide it.
+    """
+    given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
+    if "config_path" in given:
+        raise UsageError("--config_path would hide the scale; give single options as flags")
+    name = given.get("scale", ExperimentConfig().scale)
+    known = {str(scale): make for scale, make in SCALES.items()}
+    if name not in known:
+        raise UsageError(f"unknown value --scale={name}{suggest(name, known)}")
+    encoded: dict[str, Any] = draccus.encode(known[name]())
+    return encoded
+
+
+def execute(config: ExperimentConfig, name: str, command: str) -> None:
+    """Run what is missing, and write the report of what is there, also when it was stopped.
+
+    Raises:
+        UsageError: an option makes no sense, or results of other settings are there.
+        EnvironmentFailure: cells failed, or the folder cannot be used.
+        KeyboardInterrupt: after SIGINT or SIGTERM.
+    """
+    config.check()
+    experiment = EXPERIMENTS[name]
+    cells = in_order(experiment.cells(config))
+    store = Store(Path(config.output_dir))
+    with store.locked():
+        schedule = Schedule(cells, store, config.jobs, partial(print, flush=True))
+        print(f"{PROG} {name}: {len(cells)} cells, {len(schedule.records)} complete", flush=True)
+        try:
+            schedule.run()
+        finally:
+            records = {
+                c.name: schedule.records[c.name] for c in cells if c.name in schedule.records
+            }
+            missing = [cell.name for cell in cells if cell.name not in records]
+            report = experiment.report(config, records)
+            encoded = draccus.encode(config)
+            publish(store.folder, name, report, records, missing, encoded, command)
+    for line in report.shows:
+        print(f"- {line}")
+    print(f"report: {store.folder / name}.html, .md, .json")
+
+
+def _help() -> str:
+    width = max(map(len, EXPERIMENTS))
+    lines = [f"  {name:{width}}  {entry.summary}" for name, entry in EXPERIMENTS.items()]
+    return "\n".join(
+        [
+            f"usage: {PROG} NAME --output_dir=... [--scale=smoke|small|paper] [--flags]",
+            "",
+            "Run one of the paper's experiments, cell by cell, and write its report.",
+            "",
+            *lines,
+            "",
+            f"`{PROG} NAME --help` explains the options.",
+        ]
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

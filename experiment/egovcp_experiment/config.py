@@ -1,0 +1,135 @@
+"""The options of `egovcp-experiment`: what a scale stands for, and what flags may change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+from egovcp.errors import UsageError, suggest
+from egovcp.spec import TASKS
+
+Scale = Literal["smoke", "small", "paper"]
+
+
+@dataclass(frozen=True)
+class EpisodesConfig:
+    """A number of episodes for each task."""
+
+    ball: int = 1334
+    """Of the ball task, 150 ticks each."""
+    wall: int = 1334
+    """Of the wall task, 150 ticks each."""
+    arch: int = 870
+    """Of the arch task, 230 ticks each."""
+
+
+@dataclass(frozen=True)
+class DataConfig:
+    """The random data that models are trained on."""
+
+    episodes: EpisodesConfig = field(default_factory=EpisodesConfig)
+    """Episodes to collect."""
+    seed: int = 0
+    """Seed of the collection."""
+    parts: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0)
+    """Shares of the episodes that models are trained on in sample-efficiency, ascending; above 1,
+    more are collected for it."""
+    roots: dict[str, str] = field(default_factory=dict)
+    """Datasets that are there already, '{ball: data/ball}'; they are not collected again."""
+    flags: tuple[str, ...] = ()
+    """Further flags of egovcp-collect, '[--num_envs=8]'."""
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """How models are trained."""
+
+    preset: Literal["default", "paper", "debug"] = "default"
+    """Starting point of all options of egovcp-train."""
+    steps: int = 20_000
+    """Gradient steps of a model."""
+    max_minutes: float = 0.0
+    """Wall-clock limit of a training, minutes; 0: none."""
+    compared_steps: int = 20_000
+    """Gradient steps, without a limit of time, where choices of training are compared."""
+    seeds: tuple[int, ...] = (0,)
+    """Every model is trained once with each of these."""
+    policies: dict[str, str] = field(default_factory=dict)
+    """Artefacts that are there already, '{ball: RUN/checkpoints/last/pretrained_model}', in the
+    place of the default model of that task (all: of the multi-task model) under every seed."""
+    flags: tuple[str, ...] = ()
+    """Further flags of egovcp-train."""
+
+
+@dataclass(frozen=True)
+class PlayConfig:
+    """The closed-loop episodes."""
+
+    episodes: int = 100
+    """Scenarios of each task; all variants play the same."""
+    seed: int = 0
+    """Which held-out scenarios."""
+    branches: int = 12
+    """Random walks from each step of a plan, whose mean return is what the step is worth."""
+    budget_ms: float = 40.0
+    """Time for a plan, where searches are compared on equal time, ms."""
+    flags: tuple[str, ...] = ()
+    """Further flags of egovcp-eval."""
+
+
+@dataclass(frozen=True)
+class ExperimentConfig:
+    """Run one of the paper's experiments, cell by cell, and write its report.
+
+    A cell that is complete is never run again: the same command goes on where it was stopped, and
+    experiments with the same output folder share datasets and models. --scale says what all other
+    options are, unless they are given.
+    """
+
+    output_dir: str = ""
+    """Folder of cells and reports; may hold those of other experiments of the same options."""
+    scale: Scale = "small"
+    """smoke: minutes, the figures mean nothing; small: hours on two cores; paper: the paper's."""
+    jobs: int = 1
+    """Cells that run side by side, each on its share of the processor cores."""
+    tasks: tuple[str, ...] = TASKS
+    """Tasks to learn and play."""
+    only: tuple[str, ...] = ()
+    """Names of the variants to run; empty: all."""
+    most: int = 0
+    """Of all, only so many variants; 0: no limit."""
+    scenes: tuple[str, ...] = ()
+    """--env.* flags of both collection and play, '[--env.controller=stance]'."""
+    data: DataConfig = field(default_factory=DataConfig)
+    """Data."""
+    train: TrainingConfig = field(default_factory=TrainingConfig)
+    """Training."""
+    play: PlayConfig = field(default_factory=PlayConfig)
+    """Closed loop."""
+
+    def check(self) -> None:
+        """Raise `UsageError` for values that make no sense."""
+        if not self.output_dir:
+            raise UsageError("--output_dir is missing; name the folder of cells and reports")
+        for task in self.tasks:
+            if task not in TASKS:
+                raise UsageError(f"unknown task --tasks={task}{suggest(task, TASKS)}")
+        if not self.tasks or not self.train.seeds:
+            raise UsageError("--tasks and --train.seeds must name at least one each")
+        if not self.data.parts or min(self.data.parts) <= 0:
+            raise UsageError(f"--data.parts={list(self.data.parts)}: expected shares above 0")
+        for flag in self.scenes:
+            if not flag.startswith("--env."):
+                raise UsageError(f"--scenes holds {flag}; expected --env.NAME=value")
+
+    def chosen[T](self, variants: dict[str, T]) -> dict[str, T]:
+        """Those of the variants that `only` names, or the first `most`.
+
+        Raises:
+            UsageError: one of the names is unknown.
+        """
+        for name in self.only:
+            if name not in variants:
+                raise UsageError(f"unknown variant --only={name}{suggest(name, variants)}")
+        names = self.only or tuple(variants)[: self.most or None]
+        return {name: variants[name] for name in variants if name in names}

@@ -1,0 +1,165 @@
+"""What each choice of the world model is worth, on held-out episodes.
+
+One model for each choice, with equal steps and seeds, on the data of all tasks together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+from egovcp import spec
+from egovcp_experiment.cell import Cell, Flags
+from egovcp_experiment.config import ExperimentConfig
+from egovcp_experiment.experiment import Experiment
+from egovcp_experiment.grid import ALL, Grid, Model
+from egovcp_experiment.report.document import Report, Table
+from egovcp_experiment.store import Record
+
+_PIXELS: Final = spec.DEPTH_ROWS * spec.DEPTH_COLS
+
+#: Choice -> flags of egovcp-train in which it differs from the default.
+CHOICES: Final[dict[str, Flags]] = {
+    "default": {},
+    "paper": {"preset": "paper"},
+    "kl_equal": {"policy.loss.kl_posterior": 0.1},
+    "kl_tenfold": {"policy.loss.kl_prior": 1, "policy.loss.kl_posterior": 0.1},
+    "no_free_nats": {"policy.loss.free_nats": 0},
+    "free_nats_per_dimension": {"policy.loss.free_nats_per": "dimension"},
+    "pixels_summed": {"policy.loss.depth": _PIXELS},
+    "state_summed": {"policy.loss.state": spec.STATE_DIM},
+    "state_1": {"policy.loss.state": 1, "policy.loss.foresight_state": 1},
+    "no_moving": {"policy.loss.moving": 0},
+    "no_flight": {"policy.loss.flight": 0},
+    "no_foresight": {"policy.loss.foresight_depth": 0, "policy.loss.foresight_state": 0},
+    "near": {"policy.loss.near": 10},
+    "no_paint_flight": {"policy.paint_flight": False},
+    "no_motion": {"policy.paint_flight": False, "policy.loss.motion": 0},
+    "raw_returns": {"returns.scale": "none"},
+    "two_hot": {"policy.value_loss": "two_hot"},
+    "five_q_heads": {"policy.q_heads": 5},
+    "q_of_posterior_only": {"policy.loss.imagined_steps": 0},
+    "reward_head": {"policy.loss.reward": 1},
+    "arwm": {"policy.dynamics": "autoregressive"},
+    "td": {"policy.loss.q_target": "td"},
+    "burn_in": {"sampling.burn_in": 8},
+    "long_windows": {"sampling.length": 40, "batch_size": 8},  # as many rows per step
+    "per_task_returns": {"returns.scale": "per_task"},
+}
+
+
+def _depth(task: Mapping[str, Any], region: str, k: int) -> float | None:
+    """How many times smaller the error is than that of the last image repeated."""
+    return _gain(task["depth"][region][str(k)], "model_mm", "repeat_mm")
+
+
+def _gain(errors: Mapping[str, float | None], model: str, repeat: str) -> float | None:
+    ours, theirs = errors[model], errors[repeat]
+    return None if not ours or theirs is None else theirs / ours
+
+
+_COLUMNS: Final[Mapping[str, Callable[[Mapping[str, Any]], float | None]]] = {
+    "ball, 4 ahead (x)": lambda task: _depth(task, "ball_watched", 4),
+    "ball, 8 (x)": lambda task: _depth(task, "ball_watched", 8),
+    "near, 8 (x)": lambda task: _depth(task, "near", 8),
+    "all pixels, 8 (x)": lambda task: _depth(task, "valid", 8),
+    "joints, 4 (x)": lambda task: _gain(task["state"]["joint_position"]["4"], "model", "repeat"),
+    "AUC within 5": lambda task: task["termination"]["5"]["auc"],
+    "Q R2": lambda task: task["value"]["r2"],
+    "Q slope": lambda task: task["value"]["slope"],
+    "z active": lambda task: task["latent"]["active"],
+    "KL (nats)": lambda task: task["latent"]["kl_nats"],
+}
+
+
+def _trainings(config: ExperimentConfig, grid: Grid) -> dict[str, list[Cell]]:
+    """Choice -> its cells, one for each seed."""
+    task = ALL if len(config.tasks) > 1 else config.tasks[0]
+    equal = {"steps": config.train.compared_steps, "max_minutes": 0}
+    return {
+        name: [
+            grid.train(task, seed, Model(name, {**equal, **flags}), f"ablate-{task}-{name}-s{seed}")
+            for seed in config.train.seeds
+        ]
+        for name, flags in config.chosen(CHOICES).items()
+    }
+
+
+def _cells(config: ExperimentConfig) -> list[Cell]:
+    grid = Grid(config)
+    _trainings(config, grid)
+    return grid.cells
+
+
+def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
+    found = {
+        name: [records[cell.name]["figures"]["tasks"] for cell in cells if cell.name in records]
+        for name, cells in _trainings(config, Grid(config)).items()
+    }
+    measured = {
+        task: {name: _measured([run[task] for run in runs]) for name, runs in found.items() if runs}
+        for task in config.tasks
+    }
+    tables = tuple(_table(task, rows) for task, rows in measured.items())
+    return Report(
+        title="Ablations: what each choice of the world model is worth on held-out episodes",
+        shows=tuple(line for task, rows in measured.items() for line in _shows(task, rows)),
+        parts=(
+            f"Every model was trained for {config.train.compared_steps} gradient steps on the "
+            "data of all tasks named here together, and differs from `default` in the flags named. "
+            "(x): times below the error of repeating the last image, at that many ticks "
+            "open-loop. `paper` and `per_task_returns` are judged against their own returns, "
+            "which differ from those of the others.",
+            *tables,
+        ),
+        figures=measured,
+    )
+
+
+def _measured(runs: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
+    """Column -> its value of each seed that has one."""
+    values = {name: [column(run) for run in runs] for name, column in _COLUMNS.items()}
+    return {name: [v for v in column if v is not None] for name, column in values.items()}
+
+
+def _shows(task: str, rows: Mapping[str, Mapping[str, Sequence[float]]]) -> list[str]:
+    """The best choice of the columns that matter most, and where the default stands."""
+    lines = []
+    for column in ("ball, 8 (x)", "all pixels, 8 (x)", "Q R2"):
+        means = {n: sum(row[column]) / len(row[column]) for n, row in rows.items() if row[column]}
+        if len(means) > 1 and "default" in means:
+            best = max(means, key=means.__getitem__)
+            rank = 1 + sum(value > means["default"] for value in means.values())
+            lines.append(
+                f"{task}, {column}: `{best}` is best with {means[best]:.3g}; `default` has "
+                f"{means['default']:.3g}, place {rank} of {len(means)}"
+            )
+    return lines
+
+
+def _table(task: str, rows: Mapping[str, Mapping[str, Sequence[float]]]) -> Table:
+    return Table(
+        title=f"{task} (several seeds: mean and half of the range)",
+        head=("choice", "changed", *_COLUMNS),
+        rows=tuple(
+            (name, _changed(CHOICES[name]), *(_shown(values) for values in row.values()))
+            for name, row in rows.items()
+        ),
+    )
+
+
+def _changed(flags: Flags) -> str:
+    text = " ".join(f"{name}={value}" for name, value in flags.items())
+    return f"`{text}`" if text else ""
+
+
+def _shown(values: Sequence[float]) -> str:
+    if not values:
+        return "-"
+    text = f"{sum(values) / len(values):.3g}"
+    return text if len(values) == 1 else f"{text} ± {(max(values) - min(values)) / 2:.2g}"
+
+
+EXPERIMENT: Final = Experiment(
+    "what each choice of the world model is worth on held-out episodes", _cells, _report
+)

@@ -1,0 +1,159 @@
+"""Success and reward against the transitions that a model has seen (figure 5).
+
+Models learn from growing first parts of one dataset, each for as long as any other.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, Final
+
+from egovcp.spec import TASKS
+from egovcp_experiment.cell import Cell, Given
+from egovcp_experiment.config import EpisodesConfig, ExperimentConfig
+from egovcp_experiment.experiment import Experiment
+from egovcp_experiment.grid import Grid, Model, Variant
+from egovcp_experiment.outcomes import Outcome, outcome
+from egovcp_experiment.report.comparison import comparison
+from egovcp_experiment.report.document import Plot, Report, Table, points_range
+from egovcp_experiment.report.svg import drawn
+from egovcp_experiment.store import Record
+
+_REFERENCES: Final = ("hold", "random", "oracle")
+
+
+def _episodes(config: ExperimentConfig, task: str, part: float) -> int:
+    """How many of the first episodes make that part."""
+    whole: int = getattr(config.data.episodes, task)
+    return max(1, round(part * whole))
+
+
+def _name(config: ExperimentConfig, task: str, part: float) -> str:
+    return f"first_{_episodes(config, task, part)}"
+
+
+def _grid(config: ExperimentConfig) -> Grid:
+    """Its datasets are as large as the largest part."""
+    largest = max(1.0, *config.data.parts)
+    episodes = {task: _episodes(config, task, largest) for task in TASKS}
+    data = replace(config.data, episodes=EpisodesConfig(**episodes))
+    return Grid(replace(config, data=data))
+
+
+def _plays(config: ExperimentConfig, grid: Grid) -> dict[str, dict[float, list[str]]]:
+    """Task -> part of the data -> names of its cells, one for each seed."""
+    found: dict[str, dict[float, list[str]]] = {}
+    for task in config.tasks:
+        for part in config.data.parts:
+            name = _name(config, task, part)
+            flags = {"dataset.episodes": f"0:{_episodes(config, task, part)}"}
+            variant = Variant(name, Model(name, flags))
+            cells = [grid.play(task, seed, variant).name for seed in config.train.seeds]
+            found.setdefault(task, {})[part] = cells
+        grid.references(task, f"bounds-{task}", who=_REFERENCES)
+    return found
+
+
+def _cells(config: ExperimentConfig) -> list[Cell]:
+    grid = _grid(config)
+    _plays(config, grid)
+    return grid.cells
+
+
+def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
+    grid = _grid(config)
+    shows: list[str] = []
+    parts: list[str | Table | Plot] = [_training(config)]
+    figures: dict[str, Any] = {}
+    curves: dict[str, dict[int, Outcome]] = {}
+    for task, cells in _plays(config, grid).items():
+        found = {p: o for p, c in cells.items() if (o := outcome(records, c, task)) is not None}
+        if not found:
+            continue
+        per_episode = _steps_per_episode(grid, task, records)
+        sizes = {p: round(_episodes(config, task, p) * per_episode) for p in found}
+        curves[task] = {sizes[p]: played for p, played in found.items()}
+        others = {
+            r: o
+            for r in _REFERENCES
+            if (o := outcome(records, [f"bounds-{task}"], task, r)) is not None
+        }
+        named = {_steps(sizes[p]): played for p, played in found.items()}
+        largest = list(named)[-1]
+        parts.append(comparison(task, {**named, **others}, largest))
+        shows += _shows(task, named)
+        figures[task] = {name: o.figures() for name, o in {**named, **others}.items()}
+    if curves:
+        parts.insert(1, _plot(curves))
+    title = "Sample efficiency: success against the transitions that a model has seen"
+    return Report(title, tuple(shows), tuple(parts), figures)
+
+
+def _training(config: ExperimentConfig) -> str:
+    limit = config.train.max_minutes
+    words = f"{limit:g} minutes" if limit else f"{config.train.steps} gradient steps"
+    return (
+        f"Every model was trained for {words} on the first episodes of one random dataset, "
+        "whatever their number; a twentieth of them is held out. The model-free baseline (PPO) is "
+        "no part of this report."
+    )
+
+
+def _steps_per_episode(grid: Grid, task: str, records: Mapping[str, Record]) -> float:
+    """Of the collected data; of a given dataset the scale's, which it is taken to have."""
+    data = grid.data(task)
+    if isinstance(data, Given) or data.cell not in records:
+        return {"arch": 230.0}.get(task, 150.0)
+    figures = records[data.cell]["figures"]
+    return float(figures["steps"] / figures["episodes"])
+
+
+def _steps(count: int) -> str:
+    return f"{count / 1000:.0f}k steps" if count >= 10_000 else f"{count} steps"
+
+
+def _shows(task: str, named: Mapping[str, Outcome]) -> list[str]:
+    names = list(named)
+    first, last = named[names[0]], named[names[-1]]
+    if len(names) < 2:
+        return [f"{task}: {last.success_rate:.1%} success from {names[-1]}"]
+    gain, (low, high) = last.success_gain(first)
+    more = (
+        "more data helps" if low > 0 else "more data hurts" if high < 0 else "no clear difference"
+    )
+    return [
+        f"{task}: {first.success_rate:.1%} success from {names[0]}, {last.success_rate:.1%} from "
+        f"{names[-1]}: {more} ({100 * gain:+.1f} points, 95 % {points_range((low, high))})"
+    ]
+
+
+def _plot(curves: Mapping[str, Mapping[int, Outcome]]) -> Plot:
+    def paint(figure: Any) -> None:
+        left, right = figure.subplots(1, 2)
+        for k, (task, row) in enumerate(curves.items()):
+            xs = list(row)
+            colour = f"C{k}"
+            left.plot(
+                xs, [100 * o.success_rate for o in row.values()], "o-", color=colour, label=task
+            )
+            right.plot(
+                xs, [o.reward_per_step for o in row.values()], "o-", color=colour, label=task
+            )
+            for axes, ranges in (
+                (left, [[100 * v for v in o.success_interval] for o in row.values()]),
+                (right, [list(o.reward_interval) for o in row.values()]),
+            ):
+                low, high = zip(*ranges, strict=True)
+                axes.fill_between(xs, low, high, color=colour, alpha=0.15, linewidth=0)
+        for axes, words in ((left, "success, %"), (right, "reward per step")):
+            axes.set_xscale("log")
+            axes.set(xlabel="transitions", ylabel=words)
+        left.legend(fontsize=8)
+
+    return drawn("transitions", "Success and reward against transitions, 95 % intervals", paint)
+
+
+EXPERIMENT: Final = Experiment(
+    "success against the transitions that a model has seen (fig. 5)", _cells, _report
+)

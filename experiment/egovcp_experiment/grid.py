@@ -1,0 +1,140 @@
+"""A table of training flags x playing flags x tasks x seeds, as cells that share what they can.
+
+collect-TASK-COUNT
+train-TASK-MODEL-sSEED     from the data of a task, or under the task `all` from that of all
+play-TASK-VARIANT-sSEED    the planner with that model
+references-TASK            hold, constant, random and oracle on the same scenarios
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+from egovcp_experiment.cell import Cell, Flags, Given, Output
+from egovcp_experiment.config import ExperimentConfig
+from egovcp_experiment.tools import ARTEFACT, COLLECT, PLAY, TRAIN
+
+#: The task of a model that learns all tasks, as egovcp-collect and egovcp-eval call them together.
+ALL: Final = "all"
+#: Controllers of egovcp-eval that need no model.
+REFERENCES: Final = ("hold", "constant", "random", "oracle")
+
+
+@dataclass(frozen=True)
+class Model:
+    """How a world model is trained."""
+
+    name: str = "default"
+    """Part of the names of cells."""
+    flags: Flags = field(default_factory=dict)
+    """What differs from the default, flags of egovcp-train."""
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A model, and how it is used."""
+
+    name: str
+    """Part of the names of cells."""
+    model: Model = field(default_factory=Model)
+    """Its training."""
+    play: Flags = field(default_factory=dict)
+    """What differs in its use, flags of egovcp-eval."""
+
+
+class Grid:
+    """Makes the cells of one configuration; equal requests give equal cells."""
+
+    def __init__(self, config: ExperimentConfig) -> None:
+        self.config = config
+        self._cells: dict[str, Cell] = {}
+
+    @property
+    def cells(self) -> list[Cell]:
+        """All that was asked for, every cell after those it needs."""
+        return list(self._cells.values())
+
+    def add(self, cell: Cell) -> Cell:
+        """Add a cell, after those it needs."""
+        self._cells.setdefault(cell.name, cell)
+        return cell
+
+    def data(self, task: str) -> Output | Given:
+        """The random data of a task."""
+        config = self.config.data
+        if task in config.roots:
+            return Given(config.roots[task])
+        episodes = getattr(config.episodes, task)
+        flags = {"task": task, "episodes": episodes, "seed": config.seed}
+        extra = (*self.config.scenes, *config.flags)
+        return Output(self.add(Cell(f"collect-{task}-{episodes}", COLLECT, flags, extra)).name)
+
+    def model(self, task: str, seed: int, model: Model | None = None) -> Output | Given:
+        """The artefact of a model that was trained on a task, or on `ALL` of them."""
+        model = model or Model()
+        config = self.config.train
+        if task in config.policies and not model.flags:
+            return Given(config.policies[task])
+        return Output(self.train(task, seed, model).name, ARTEFACT)
+
+    def train(self, task: str, seed: int, model: Model, name: str = "") -> Cell:
+        """The training itself, whose figures are those on held-out episodes."""
+        config = self.config.train
+        tasks = self.config.tasks if task == ALL else (task,)
+        roots = [self.data(one) for one in tasks]
+        data: dict[str, Any] = {"dataset.root": roots[0]}
+        if len(roots) > 1:
+            data = {"datasets": [{"root": root} for root in roots]}
+        flags = {**data, "preset": config.preset, "steps": config.steps, "seed": seed}
+        if config.max_minutes:
+            flags["max_minutes"] = config.max_minutes
+        named = dict(flag.removeprefix("--").split("=", 1) for flag in config.flags)
+        cell = Cell(
+            name or f"train-{task}-{model.name}-s{seed}", TRAIN, {**flags, **named, **model.flags}
+        )
+        return self.add(cell)
+
+    def play(self, task: str, seed: int, variant: Variant, learned_from: str = "") -> Cell:
+        """The planner in closed loop.
+
+        Args:
+            task: what is played.
+            seed: of the training.
+            variant: the model and its use.
+            learned_from: the task, or `ALL`, that the model was trained on; empty: the one played.
+        """
+        policy = self.model(learned_from or task, seed, variant.model)
+        flags = {**self._common(task), "controllers": "planner", "policy.path": policy}
+        name = f"play-{task}-{variant.name}-s{seed}"
+        return self.add(Cell(name, PLAY, {**flags, **variant.play}))
+
+    def references(
+        self,
+        task: str,
+        name: str = "",
+        scene: Flags | None = None,
+        who: Sequence[str] = REFERENCES,
+    ) -> Cell:
+        """Who needs no model, on the same scenarios as the planner.
+
+        Args:
+            task: what is played.
+            name: of the cell; empty: references-TASK.
+            scene: --env.* flags that differ from the configuration's.
+            who: controllers of egovcp-eval.
+        """
+        flags = {**self._common(task), "controllers": ",".join(who), **(scene or {})}
+        return self.add(Cell(name or f"references-{task}", PLAY, flags))
+
+    def _common(self, task: str) -> Flags:
+        config = self.config.play
+        named = (*self.config.scenes, *config.flags)
+        given = dict(flag.removeprefix("--").split("=", 1) for flag in named)
+        return {
+            "task": task,
+            "episodes": config.episodes,
+            "seed": config.seed,
+            **given,
+        }

@@ -1,0 +1,108 @@
+"""Closed-loop results of several seeds on the same scenarios, and their paired differences."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.intervals import Interval, bootstrap, wilson
+from egovcp_experiment.store import Record
+
+type Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """S training seeds on the same E scenarios."""
+
+    reward: Array
+    """(S, E) sum over the episode."""
+    steps: Array
+    """(S, E) planner ticks."""
+    success: Array
+    """(S, E) 0 or 1."""
+    plan_ms: tuple[float, ...] = ()
+    """(S,) median time per plan and robot, ms."""
+
+    @property
+    def success_rate(self) -> float:
+        """Mean over seeds and scenarios."""
+        return float(self.success.mean())
+
+    @property
+    def success_interval(self) -> Interval:
+        """Of one seed Wilson's; of several, from drawing scenarios again."""
+        if len(self.success) == 1:
+            return wilson(int(self.success.sum()), self.success.size)
+        return bootstrap(lambda i: _mean(self.success, i), self.success.shape[1])
+
+    @property
+    def reward_per_step(self) -> float:
+        """All rewards over all steps."""
+        return float(self.reward.sum() / self.steps.sum())
+
+    @property
+    def reward_interval(self) -> Interval:
+        """From drawing scenarios again."""
+        return bootstrap(self._reward_per_step, self.reward.shape[1])
+
+    @property
+    def reward_spread(self) -> float | None:
+        """Standard deviation of reward per step over training seeds; None of one seed."""
+        if len(self.reward) < 2:
+            return None
+        return float(np.std(self.reward.sum(1) / self.steps.sum(1), ddof=1))
+
+    def _reward_per_step(self, i: NDArray[np.int64]) -> Array:
+        return _mean(self.reward, i) / _mean(self.steps, i)
+
+    def success_gain(self, other: Outcome) -> tuple[float, Interval]:
+        """Success rate minus another's on the same scenarios."""
+        difference = self.success.mean(0) - other.success.mean(0)
+        interval = bootstrap(lambda i: difference[i].mean(1), len(difference))
+        return float(difference.mean()), interval
+
+    def reward_gain(self, other: Outcome) -> tuple[float, Interval]:
+        """Reward per step minus another's on the same scenarios."""
+        interval = bootstrap(
+            lambda i: self._reward_per_step(i) - other._reward_per_step(i), self.reward.shape[1]
+        )
+        return self.reward_per_step - other.reward_per_step, interval
+
+    def figures(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "seeds": len(self.reward),
+            "episodes": self.reward.shape[1],
+            "success_rate": self.success_rate,
+            "success_ci95": list(self.success_interval),
+            "reward_mean": self.reward_per_step,
+            "reward_ci95": list(self.reward_interval),
+            "reward_sd_over_seeds": self.reward_spread,
+            "plan_ms_p50": list(self.plan_ms),
+        }
+
+
+def _mean(values: Array, picks: NDArray[np.int64]) -> Array:
+    """(S, E) values -> (R,) means over seeds and the picked scenarios (R, E)."""
+    mean: Array = values.mean(0)[picks].mean(1)
+    return mean
+
+
+def outcome(
+    records: Mapping[str, Record], cells: Iterable[str], task: str, controller: str = "planner"
+) -> Outcome | None:
+    """What the cells, one for each seed, say of a controller on a task; None if none is there."""
+    rows = [records[name]["figures"][task][controller] for name in cells if name in records]
+    if not rows:
+        return None
+
+    def column(name: str) -> Array:
+        return np.array([row["played"][name] for row in rows], np.float64)
+
+    times = tuple(float(row["plan_ms_p50"]) for row in rows)
+    return Outcome(column("reward"), column("steps"), column("success"), times)

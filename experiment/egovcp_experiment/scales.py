@@ -1,0 +1,88 @@
+"""What `--scale` stands for: a complete configuration each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from egovcp_experiment.config import (
+    DataConfig,
+    EpisodesConfig,
+    ExperimentConfig,
+    PlayConfig,
+    Scale,
+    TrainingConfig,
+)
+
+#: Episodes of a second or two, for robots that stand by the cheap controller.
+_BRIEF: Final = (
+    "--env.controller=stance",
+    "--env.ball_episode.ticks=30",
+    "--env.ball_episode.event_ticks=[2,4]",
+    "--env.wall_episode.ticks=30",
+    "--env.wall_episode.event_ticks=[2,4]",
+    "--env.arch_episode.ticks=50",
+    "--env.arch_episode.event_ticks=[2,4]",
+)
+
+
+def smoke() -> ExperimentConfig:
+    """Every command of an experiment once, in minutes; the figures mean nothing."""
+    return ExperimentConfig(
+        scale="smoke",
+        most=3,
+        scenes=_BRIEF,
+        data=DataConfig(EpisodesConfig(ball=24, wall=24, arch=24), parts=(0.5, 1.0)),
+        train=TrainingConfig(
+            preset="debug",
+            steps=4,
+            compared_steps=4,
+            flags=(
+                "--batch_size=4",
+                "--sampling.length=8",
+                "--returns.steps=6",
+                "--value_fit.steps=4",
+                "--value_fit.rows=64",
+                "--planner.samples=32",
+                "--planner.elites=8",
+                "--tensorboard=false",
+                "--device=cpu",
+                "--threads=1",
+            ),
+        ),
+        play=PlayConfig(
+            episodes=4, branches=2, budget_ms=5.0, flags=("--num_workers=1", "--num_envs=4")
+        ),
+    )
+
+
+def small() -> ExperimentConfig:
+    """Two cores, hours: 200 000 random steps of each task, at most ten minutes of training for a
+    model, 100 paired episodes."""
+    return ExperimentConfig(
+        scale="small",
+        train=TrainingConfig(
+            max_minutes=10.0, compared_steps=1000, flags=("--eval_freq=0", "--tensorboard=false")
+        ),
+    )
+
+
+def paper() -> ExperimentConfig:
+    """The paper's scale: half a million steps of each task, three training seeds; for a GPU."""
+    return ExperimentConfig(
+        scale="paper",
+        data=DataConfig(
+            EpisodesConfig(ball=3334, wall=3334, arch=2174), parts=(0.1, 0.2, 0.5, 1.0, 2.0)
+        ),
+        train=TrainingConfig(
+            steps=100_000, compared_steps=100_000, seeds=(0, 1, 2), flags=("--eval_freq=0",)
+        ),
+        play=PlayConfig(episodes=300),
+    )
+
+
+SCALES: Final[Mapping[Scale, Callable[[], ExperimentConfig]]] = {
+    "smoke": smoke,
+    "small": small,
+    "paper": paper,
+}

@@ -1,0 +1,221 @@
+"""Runs the cells that are missing, some side by side, each in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.hardware import hardware
+from egovcp_experiment.cell import Cell, in_order
+from egovcp_experiment.store import Record, Store
+
+_POLL_S: Final = 0.05
+_MINUTE: Final = 60.0
+_INTERRUPTED: Final = 130  # exit code
+
+
+@dataclass
+class _Running:
+    """A cell whose process runs."""
+
+    cell: Cell
+    argv: list[str]
+    process: subprocess.Popen[bytes]
+    start: float
+    slot: int
+
+
+class Schedule:
+    """The cells of an experiment on their way from missing to kept.
+
+    Args:
+        cells: every one after those it needs.
+        store: where results are kept.
+        jobs: cells that run side by side; each has its share of the processor cores.
+        say: takes the lines of progress.
+
+    Raises:
+        UsageError: a result is there that was made with other settings.
+    """
+
+    def __init__(
+        self,
+        cells: Sequence[Cell],
+        store: Store,
+        jobs: int = 1,
+        say: Callable[[str], None] = print,
+    ) -> None:
+        if jobs < 1:
+            raise UsageError(f"--jobs={jobs}: expected at least 1")
+        self._cells = in_order(cells)
+        self._store, self._jobs, self._say = store, jobs, say
+        self.records: dict[str, Record] = {}
+        self.failed: dict[str, str] = {}
+        self._running: list[_Running] = []
+        self._stopping = False
+        self._machine = {k: v for k, v in hardware().items() if k.startswith("hardware")}
+        for cell in self._cells:  # before anything runs: all that can be refused
+            if all(name in self.records for name in cell.needs):
+                self._recall(cell)
+
+    def _recall(self, cell: Cell) -> bool:
+        record = self._store.kept(cell, self.records)
+        if record is not None:
+            self.records[cell.name] = record
+        return record is not None
+
+    def run(self) -> Mapping[str, Record]:
+        """Run what is missing; a cell that fails keeps only those waiting that need it.
+
+        Raises:
+            UsageError: as above, for a cell that could not be looked at earlier.
+            EnvironmentFailure: cells failed; all that do not need them are complete.
+            KeyboardInterrupt: after SIGINT or SIGTERM, once the processes have ended.
+        """
+        with _stop_on_signal() as stopped:
+            try:
+                while not stopped and (self._start_some() or self._running):
+                    self._collect()
+                    time.sleep(_POLL_S)
+                if stopped:
+                    self._stop(stopped)
+            finally:
+                self._kill()
+        if self.failed:
+            raise EnvironmentFailure(self._failures())
+        return self.records
+
+    def _start_some(self) -> bool:
+        """Start what can be started; whether anything still waits for nothing but room."""
+        for cell in self._waiting():
+            if len(self._running) >= self._jobs:
+                return True
+            if not self._recall(cell):
+                self._start(cell)
+        return bool(self._waiting())
+
+    def _waiting(self) -> list[Cell]:
+        """Cells that could begin now."""
+        busy = {running.cell.name for running in self._running}
+        return [
+            cell
+            for cell in self._cells
+            if cell.name not in self.records
+            and cell.name not in self.failed
+            and cell.name not in busy
+            and all(name in self.records for name in cell.needs)
+        ]
+
+    def _start(self, cell: Cell) -> None:
+        argv = self._store.prepare(cell, self.records)
+        slot = min(set(range(self._jobs)) - {running.slot for running in self._running})
+        self._progress(cell, "begins")
+        with self._store.log(cell).open("ab") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "egovcp_experiment.child", cell.tool.module, *argv],
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # Ctrl-C is answered here
+                env=os.environ | {"PYTHONUNBUFFERED": "1"},
+            )
+        _pin(process.pid, slot, self._jobs)
+        self._running.append(_Running(cell, argv, process, time.monotonic(), slot))
+
+    def _collect(self) -> None:
+        """Keep the results of processes that have ended."""
+        for running in list(self._running):
+            code = running.process.poll()
+            if code is None:
+                continue
+            self._running.remove(running)
+            assert running.process.stdin is not None
+            running.process.stdin.close()
+            minutes = (time.monotonic() - running.start) / _MINUTE
+            cell = running.cell
+            if code == _INTERRUPTED and self._stopping:
+                self._progress(cell, f"stopped after {minutes:.1f} min")
+                continue
+            if code != 0:
+                self.failed[cell.name] = _last_line(self._store.log(cell)) or f"exit code {code}"
+                self._progress(cell, f"failed after {minutes:.1f} min: {self.failed[cell.name]}")
+                continue
+            now = {"date": datetime.now(UTC).isoformat(timespec="seconds"), **self._machine}
+            self.records[cell.name] = self._store.keep(
+                cell, self.records, running.argv, minutes, now
+            )
+            self._progress(cell, f"done in {minutes:.1f} min")
+
+    def _progress(self, cell: Cell, what: str) -> None:
+        number = [c.name for c in self._cells].index(cell.name) + 1
+        left = len(self._cells) - len(self.records)
+        self._say(f"cell {number} of {len(self._cells)}, {cell.name}: {what}; {left} to go")
+
+    def _stop(self, stopped: Sequence[int]) -> None:
+        """Interrupt all processes and wait for them; a second signal kills them."""
+        self._stopping = True
+        self._say(f"stopping {len(self._running)} processes; once more to kill them")
+        for running in self._running:
+            assert running.process.stdin is not None
+            running.process.stdin.close()
+        while self._running and len(stopped) < 2:
+            self._collect()
+            time.sleep(_POLL_S)
+        raise KeyboardInterrupt
+
+    def _kill(self) -> None:
+        """Leave no process behind."""
+        for running in self._running:
+            with suppress(ProcessLookupError):
+                os.killpg(running.process.pid, signal.SIGKILL)
+            running.process.wait()
+        self._running = []
+
+    def _failures(self) -> str:
+        name, words = next(iter(self.failed.items()))
+        log = self._store.log(next(c for c in self._cells if c.name == name))
+        more = f" (and {len(self.failed) - 1} more)" if len(self.failed) > 1 else ""
+        return (
+            f"cell {name}{more} failed: {words}; see {log}. All that does not need it is "
+            "complete; the same command goes on from here once the cause is mended"
+        )
+
+
+@contextmanager
+def _stop_on_signal() -> Iterator[list[int]]:
+    """Each SIGINT or SIGTERM adds itself to the list."""
+    received: list[int] = []
+
+    def note(number: int, frame: object) -> None:
+        received.append(number)
+
+    previous = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _pin(pid: int, slot: int, jobs: int) -> None:
+    """Give a process its share of the cores, where the system can."""
+    if jobs == 1 or not hasattr(os, "sched_setaffinity"):
+        return
+    cores = sorted(os.sched_getaffinity(0))
+    with suppress(OSError):  # it may have ended already
+        os.sched_setaffinity(pid, cores[slot::jobs] or cores)
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return lines[-1] if lines else ""

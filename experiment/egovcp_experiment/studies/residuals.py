@@ -1,0 +1,197 @@
+"""The errors of Q along plans, against what the plans were really worth (section III-D).
+
+    e_k = Q^(h_k, z^_k, a_k) - Q(s_k, a_k),    k = 0 .. N-1
+
+Q^ is what the model says along a plan that it imagines. Q is what the data's random walk earns from
+there: the simulator is brought to the same state again, follows the plan up to a_k, and walks on at
+random, several times over. The mean of these returns has an error of its own, whose variance is
+known and taken off; errors of different k come from different walks and do not mix.
+
+Two kinds of plans: the planner's own, which were chosen for their Q^, and random ones.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from egovcp.artefact import Artefact
+from egovcp.cli import run_command
+from egovcp.errors import UsageError
+from egovcp.model import Carry, WorldModel
+from egovcp.plan.process import walk
+from egovcp.sim.config import EnvConfig
+from egovcp.sim.env import StepResult, VectorEnv
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import ACTION_DIM, ACTION_ETA, reflect
+from egovcp_experiment.studies.study import finish
+from egovcp_experiment.studies.watching import Moment, WatchConfig, Watcher, watch
+from egovcp_experiment.variance import Residuals, analysis
+
+PROG: Final = "python -m egovcp_experiment.studies.residuals"
+STEPS: Final = 6  # the longest horizon of table I
+#: Ticks from the event to the moment of a plan; episodes take them in turn.
+_AFTER: Final = {"ball": (-5, 4, 8, 12, 16), "wall": (-5, 1, 4, 8), "arch": (-2, 20, 40, 60, 80)}
+
+type Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ResidualsConfig(WatchConfig):
+    """Errors of Q along plans, one plan of each kind in every episode."""
+
+    branches: int = 12
+    """Random walks that the worth of a step is the mean of."""
+
+
+@dataclass
+class _Point:
+    """The moment of a plan."""
+
+    scenario: Scenario
+    tick: int
+    sent: list[Array]
+    """Actions up to here."""
+    plans: dict[str, Array]
+    """Kind -> (STEPS, 7)."""
+    values: dict[str, Array]
+    """Kind -> (STEPS,) what the model says."""
+
+
+class _Points(Watcher):
+    """Keeps one moment of every episode."""
+
+    def __init__(self, task: str, model: WorldModel, seed: int) -> None:
+        self._after, self._model = _AFTER[task], model
+        self._generator = torch.Generator().manual_seed(seed)
+        self.points: list[_Point] = []
+
+    def begin(self, scenarios: Sequence[Scenario]) -> None:
+        self._scenarios = tuple(scenarios)
+        self._sent: list[list[Array]] = [[] for _ in scenarios]
+
+    def before(self, moment: Moment) -> None:
+        for row in np.flatnonzero(moment.live).tolist():
+            scenario = self._scenarios[row]
+            event = int(moment.env.parameters[row]["event_tick"])
+            due = max(0, event + self._after[scenario.episode % len(self._after)])
+            if int(moment.env.tick[row]) == due:
+                self.points.append(self._point(moment, row, scenario))
+
+    def after(self, moment: Moment, result: StepResult) -> None:
+        for row in np.flatnonzero(moment.live).tolist():
+            self._sent[row].append(result.sent_action[row].copy())
+
+    def _point(self, moment: Moment, row: int, scenario: Scenario) -> _Point:
+        start = self._sent[row][-1] if self._sent[row] else np.zeros(ACTION_DIM)
+        deltas = 2 * torch.rand(STEPS, ACTION_DIM, generator=self._generator) - 1
+        executed = torch.as_tensor(start, dtype=torch.float32)
+        plans = {
+            "planner": moment.step.plan[row].astype(np.float64),
+            "random": walk(executed, deltas, ACTION_ETA).double().numpy(),
+        }
+        carry = Carry(*(part[row : row + 1] for part in moment.policy.carry))
+        values = {kind: _values(self._model, carry, plan) for kind, plan in plans.items()}
+        tick = int(moment.env.tick[row])
+        return _Point(scenario, tick, list(self._sent[row]), plans, values)
+
+
+@torch.no_grad()
+def _values(model: WorldModel, carry: Carry, plan: Array) -> Array:
+    """(STEPS,) Q^ along the plan."""
+    actions = torch.as_tensor(plan).to(carry.h)
+    found = []
+    for action in actions:
+        found.append(float(model.value(carry, action[None])))
+        carry = model.imagine(carry, action[None])
+    return np.array(found)
+
+
+def measure(config: ResidualsConfig) -> None:
+    """Plan, branch, and write the errors."""
+    if config.task not in _AFTER:
+        raise UsageError(f"--task={config.task}: expected one of {', '.join(_AFTER)}")
+    if config.branches < 2:
+        raise UsageError(f"--branches={config.branches}: expected at least 2")
+    artefact = config.artefact()
+    points = _Points(config.task, artefact.world_model, config.seed)
+    longest = replace(artefact, planner=replace(artefact.planner, horizon=STEPS))
+    watch(longest, config.env, config, points)
+    returns = _returns(artefact)
+    found: dict[str, list[Residuals]] = {}
+    for number, point in enumerate(tqdm(points.points, unit="plan", desc="branch")):
+        for kind, plan in point.plans.items():
+            rng = np.random.default_rng([config.seed, number])
+            worth = _branches(config.env, point, plan, config.branches, rng, *returns)
+            found.setdefault(kind, []).append(Residuals(point.values[kind], *worth))
+    finish(
+        config,
+        {
+            "task": config.task,
+            "branches": config.branches,
+            "return_steps": returns[1],
+            "return_std": float(artefact.world_model.return_std),
+            "plans": {kind: analysis(rows) for kind, rows in found.items()},
+        },
+    )
+
+
+def _returns(artefact: Artefact) -> tuple[float, int]:
+    """Discount and ticks of the return that Q was trained on."""
+    settings = artefact.manifest.get("train_config", {}).get("returns", {})
+    if not settings:
+        raise UsageError(f"{artefact.path} does not say which return it was trained on")
+    return float(settings["gamma"]), int(settings["steps"])
+
+
+def _branches(
+    env_config: EnvConfig,
+    point: _Point,
+    plan: Array,
+    branches: int,
+    rng: np.random.Generator,
+    gamma: float,
+    steps: int,
+) -> tuple[Array, Array]:
+    """(STEPS, branches) returns over ``steps`` ticks, and to the end of the episode, from each step
+    of the plan on."""
+    rows = STEPS * branches
+    env = VectorEnv(env_config, rows, pictures=False)
+    env.reset([point.scenario] * rows)
+    for action in point.sent:
+        env.step(np.tile(action, (rows, 1)))
+    own = np.repeat(np.arange(STEPS), branches)  # the step of the plan that a row is about
+    short, whole = np.zeros(rows), np.zeros(rows)
+    age = 0
+    while not env.done.all():
+        delta = rng.uniform(-1.0, 1.0, (rows, ACTION_DIM))
+        action = reflect(env.sent_action + ACTION_ETA * delta)
+        planned = own >= age
+        action[planned] = plan[min(age, STEPS - 1)]
+        reward = env.step(action).reward
+        since = age - own
+        discount = np.where(since >= 0, gamma ** np.maximum(since, 0), 0.0)
+        whole += discount * reward
+        short += np.where(since < steps, discount, 0.0) * reward
+        age += 1
+    env.close()
+    return short.reshape(STEPS, branches), whole.reshape(STEPS, branches)
+
+
+CONFIG = ResidualsConfig
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run_command(CONFIG, measure, argv, prog=PROG)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

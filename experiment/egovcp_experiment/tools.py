@@ -1,0 +1,124 @@
+"""The commands that cells run, and what is kept of each run.
+
+They are named, not imported: applications know nothing of each other.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from egovcp.artefact import MANIFEST, SEAL
+from egovcp.data.files import sha256
+from egovcp.data.schema import COLLECTION_PATH, HASHES_PATH
+from egovcp_experiment.cell import Flags, Tool
+
+#: Where egovcp-train leaves its artefact, below the folder of the run.
+ARTEFACT: Final = "checkpoints/last/pretrained_model"
+#: The file in which a study of this package leaves its figures.
+RESULT: Final = "result.json"
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def _collected(folder: Path) -> dict[str, Any]:
+    info = read_json(folder / "meta" / "info.json")
+    collection = read_json(folder / COLLECTION_PATH)
+    return {
+        "episodes": info["total_episodes"],
+        "steps": info["total_frames"],
+        "controller_id": collection.get("controller_id", ""),
+    }
+
+
+def dataset_digest(folder: Path) -> str:
+    """SHA-256 of the list of the SHA-256 of a dataset's files."""
+    return sha256(folder / HASHES_PATH)
+
+
+def _trained(folder: Path) -> dict[str, Any]:
+    manifest = read_json(folder / ARTEFACT / MANIFEST)
+    return {"step": manifest["step"], "tasks": manifest["heldout_tasks"]}
+
+
+def artefact_digest(folder: Path) -> str:
+    """The SHA-256 that seals an artefact's manifest, and with it all of its files."""
+    return str(read_json(folder / MANIFEST)[SEAL])
+
+
+def _played(folder: Path) -> dict[str, Any]:
+    """Task -> controller -> figures, and under ``played`` every episode."""
+    run = read_json(folder / "eval_run.json")["episodes"]
+    return {
+        task: {name: {**row, "played": _columns(run[task][name])} for name, row in rows.items()}
+        for task, rows in read_json(folder / "eval.json").items()
+    }
+
+
+def _columns(episodes: list[Mapping[str, Any]]) -> dict[str, list[Any]]:
+    names = ("episode", "steps", "reward", "success")
+    return {name: [episode[name] for episode in episodes] for name in names}
+
+
+def _resumed(folder: Path) -> Flags | None:
+    return {"resume": True} if (folder / "checkpoints" / "last").exists() else None
+
+
+def _extended(folder: Path) -> Flags | None:
+    return {"resume": True} if folder.exists() else None
+
+
+COLLECT: Final = Tool(
+    module="egovcp_collect.collect",
+    output="dataset.root",
+    figures=_collected,
+    digest=dataset_digest,
+    continued=_extended,
+    prog="egovcp-collect",
+)
+TRAIN: Final = Tool(
+    module="egovcp_train.train",
+    output="output_dir",
+    figures=_trained,
+    digest=lambda folder: artefact_digest(folder / ARTEFACT),
+    continued=_resumed,
+    prog="egovcp-train",
+)
+PLAY: Final = Tool(
+    module="egovcp_deploy.evaluate",
+    output="output_dir",
+    figures=_played,
+    digest=lambda folder: sha256(folder / "eval_run.json"),
+    prog="egovcp-eval",
+)
+
+
+def study(name: str) -> Tool:
+    """A study of this package, ``egovcp_experiment.studies.NAME``."""
+    return Tool(
+        module=f"egovcp_experiment.studies.{name}",
+        output="output_dir",
+        figures=lambda folder: dict(read_json(folder / RESULT)),
+        digest=lambda folder: sha256(folder / RESULT),
+    )
+
+
+def given_digest(path: str) -> str:
+    """What is known of something that no cell made: an artefact, a dataset, a file, or an id.
+
+    Something on the Hub is known by its name alone.
+    """
+    folder = Path(path).expanduser()
+    if (folder / MANIFEST).is_file():
+        return artefact_digest(folder)
+    if (folder / HASHES_PATH).is_file():
+        return dataset_digest(folder)
+    if folder.is_file():
+        return sha256(folder)
+    return hashlib.sha256(str(path).encode()).hexdigest()

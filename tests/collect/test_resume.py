@@ -1,0 +1,31 @@
+"""What a collection may go on from."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import replace
+from typing import Any
+
+import draccus
+import pytest
+
+from egovcp.data import Provenance
+from egovcp.errors import UsageError
+from egovcp_collect.config import SHAPING, CollectConfig
+from egovcp_collect.resume import require_same
+
+
+def made() -> Provenance:
+    settings: dict[str, Any] = draccus.encode(CollectConfig())
+    return Provenance("walk", seed=0, config={name: settings[name] for name in SHAPING})
+
+
+def test_an_option_newer_than_the_dataset_was_made_with_its_default() -> None:
+    now = made()
+    older: dict[str, Any] = copy.deepcopy(dict(now.config))
+    del older["env"]["ball"]["shape"]
+    require_same(now, replace(now, config=older))
+    other = copy.deepcopy(dict(now.config))
+    other["env"]["ball"]["shape"] = "box"
+    with pytest.raises(UsageError, match=r"--env\.ball\.shape was sphere, is box"):
+        require_same(replace(now, config=other), replace(now, config=older))

@@ -1,0 +1,36 @@
+"""Equal time: candidates follow from the time of few and of many."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from egovcp_experiment.studies import plan_time
+from egovcp_experiment.tools import read_json
+
+
+@pytest.mark.parametrize(
+    ("few", "many", "budget", "samples"),
+    [
+        (10.0, 34.0, 40.0, 1216),  # 2 + M / 32 ms
+        (10.0, 34.0, 34.0, 1024),
+        (10.0, 34.0, 1.0, 32),  # out of reach: the least there is
+    ],
+)
+def test_the_line_through_two_times(few: float, many: float, budget: float, samples: int) -> None:
+    found = plan_time._afforded("cem", few, many, budget)
+    assert found["samples"] == samples
+    assert found["elites"] == samples // 16
+    assert found["plan_ms"] == pytest.approx(2 + samples / 32)
+
+
+def test_every_search_is_timed_and_can_be_played(flags: list[str], tmp_path: Path) -> None:
+    from egovcp.plan import PlannerConfig
+
+    only = [f for f in flags if f.startswith(("--policy", "--output"))]
+    assert plan_time.main([*only, "--rounds=1", "--budget_ms=20"]) == 0
+    found = read_json(tmp_path / "out" / "result.json")["searches"]
+    assert set(found) == set(plan_time.SEARCHES)
+    for row in found.values():
+        PlannerConfig(**{k: row[k] for k in ("optimiser", "iterations", "samples", "elites")})

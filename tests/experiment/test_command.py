@@ -1,0 +1,64 @@
+"""`egovcp-experiment`: misuse is explained, and one small experiment works from end to end."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from egovcp_experiment.command import main
+from egovcp_experiment.experiments import EXPERIMENTS
+
+
+def test_help_lists_every_experiment(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--help"]) == 0
+    out = capsys.readouterr().out
+    for name, experiment in EXPERIMENTS.items():
+        assert name in out
+        assert experiment.summary in out
+
+
+@pytest.mark.parametrize(
+    ("argv", "message"),
+    [
+        ([], ""),
+        (["planer"], "did you mean 'planners'"),
+        (["planners"], "--output_dir is missing"),
+        (["planners", "--scale=smal", "--output_dir=x"], "did you mean 'small'"),
+        (["planners", "--output_dir=x", "--scenes=[--seed=3]"], "expected --env.NAME=value"),
+        (["planners", "--output_dir=x", "--only=[cme]"], "did you mean 'cem'"),
+        (["planners", "--output_dir=x", "--jobs=0"], "--jobs=0"),
+        (["planners", "--config_path=a.yaml"], "would hide the scale"),
+    ],
+)
+def test_misuse_ends_with_2_before_anything_is_written(
+    argv: list[str],
+    message: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(argv) == 2
+    assert message in capsys.readouterr().err
+    assert not list(tmp_path.glob("x/cells/*.json"))
+
+
+def test_an_experiment_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Collects, trains and reports through the real commands; again, nothing is left to do."""
+    out = tmp_path / "out"
+    argv = ["ablations", "--scale=smoke", f"--output_dir={out}", "--tasks=[ball]"]
+    argv += ["--only=[two_hot]", "--data.episodes.ball=10", "--data.flags=[--num_workers=1]"]
+    assert main(argv) == 0
+    content = json.loads((out / "ablations.json").read_text())
+    assert list(content["cells"]) == ["collect-ball-10", "ablate-ball-two_hot-s0"]
+    assert content["missing"] == []
+    assert content["cells"]["collect-ball-10"]["figures"]["episodes"] == 10
+    assert "policy.value_loss=two_hot" in (out / "ablations.md").read_text()
+    model = out / "work" / "ablate-ball-two_hot-s0" / "checkpoints" / "last" / "pretrained_model"
+    assert json.loads((model / "config.json").read_text())["world_model"]["value_loss"] == "two_hot"
+    capsys.readouterr()
+    assert main(argv) == 0
+    assert "2 cells, 2 complete" in capsys.readouterr().out
+    assert json.loads((out / "ablations.json").read_text())["cells"] == content["cells"]

@@ -1,0 +1,91 @@
+"""Reports of every experiment: from nothing, and from whatever closed-loop results there are."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from egovcp_experiment.cell import Cell
+from egovcp_experiment.experiments import EXPERIMENTS
+from egovcp_experiment.report.document import Plot, Report, Table
+from egovcp_experiment.scales import SCALES
+from egovcp_experiment.tools import COLLECT, PLAY
+
+CLOSED_LOOP = ("generalise", "multitask", "planners", "sample-efficiency", "variance")
+
+
+def played(cell: Cell) -> dict[str, Any]:
+    """What a play might have been: who plays better in some cells than in others."""
+    rng = np.random.default_rng(sum(map(ord, cell.name)))
+    count = 20
+    return {
+        cell.flags["task"]: {
+            name: {
+                "plan_ms_p50": 1.0,
+                "played": {
+                    "episode": list(range(count)),
+                    "steps": [10] * count,
+                    "reward": rng.normal(size=count).tolist(),
+                    "success": (rng.random(count) < 0.5).tolist(),
+                },
+            }
+            for name in cell.flags["controllers"].split(",")
+        }
+    }
+
+
+def records(name: str, share: float) -> dict[str, Mapping[str, Any]]:
+    """Results of the first ``share`` of the plays, and of all collections."""
+    cells = EXPERIMENTS[name].cells(SCALES["small"]())
+    plays = [cell for cell in cells if cell.tool is PLAY]
+    found = {cell.name: {"figures": played(cell)} for cell in plays[: round(share * len(plays))]}
+    collected = {"figures": {"episodes": 100, "steps": 15_000}}
+    return {**{c.name: collected for c in cells if c.tool is COLLECT}, **found}
+
+
+def report(name: str, share: float) -> Report:
+    return EXPERIMENTS[name].report(SCALES["small"](), records(name, share))
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_with_nothing_to_report_there_is_a_report(name: str) -> None:
+    found = EXPERIMENTS[name].report(SCALES["small"](), {})
+    assert found.title
+    assert found.shows == ()
+    assert not [part for part in found.parts if isinstance(part, Plot)]
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 1.0])
+@pytest.mark.parametrize("name", CLOSED_LOOP)
+def test_tables_hold_what_is_there_and_agree_with_their_heads(name: str, share: float) -> None:
+    found = report(name, share)
+    tables = [part for part in found.parts if isinstance(part, Table)]
+    assert tables
+    for table in tables:
+        assert table.rows
+        assert {len(row) for row in table.rows} == {len(table.head)}
+    plots = [part for part in found.parts if isinstance(part, Plot)]
+    assert len({plot.name for plot in plots}) == len(plots)
+
+
+@pytest.mark.parametrize("name", CLOSED_LOOP)
+def test_every_task_has_a_verdict(name: str) -> None:
+    shows = " ".join(report(name, 1.0).shows)
+    if name != "variance":  # its verdicts need residuals
+        for task in ("ball", "wall", "arch"):
+            assert f"{task}" in shows
+
+
+def test_a_loss_is_called_one() -> None:
+    """Half of the scenes lost, in one condition only."""
+    found = records("generalise", 1.0)
+    for cell in EXPERIMENTS["generalise"].cells(SCALES["small"]()):
+        if cell.tool is PLAY and cell.flags["controllers"] == "planner":
+            row = found[cell.name]["figures"][cell.flags["task"]]["planner"]["played"]
+            row["success"] = [True] * 20 if "box" not in cell.name else [False] * 10 + [True] * 10
+    shows = EXPERIMENTS["generalise"].report(SCALES["small"](), found).shows
+    assert "ball: worse by more than chance, points: `box` -50" in shows
+    assert not [line for line in shows if line.startswith("wall: worse")]

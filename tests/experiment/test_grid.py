@@ -1,0 +1,124 @@
+"""Cells of a grid: shared where they can be, with flags that their commands take."""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import pytest
+
+from egovcp.cli import parse_config
+from egovcp.errors import UsageError
+from egovcp_experiment.cell import Cell, Found, Given, Output, filled, in_order, written
+from egovcp_experiment.config import DataConfig, ExperimentConfig, TrainingConfig
+from egovcp_experiment.experiments import EXPERIMENTS
+from egovcp_experiment.grid import ALL, Grid, Model, Variant
+from egovcp_experiment.scales import SCALES
+from egovcp_experiment.tools import COLLECT, PLAY, TRAIN
+
+CONFIGS = {
+    "egovcp_collect.collect": ("egovcp_collect.config", "CollectConfig"),
+    "egovcp_train.train": ("egovcp_train.config", "TrainConfig"),
+    "egovcp_deploy.evaluate": ("egovcp_deploy.evaluate", "EvalConfig"),
+}
+
+
+def names(cells: Iterable[Cell]) -> list[str]:
+    return [cell.name for cell in cells]
+
+
+def test_variants_share_data_and_models() -> None:
+    grid = Grid(ExperimentConfig(train=TrainingConfig(seeds=(0, 1))))
+    for seed in (0, 1):
+        grid.play("ball", seed, Variant("plain"))
+        grid.play("ball", seed, Variant("long", play={"planner.horizon": 6}))
+        grid.play("ball", seed, Variant("other", Model("other", {"policy.q_heads": 5})))
+    tools = [cell.tool for cell in grid.cells]
+    assert (tools.count(COLLECT), tools.count(TRAIN), tools.count(PLAY)) == (1, 4, 6)
+    assert in_order(grid.cells) == tuple(grid.cells)
+
+
+def test_what_is_there_already_is_not_made_again() -> None:
+    data = DataConfig(roots={"ball": "data/ball"})
+    grid = Grid(ExperimentConfig(data=data, train=TrainingConfig(policies={"wall": "a/wall"})))
+    grid.play("ball", 0, Variant("plain"))
+    grid.play("wall", 0, Variant("plain"))
+    assert names(grid.cells) == [
+        "train-ball-default-s0",
+        "play-ball-plain-s0",
+        "play-wall-plain-s0",
+    ]
+    assert grid.cells[0].flags["dataset.root"] == Given("data/ball")
+    assert grid.cells[2].flags["policy.path"] == Given("a/wall")
+
+
+def test_a_model_of_all_tasks_reads_all_of_their_data() -> None:
+    grid = Grid(ExperimentConfig())
+    grid.play("ball", 0, Variant("mixed"), learned_from=ALL)
+    train = next(cell for cell in grid.cells if cell.tool is TRAIN)
+    names = ("collect-ball-1334", "collect-wall-1334", "collect-arch-870")
+    assert train.flags["datasets"] == [{"root": Output(name)} for name in names]
+
+
+def test_unknown_variants_and_tasks_are_named() -> None:
+    with pytest.raises(UsageError, match="did you mean 'default'"):
+        replace(ExperimentConfig(), only=("defualt",)).chosen({"default": 1})
+    with pytest.raises(UsageError, match="did you mean 'ball'"):
+        ExperimentConfig(output_dir="x", tasks=("bal",)).check()
+
+
+def test_every_cell_has_flags_that_its_command_takes() -> None:
+    """Each distinct value of each flag is parsed once, several flags at a time; of a training all
+    together, for its options depend on each other."""
+    values: dict[str, dict[str, list[str]]] = {}
+    trainings: dict[frozenset[str], list[str]] = {}
+    tools: dict[str, Cell] = {}
+    for make, experiment in product(SCALES.values(), EXPERIMENTS.values()):
+        for cell in in_order(experiment.cells(make())):
+            tools[cell.tool.module] = cell
+            argv = [*written(filled(cell.flags, _any)), *cell.extra]
+            if cell.tool is TRAIN:
+                chosen = frozenset(a for a in argv if not a.startswith(("--seed", "--dataset")))
+                trainings[chosen] = argv
+                continue
+            for name, _, value in (arg.partition("=") for arg in argv):
+                known = values.setdefault(cell.tool.module, {}).setdefault(name, [])
+                if value not in known:
+                    known.append(value)
+    for module, flags in values.items():
+        for k in range(max(map(len, flags.values()))):
+            argv = [f"{name}={known[k]}" for name, known in flags.items() if k < len(known)]
+            parse_config(_config(tools[module]), argv, "cell")
+    train = tools[TRAIN.module]
+    for argv in trainings.values():
+        parse_config(_config(train), ["--output_dir=x", *argv], "train", "", _option_defaults())
+
+
+def _any(reference: Output | Found | Given) -> object:
+    """What a reference may stand for."""
+    if not isinstance(reference, Found):
+        return "folder"
+    values: Mapping[str, object] = {"optimiser": "cem"}
+    return values.get(reference.keys[-1], 1)
+
+
+def _config(cell: Cell) -> type[Any]:
+    module, name = CONFIGS.get(cell.tool.module, (cell.tool.module, "CONFIG"))
+    found: type[Any] = getattr(importlib.import_module(module), name)
+    return found
+
+
+def _option_defaults() -> Any:
+    return importlib.import_module("egovcp_train.train").option_defaults
+
+
+def test_parts_are_prefixes_of_one_dataset_as_large_as_the_largest() -> None:
+    data = DataConfig(parts=(0.5, 2.0))
+    config = ExperimentConfig(tasks=("ball",), data=data)
+    cells = {c.name: c for c in EXPERIMENTS["sample-efficiency"].cells(config)}
+    assert cells["collect-ball-2668"].flags["episodes"] == 2668
+    parts = [c.flags["dataset.episodes"] for c in cells.values() if c.tool is TRAIN]
+    assert parts == ["0:667", "0:2668"]

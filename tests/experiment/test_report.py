@@ -1,0 +1,72 @@
+"""Reports: the same in three forms, and the page needs nothing else."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+from egovcp_experiment.report.document import Report, Table
+from egovcp_experiment.report.publish import publish
+from egovcp_experiment.report.svg import drawn
+
+RECORD: dict[str, Any] = {
+    "command": "egovcp-train --steps=3",
+    "minutes": 1.25,
+    "date": "2026-01-01T00:00:00+00:00",
+    "settings": {"versions": {"egovcp": "0.1.0"}},
+    "settings_sha256": "a" * 64,
+    "sha256": "b" * 64,
+    "hardware_cpu": "a processor",
+    "hardware_cores": 2,
+    "hardware_gpu": "none",
+    "figures": {},
+}
+
+
+def _report() -> Report:
+    plot = drawn("curve", "a curve & more", lambda figure: figure.subplots().plot([1, 2]))
+    table = Table("rows", ("name", "value"), (("a|b", "`x<1`"),))
+    return Report("Title <1>", ("ours is **worse**",), ("text", table, plot), {"x": 1.5})
+
+
+def _publish(folder: Path, scale: str = "small", missing: tuple[str, ...] = ()) -> None:
+    command = "egovcp-experiment test --output_dir=out"
+    publish(folder, "test", _report(), {"cell": RECORD}, missing, {"scale": scale}, command)
+
+
+def test_three_forms_say_the_same(tmp_path: Path) -> None:
+    _publish(tmp_path)
+    content = json.loads((tmp_path / "test.json").read_text())
+    text = (tmp_path / "test.md").read_text()
+    page = (tmp_path / "test.html").read_text()
+    assert content["figures"] == {"x": 1.5}
+    assert "| a\\|b | `x<1` |" in text
+    assert "<td>a|b</td><td><code>x&lt;1</code></td>" in page
+    assert "Title &lt;1&gt;" in page
+    assert "<b>worse</b>" in page
+    for form in (text, page):
+        assert "egovcp-train --steps=3" in form
+        assert "a processor, 2 cores" in form
+        assert "b" * 12 in form
+    assert (tmp_path / "test-curve.svg").read_text().startswith("<?xml")
+
+
+def test_the_page_refers_to_nothing_outside(tmp_path: Path) -> None:
+    _publish(tmp_path)
+    page = (tmp_path / "test.html").read_text()
+    assert "<svg" in page
+    assert not re.findall(r'(?:src|href)="(?!#|data:)[^"]*"', page)
+    assert "@import" not in page
+
+
+def test_drawings_are_reproducible() -> None:
+    assert _report().parts[2] == _report().parts[2]
+
+
+def test_smoke_and_missing_cells_are_said_first(tmp_path: Path) -> None:
+    _publish(tmp_path, "smoke", ("other",))
+    shows = json.loads((tmp_path / "test.json").read_text())["shows"]
+    assert "mean nothing" in shows[0]
+    assert "1 of 2 cells" in shows[1]

@@ -1,0 +1,154 @@
+"""Cells run once, in order, side by side; what fails or is stopped goes on later."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp_experiment.cell import Cell, Found, Given, Output
+from egovcp_experiment.schedule import Schedule
+from egovcp_experiment.store import Store
+
+from .conftest import MakeCell
+
+
+def run(
+    cells: Sequence[Cell],
+    folder: Path,
+    jobs: int = 1,
+    say: Callable[[str], None] = lambda line: None,
+) -> Schedule:
+    """Run cells, or raise what running them raises."""
+    store = Store(folder)
+    with store.locked():
+        schedule = Schedule(cells, store, jobs, say)
+        schedule.run()
+    return schedule
+
+
+def chain(cell: MakeCell) -> list[Cell]:
+    """a, then b from a file of a, then c from a figure of b."""
+    b = cell("b", add=2, source=Output("a", "result.json"))
+    return [cell("a", add=1), b, cell("c", add=Found("b", ("total",)))]
+
+
+def test_cells_take_files_and_figures_of_those_before(cell: MakeCell, tmp_path: Path) -> None:
+    records = run(chain(cell), tmp_path / "out").records
+    assert [records[name]["figures"]["total"] for name in "abc"] == [1, 3, 3]
+    assert records["b"]["settings"]["flags"]["source"]["sha256"] == records["a"]["sha256"]
+    assert str(tmp_path / "out" / "work" / "a" / "result.json") in records["b"]["command"]
+
+
+def test_a_finished_cell_is_never_run_again(cell: MakeCell, tmp_path: Path, diary: Path) -> None:
+    first = run(chain(cell), tmp_path / "out").records
+    again = run([*chain(cell), cell("d", add=1)], tmp_path / "out").records
+    assert diary.read_text().split() == ["a", "b", "c", "d"]
+    assert {name: again[name] for name in first} == first
+
+
+def test_other_settings_are_refused_before_anything_runs(
+    cell: MakeCell, tmp_path: Path, diary: Path
+) -> None:
+    run([cell("a", add=1)], tmp_path / "out")
+    with pytest.raises(UsageError, match=r"flags\.add was 1, is 2; name another --output_dir"):
+        run([cell("new"), cell("a", add=2)], tmp_path / "out")
+    assert diary.read_text().split() == ["a"]
+
+
+def test_other_content_of_a_given_file_is_refused(cell: MakeCell, tmp_path: Path) -> None:
+    file = tmp_path / "given.json"
+    file.write_text('{"total": 4}')
+    cells = [cell("a", source=Given(str(file)))]
+    assert run(cells, tmp_path / "out").records["a"]["figures"]["total"] == 4
+    run(cells, tmp_path / "out")
+    file.write_text('{"total": 5}')
+    with pytest.raises(UsageError, match=r"flags\.source\.sha256 was"):
+        run(cells, tmp_path / "out")
+
+
+def test_a_failure_keeps_only_those_waiting_that_need_it(
+    cell: MakeCell, tmp_path: Path, diary: Path
+) -> None:
+    broken, alone = cell("a", fail=3), cell("d", add=1)
+    with pytest.raises(EnvironmentFailure, match=r"cell a failed: the cause of it all.*a\.log"):
+        run([broken, *chain(cell)[1:], alone], tmp_path / "out")
+    assert diary.read_text().split() == ["a", "d"]
+    run([*chain(cell), alone], tmp_path / "out")
+    assert diary.read_text().split() == ["a", "d", "a", "b", "c"]
+
+
+def test_independent_cells_run_side_by_side(cell: MakeCell, tmp_path: Path) -> None:
+    """Each of two waits until it is interrupted: both have begun only if they run together."""
+    cells = [cell("a", wait=60), cell("b", wait=60)]
+    with pytest.raises(KeyboardInterrupt):
+        interrupted(cells, tmp_path / "out", jobs=2)
+
+
+def test_an_interrupt_stops_cleanly_and_the_same_cells_go_on(
+    cell: MakeCell, tmp_path: Path, diary: Path
+) -> None:
+    out = tmp_path / "out"
+    said: list[str] = []
+    with pytest.raises(KeyboardInterrupt):
+        interrupted([cell("a", wait=60)], out, say=said.append)
+    assert "a: stopped after" in said[-1]
+    assert (out / "work" / "a" / "checkpoint").exists()
+    assert not (out / "cells" / "a.json").exists()
+    run([cell("a", wait=0.01)], out)
+    assert diary.read_text().splitlines() == ["a ", "a true"]
+
+
+def interrupted(cells: Sequence[Cell], folder: Path, jobs: int = 1, **options: Any) -> None:
+    """Run cells, and interrupt this process when all of them have begun."""
+
+    def press() -> None:
+        while not all((folder / "work" / c.name / "begun").exists() for c in cells):
+            time.sleep(0.02)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=press, daemon=True).start()
+    run(cells, folder, jobs, **options)
+
+
+def test_what_an_attempt_left_without_a_checkpoint_is_removed(
+    cell: MakeCell, tmp_path: Path
+) -> None:
+    rest = tmp_path / "out" / "work" / "a" / "torn"
+    (tmp_path / "out" / "cells").mkdir(parents=True)
+    rest.mkdir(parents=True)
+    run([cell("a", add=1)], tmp_path / "out")
+    assert not rest.exists()
+
+
+def test_two_commands_do_not_work_in_one_folder(tmp_path: Path) -> None:
+    with (
+        Store(tmp_path / "out").locked(),
+        pytest.raises(EnvironmentFailure, match="is being written by process"),
+        Store(tmp_path / "out").locked(),
+    ):
+        pass
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "thesis.txt").write_text("do not touch")
+    with (
+        pytest.raises(UsageError, match="something other than experiments"),
+        Store(tmp_path).locked(),
+    ):
+        pass
+
+
+def test_cells_out_of_order_or_in_conflict_are_refused(cell: MakeCell, tmp_path: Path) -> None:
+    a, b, _ = chain(cell)
+    with pytest.raises(UsageError, match="b needs a, which does not come before it"):
+        run([b, a], tmp_path / "out")
+    with pytest.raises(UsageError, match="two different cells are called a"):
+        run([a, cell("a", add=7)], tmp_path / "out")
