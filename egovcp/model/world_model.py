@@ -57,6 +57,10 @@ class Carry(NamedTuple):
         flight = None if self.flight is None else change(self.flight)
         return Carry(change(self.h), change(self.z), flight)
 
+    def row(self, index: int) -> Carry:
+        """That of one robot, (1, ...)."""
+        return self.map(lambda x: x[index : index + 1])
+
     @staticmethod
     def join(carries: Sequence[Carry], how: Callable[[list[Tensor]], Tensor]) -> Carry:
         """Equal parts of several joined in the same way."""

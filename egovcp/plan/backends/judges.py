@@ -74,7 +74,7 @@ class IntegerJudge:
     def at(self, carry: Carry) -> Worth:
         """See `Judge`."""
         # One by one: what a robot's plans are worth does not depend on the robots beside it.
-        states = (_row(carry, e) for e in range(len(carry.h)))
+        states = (carry.row(e) for e in range(len(carry.h)))
         robots = [self._network.shared(root_of(self._model, state)) for state in states]
         sound = carry.h.isfinite().all(1) & carry.z.isfinite().all(1)
 
@@ -97,7 +97,3 @@ class IntegerJudge:
             if 0 < k < horizon - 1:
                 tally.risk(risk[:, k])
         return tally.mean(horizon)
-
-
-def _row(carry: Carry, e: int) -> Carry:
-    return carry.map(lambda x: x[e : e + 1])

@@ -63,10 +63,10 @@ class _Seen(Watcher):
         self._episodes = [scenario.episode for scenario in scenarios]
 
     def before(self, moment: Moment) -> None:
-        h, z = (part.cpu().clone() for part in moment.policy.carry)
+        carry = moment.policy.carry.map(lambda x: x.cpu().clone())
         for row in np.flatnonzero(moment.live).tolist():
             facts = (self._task, self._episodes[row], int(moment.env.tick[row]))
-            self.rows.append((h[row], z[row], *facts))
+            self.rows.append((carry.h[row], carry.z[row], *facts))
 
 
 def measure(config: LatentsConfig) -> None:

@@ -61,7 +61,7 @@ class _Films(Watcher):
             episode = self._episodes[row]
             due = self._seen - 1e-6 <= since[row] < self._seen + PLANNER_DT - 1e-6
             if due and episode not in self.films:
-                carry = Carry(*(part[row : row + 1].clone() for part in moment.policy.carry))
+                carry = moment.policy.carry.row(row).map(torch.clone)
                 self.films[episode] = _Film(carry)
             if episode in self.films:
                 self.films[episode].depth.append(moment.observation.depth[row].copy())

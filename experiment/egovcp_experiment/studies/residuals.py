@@ -97,7 +97,7 @@ class _Points(Watcher):
             "planner": moment.step.plan[row].astype(np.float64),
             "random": walk(executed, deltas, ACTION_ETA).double().numpy(),
         }
-        carry = Carry(*(part[row : row + 1] for part in moment.policy.carry))
+        carry = moment.policy.carry.row(row)
         values = {kind: _values(self._model, carry, plan) for kind, plan in plans.items()}
         tick = int(moment.env.tick[row])
         return _Point(scenario, tick, list(self._sent[row]), plans, values)

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
-from egovcp.model import Carry
 from egovcp.plan import hand_grid, value_map
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import PLANNER_DT
@@ -85,7 +84,7 @@ class _Maps(Watcher):
         hand: Literal["left", "right"] = (
             "left" if moment.env.parameters[row]["aim_lateral"] > 0 else "right"
         )
-        carry = Carry(*(part[row : row + 1] for part in moment.policy.carry))
+        carry = moment.policy.carry.row(row)
         action = torch.as_tensor(moment.step.action[row : row + 1]).to(carry.h)
         values = value_map(moment.policy.model, carry, action, hand, hand_grid(hand))
         first = 0 if hand == "left" else 3
