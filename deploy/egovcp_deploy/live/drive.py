@@ -14,7 +14,7 @@ import torch
 from tqdm import tqdm
 
 from egovcp.artefact import Artefact
-from egovcp.errors import EnvironmentFailure, SafetyStop, UsageError
+from egovcp.errors import EgovcpError, EnvironmentFailure, SafetyStop, UsageError
 from egovcp.log.info import CameraView
 from egovcp.log.tick import Tick
 from egovcp.robot.controllers import make_controller
@@ -22,7 +22,7 @@ from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import CAMERAS, HardwareOptions, open_eye
 from egovcp_deploy.live.operators import OPERATORS, operator
-from egovcp_deploy.live.planner import LiveSummary
+from egovcp_deploy.live.planner import LiveSummary, failure_words
 from egovcp_deploy.live.run import LiveSetup, run_live
 from egovcp_deploy.live.simulated import simulated
 from egovcp_deploy.options import check_choice, make_output_dir, versions, write_json
@@ -71,7 +71,7 @@ def drive_simulated(config: DeployConfig, artefact: Artefact) -> None:
     config = replace(config, robot=robot, operator=operator_options)
     folder = _prepare(config, artefact)
     with simulated(config, folder / "task.json") as hardware:
-        _run(config, artefact, folder, LiveSetup(hardware, *_how(config), stays=False))
+        _run(config, artefact, folder, LiveSetup(hardware, *_how(config), False, simulated=True))
 
 
 def _prepare(config: DeployConfig, artefact: Artefact) -> Path:
@@ -100,11 +100,23 @@ def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetu
         summary = run_live(setup, thinker, who, sink, lambda tick: _show(bar, tick))
     write_json(folder / "deploy.json", _report(config, artefact, controller_id, summary))
     _print(summary, folder)
+    _judge(summary, folder)
+
+
+def _judge(summary: LiveSummary, folder: Path) -> None:
+    """Raise what kept the run from coming to its own end."""
     if summary.damped:
         raise SafetyStop(
             f"the motors were damped: {summary.damped}. The log is in {folder}; "
             "find the cause before the next run"
-        )
+        ) from summary.failure
+    if isinstance(summary.failure, EgovcpError):
+        raise summary.failure
+    if summary.failure is not None:
+        raise SafetyStop(
+            f"the planner failed and the robot was held: {failure_words(summary.failure)}. The log "
+            f"is in {folder}; --debug prints the traceback"
+        ) from summary.failure
 
 
 def _leave_a_core() -> None:
@@ -137,6 +149,7 @@ def _report(
         **_percentiles("latency_ms", summary.latency_ms),
         "iterations_mean": float(np.mean(summary.iterations or [0])),
         "damped": summary.damped,
+        "failure": "" if summary.failure is None else failure_words(summary.failure),
         "events": summary.events,
         "config": draccus.encode(config),
         "artefact": artefact.manifest["files"],

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -46,6 +47,7 @@ class ControlSetup:
 
 def control_process(setup: ControlSetup) -> None:
     """Body of the process; returns when it is told to quit, or is no longer needed."""
+    os.setsid()  # a terminal that is closed, Ctrl-Z and Ctrl-\ are not for who balances a robot
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the planner's process to judge
     quitting = Flag()
     signal.signal(signal.SIGTERM, lambda number, frame: quitting.set())
@@ -115,8 +117,20 @@ class ControlProcess:
 
     def _look_for_parent(self) -> None:
         if os.getppid() != self._parent:
+            if self._desk.alive and self._loop.state not in (State.INIT, State.DAMP):
+                _say_who_is_left()
             self._desk.alive = False
             self._orphaned += self._loop.state in (State.INIT, State.DAMP)
+
+
+def _say_who_is_left() -> None:
+    with suppress(OSError):  # the terminal may be gone as well
+        print(
+            "egovcp-deploy: the planner's process is gone; the robot is held, and stands until it "
+            f"is ended: kill {os.getpid()} damps it, as does L1 + B on its remote control",
+            file=sys.stderr,
+            flush=True,
+        )
 
 
 class RemoteKeys:

@@ -38,6 +38,8 @@ class LiveSetup:
     limits: Limits
     stays: bool
     """Whether the robot stands until a second Ctrl-C."""
+    simulated: bool = False
+    """Whether the robot ends with the run, so that nothing is gained by letting it stand."""
 
 
 def run_live(
@@ -48,6 +50,8 @@ def run_live(
     on_tick: Callable[[Tick], None] = lambda tick: None,
 ) -> LiveSummary:
     """Drive the robot until the operator ends it or its motors are damped.
+
+    An exception in the planning leaves the robot standing until then: `LiveSummary.failure`.
 
     Raises:
         EnvironmentFailure: the robot does not answer, or the control process died.
@@ -62,7 +66,14 @@ def run_live(
         stack.callback(spare.close)
         process = stack.enter_context(started(setup, address))
         planner = PlannerLoop(
-            thinker, link, operator, sink, MonotonicClock(), process.is_alive, setup.stays
+            thinker,
+            link,
+            operator,
+            sink,
+            MonotonicClock(),
+            process.is_alive,
+            setup.stays,
+            stands=not setup.simulated,
         )
         guard = Guard(process, spare, lambda: planner.quitting)
         summary = planner.run(on_tick)
@@ -111,7 +122,7 @@ def _explain(process: BaseProcess, guard: Guard, summary: LiveSummary) -> None:
     if guard.acted and summary.ticks:
         summary.damped = f"the control process died (exit code {process.exitcode})"
         return
-    if not summary.ticks:
+    if not summary.ticks and summary.failure is None:
         raise EnvironmentFailure(
             f"the control process ended with code {process.exitcode} before the robot was ready; "
             "its own message is above. egovcp-deploy --dry_run=true checks robot and camera"

@@ -40,6 +40,25 @@ PATIENT = [
     "--robot.limits.state_damp_s=10",
 ]
 
+_PROGRAM = """
+import sys
+from egovcp_deploy.deploy import main
+sys.exit(main(sys.argv[1:]))
+"""
+#: The planner raises once it has driven for a while.
+_STUMBLE = """
+from egovcp_deploy.pilot import desk
+think = desk.Thinker.think
+running = 0
+def stumble(self, reports, remaining=None):
+    global running
+    running += reports[-1].mode == "run"
+    if running > 5:
+        raise ZeroDivisionError("a mistake")
+    return think(self, reports, remaining)
+desk.Thinker.think = stumble
+"""
+
 
 @dataclass
 class Stand:
@@ -62,7 +81,11 @@ class Stand:
         return found
 
     def await_run(self) -> None:
-        assert eventually(lambda: State.RUN in self.modes()), self.program.poll()
+        def over() -> bool:
+            return State.RUN in self.modes() or self.program.poll() is not None
+
+        assert eventually(over)
+        assert self.program.poll() is None, self.end()
 
     def modes(self) -> list[str]:
         """Of the ticks that are in the recording by now."""
@@ -74,7 +97,7 @@ class Stand:
 
     def end(self) -> str:
         """Its last words."""
-        return self.program.communicate(timeout=60)[1]
+        return self.program.communicate(timeout=120)[1]
 
 
 @pytest.fixture(scope="module")
@@ -89,10 +112,10 @@ def drive(robot: LiveRobot, artefact_dir: Path, tmp_path: Path) -> Iterator[Call
     fake = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
     running, programs = Running(fake), list[subprocess.Popen[str]]()
 
-    def start(*flags: str) -> Stand:
+    def start(*flags: str, before: str = "") -> Stand:
         folder, ports = tmp_path / "run", fake.ports
         command = [
-            *(sys.executable, "-m", "egovcp_deploy.deploy", "--robot.type=unitree_g1"),
+            *(sys.executable, "-c", before + _PROGRAM, "--robot.type=unitree_g1"),
             *(f"--policy.path={artefact_dir}", f"--output_dir={folder}", "--log.rrd=false"),
             "--robot.controller=stance",
             f"--robot.bridge.state_port={ports.state_port}",
@@ -148,13 +171,23 @@ def test_killing_the_control_process_damps_the_robot_and_ends_with_a_safety_stop
     assert read_recording(stand.folder / "rollout-0.mcap").complete
 
 
+def kill(program: subprocess.Popen[str]) -> None:
+    program.kill()
+
+
+def hang_up(program: subprocess.Popen[str]) -> None:
+    """What closing its terminal does."""
+    os.killpg(program.pid, signal.SIGHUP)
+
+
+@pytest.mark.parametrize("end", [kill, hang_up])
 def test_killing_the_planner_leaves_a_robot_that_stands_until_it_is_told_to_end(
-    drive: Callable[..., Stand],
+    drive: Callable[..., Stand], end: Callable[[subprocess.Popen[str]], None]
 ) -> None:
     stand = drive()
     stand.await_run()
     control = stand.control
-    stand.program.kill()
+    end(stand.program)
     stand.program.wait()
     before = stand.fake.counts.commands
     assert eventually(lambda: stand.fake.counts.commands > before + 50)
@@ -162,8 +195,29 @@ def test_killing_the_planner_leaves_a_robot_that_stands_until_it_is_told_to_end(
     control.terminate()
     assert eventually(lambda: not control.is_running() or control.status() == "zombie")
     assert not stand.holds
+    assert f"kill {control.pid} damps it" in stand.end()
     recording = read_recording(stand.folder / "rollout-0.mcap")
     assert State.RUN in [tick.mode for tick in recording.ticks]
+
+
+def test_an_exception_in_the_planner_leaves_a_robot_that_stands_until_the_second_interrupt(
+    drive: Callable[..., Stand],
+) -> None:
+    stand = drive(before=_STUMBLE)
+    assert eventually(lambda: stand.modes()[-1:] == [State.HOLD])
+    ticks = len(stand.modes())
+    stand.program.send_signal(signal.SIGINT)
+    assert eventually(lambda: len(stand.modes()) > ticks + 25)
+    assert stand.modes()[-1] == State.HOLD
+    assert stand.holds
+    stand.program.send_signal(signal.SIGINT)
+    assert eventually(lambda: not stand.holds)
+    words = stand.end()
+    assert stand.program.returncode == 6, words
+    assert "the planner failed: ZeroDivisionError: a mistake" in words
+    assert "Traceback" not in words
+    report = json.loads((stand.folder / "deploy.json").read_text())
+    assert report["failure"] == "ZeroDivisionError: a mistake"
 
 
 def test_the_first_interrupt_holds_the_second_damps(drive: Callable[..., Stand]) -> None:
