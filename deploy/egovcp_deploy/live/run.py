@@ -16,7 +16,7 @@ from egovcp.log.sink import Sink
 from egovcp.log.tick import Tick
 from egovcp.rate import MonotonicClock
 from egovcp.workers import inherited_by_workers
-from egovcp_deploy.live.guard import Guard
+from egovcp_deploy.live.guard import Guard, spare_body
 from egovcp_deploy.live.hardware import HardwareOptions
 from egovcp_deploy.live.link import Link
 from egovcp_deploy.live.operators import Operator
@@ -24,7 +24,6 @@ from egovcp_deploy.live.planner import LiveSummary, PlannerLoop
 from egovcp_deploy.live.process import ControlSetup, control_process
 from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
-from egovcp_deploy.robots.bridge import BridgeBody
 
 _END_S: Final = 5.0  # for the control process to say its last words
 
@@ -61,9 +60,7 @@ def run_live(
         address = f"ipc://{folder}/link"
         link = Link(address, serve=True)
         stack.callback(link.close)
-        spare = BridgeBody(setup.hardware.bridge)
-        spare.connect()
-        stack.callback(spare.close)
+        spare = stack.enter_context(spare_body(setup.hardware.bridge))
         process = stack.enter_context(started(setup, address))
         planner = PlannerLoop(
             thinker,
