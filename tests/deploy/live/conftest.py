@@ -23,6 +23,18 @@ from egovcp_deploy.pilot.states import Limits, Request, State
 from egovcp_deploy.robots.body import BodyState, MotorCommand, Picture
 
 TICK_NS = 20_000_000
+QUICK = [
+    *("--robot.limits.stand_s=0.3", "--imagine=0"),
+    *("--planner.samples=16", "--planner.elites=4"),
+]
+#: A busy machine is no fault here.
+PATIENT = [
+    "--robot.limits.planner_hold_s=5",
+    "--robot.limits.misses_hold=100000",
+    "--robot.limits.picture_hold_s=5",
+    "--robot.limits.state_hold_s=5",
+    "--robot.limits.state_damp_s=10",
+]
 
 
 @dataclass

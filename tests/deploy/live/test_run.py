@@ -27,22 +27,12 @@ from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.fake import FakeBridge, Ports
 from egovcp_deploy.robots.fake.running import Running, eventually
 
-QUICK = [
-    *("--robot.limits.stand_s=0.3", "--imagine=0"),
-    *("--planner.samples=16", "--planner.elites=4"),
-]
-#: A busy machine is no fault here.
-PATIENT = [
-    "--robot.limits.planner_hold_s=5",
-    "--robot.limits.misses_hold=100000",
-    "--robot.limits.picture_hold_s=5",
-    "--robot.limits.state_hold_s=5",
-    "--robot.limits.state_damp_s=10",
-]
+from .conftest import PATIENT, QUICK
 
 _PROGRAM = """
-import sys
+import signal, sys
 from egovcp_deploy.deploy import main
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # also under nohup
 sys.exit(main(sys.argv[1:]))
 """
 #: The planner raises once it has driven for a while.
@@ -187,15 +177,20 @@ def test_killing_the_planner_leaves_a_robot_that_stands_until_it_is_told_to_end(
     stand = drive()
     stand.await_run()
     control = stand.control
+    others = psutil.Process(stand.program.pid).children(recursive=True)
+    commands = {p.pid: " ".join(p.cmdline()) for p in others}
     end(stand.program)
     stand.program.wait()
     before = stand.fake.counts.commands
     assert eventually(lambda: stand.fake.counts.commands > before + 50)
     assert stand.holds
+    needed = {control.pid, *(p.pid for p in others if "resource_tracker" in commands[p.pid])}
+    assert not psutil.wait_procs([p for p in others if p.pid not in needed], timeout=60)[1]
     control.terminate()
     assert eventually(lambda: not control.is_running() or control.status() == "zombie")
     assert not stand.holds
     assert f"kill {control.pid} damps it" in stand.end()
+    assert not psutil.wait_procs(others, timeout=60)[1]
     recording = read_recording(stand.folder / "rollout-0.mcap")
     assert State.RUN in [tick.mode for tick in recording.ticks]
 
