@@ -6,9 +6,9 @@ moves bytes into a pipe, as many as fit without waiting (`benchmarks/tick.py` me
 
     loop: write(tick) -> [queue, bounded] -> pipe ~> process: sink.write(tick)
 
-What does not fit into the queue is dropped and counted. What goes wrong behind the pipe (a full
-disk, a viewer that died, the process killed) is told once, as one line; the sink is then given
-up, and the run goes on without it.
+What does not fit into the queue is dropped and counted, also while the disk is full. What else
+goes wrong behind the pipe (a viewer that died, a broken disk, the process killed) is told once, as
+one line; the sink is then given up, and the run goes on without it.
 """
 
 from __future__ import annotations
@@ -25,7 +25,17 @@ from types import TracebackType
 from typing import Final, Self
 
 from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.log.commands import Close, Closed, Failed, Open, Opened, Report, Written
+from egovcp.log.commands import (
+    Close,
+    Closed,
+    Failed,
+    Open,
+    Opened,
+    Report,
+    Resumed,
+    Waiting,
+    Written,
+)
 from egovcp.log.frames import Inbox, Outbox, enlarge, pack
 from egovcp.log.info import RunInfo
 from egovcp.log.sink import Sink
@@ -52,6 +62,7 @@ class BackgroundSink:
         sink: what the process opens and writes to; must be picklable before it is opened.
         name: what to call it in messages, such as ``rollout-0.mcap``.
         lossless: rather wait than drop: for a simulation in lock-step, whose time stands still.
+            A full disk is not waited for, then.
         queue_ticks: ticks that may wait here.
         close_timeout_s: how long `close` waits for what is still on its way.
         tell: takes each message, one line.
@@ -115,7 +126,7 @@ class BackgroundSink:
         """
         self.start()
         assert self._worker is not None
-        self._worker.outbox.put(pack(Open(self._sink, info)))
+        self._worker.outbox.put(pack(Open(self._sink, info, waits=not self._lossless)))
         self._await(lambda: self._opened, START_TIMEOUT_S)
         if not self._opened:
             self.close()
@@ -187,6 +198,10 @@ class BackgroundSink:
                 self._opened = True
             case Written():
                 self._written = report.count
+            case Waiting():
+                self._tell(f"{self._name}: {_words(report.error)}; ticks wait until there is room")
+            case Resumed():
+                self._tell(f"{self._name}: there is room again")
             case Closed():
                 self._closed = True
             case Failed():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack
 from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, Self, runtime_checkable
 
 from egovcp.log.info import RunInfo
 from egovcp.log.tick import Tick
@@ -24,6 +24,15 @@ class Sink(Protocol):
 
     def close(self) -> None:
         """Finish the log; it is complete on disk afterwards. Further calls do nothing."""
+        ...
+
+
+@runtime_checkable
+class RetryingSink(Sink, Protocol):
+    """A sink that keeps a tick for which there was no room, until there is."""
+
+    def retry(self) -> None:
+        """Write that tick; raises OSError if it still does not fit."""
         ...
 
 
