@@ -86,8 +86,9 @@ def run_info(
     config: Mapping[str, Any],
     controller_id: str,
     artefact: Artefact | None,
+    backend: str,
 ) -> RunInfo:
-    """The first record of a log. ``config`` holds JSON values."""
+    """The first record of a log. ``config`` holds JSON values, ``backend`` see `backend_of`."""
     files = artefact.manifest["files"] if artefact else {}
     return RunInfo(
         task=task,
@@ -97,4 +98,5 @@ def run_info(
         config=config,
         hashes={"low_level_controller": controller_id, **files},
         versions=versions(),
+        backend=backend,
     )

@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from egovcp.artefact import Artefact
 from egovcp.errors import EgovcpError, EnvironmentFailure, SafetyStop, UsageError
-from egovcp.log.info import CameraView
+from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.tick import Tick
 from egovcp.robot.controllers import make_controller
 from egovcp_deploy import dry_run
@@ -25,9 +25,10 @@ from egovcp_deploy.live.operators import OPERATORS, operator
 from egovcp_deploy.live.planner import LiveSummary, failure_words
 from egovcp_deploy.live.run import LiveSetup, run_live
 from egovcp_deploy.live.simulated import simulated
-from egovcp_deploy.options import check_choice, make_output_dir, versions, write_json
+from egovcp_deploy.options import check_choice, make_output_dir, write_json
 from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
+from egovcp_deploy.policy import backend_of
 from egovcp_deploy.recording import recording, run_info
 from egovcp_deploy.robots.bridge import BridgeBody
 
@@ -86,20 +87,28 @@ def _how(config: DeployConfig) -> tuple[str, Limits]:
 def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetup) -> None:
     options = config.operator
     controller_id = make_controller(setup.controller).id
-    info = run_info(
-        config.task, config.seed, 0, CameraView(), draccus.encode(config), controller_id, artefact
-    )
     _leave_a_core()
-    thinker = Thinker(artefact.make_policy(1, config.seed), config.imagine)
+    policy = artefact.make_policy(1, config.seed)
+    thinker = Thinker(policy, config.imagine)
     thinker.warm_up()
+    info = run_info(
+        config.task,
+        config.seed,
+        0,
+        CameraView(),
+        draccus.encode(config),
+        controller_id,
+        artefact,
+        backend_of(policy),
+    )
     with (
         operator(options.type, options.velocity, options.duration) as who,
         recording(folder, 0, info, config.log, waits=False) as sink,
         tqdm(unit="tick", desc="live") as bar,
     ):
         summary = run_live(setup, thinker, who, sink, lambda tick: _show(bar, tick))
-    write_json(folder / "deploy.json", _report(config, artefact, controller_id, summary))
-    _print(summary, folder)
+    write_json(folder / "deploy.json", _report(config, artefact, info, summary))
+    _print(summary, info.backend, folder)
     _judge(summary, folder)
 
 
@@ -135,7 +144,7 @@ def _show(bar: Any, tick: Tick) -> None:
 
 
 def _report(
-    config: DeployConfig, artefact: Artefact, controller_id: str, summary: LiveSummary
+    config: DeployConfig, artefact: Artefact, info: RunInfo, summary: LiveSummary
 ) -> dict[str, Any]:
     """Content of ``deploy.json``."""
     return {
@@ -153,8 +162,9 @@ def _report(
         "events": summary.events,
         "config": draccus.encode(config),
         "artefact": artefact.manifest["files"],
-        "low_level_controller": controller_id,
-        "versions": versions(),
+        "low_level_controller": info.hashes["low_level_controller"],
+        "backend": info.backend,
+        "versions": dict(info.versions),
     }
 
 
@@ -163,11 +173,12 @@ def _percentiles(name: str, values: list[float]) -> dict[str, float]:
     return {f"{name}_p50": float(p50), f"{name}_p99": float(p99)}
 
 
-def _print(summary: LiveSummary, folder: Path) -> None:
+def _print(summary: LiveSummary, backend: str, folder: Path) -> None:
     latency = _percentiles("ms", summary.latency_ms)
     print(
         f"{summary.ticks} ticks, {summary.running} running, {summary.held} held; observation to "
-        f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late"
+        f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late; plans "
+        f"computed by {backend}"
     )
     print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
 
