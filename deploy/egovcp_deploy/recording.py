@@ -49,10 +49,11 @@ def recording(
         viewers = list(_viewers(options, stack))
         sink: Sink
         if waits:
-            sink = stack.enter_context(Fanout([*files.values(), *viewers]))
+            sink = Fanout([*files.values(), *viewers])
         else:
             writers = [BackgroundSink(file, name) for name, file in files.items()]
-            sink = stack.enter_context(BackgroundFanout([*writers, *viewers]))
+            sink = BackgroundFanout([*writers, *viewers])
+        stack.callback(sink.close)
         sink.open(info)
         yield sink
 

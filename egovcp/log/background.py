@@ -21,8 +21,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from egovcp.errors import EgovcpError, EnvironmentFailure
 from egovcp.log.commands import (
@@ -227,7 +226,7 @@ class BackgroundSink:
 class BackgroundFanout:
     """Several sinks, each in a process of its own: a tick is serialised once for all of them.
 
-    A sink itself, and a context manager; none of the sinks can hold up another.
+    A sink itself; none of the sinks can hold up another.
     """
 
     def __init__(self, sinks: Sequence[BackgroundSink]) -> None:
@@ -254,17 +253,6 @@ class BackgroundFanout:
         """Close every sink, one after the other."""
         for sink in self.sinks:
             sink.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 class _Worker:

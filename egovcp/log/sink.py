@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from types import TracebackType
-from typing import Protocol, Self, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from egovcp.log.info import RunInfo
 from egovcp.log.tick import Tick
@@ -37,7 +36,7 @@ class RetryingSink(Sink, Protocol):
 
 
 class Fanout:
-    """Writes every tick to several sinks; a sink itself, and a context manager."""
+    """Writes every tick to several sinks; a sink itself."""
 
     def __init__(self, sinks: Sequence[Sink]) -> None:
         self._sinks = tuple(sinks)
@@ -57,14 +56,3 @@ class Fanout:
         with ExitStack() as stack:
             for sink in reversed(self._sinks):
                 stack.callback(sink.close)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()

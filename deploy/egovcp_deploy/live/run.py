@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
-from typing import Final
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.log.sink import Sink
 from egovcp.log.tick import Tick
 from egovcp.rate import MonotonicClock
 from egovcp.workers import inherited_by_workers
+from egovcp_deploy.live.ending import END_S, end
 from egovcp_deploy.live.guard import Guard, spare_body
 from egovcp_deploy.live.hardware import HardwareOptions
 from egovcp_deploy.live.link import Link
@@ -24,8 +24,6 @@ from egovcp_deploy.live.planner import LiveSummary, PlannerLoop
 from egovcp_deploy.live.process import ControlSetup, control_process
 from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
-
-_END_S: Final = 5.0  # for the control process to say its last words
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ def run_live(
         )
         guard = Guard(process, spare, lambda: planner.quitting)
         summary = planner.run(on_tick)
-        _end(process, planner)
+        end(process, planner)
         guard.join()
         _explain(process, guard, summary)
         return summary
@@ -94,25 +92,10 @@ def started(setup: LiveSetup, address: str) -> Iterator[BaseProcess]:
     finally:
         if process.is_alive():
             process.terminate()
-            process.join(_END_S)
+            process.join(END_S)
         if process.is_alive():
             process.kill()
             process.join()
-
-
-def _end(process: BaseProcess, planner: PlannerLoop) -> None:
-    """Wait for the control process. One that did not hear that it should end is asked by a signal,
-    on which it damps too; one that has to be killed damps nothing, so the guard must."""
-    if planner.quitting:
-        process.join(_END_S)
-    if process.is_alive():
-        planner.quitting = True
-        process.terminate()
-        process.join(_END_S)
-    if process.is_alive():
-        planner.quitting = False
-        process.kill()
-        process.join()
 
 
 def _explain(process: BaseProcess, guard: Guard, summary: LiveSummary) -> None:

@@ -138,6 +138,7 @@ class Rig:
     faults: Faults
     body: SimBody
     policy: Reaching
+    controller: StanceController
     loop: ControlLoop
     states: list[State] = field(default_factory=list)
 
@@ -184,13 +185,14 @@ def make_rig() -> Callable[..., Rig]:
         clock, faults, policy = LockstepClock(time_ns=10**12), Faults(), Reaching(level)
         body = SimBody(robot, clock, faults)
         desk = InlineDesk(Thinker(policy), clock, lambda tick: delay_ms(tick) * 1_000_000)
+        controller = StanceController()
         loop = ControlLoop(
             body,
             SimEye(robot, faults),
-            StanceController(),
+            controller,
             Pilot(desk, Limits()),
             refusal=lambda: faults.refusal,
         )
-        return Rig(robot, clock, faults, body, policy, loop)
+        return Rig(robot, clock, faults, body, policy, controller, loop)
 
     return make

@@ -113,6 +113,7 @@ def test_a_viewer_that_hangs_does_not_hold_up_the_end(web: LiveRerun, make_tick:
 
 _RUN = """
 import sys, time
+from contextlib import closing
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from conftest import _tick
@@ -129,7 +130,7 @@ with LiveRerun("web", Viewer({address!r}), {port}) as live:
         BackgroundSink(RerunSink(folder / "a.rrd"), "a.rrd"),
         BackgroundSink(RerunSink(live.viewer), "Rerun"),
     ]
-    with BackgroundFanout(sinks) as log:
+    with closing(BackgroundFanout(sinks)) as log:
         log.open(RunInfo("ball"))
         for index in range(10_000):
             log.write(_tick(index))
