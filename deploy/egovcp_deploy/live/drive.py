@@ -102,7 +102,7 @@ def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetu
         backend_of(policy),
     )
     with (
-        operator(options.type, options.velocity, options.duration) as who,
+        operator(options.type, options.velocity, options.duration, options.gamepad) as who,
         recording(folder, 0, info, config.log, waits=False) as sink,
         tqdm(unit="tick", desc="live") as bar,
     ):

@@ -18,6 +18,7 @@ from egovcp.rate import FixedRate, MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.spec import CONTROLLER_HZ
 from egovcp_deploy.live import motors
+from egovcp_deploy.live.buttons import Buttons
 from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
 from egovcp_deploy.live.hardware import Hardware, HardwareOptions, open_hardware
 from egovcp_deploy.live.link import Link, Order, RemoteDesk
@@ -134,10 +135,10 @@ def _say_who_is_left() -> None:
 
 
 class RemoteKeys:
-    """The robot's own remote control: Y stands up, A arms, start runs, B holds, L1 + B damps."""
+    """The robot's own remote control: its buttons (`Buttons`), and its sticks when they move."""
 
     def __init__(self) -> None:
-        self._before: frozenset[str] = frozenset()
+        self._buttons = Buttons()
 
     def orders(self, body: Body) -> list[Order]:
         """What was pressed since the last call, and where the sticks point."""
@@ -145,13 +146,9 @@ class RemoteKeys:
         remote = None if reading is None else Remote.parse(reading.remote)
         if remote is None:
             return []
-        pressed, self._before = remote.pressed - self._before, remote.pressed
         vx, vy, turn = remote.velocity.tolist()
         orders = [Order(velocity=(vx, vy, turn))] if any((vx, vy, turn)) else []
-        if {"L1", "B"} <= remote.pressed:
-            return [*orders, Order(Request.ESTOP)]
-        keys = {"Y": Request.STAND, "A": Request.ARM, "start": Request.RUN, "B": Request.HOLD}
-        return orders + [Order(keys[key]) for key in sorted(pressed) if key in keys]
+        return orders + self._buttons.orders(remote.pressed)
 
 
 def last_words(body: Body) -> None:
