@@ -6,8 +6,9 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -45,6 +46,16 @@ def start(artefact_dir: Path, tmp_path: Path, short: list[str]) -> Iterator[Star
         program.wait()
 
 
+def listening(processes: Iterable[psutil.Process]) -> list[Any]:
+    """Where they listen for connections from outside."""
+    return [
+        connection.laddr
+        for process in processes
+        for connection in process.net_connections(kind="inet")
+        if connection.status == psutil.CONN_LISTEN
+    ]
+
+
 def test_an_episode_is_played_judged_and_recorded(start: Start, tmp_path: Path) -> None:
     program = start(*PATIENT, "--operator.duration=8")
     words = program.communicate(timeout=200)[1]
@@ -56,7 +67,9 @@ def test_an_episode_is_played_judged_and_recorded(start: Start, tmp_path: Path) 
     assert outcome["ticks"] == 15
 
 
-def test_a_killed_run_leaves_no_process_behind(start: Start, tmp_path: Path) -> None:
+def test_a_run_listens_on_the_loopback_only_and_killed_leaves_no_process_behind(
+    start: Start, tmp_path: Path
+) -> None:
     program = start()
 
     def begun() -> bool:
@@ -67,6 +80,9 @@ def test_a_killed_run_leaves_no_process_behind(start: Start, tmp_path: Path) -> 
 
     assert eventually(begun)
     children = psutil.Process(program.pid).children(recursive=True)
+    assert {address.ip for address in listening([psutil.Process(program.pid), *children])} == {
+        "127.0.0.1"
+    }
     program.kill()
     assert len(children) >= 3  # simulator, control, log
     assert not psutil.wait_procs(children, timeout=60)[1]
