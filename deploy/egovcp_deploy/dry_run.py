@@ -129,8 +129,9 @@ def plan_time(policy: RolloutPolicy) -> str:
     p50, p99 = np.percentile(times[_WARM_UP:], [50, 99])
     if p99 > PLAN_BUDGET_MS:
         raise EnvironmentFailure(
-            f"a plan of one iteration takes {p50:.0f} ms (p99 {p99:.0f}), expected at most "
-            f"{PLAN_BUDGET_MS:.0f} at 25 Hz; end other programs, or use fewer --planner.samples"
+            f"a plan of one iteration takes {p50:.0f} ms (p99 {p99:.0f}), computed by "
+            f"{backend_of(policy)}, expected at most {PLAN_BUDGET_MS:.0f} at 25 Hz; end other "
+            "programs, or use fewer --planner.samples"
         )
     mean = np.mean(iterations[_WARM_UP:])
     return (

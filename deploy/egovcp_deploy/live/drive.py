@@ -85,7 +85,6 @@ def _how(config: DeployConfig) -> tuple[str, Limits]:
 
 
 def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetup) -> None:
-    options = config.operator
     controller_id = make_controller(setup.controller).id
     _leave_a_core()
     policy = artefact.make_policy(1, config.seed)
@@ -101,15 +100,32 @@ def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetu
         artefact,
         backend_of(policy),
     )
+    try:
+        summary = _drive(config, folder, setup, thinker, info)
+    except EgovcpError:
+        _clear(folder)
+        raise
+    write_json(folder / "deploy.json", _report(config, artefact, info, summary))
+    _print(summary, info.backend, folder)
+    _judge(summary, folder)
+
+
+def _drive(
+    config: DeployConfig, folder: Path, setup: LiveSetup, thinker: Thinker, info: RunInfo
+) -> LiveSummary:
+    options = config.operator
     with (
         operator(options.type, options.velocity, options.duration, options.gamepad) as who,
         recording(folder, 0, info, config.log, waits=False) as sink,
         tqdm(unit="tick", desc="live") as bar,
     ):
-        summary = run_live(setup, thinker, who, sink, lambda tick: _show(bar, tick))
-    write_json(folder / "deploy.json", _report(config, artefact, info, summary))
-    _print(summary, info.backend, folder)
-    _judge(summary, folder)
+        return run_live(setup, thinker, who, sink, lambda tick: _show(bar, tick))
+
+
+def _clear(folder: Path) -> None:
+    """Take back the logs of a run that did not begin, so that the same command can be repeated."""
+    for path in folder.glob("rollout-0.*"):
+        path.unlink()
 
 
 def _judge(summary: LiveSummary, folder: Path) -> None:

@@ -55,7 +55,7 @@ def control_process(setup: ControlSetup) -> None:
     try:
         hardware = open_hardware(setup.hardware)
     except EgovcpError as error:
-        print(f"egovcp-deploy: error: {error}", file=sys.stderr)
+        print(f"\negovcp-deploy: error: {error}", file=sys.stderr)  # a progress bar is above
         sys.exit(error.exit_code)
     link = Link(setup.address, serve=False)
     try:

@@ -254,3 +254,4 @@ def test_no_robot_there_is_said_at_once(artefact_dir: Path, tmp_path: Path) -> N
     assert result.returncode == 5
     assert "egovcp-fake-g1" in result.stderr
     assert "Traceback" not in result.stderr
+    assert list((tmp_path / "run").iterdir()) == []  # the same command can be repeated
