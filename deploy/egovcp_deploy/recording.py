@@ -58,6 +58,13 @@ def recording(
         yield sink
 
 
+def missing_ticks(sink: Sink) -> dict[str, int]:
+    """Log -> ticks that are not in it, or may not be, once it is closed; only of `recording` on
+    the wall clock, which drops rather than waits."""
+    sinks = sink.sinks if isinstance(sink, BackgroundFanout) else ()
+    return {each.name: each.dropped + each.lost for each in sinks}
+
+
 def _files(stem: Path, episode: int, options: LogOptions) -> dict[str, Sink]:
     """File name -> what writes it."""
     mcap, rrd, png = (stem.with_suffix(suffix) for suffix in (".mcap", ".rrd", ".png"))

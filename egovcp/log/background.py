@@ -78,7 +78,8 @@ class BackgroundSink:
         tell: Callable[[str], None] = tell_on_stderr,
     ) -> None:
         self._sink = sink
-        self._name = name
+        self.name = name
+        """What it is called in messages."""
         self._lossless = lossless
         self._capacity = queue_ticks
         self._close_timeout_s = close_timeout_s
@@ -130,7 +131,7 @@ class BackgroundSink:
         if not self._opened:
             self.close()
             raise self._failure or EnvironmentFailure(
-                f"{self._name}: the process that writes it was not ready in {START_TIMEOUT_S:.0f} s"
+                f"{self.name}: the process that writes it was not ready in {START_TIMEOUT_S:.0f} s"
             )
 
     def write(self, tick: Tick) -> None:
@@ -198,9 +199,9 @@ class BackgroundSink:
             case Written():
                 self._written = report.count
             case Waiting():
-                self._tell(f"{self._name}: {_words(report.error)}; ticks wait until there is room")
+                self._tell(f"{self.name}: {_words(report.error)}; ticks wait until there is room")
             case Resumed():
-                self._tell(f"{self._name}: there is room again")
+                self._tell(f"{self.name}: there is room again")
             case Closed():
                 self._closed = True
             case Failed():
@@ -209,18 +210,18 @@ class BackgroundSink:
     def _give_up(self, error: Exception) -> None:
         self._failure = error
         if self._opened:  # else `open` raises it
-            self._tell(f"{self._name}: {_words(error)}; the run goes on without this log")
+            self._tell(f"{self.name}: {_words(error)}; the run goes on without this log")
 
     def _sum_up(self) -> None:
         if self._opened and (self._dropped or self.lost):
             whole = self._accepted + self._dropped
             unfinished = "" if self._closed else "; it is not finished"
             self._tell(
-                f"{self._name}: {self._dropped} of {whole} ticks were dropped, "
+                f"{self.name}: {self._dropped} of {whole} ticks were dropped, "
                 f"{self.lost} more may be missing at its end{unfinished}"
             )
         elif self._opened and not self._closed:
-            self._tell(f"{self._name}: not finished in time; every tick is in it, its index is not")
+            self._tell(f"{self.name}: not finished in time; every tick is in it, its index is not")
 
 
 class BackgroundFanout:

@@ -29,7 +29,7 @@ from egovcp_deploy.options import check_choice, make_output_dir, write_json
 from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.policy import backend_of
-from egovcp_deploy.recording import recording, run_info
+from egovcp_deploy.recording import missing_ticks, recording, run_info
 from egovcp_deploy.robots.bridge import BridgeBody
 
 SIMULATED_S: Final = 15.0  # in RUN: the crane lets go, the robot settles, the episode
@@ -119,7 +119,9 @@ def _drive(
         recording(folder, 0, info, config.log, waits=False) as sink,
         tqdm(unit="tick", desc="live") as bar,
     ):
-        return run_live(setup, thinker, who, sink, lambda tick: _show(bar, tick))
+        summary = run_live(setup, thinker, who, sink, lambda tick: _show(bar, tick))
+    summary.missing_ticks = missing_ticks(sink)
+    return summary
 
 
 def _clear(folder: Path) -> None:
@@ -173,6 +175,7 @@ def _report(
         **_percentiles("plan_ms", summary.plan_ms),
         **_percentiles("latency_ms", summary.latency_ms),
         "iterations_mean": float(np.mean(summary.iterations or [0])),
+        "missing_ticks": summary.missing_ticks,
         "damped": summary.damped,
         "failure": "" if summary.failure is None else failure_words(summary.failure),
         "events": summary.events,

@@ -51,6 +51,8 @@ class LiveSummary:
     """From the observation to the plan on its way back, per plan."""
     iterations: list[int] = field(default_factory=list)
     events: list[str] = field(default_factory=list)
+    missing_ticks: dict[str, int] = field(default_factory=dict)
+    """Log -> ticks that it lacks, because its disk was full or too slow."""
     failure: Exception | None = None
     """What ended the planning, after which the robot was held."""
 
@@ -214,7 +216,7 @@ class PlannerLoop:
         self._told.append(what)
         if not self._stands:
             self._held_ns = self._clock.now_ns()
-        how = "the robot stands until it is ended: Ctrl-C, or its remote control"
+        how = "the robot is held until somebody ends it: Ctrl-C twice damps it"
         with suppress(Exception):  # the terminal may be what failed
             self._tell(f"{what}; {how if self._stands else 'the run ends'}")
 

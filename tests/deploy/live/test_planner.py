@@ -140,7 +140,7 @@ def test_a_planner_that_raises_holds_the_robot_and_goes_on_listening_and_logging
     assert [tick.index for tick in log.ticks] == list(range(199))
     assert "the planner failed: RuntimeError: out of ideas" in log.ticks[5].events
     assert len(told) == 1
-    assert told[0].startswith("the planner failed: RuntimeError: out of ideas; the robot stands")
+    assert told[0].startswith("the planner failed: RuntimeError: out of ideas; the robot is held")
 
 
 def test_the_operator_ends_it_afterwards(
