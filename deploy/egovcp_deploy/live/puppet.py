@@ -27,7 +27,7 @@ from egovcp_deploy.pilot.states import Request, State
 
 Array = NDArray[np.float64]
 
-_START_S: Final = 30.0  # for the control process to come up
+_START_S: Final = 60.0  # for the control process to come up
 _STAND_S: Final = 60.0  # for the robot to stand, on somebody's word
 _NEWS_S: Final = 0.5  # longest wait for an observation; they come every 40 ms
 _END_S: Final = 5.0
