@@ -65,9 +65,9 @@ class Artefact:
         if controller_id != self.controller_id:
             raise ArtefactError(
                 f"{self.path} was trained on data of low-level controller {self.controller_id!r}, "
-                f"but the robot runs {controller_id!r}; choose the data's (in simulation: "
-                "--env.controller), or collect data with this one and "
-                "train again, or run the controller that the artefact names"
+                f"but the robot runs {controller_id!r}; choose the data's "
+                "(--env.controller in simulation, --robot.controller on a robot), or collect data "
+                "with this one and train again"
             )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from egovcp.sim.config import EnvConfig, eventful
+from egovcp_deploy.live.gamepad import GamepadOptions
 from egovcp_deploy.live.hardware import CameraOptions
 from egovcp_deploy.options import PLANNER, PlannerOptions, PolicyOptions
 from egovcp_deploy.pilot.states import Limits
@@ -38,11 +39,14 @@ class OperatorOptions:
     """Who says when to stand, arm, run, hold and stop; on a G1 its remote control always may."""
 
     type: str = "auto"
-    """auto: stands up, arms and runs by itself. keyboard: the keys of this terminal."""
+    """auto: stands up, arms and runs by itself. keyboard: the keys of this terminal. gamepad: one
+    at this machine, on Linux."""
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """What auto asks for while running: vx, vy (m/s), yaw rate (rad/s)."""
     duration: float = 0.0
     """How long auto runs before it holds and ends, s; 0: until interrupted."""
+    gamepad: GamepadOptions = field(default_factory=GamepadOptions)
+    """Which gamepad, and which of its buttons does what."""
 
 
 @dataclass(frozen=True)

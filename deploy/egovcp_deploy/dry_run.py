@@ -16,7 +16,7 @@ from egovcp.errors import EgovcpError, EnvironmentFailure
 from egovcp.plan import until
 from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, STATE_DIM, STATE_SLICES
 from egovcp_deploy.pilot.effort import BUDGET_S
-from egovcp_deploy.policy import RolloutPolicy
+from egovcp_deploy.policy import RolloutPolicy, backend_of
 from egovcp_deploy.robots.body import Body, Eye
 
 FREE_BYTES: Final = 1_000_000_000  # an hour of recording is about 0.6 GB
@@ -129,11 +129,15 @@ def plan_time(policy: RolloutPolicy) -> str:
     p50, p99 = np.percentile(times[_WARM_UP:], [50, 99])
     if p99 > PLAN_BUDGET_MS:
         raise EnvironmentFailure(
-            f"a plan of one iteration takes {p50:.0f} ms (p99 {p99:.0f}), expected at most "
-            f"{PLAN_BUDGET_MS:.0f} at 25 Hz; end other programs, or use fewer --planner.samples"
+            f"a plan of one iteration takes {p50:.0f} ms (p99 {p99:.0f}), computed by "
+            f"{backend_of(policy)}, expected at most {PLAN_BUDGET_MS:.0f} at 25 Hz; end other "
+            "programs, or use fewer --planner.samples"
         )
     mean = np.mean(iterations[_WARM_UP:])
-    return f"{p50:.1f} ms per plan, p99 {p99:.1f}, with {mean:.1f} iterations"
+    return (
+        f"{p50:.1f} ms per plan, p99 {p99:.1f}, with {mean:.1f} iterations, computed by "
+        f"{backend_of(policy)}"
+    )
 
 
 def state_rate(body: Body) -> str:

@@ -35,6 +35,7 @@ from egovcp_deploy.options import (
     make_output_dir,
     versions,
 )
+from egovcp_deploy.policy import backend_of
 from egovcp_deploy.report import gains, summary, table
 from egovcp_deploy.scenarios import held_out
 from egovcp_deploy.scores import EpisodeScore
@@ -158,9 +159,13 @@ def evaluate(config: EvalConfig) -> None:
             write_json(folder / "constant.json", {k: asdict(v) for k, v in constants.items()})
         scores = _play(config, stage, constants)
     figures = summary(scores)
-    write_json(folder / "eval_run.json", _record(config, artefact, ppo, constants, scores))
+    backend = backend_of(artefact.make_policy(1, config.seed)) if artefact else ""
+    record = _record(config, artefact, ppo, constants, scores)
+    write_json(folder / "eval_run.json", {"backend": backend, **record})
     write_json(folder / "eval.json", figures)
     print(table(figures))
+    if backend:
+        print(f"plans computed by {backend}")
     print(f"figures: {folder / 'eval.json'}")
 
 

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.plan import PlannerConfig, PolicyStep
+from egovcp.plan import PlannerConfig, Policy, PolicyStep
+
+_BACKENDS: Final = {"StepByStep": "eager", "FloatJudge": "float32", "IntegerJudge": "int8"}
 
 
 class RolloutPolicy(Protocol):
@@ -58,3 +60,16 @@ class Adjustable(RolloutPolicy, Protocol):
 
     config: PlannerConfig
     """What the next plan is made with; its horizon must stay."""
+
+
+def backend_of(policy: RolloutPolicy) -> str:
+    """Who computes the plans; ``auto`` chooses by machine, and plans differ a little between them.
+
+    Empty: it does not plan.
+    """
+    if not isinstance(policy, Policy):
+        return ""
+    if policy.config.backend != "auto":
+        return policy.config.backend
+    judge = type(policy.prepare()).__name__
+    return _BACKENDS.get(judge, judge)

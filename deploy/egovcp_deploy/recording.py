@@ -49,12 +49,20 @@ def recording(
         viewers = list(_viewers(options, stack))
         sink: Sink
         if waits:
-            sink = stack.enter_context(Fanout([*files.values(), *viewers]))
+            sink = Fanout([*files.values(), *viewers])
         else:
             writers = [BackgroundSink(file, name) for name, file in files.items()]
-            sink = stack.enter_context(BackgroundFanout([*writers, *viewers]))
+            sink = BackgroundFanout([*writers, *viewers])
+        stack.callback(sink.close)
         sink.open(info)
         yield sink
+
+
+def missing_ticks(sink: Sink) -> dict[str, int]:
+    """Log -> ticks that are not in it, or may not be, once it is closed; only of `recording` on
+    the wall clock, which drops rather than waits."""
+    sinks = sink.sinks if isinstance(sink, BackgroundFanout) else ()
+    return {each.name: each.dropped + each.lost for each in sinks}
 
 
 def _files(stem: Path, episode: int, options: LogOptions) -> dict[str, Sink]:
@@ -86,8 +94,9 @@ def run_info(
     config: Mapping[str, Any],
     controller_id: str,
     artefact: Artefact | None,
+    backend: str,
 ) -> RunInfo:
-    """The first record of a log. ``config`` holds JSON values."""
+    """The first record of a log. ``config`` holds JSON values, ``backend`` see `backend_of`."""
     files = artefact.manifest["files"] if artefact else {}
     return RunInfo(
         task=task,
@@ -97,4 +106,5 @@ def run_info(
         config=config,
         hashes={"low_level_controller": controller_id, **files},
         versions=versions(),
+        backend=backend,
     )

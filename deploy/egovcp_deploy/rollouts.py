@@ -21,7 +21,7 @@ from egovcp.spec import PLANNER_HZ
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.options import make_output_dir, versions
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
-from egovcp_deploy.policy import RolloutPolicy
+from egovcp_deploy.policy import RolloutPolicy, backend_of
 from egovcp_deploy.recording import recording, run_info
 from egovcp_deploy.robots import Robot
 from egovcp_deploy.robots.replay import open_recordings
@@ -91,23 +91,27 @@ def _play(
     folder = make_output_dir(config.output_dir)
     clock = LockstepClock()
     desk = InlineDesk(Thinker(policy, config.imagine), clock)
+    backend = backend_of(policy)
     runner = Runner(desk, robot, FixedRate(PLANNER_HZ, clock), limits=config.robot.limits)
     summaries: list[RolloutSummary] = []
     try:
         with tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar:
             for episode in range(config.episodes):
                 robot.start(episode)
-                info = _info(config, artefact, robot, episode)
+                info = _info(config, artefact, robot, episode, backend)
                 with recording(folder, episode, info, config.log, waits=True) as sink:
                     summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))
                 bar.update(1)
     finally:
         if summaries:
-            write_json(folder / "deploy.json", _report(config, artefact, robot, summaries))
+            report = _report(config, artefact, robot, backend, summaries)
+            write_json(folder / "deploy.json", report)
             _print(summaries, folder)
 
 
-def _info(config: DeployConfig, artefact: Artefact | None, robot: Robot, episode: int) -> RunInfo:
+def _info(
+    config: DeployConfig, artefact: Artefact | None, robot: Robot, episode: int, backend: str
+) -> RunInfo:
     return run_info(
         config.task,
         config.seed,
@@ -116,6 +120,7 @@ def _info(config: DeployConfig, artefact: Artefact | None, robot: Robot, episode
         draccus.encode(config),
         robot.controller_id,
         artefact,
+        backend,
     )
 
 
@@ -129,6 +134,7 @@ def _report(
     config: DeployConfig,
     artefact: Artefact | None,
     robot: Robot,
+    backend: str,
     summaries: Sequence[RolloutSummary],
 ) -> dict[str, Any]:
     """Content of ``deploy.json``."""
@@ -140,6 +146,7 @@ def _report(
         "config": draccus.encode(config),
         "artefact": artefact.manifest["files"] if artefact else None,
         "low_level_controller": robot.controller_id,
+        "backend": backend,
         "versions": versions(),
     }
 

@@ -16,7 +16,7 @@ class AppendFile:
     A killed process loses nothing that was flushed. Losing power loses at most ``sync_period_s``
     more than that: `flush` tells the disk to keep what it has, but no more often, since that
     may take long. When the disk is full the piece that did not fit is removed again, so that
-    the file ends with a whole one.
+    the file ends with a whole one; it is kept here, and the next `flush` tries again.
 
     Args:
         path: the file to create; raises `FileExistsError` when it exists.
@@ -42,13 +42,14 @@ class AppendFile:
 
     def flush(self) -> None:
         """Append what has been collected; raises OSError after taking back a part of it."""
-        data, self._pending = self._pending, bytearray()
         try:
-            _write_all(self._file.fileno(), data)
+            _write_all(self._file.fileno(), self._pending)
         except OSError:
             os.ftruncate(self._file.fileno(), self._size)
+            os.lseek(self._file.fileno(), self._size, os.SEEK_SET)
             raise
-        self._size += len(data)
+        self._size += len(self._pending)
+        self._pending = bytearray()
         if time.monotonic() - self._synced >= self._period:
             self._sync()
 

@@ -6,9 +6,9 @@ moves bytes into a pipe, as many as fit without waiting (`benchmarks/tick.py` me
 
     loop: write(tick) -> [queue, bounded] -> pipe ~> process: sink.write(tick)
 
-What does not fit into the queue is dropped and counted. What goes wrong behind the pipe (a full
-disk, a viewer that died, the process killed) is told once, as one line; the sink is then given
-up, and the run goes on without it.
+What does not fit into the queue is dropped and counted, also while the disk is full. What else
+goes wrong behind the pipe (a viewer that died, a broken disk, the process killed) is told once, as
+one line; the sink is then given up, and the run goes on without it.
 """
 
 from __future__ import annotations
@@ -21,11 +21,20 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from types import TracebackType
-from typing import Final, Self
+from typing import Final
 
 from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.log.commands import Close, Closed, Failed, Open, Opened, Report, Written
+from egovcp.log.commands import (
+    Close,
+    Closed,
+    Failed,
+    Open,
+    Opened,
+    Report,
+    Resumed,
+    Waiting,
+    Written,
+)
 from egovcp.log.frames import Inbox, Outbox, enlarge, pack
 from egovcp.log.info import RunInfo
 from egovcp.log.sink import Sink
@@ -52,6 +61,7 @@ class BackgroundSink:
         sink: what the process opens and writes to; must be picklable before it is opened.
         name: what to call it in messages, such as ``rollout-0.mcap``.
         lossless: rather wait than drop: for a simulation in lock-step, whose time stands still.
+            A full disk is not waited for, then.
         queue_ticks: ticks that may wait here.
         close_timeout_s: how long `close` waits for what is still on its way.
         tell: takes each message, one line.
@@ -68,7 +78,8 @@ class BackgroundSink:
         tell: Callable[[str], None] = tell_on_stderr,
     ) -> None:
         self._sink = sink
-        self._name = name
+        self.name = name
+        """What it is called in messages."""
         self._lossless = lossless
         self._capacity = queue_ticks
         self._close_timeout_s = close_timeout_s
@@ -115,12 +126,12 @@ class BackgroundSink:
         """
         self.start()
         assert self._worker is not None
-        self._worker.outbox.put(pack(Open(self._sink, info)))
+        self._worker.outbox.put(pack(Open(self._sink, info, waits=not self._lossless)))
         self._await(lambda: self._opened, START_TIMEOUT_S)
         if not self._opened:
             self.close()
             raise self._failure or EnvironmentFailure(
-                f"{self._name}: the process that writes it was not ready in {START_TIMEOUT_S:.0f} s"
+                f"{self.name}: the process that writes it was not ready in {START_TIMEOUT_S:.0f} s"
             )
 
     def write(self, tick: Tick) -> None:
@@ -187,6 +198,10 @@ class BackgroundSink:
                 self._opened = True
             case Written():
                 self._written = report.count
+            case Waiting():
+                self._tell(f"{self.name}: {_words(report.error)}; ticks wait until there is room")
+            case Resumed():
+                self._tell(f"{self.name}: there is room again")
             case Closed():
                 self._closed = True
             case Failed():
@@ -195,24 +210,24 @@ class BackgroundSink:
     def _give_up(self, error: Exception) -> None:
         self._failure = error
         if self._opened:  # else `open` raises it
-            self._tell(f"{self._name}: {_words(error)}; the run goes on without this log")
+            self._tell(f"{self.name}: {_words(error)}; the run goes on without this log")
 
     def _sum_up(self) -> None:
         if self._opened and (self._dropped or self.lost):
             whole = self._accepted + self._dropped
             unfinished = "" if self._closed else "; it is not finished"
             self._tell(
-                f"{self._name}: {self._dropped} of {whole} ticks were dropped, "
+                f"{self.name}: {self._dropped} of {whole} ticks were dropped, "
                 f"{self.lost} more may be missing at its end{unfinished}"
             )
         elif self._opened and not self._closed:
-            self._tell(f"{self._name}: not finished in time; every tick is in it, its index is not")
+            self._tell(f"{self.name}: not finished in time; every tick is in it, its index is not")
 
 
 class BackgroundFanout:
     """Several sinks, each in a process of its own: a tick is serialised once for all of them.
 
-    A sink itself, and a context manager; none of the sinks can hold up another.
+    A sink itself; none of the sinks can hold up another.
     """
 
     def __init__(self, sinks: Sequence[BackgroundSink]) -> None:
@@ -239,17 +254,6 @@ class BackgroundFanout:
         """Close every sink, one after the other."""
         for sink in self.sinks:
             sink.close()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()
 
 
 class _Worker:

@@ -15,6 +15,8 @@ class Open:
 
     sink: Sink
     info: RunInfo
+    waits: bool = False
+    """Whether a full disk is waited for, if the sink can; else the sink is given up."""
 
 
 @dataclass(frozen=True)
@@ -38,6 +40,18 @@ class Written:
 
 
 @dataclass(frozen=True)
+class Waiting:
+    """The disk is full; what comes waits in the pipe."""
+
+    error: OSError
+
+
+@dataclass(frozen=True)
+class Resumed:
+    """There is room again, and nothing of what was taken is missing."""
+
+
+@dataclass(frozen=True)
 class Failed:
     """The sink raised this and is given up."""
 
@@ -49,4 +63,4 @@ class Closed:
     """The log is finished."""
 
 
-type Report = Opened | Written | Failed | Closed
+type Report = Opened | Written | Waiting | Resumed | Failed | Closed

@@ -57,6 +57,8 @@ class RunInfo:
     """Identities: artefact files, low-level controller, dataset."""
     versions: Mapping[str, str] = field(default_factory=dict)
     """Distribution name -> version."""
+    backend: str = ""
+    """Who computed the plans, such as int8 or float32; empty: nobody, or it is not known."""
 
     def to_metadata(self) -> dict[str, str]:
         """Flat strings for an MCAP metadata record; structured values are JSON."""
@@ -79,4 +81,5 @@ class RunInfo:
             config=json.loads(record["config"]),
             hashes=json.loads(record["hashes"]),
             versions=json.loads(record["versions"]),
+            backend=record.get("backend", ""),  # recordings of before do not say
         )

@@ -16,10 +16,10 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from types import TracebackType
 from typing import Final, Literal, Self
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.lifeline import command
 from egovcp.log.destination import GRPC_PORT, LOOPBACK, Viewer
 
 WEB_PORT: Final = 9090
@@ -34,7 +34,7 @@ class LiveRerun:
     """A viewer that is started by `start`, unless it runs already (``connect``).
 
     ``spawn``: the native viewer, which stays open after the run. ``web``: a server that ends
-    with the run; `page` is what to open in a browser.
+    with the run, however the run ends; `page` is what to open in a browser.
     """
 
     kind: Kind
@@ -70,7 +70,7 @@ class LiveRerun:
         return self._process.pid if self._process else None
 
     def start(self) -> None:
-        """Start the viewer and wait until it listens.
+        """Start the viewer and wait until it listens; call it from a thread that lasts.
 
         Raises:
             EnvironmentFailure: a port is in use, or the viewer ends at once (no display?).
@@ -80,8 +80,9 @@ class LiveRerun:
         ports = [self.viewer.address[1], *([self.web_port] if self.kind == "web" else [])]
         for port in ports:
             _require_free(port)
+        program, flags = str(_program()), self._flags()
         self._process = subprocess.Popen(
-            [str(_program()), *self._flags()],
+            command(program, *flags) if self.kind == "web" else [program, *flags],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
@@ -98,12 +99,7 @@ class LiveRerun:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *details: object) -> None:
         self.close()
 
     def _flags(self) -> list[str]:

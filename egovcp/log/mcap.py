@@ -8,8 +8,8 @@ reach the disk every second, so losing power loses little more. `messages.Topic`
 
 from __future__ import annotations
 
-import errno
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -43,7 +43,7 @@ class McapFile:
     """A new recording, message by message; raises `EnvironmentFailure` where it cannot be created.
 
     After an OSError (a full disk) the file ends with the last flush that fitted, without an
-    index, as after a kill; what is written later is refused.
+    index, as after a kill. What did not fit is kept: once `flush` has succeeded, all is well.
     """
 
     def __init__(self, path: Path, sync_period_s: float = SYNC_PERIOD_S) -> None:
@@ -52,7 +52,6 @@ class McapFile:
         self._file: AppendFile | None = None
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
-        self._torn = False
 
     def open(self, metadata: Mapping[str, str]) -> None:
         """Create the file and write the metadata record."""
@@ -73,8 +72,6 @@ class McapFile:
 
     def add(self, line: Line, index: int, time_ns: int, data: bytes) -> None:
         """A message of tick ``index``."""
-        if self._torn:
-            raise OSError(errno.EIO, "given up after an earlier failure", str(self._path))
         self._writer.add_message(
             channel_id=self._channel(line),
             log_time=time_ns,
@@ -85,19 +82,17 @@ class McapFile:
 
     def flush(self) -> None:
         """Hand everything to the operating system; raises OSError when the disk is full."""
-        try:
-            self._writer.flush()  # type: ignore[no-untyped-call]
-        except OSError:
-            self._torn = True
-            raise
+        self._writer.flush()  # type: ignore[no-untyped-call]
 
     def close(self) -> None:
-        """Write the index and close the file. Further calls do nothing."""
+        """Write the index and close the file; raises OSError when the disk is full, and the file
+        is as after a kill. Further calls do nothing."""
         file, self._file = self._file, None
-        if file is not None:
-            if not self._torn:  # else the index would list what is not there
-                self._writer.finish()  # type: ignore[no-untyped-call]
-            file.close()
+        if file is None:
+            return
+        with closing(file):
+            self.flush()  # first, so that a disk with little room gets at least this
+            self._writer.finish()  # type: ignore[no-untyped-call]
 
     def _channel(self, line: Line) -> int:
         if line.topic not in self._channels:
@@ -140,6 +135,10 @@ class McapSink:
         """
         for topic, message in encode_tick(tick, self._view).items():
             self._file.add(_line(topic), tick.index, tick.time_ns, message)
+        self._file.flush()
+
+    def retry(self) -> None:
+        """Write the tick that did not fit; raises OSError if it still does not."""
         self._file.flush()
 
     def close(self) -> None:

@@ -8,37 +8,48 @@ and to finish the log, and then ends.
 
 from __future__ import annotations
 
+import errno
 import os
 import pickle
 import signal
 import sys
+import time
 import traceback
+from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
 from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.log.commands import Closed, Failed, Open, Opened, Report, Written
+from egovcp.log.commands import Closed, Failed, Open, Opened, Report, Resumed, Waiting, Written
 from egovcp.log.frames import Outbox, pack, receive
-from egovcp.log.sink import Sink
+from egovcp.log.sink import RetryingSink, Sink
 from egovcp.log.tick import Tick
 
 NICENESS: Final = 5  # the loop comes first where both want the same core
+RETRY_S: Final = 0.25  # between two looks whether a full disk has room again
 
 
 def serve(commands: int, reports: int) -> None:
     """Obey the commands from one pipe and report into the other, until the first is closed."""
-    outbox = Outbox(reports)
+    outbox, run = Outbox(reports), os.getppid()
     sink: Sink | None = None
-    count = 0
+    waits, count = False, 0
     try:
         for command in receive(commands):
             match command:
                 case Open():
-                    sink = command.sink
+                    sink, waits = command.sink, command.waits
                     sink.open(command.info)
                     _report(outbox, Opened())
                 case Tick() if sink is not None:
-                    sink.write(command)
+                    try:
+                        sink.write(command)
+                    except OSError as error:
+                        if not waits or not isinstance(sink, RetryingSink) or not _is_full(error):
+                            raise
+                        _report(outbox, Waiting(error))
+                        _wait_for_room(sink, lambda: os.getppid() == run)
+                        _report(outbox, Resumed())
                     count += 1
                     _report(outbox, Written(count))
                 case _:
@@ -51,6 +62,21 @@ def serve(commands: int, reports: int) -> None:
         with suppress(Exception):
             if sink is not None:
                 sink.close()
+
+
+def _is_full(error: OSError) -> bool:
+    return error.errno in (errno.ENOSPC, errno.EDQUOT)
+
+
+def _wait_for_room(sink: RetryingSink, wanted: Callable[[], bool]) -> None:
+    """Until the disk takes the tick; raises OSError when it fails otherwise, or the run is over."""
+    while True:
+        time.sleep(RETRY_S)
+        try:
+            return sink.retry()
+        except OSError as error:
+            if not _is_full(error) or not wanted():
+                raise
 
 
 def _report(outbox: Outbox, report: Report) -> None:

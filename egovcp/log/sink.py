@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from types import TracebackType
-from typing import Protocol, Self
+from typing import Protocol, runtime_checkable
 
 from egovcp.log.info import RunInfo
 from egovcp.log.tick import Tick
@@ -27,8 +26,17 @@ class Sink(Protocol):
         ...
 
 
+@runtime_checkable
+class RetryingSink(Sink, Protocol):
+    """A sink that keeps a tick for which there was no room, until there is."""
+
+    def retry(self) -> None:
+        """Write that tick; raises OSError if it still does not fit."""
+        ...
+
+
 class Fanout:
-    """Writes every tick to several sinks; a sink itself, and a context manager."""
+    """Writes every tick to several sinks; a sink itself."""
 
     def __init__(self, sinks: Sequence[Sink]) -> None:
         self._sinks = tuple(sinks)
@@ -48,14 +56,3 @@ class Fanout:
         with ExitStack() as stack:
             for sink in reversed(self._sinks):
                 stack.callback(sink.close)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.close()

@@ -20,6 +20,9 @@ from egovcp_deploy.deploy import main
 from egovcp_deploy.robots import Outcome
 from egovcp_deploy.robots.sim import SimRobot
 
+#: What ``auto`` may stand for.
+BACKENDS = ("float32", "int8")
+
 
 def run(*flags: str) -> int:
     return main(list(flags))
@@ -40,10 +43,12 @@ def test_rollouts_are_recorded_and_summed_up(
         *(f"rollout-{i}.{kind}" for i in (0, 1) for kind in ("mcap", "rrd")),
     }
     report = json.loads((out / "deploy.json").read_text())
+    assert report["backend"] in BACKENDS
     assert [row["episode"] for row in report["rollouts"]] == [0, 1]
     for i, row in enumerate(report["rollouts"]):
         recording = read_recording(out / row["mcap"])
         assert recording.complete
+        assert recording.info.backend == report["backend"]
         assert (recording.info.seed, recording.info.episode) == (3, i)
         assert "model.safetensors" in recording.info.hashes
         assert len(recording.ticks) == row["steps"] == 15

@@ -58,6 +58,8 @@ def test_all_controllers_play_the_same_scenarios(
     )
     captured = capsys.readouterr()
     assert code == 0, captured.err
+    backend = json.loads((out / "eval_run.json").read_text())["backend"]
+    assert f"plans computed by {backend}" in captured.out
     figures = json.loads((out / "eval.json").read_text())
     assert set(figures) == {"ball"}
     assert set(figures["ball"]) == {"planner", "hold", "constant", "random", "oracle"}

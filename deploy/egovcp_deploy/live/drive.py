@@ -15,21 +15,22 @@ from tqdm import tqdm
 
 from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
-from egovcp.errors import EnvironmentFailure, SafetyStop, UsageError
-from egovcp.log.info import CameraView
+from egovcp.errors import EgovcpError, EnvironmentFailure, SafetyStop, UsageError
+from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.tick import Tick
 from egovcp.robot.controllers import make_controller
 from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import CAMERAS, HardwareOptions, open_eye
 from egovcp_deploy.live.operators import OPERATORS, operator
-from egovcp_deploy.live.planner import LiveSummary
+from egovcp_deploy.live.planner import LiveSummary, failure_words
 from egovcp_deploy.live.run import LiveSetup, run_live
 from egovcp_deploy.live.simulated import simulated
-from egovcp_deploy.options import check_choice, make_output_dir, versions
+from egovcp_deploy.options import check_choice, make_output_dir
 from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
-from egovcp_deploy.recording import recording, run_info
+from egovcp_deploy.policy import backend_of
+from egovcp_deploy.recording import missing_ticks, recording, run_info
 from egovcp_deploy.robots.bridge import BridgeBody
 
 SIMULATED_S: Final = 15.0  # in RUN: the crane lets go, the robot settles, the episode
@@ -72,7 +73,7 @@ def drive_simulated(config: DeployConfig, artefact: Artefact) -> None:
     config = replace(config, robot=robot, operator=operator_options)
     folder = _prepare(config, artefact)
     with simulated(config, folder / "task.json") as hardware:
-        _run(config, artefact, folder, LiveSetup(hardware, *_how(config), stays=False))
+        _run(config, artefact, folder, LiveSetup(hardware, *_how(config), False, simulated=True))
 
 
 def _prepare(config: DeployConfig, artefact: Artefact) -> Path:
@@ -85,27 +86,65 @@ def _how(config: DeployConfig) -> tuple[str, Limits]:
 
 
 def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetup) -> None:
-    options = config.operator
     controller_id = make_controller(setup.controller).id
-    info = run_info(
-        config.task, config.seed, 0, CameraView(), draccus.encode(config), controller_id, artefact
-    )
     _leave_a_core()
-    thinker = Thinker(artefact.make_policy(1, config.seed), config.imagine)
+    policy = artefact.make_policy(1, config.seed)
+    thinker = Thinker(policy, config.imagine)
     thinker.warm_up()
+    info = run_info(
+        config.task,
+        config.seed,
+        0,
+        CameraView(),
+        draccus.encode(config),
+        controller_id,
+        artefact,
+        backend_of(policy),
+    )
+    try:
+        summary = _drive(config, folder, setup, thinker, info)
+    except EgovcpError:
+        _clear(folder)
+        raise
+    write_json(folder / "deploy.json", _report(config, artefact, info, summary))
+    _print(summary, info.backend, folder)
+    _judge(summary, folder)
+
+
+def _drive(
+    config: DeployConfig, folder: Path, setup: LiveSetup, thinker: Thinker, info: RunInfo
+) -> LiveSummary:
+    options = config.operator
     with (
-        operator(options.type, options.velocity, options.duration) as who,
+        operator(options.type, options.velocity, options.duration, options.gamepad) as who,
         recording(folder, 0, info, config.log, waits=False) as sink,
         tqdm(unit="tick", desc="live") as bar,
     ):
         summary = run_live(setup, thinker, who, sink, lambda tick: _show(bar, tick))
-    write_json(folder / "deploy.json", _report(config, artefact, controller_id, summary))
-    _print(summary, folder)
+    summary.missing_ticks = missing_ticks(sink)
+    return summary
+
+
+def _clear(folder: Path) -> None:
+    """Take back the logs of a run that did not begin, so that the same command can be repeated."""
+    for path in folder.glob("rollout-0.*"):
+        path.unlink()
+
+
+def _judge(summary: LiveSummary, folder: Path) -> None:
+    """Raise what kept the run from coming to its own end."""
     if summary.damped:
         raise SafetyStop(
             f"the motors were damped: {summary.damped}. The log is in {folder}; "
             "find the cause before the next run"
-        )
+        ) from summary.failure
+    if isinstance(summary.failure, EgovcpError):
+        raise summary.failure
+    if summary.failure is not None:
+        raise SafetyStop(
+            f"the planner failed and the robot was held: {failure_words(summary.failure)}. The log "
+            f"is in {folder}; --debug prints the traceback"
+        ) from summary.failure
 
 
 def _leave_a_core() -> None:
@@ -124,7 +163,7 @@ def _show(bar: Any, tick: Tick) -> None:
 
 
 def _report(
-    config: DeployConfig, artefact: Artefact, controller_id: str, summary: LiveSummary
+    config: DeployConfig, artefact: Artefact, info: RunInfo, summary: LiveSummary
 ) -> dict[str, Any]:
     """Content of ``deploy.json``."""
     return {
@@ -137,12 +176,15 @@ def _report(
         **_percentiles("plan_ms", summary.plan_ms),
         **_percentiles("latency_ms", summary.latency_ms),
         "iterations_mean": float(np.mean(summary.iterations or [0])),
+        "missing_ticks": summary.missing_ticks,
         "damped": summary.damped,
+        "failure": "" if summary.failure is None else failure_words(summary.failure),
         "events": summary.events,
         "config": draccus.encode(config),
         "artefact": artefact.manifest["files"],
-        "low_level_controller": controller_id,
-        "versions": versions(),
+        "low_level_controller": info.hashes["low_level_controller"],
+        "backend": info.backend,
+        "versions": dict(info.versions),
     }
 
 
@@ -151,11 +193,12 @@ def _percentiles(name: str, values: list[float]) -> dict[str, float]:
     return {f"{name}_p50": float(p50), f"{name}_p99": float(p99)}
 
 
-def _print(summary: LiveSummary, folder: Path) -> None:
+def _print(summary: LiveSummary, backend: str, folder: Path) -> None:
     latency = _percentiles("ms", summary.latency_ms)
     print(
         f"{summary.ticks} ticks, {summary.running} running, {summary.held} held; observation to "
-        f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late"
+        f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late; plans "
+        f"computed by {backend}"
     )
     print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
 

@@ -3,15 +3,34 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import Final
 
 from egovcp_deploy.live.process import last_words
 from egovcp_deploy.robots.body import Body
+from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
 
 _ROUNDS: Final = 20  # of last words, 50 ms each
+
+
+@contextmanager
+def spare_body(config: BridgeConfig) -> Iterator[BridgeBody]:
+    """A second connection to the robot that only speaks: 500 states a second are not decoded for
+    a few last words, which need the robot's mode and no more.
+
+    Raises:
+        EnvironmentFailure: the robot does not answer.
+    """
+    body = BridgeBody(config)
+    body.connect()
+    try:
+        body.deafen()
+        yield body
+    finally:
+        body.close()
 
 
 class Guard:

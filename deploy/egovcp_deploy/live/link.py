@@ -60,7 +60,7 @@ def decode_report(parts: Sequence[bytes]) -> Report | None:
             tick=int(header["tick"]),
             time_ns=int(header["time_ns"]),
             depth=np.frombuffer(depth, "<u2").reshape(DEPTH_ROWS, DEPTH_COLS),
-            state=np.frombuffer(state, "<f4").reshape(STATE_DIM),
+            state=np.frombuffer(state, "<f4").reshape(STATE_DIM).copy(),  # torch wants to own it
             sent=np.frombuffer(sent, "<f8").reshape(ACTION_DIM),
             first=bool(header["first"]),
             mode=str(header["mode"]),

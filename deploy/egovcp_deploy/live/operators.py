@@ -1,4 +1,4 @@
-"""Who says when to stand, run and stop, and where to go: a script, or somebody at the keys."""
+"""Who says when to stand, run and stop, and where to go: a script, the keys, or a gamepad."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from collections.abc import Iterator
 from typing import Final, Protocol
 
 from egovcp.errors import UsageError
+from egovcp_deploy.live.gamepad import GamepadOptions, gamepad
 from egovcp_deploy.live.link import Order
 from egovcp_deploy.pilot.states import Request, State
 
-OPERATORS: Final = ("auto", "keyboard")
+OPERATORS: Final = ("auto", "keyboard", "gamepad")
 EASE_S: Final = 2.0  # from HOLD until the hands have come to rest
 _REPEAT_NS: Final = 100_000_000
 _ASK_AGAIN_NS: Final = 500_000_000  # a request that was refused; more often only fills the log
@@ -126,16 +127,29 @@ def _pressed() -> Iterator[str]:
 
 @contextlib.contextmanager
 def operator(
-    kind: str, velocity: tuple[float, float, float], duration_s: float
+    kind: str,
+    velocity: tuple[float, float, float],
+    duration_s: float,
+    pad: GamepadOptions | None = None,
 ) -> Iterator[Operator]:
     """The operator of ``kind``; the terminal is as before afterwards.
 
     Raises:
         UsageError: there is no terminal to read keys from.
+        EnvironmentFailure: there is no gamepad.
     """
     if kind == "auto":
         yield Auto(velocity, duration_s)
-        return
+    elif kind == "gamepad":
+        with gamepad(pad or GamepadOptions()) as at_the_pad:
+            yield at_the_pad
+    else:
+        with _keyboard() as at_the_keys:
+            yield at_the_keys
+
+
+@contextlib.contextmanager
+def _keyboard() -> Iterator[Keyboard]:
     if not sys.stdin.isatty():
         raise UsageError(
             "--operator.type=keyboard needs a terminal, but the input is none; "

@@ -1,18 +1,22 @@
-"""The planner's side of a run on the wall clock: think, log, and pass on the operator's orders."""
+"""The planner's side of a run on the wall clock: think, log, and pass on the operator's orders.
+
+Whatever fails here, the robot goes on standing: `PlannerLoop` then only listens to the operator.
+"""
 
 from __future__ import annotations
 
-import signal
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from types import FrameType
 from typing import Final
 
+from egovcp.errors import EgovcpError
+from egovcp.log.background import tell_on_stderr
 from egovcp.log.sink import Sink
 from egovcp.log.tick import Tick
 from egovcp.rate import Clock
 from egovcp.spec import PLANNER_DT
+from egovcp_deploy.live.interrupts import Interrupts
 from egovcp_deploy.live.link import Link, Order, decode_report, encode_order, encode_reply
 from egovcp_deploy.live.operators import EASE_S, Operator
 from egovcp_deploy.pilot.desk import Reply, Report, Thinker
@@ -47,25 +51,10 @@ class LiveSummary:
     """From the observation to the plan on its way back, per plan."""
     iterations: list[int] = field(default_factory=list)
     events: list[str] = field(default_factory=list)
-
-
-class Interrupts:
-    """Counts Ctrl-C: the first asks for a graceful end, the second for an immediate one."""
-
-    def __init__(self) -> None:
-        self.count = 0
-
-    @contextmanager
-    def caught(self) -> Iterator[None]:
-        """While this lasts, an interrupt is counted and raises nothing."""
-        before = signal.signal(signal.SIGINT, self._count)
-        try:
-            yield
-        finally:
-            signal.signal(signal.SIGINT, before)
-
-    def _count(self, number: int, frame: FrameType | None) -> None:
-        self.count += 1
+    missing_ticks: dict[str, int] = field(default_factory=dict)
+    """Log -> ticks that it lacks, because its disk was full or too slow."""
+    failure: Exception | None = None
+    """What ended the planning, after which the robot was held."""
 
 
 class PlannerLoop:
@@ -80,6 +69,9 @@ class PlannerLoop:
         control_alive: whether the control process is there.
         stays: whether a robot that holds after Ctrl-C goes on standing until the second one, as a
             real one must that nobody has hung up yet.
+        stands: whether a robot whose planner has failed stands until the operator ends it; else
+            it is held for as long as its hands need, and the run ends.
+        tell: takes what the operator must know at once, one line.
     """
 
     def __init__(
@@ -91,10 +83,12 @@ class PlannerLoop:
         clock: Clock,
         control_alive: Callable[[], bool],
         stays: bool = False,
+        stands: bool = True,
+        tell: Callable[[str], None] = tell_on_stderr,
     ) -> None:
         self._thinker, self._link, self._operator = thinker, link, operator
         self._sink, self._clock, self._control_alive = sink, clock, control_alive
-        self._stays = stays
+        self._stays, self._stands, self._tell = stays, stands, tell
         self.summary = LiveSummary()
         self.interrupts = Interrupts()
         self.quitting = False
@@ -108,34 +102,50 @@ class PlannerLoop:
         self._damped_ns: int | None = None
 
     def run(self, on_tick: Callable[[Tick], None] = lambda tick: None) -> LiveSummary:
-        """Until the operator ends it, the motors are damped, or the control process is gone."""
-        started_ns = self._clock.now_ns()
+        """Until the operator ends it, the motors are damped, or the control process is gone.
+
+        An exception ends the planning but not the run: see `LiveSummary.failure`.
+        """
         with self.interrupts.caught():
-            while not self.quitting and self._control_alive():
-                now = self._clock.now_ns()
-                if self._begin_ns is None and now - started_ns > _START_S * _NS:
-                    break
-                self._obey(now)
-                reports = self._receive()
-                if reports:
-                    self._think(reports, on_tick)
+            try:
+                self._plan(on_tick)
+            except Exception as error:  # noqa: BLE001 - whatever it is, the robot must not fall
+                self._fail(error)
+                self._stand_by(on_tick)
         return self.summary
+
+    def _plan(self, on_tick: Callable[[Tick], None]) -> None:
+        started_ns = self._clock.now_ns()
+        while not self.quitting and self._control_alive():
+            now = self._clock.now_ns()
+            if self._begin_ns is None and now - started_ns > _START_S * _NS:
+                break
+            self._obey(now)
+            reports = self._receive()
+            if reports:
+                self._think(reports, on_tick)
 
     def _receive(self) -> list[Report]:
         found = (decode_report(parts) for parts in self._link.receive(_WAIT_S))
         return [report for report in found if report is not None]
 
     def _think(self, reports: Sequence[Report], on_tick: Callable[[Tick], None]) -> None:
-        last = reports[-1]
+        last, reply = reports[-1], None
         self._begin_ns = reports[0].time_ns if self._begin_ns is None else self._begin_ns
         self._mode = last.mode
+        try:
+            reply = self._answer(reports)
+        finally:  # what could not be thought about is recorded, too
+            for report in reports:
+                self._log(report, reply if report is last else None, on_tick)
+
+    def _answer(self, reports: Sequence[Report]) -> Reply:
+        last = reports[-1]
         due_ns = last.time_ns + round(BUDGET_S * _NS)
         reply = self._thinker.think(reports, lambda: (due_ns - self._clock.now_ns()) / _NS)
         self._link.send(encode_reply(reply))
         self._measure(last, reply)
-        reply = self._decoded(last, reply)
-        for report in reports:
-            self._log(report, reply if report is last else None, on_tick)
+        return self._decoded(last, reply)
 
     def _decoded(self, report: Report, reply: Reply) -> Reply:
         """With pictures for the log, if these do not make the next observation wait."""
@@ -164,11 +174,14 @@ class PlannerLoop:
     # --- the log -------------------------------------------------------------------------
     def _log(self, report: Report, reply: Reply | None, on_tick: Callable[[Tick], None]) -> None:
         """A tick is complete when the next report tells what was sent in it."""
-        if self._pending is not None and self._pending[0].tick == report.tick - 1:
-            tick = self._tick(*self._pending, report)
+        self._count(report)
+        before, self._pending = self._pending, (report, reply)
+        if before is not None and before[0].tick == report.tick - 1:
+            tick = self._tick(*before, report)
             self._sink.write(tick)
             on_tick(tick)
-        self._pending = report, reply
+
+    def _count(self, report: Report) -> None:
         self.summary.ticks += 1
         self.summary.running += report.mode == State.RUN
         self.summary.held += report.mode == State.HOLD
@@ -194,13 +207,48 @@ class PlannerLoop:
             **thoughts(reply),
         )
 
+    # --- a failure ------------------------------------------------------------------------
+    def _fail(self, error: Exception) -> None:
+        """Plan no more: the robot is held, and whoever is beside it hears why."""
+        self.summary.failure = error
+        self._link.send(encode_order(Order(Request.HOLD)))
+        what = f"the planner failed: {failure_words(error)}"
+        self._told.append(what)
+        if not self._stands:
+            self._held_ns = self._clock.now_ns()
+        how = "the robot is held until somebody ends it: Ctrl-C twice damps it"
+        with suppress(Exception):  # the terminal may be what failed
+            self._tell(f"{what}; {how if self._stands else 'the run ends'}")
+
+    def _stand_by(self, on_tick: Callable[[Tick], None]) -> None:
+        """What is left without a planner: the operator, and the log while it can be written."""
+        while not self.quitting and self._control_alive():
+            for report in self._receive():
+                self._begin_ns = report.time_ns if self._begin_ns is None else self._begin_ns
+                self._mode = report.mode
+                with suppress(Exception):
+                    self._log(report, None, on_tick)
+            self._obey(self._clock.now_ns())
+            if self._mode in ("", State.INIT):
+                self._quit()  # nothing stands yet
+
     # --- the end -------------------------------------------------------------------------
     def _obey(self, now_ns: int) -> None:
-        for order in (*self._operator.orders(now_ns, self._mode), *self._interrupted(now_ns)):
+        interrupted = self._interrupted(now_ns)
+        for order in (*self._ordered(now_ns), *interrupted):
             self._link.send(encode_order(order))
             self.quitting |= order.quit
         if self._damped_ns is not None and now_ns - self._damped_ns > _AFTERMATH_S * _NS:
             self._quit()
+
+    def _ordered(self, now_ns: int) -> Sequence[Order]:
+        """What the operator wants; a second failure, of the operator, is nobody's business."""
+        try:
+            return self._operator.orders(now_ns, self._mode)
+        except Exception:
+            if self.summary.failure is None:
+                raise
+            return ()
 
     def _interrupted(self, now_ns: int) -> list[Order]:
         """Ctrl-C once: hold, let the hands come to rest, end if that is safe. Twice: damp."""
@@ -222,3 +270,9 @@ def _reason(events: Sequence[str]) -> str:
     """Why, from the line that tells of the change to DAMP."""
     told = [event.partition(": ")[2] for event in events if f"-> {State.DAMP}" in event]
     return told[-1] if told else "unknown"
+
+
+def failure_words(error: Exception) -> str:
+    """One line about an exception."""
+    words = " ".join(str(error).split())
+    return words if isinstance(error, EgovcpError) else f"{type(error).__name__}: {words}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,6 +18,7 @@ from egovcp.rate import FixedRate, MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.spec import CONTROLLER_HZ
 from egovcp_deploy.live import motors
+from egovcp_deploy.live.buttons import Buttons
 from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
 from egovcp_deploy.live.hardware import Hardware, HardwareOptions, open_hardware
 from egovcp_deploy.live.link import Link, Order, RemoteDesk
@@ -46,13 +48,14 @@ class ControlSetup:
 
 def control_process(setup: ControlSetup) -> None:
     """Body of the process; returns when it is told to quit, or is no longer needed."""
+    os.setsid()  # a terminal that is closed, Ctrl-Z and Ctrl-\ are not for who balances a robot
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the planner's process to judge
     quitting = Flag()
     signal.signal(signal.SIGTERM, lambda number, frame: quitting.set())
     try:
         hardware = open_hardware(setup.hardware)
     except EgovcpError as error:
-        print(f"egovcp-deploy: error: {error}", file=sys.stderr)
+        print(f"\negovcp-deploy: error: {error}", file=sys.stderr)  # a progress bar is above
         sys.exit(error.exit_code)
     link = Link(setup.address, serve=False)
     try:
@@ -115,15 +118,27 @@ class ControlProcess:
 
     def _look_for_parent(self) -> None:
         if os.getppid() != self._parent:
+            if self._desk.alive and self._loop.state not in (State.INIT, State.DAMP):
+                _say_who_is_left()
             self._desk.alive = False
             self._orphaned += self._loop.state in (State.INIT, State.DAMP)
 
 
+def _say_who_is_left() -> None:
+    with suppress(OSError):  # the terminal may be gone as well
+        print(
+            "egovcp-deploy: the planner's process is gone; the robot is held, and stands until it "
+            f"is ended: kill {os.getpid()} damps it, as does L1 + B on its remote control",
+            file=sys.stderr,
+            flush=True,
+        )
+
+
 class RemoteKeys:
-    """The robot's own remote control: Y stands up, A arms, start runs, B holds, L1 + B damps."""
+    """The robot's own remote control: its buttons (`Buttons`), and its sticks when they move."""
 
     def __init__(self) -> None:
-        self._before: frozenset[str] = frozenset()
+        self._buttons = Buttons()
 
     def orders(self, body: Body) -> list[Order]:
         """What was pressed since the last call, and where the sticks point."""
@@ -131,13 +146,9 @@ class RemoteKeys:
         remote = None if reading is None else Remote.parse(reading.remote)
         if remote is None:
             return []
-        pressed, self._before = remote.pressed - self._before, remote.pressed
         vx, vy, turn = remote.velocity.tolist()
         orders = [Order(velocity=(vx, vy, turn))] if any((vx, vy, turn)) else []
-        if {"L1", "B"} <= remote.pressed:
-            return [*orders, Order(Request.ESTOP)]
-        keys = {"Y": Request.STAND, "A": Request.ARM, "start": Request.RUN, "B": Request.HOLD}
-        return orders + [Order(keys[key]) for key in sorted(pressed) if key in keys]
+        return orders + self._buttons.orders(remote.pressed)
 
 
 def last_words(body: Body) -> None:

@@ -18,17 +18,16 @@ from numpy.typing import NDArray
 from egovcp.errors import EnvironmentFailure, SafetyStop, UsageError
 from egovcp.plan import PolicyStep
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
-from egovcp_deploy.live.guard import Guard
+from egovcp_deploy.live.guard import Guard, spare_body
 from egovcp_deploy.live.link import Link, Order, decode_report, encode_order, encode_reply
 from egovcp_deploy.live.operators import EASE_S, Auto, Operator
 from egovcp_deploy.live.run import LiveSetup, started
 from egovcp_deploy.pilot.desk import Reply, Report
 from egovcp_deploy.pilot.states import Request, State
-from egovcp_deploy.robots.bridge import BridgeBody
 
 Array = NDArray[np.float64]
 
-_START_S: Final = 30.0  # for the control process to come up
+_START_S: Final = 60.0  # for the control process to come up
 _STAND_S: Final = 60.0  # for the robot to stand, on somebody's word
 _NEWS_S: Final = 0.5  # longest wait for an observation; they come every 40 ms
 _END_S: Final = 5.0
@@ -83,9 +82,7 @@ class Puppet:
         address = f"ipc://{folder}/link"
         self._link = Link(address, serve=True)
         self._stack.callback(self._link.close)
-        spare = BridgeBody(self._setup.hardware.bridge)
-        spare.connect()
-        self._stack.callback(spare.close)
+        spare = self._stack.enter_context(spare_body(self._setup.hardware.bridge))
         self._process = self._stack.enter_context(started(self._setup, address))
         guard = Guard(self._process, spare, lambda: self._closing)
         self._stack.callback(guard.join_if_acting)

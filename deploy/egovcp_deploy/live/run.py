@@ -9,14 +9,14 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing.process import BaseProcess
-from typing import Final
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.log.sink import Sink
 from egovcp.log.tick import Tick
 from egovcp.rate import MonotonicClock
 from egovcp.workers import inherited_by_workers
-from egovcp_deploy.live.guard import Guard
+from egovcp_deploy.live.ending import END_S, end
+from egovcp_deploy.live.guard import Guard, spare_body
 from egovcp_deploy.live.hardware import HardwareOptions
 from egovcp_deploy.live.link import Link
 from egovcp_deploy.live.operators import Operator
@@ -24,9 +24,6 @@ from egovcp_deploy.live.planner import LiveSummary, PlannerLoop
 from egovcp_deploy.live.process import ControlSetup, control_process
 from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
-from egovcp_deploy.robots.bridge import BridgeBody
-
-_END_S: Final = 5.0  # for the control process to say its last words
 
 
 @dataclass(frozen=True)
@@ -38,6 +35,8 @@ class LiveSetup:
     limits: Limits
     stays: bool
     """Whether the robot stands until a second Ctrl-C."""
+    simulated: bool = False
+    """Whether the robot ends with the run, so that nothing is gained by letting it stand."""
 
 
 def run_live(
@@ -49,6 +48,8 @@ def run_live(
 ) -> LiveSummary:
     """Drive the robot until the operator ends it or its motors are damped.
 
+    An exception in the planning leaves the robot standing until then: `LiveSummary.failure`.
+
     Raises:
         EnvironmentFailure: the robot does not answer, or the control process died.
     """
@@ -57,16 +58,21 @@ def run_live(
         address = f"ipc://{folder}/link"
         link = Link(address, serve=True)
         stack.callback(link.close)
-        spare = BridgeBody(setup.hardware.bridge)
-        spare.connect()
-        stack.callback(spare.close)
+        spare = stack.enter_context(spare_body(setup.hardware.bridge))
         process = stack.enter_context(started(setup, address))
         planner = PlannerLoop(
-            thinker, link, operator, sink, MonotonicClock(), process.is_alive, setup.stays
+            thinker,
+            link,
+            operator,
+            sink,
+            MonotonicClock(),
+            process.is_alive,
+            setup.stays,
+            stands=not setup.simulated,
         )
         guard = Guard(process, spare, lambda: planner.quitting)
         summary = planner.run(on_tick)
-        _end(process, planner)
+        end(process, planner)
         guard.join()
         _explain(process, guard, summary)
         return summary
@@ -86,32 +92,17 @@ def started(setup: LiveSetup, address: str) -> Iterator[BaseProcess]:
     finally:
         if process.is_alive():
             process.terminate()
-            process.join(_END_S)
+            process.join(END_S)
         if process.is_alive():
             process.kill()
             process.join()
-
-
-def _end(process: BaseProcess, planner: PlannerLoop) -> None:
-    """Wait for the control process. One that did not hear that it should end is asked by a signal,
-    on which it damps too; one that has to be killed damps nothing, so the guard must."""
-    if planner.quitting:
-        process.join(_END_S)
-    if process.is_alive():
-        planner.quitting = True
-        process.terminate()
-        process.join(_END_S)
-    if process.is_alive():
-        planner.quitting = False
-        process.kill()
-        process.join()
 
 
 def _explain(process: BaseProcess, guard: Guard, summary: LiveSummary) -> None:
     if guard.acted and summary.ticks:
         summary.damped = f"the control process died (exit code {process.exitcode})"
         return
-    if not summary.ticks:
+    if not summary.ticks and summary.failure is None:
         raise EnvironmentFailure(
             f"the control process ended with code {process.exitcode} before the robot was ready; "
             "its own message is above. egovcp-deploy --dry_run=true checks robot and camera"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import multiprocessing
+import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.lifeline import die_with_parent
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions
@@ -53,7 +55,7 @@ def simulated(config: DeployConfig, outcomes: Path) -> Iterator[HardwareOptions]
     )
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
-    process = context.Process(target=_serve, args=(fake, theirs), daemon=True)
+    process = context.Process(target=_serve, args=(fake, theirs, os.getpid()), daemon=True)
     with inherited_by_workers():
         process.start()
     theirs.close()
@@ -64,12 +66,13 @@ def simulated(config: DeployConfig, outcomes: Path) -> Iterator[HardwareOptions]
         process.join()
 
 
-def _serve(fake: FakeConfig, pipe: Connection) -> None:
+def _serve(fake: FakeConfig, pipe: Connection, parent: int) -> None:
     """Runs in the simulator's process."""
     import signal
 
     from egovcp_deploy.robots.fake.command import run
 
+    die_with_parent(parent)  # nobody else would end it
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the planner's process to judge
     run(fake, lambda ports: pipe.send((ports.command_port, ports.state_port, ports.camera_port)))
 

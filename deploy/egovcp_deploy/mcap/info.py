@@ -153,6 +153,7 @@ def text(summary: Summary) -> str:
         f"events    {summary.events}",
         *(f"hash      {name} {value}" for name, value in info.hashes.items()),
         f"versions  {', '.join(f'{name} {v}' for name, v in info.versions.items())}",
+        *([f"planner   computed by {info.backend}"] if info.backend else []),
         "topics",
     ]
     width = max(map(len, summary.messages), default=0)

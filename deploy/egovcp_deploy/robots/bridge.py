@@ -116,6 +116,11 @@ class BridgeBody:
             self._context.destroy(linger=0)
             raise
 
+    def deafen(self) -> None:
+        """Listen no more: what is left is the way to the motors, and the last reading."""
+        assert self._listener is not None, "connect first"
+        self._listener.close()
+
     def _take(self, payload: bytes, time_ns: int) -> None:
         """A message that arrived at ``time_ns``."""
         if payload == self._payload:

@@ -67,7 +67,9 @@ class Remote:
         return np.array([self.ly, -self.lx, -self.rx]) * FULL_STICK
 
     @classmethod
-    def asking_for(cls, velocity: NDArray[np.floating]) -> Remote:
-        """Sticks that ask for ``velocity`` (3,), as far as they go."""
+    def asking_for(
+        cls, velocity: NDArray[np.floating], pressed: frozenset[str] = frozenset()
+    ) -> Remote:
+        """Sticks that ask for ``velocity`` (3,), as far as they go, and these buttons."""
         forward, left, turn = np.clip(np.asarray(velocity) / FULL_STICK, -1.0, 1.0).tolist()
-        return cls(lx=-left, ly=forward, rx=-turn)
+        return cls(lx=-left, ly=forward, rx=-turn, pressed=pressed)

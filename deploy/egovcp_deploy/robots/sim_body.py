@@ -47,6 +47,7 @@ class SimBody:
         self._steps = 0
         self._reading: BodyState | None = None
         self._episode = 0
+        self.pressed: frozenset[str] = frozenset()
         self.eye = SimEye(self)
         """Its camera."""
 
@@ -92,7 +93,7 @@ class SimBody:
                 joint_velocity=seen.joint_velocity,
                 quaternion_w=seen.quaternion_w,
                 angular_velocity=seen.angular_velocity,
-                remote=Remote.asking_for(self._robot.velocity_wish).to_bytes(),
+                remote=Remote.asking_for(self._robot.velocity_wish, self.pressed).to_bytes(),
             )
         return self._reading
 

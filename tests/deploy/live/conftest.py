@@ -23,6 +23,18 @@ from egovcp_deploy.pilot.states import Limits, Request, State
 from egovcp_deploy.robots.body import BodyState, MotorCommand, Picture
 
 TICK_NS = 20_000_000
+QUICK = [
+    *("--robot.limits.stand_s=0.3", "--imagine=0"),
+    *("--planner.samples=16", "--planner.elites=4"),
+]
+#: A busy machine is no fault here.
+PATIENT = [
+    "--robot.limits.planner_hold_s=5",
+    "--robot.limits.misses_hold=100000",
+    "--robot.limits.picture_hold_s=5",
+    "--robot.limits.state_hold_s=5",
+    "--robot.limits.state_damp_s=10",
+]
 
 
 @dataclass
@@ -126,6 +138,7 @@ class Rig:
     faults: Faults
     body: SimBody
     policy: Reaching
+    controller: StanceController
     loop: ControlLoop
     states: list[State] = field(default_factory=list)
 
@@ -172,13 +185,14 @@ def make_rig() -> Callable[..., Rig]:
         clock, faults, policy = LockstepClock(time_ns=10**12), Faults(), Reaching(level)
         body = SimBody(robot, clock, faults)
         desk = InlineDesk(Thinker(policy), clock, lambda tick: delay_ms(tick) * 1_000_000)
+        controller = StanceController()
         loop = ControlLoop(
             body,
             SimEye(robot, faults),
-            StanceController(),
+            controller,
             Pilot(desk, Limits()),
             refusal=lambda: faults.refusal,
         )
-        return Rig(robot, clock, faults, body, policy, loop)
+        return Rig(robot, clock, faults, body, policy, controller, loop)
 
     return make

@@ -206,7 +206,7 @@ def test_a_controller_without_numbers_damps_in_the_same_tick(
     def broken(state: NDArray[np.floating]) -> NDArray[np.float64]:
         return np.full((1, 29), np.nan)
 
-    monkeypatch.setattr(rig.loop._controller, "step", broken)
+    monkeypatch.setattr(rig.controller, "step", broken)
     rig.run(0.1)
     assert rig.loop.state is State.DAMP
     assert all(limp(command) for command in rig.body.commands[before:])

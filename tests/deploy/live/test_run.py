@@ -27,18 +27,27 @@ from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.fake import FakeBridge, Ports
 from egovcp_deploy.robots.fake.running import Running, eventually
 
-QUICK = [
-    *("--robot.limits.stand_s=0.3", "--imagine=0"),
-    *("--planner.samples=16", "--planner.elites=4"),
-]
-#: A busy machine is no fault here.
-PATIENT = [
-    "--robot.limits.planner_hold_s=5",
-    "--robot.limits.misses_hold=100000",
-    "--robot.limits.picture_hold_s=5",
-    "--robot.limits.state_hold_s=5",
-    "--robot.limits.state_damp_s=10",
-]
+from .conftest import PATIENT, QUICK
+
+_PROGRAM = """
+import signal, sys
+from egovcp_deploy.deploy import main
+signal.signal(signal.SIGHUP, signal.SIG_DFL)  # also under nohup
+sys.exit(main(sys.argv[1:]))
+"""
+#: The planner raises once it has driven for a while.
+_STUMBLE = """
+from egovcp_deploy.pilot import desk
+think = desk.Thinker.think
+running = 0
+def stumble(self, reports, remaining=None):
+    global running
+    running += reports[-1].mode == "run"
+    if running > 5:
+        raise ZeroDivisionError("a mistake")
+    return think(self, reports, remaining)
+desk.Thinker.think = stumble
+"""
 
 
 @dataclass
@@ -62,7 +71,11 @@ class Stand:
         return found
 
     def await_run(self) -> None:
-        assert eventually(lambda: State.RUN in self.modes()), self.program.poll()
+        def over() -> bool:
+            return State.RUN in self.modes() or self.program.poll() is not None
+
+        assert eventually(over)
+        assert self.program.poll() is None, self.end()
 
     def modes(self) -> list[str]:
         """Of the ticks that are in the recording by now."""
@@ -74,7 +87,7 @@ class Stand:
 
     def end(self) -> str:
         """Its last words."""
-        return self.program.communicate(timeout=60)[1]
+        return self.program.communicate(timeout=120)[1]
 
 
 @pytest.fixture(scope="module")
@@ -89,10 +102,10 @@ def drive(robot: LiveRobot, artefact_dir: Path, tmp_path: Path) -> Iterator[Call
     fake = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
     running, programs = Running(fake), list[subprocess.Popen[str]]()
 
-    def start(*flags: str) -> Stand:
+    def start(*flags: str, before: str = "") -> Stand:
         folder, ports = tmp_path / "run", fake.ports
         command = [
-            *(sys.executable, "-m", "egovcp_deploy.deploy", "--robot.type=unitree_g1"),
+            *(sys.executable, "-c", before + _PROGRAM, "--robot.type=unitree_g1"),
             *(f"--policy.path={artefact_dir}", f"--output_dir={folder}", "--log.rrd=false"),
             "--robot.controller=stance",
             f"--robot.bridge.state_port={ports.state_port}",
@@ -132,6 +145,7 @@ def test_a_run_stands_up_runs_holds_and_leaves_the_motors_damped(
     report = json.loads((stand.folder / "deploy.json").read_text())
     assert report["ticks_running"] == pytest.approx(modes.count(State.RUN), abs=1)
     assert report["damped"] == ""
+    assert report["missing_ticks"] == {"rollout-0.mcap": 0, "rollout-0.png": 0}
 
 
 def test_killing_the_control_process_damps_the_robot_and_ends_with_a_safety_stop(
@@ -148,22 +162,58 @@ def test_killing_the_control_process_damps_the_robot_and_ends_with_a_safety_stop
     assert read_recording(stand.folder / "rollout-0.mcap").complete
 
 
+def kill(program: subprocess.Popen[str]) -> None:
+    program.kill()
+
+
+def hang_up(program: subprocess.Popen[str]) -> None:
+    """What closing its terminal does."""
+    os.killpg(program.pid, signal.SIGHUP)
+
+
+@pytest.mark.parametrize("end", [kill, hang_up])
 def test_killing_the_planner_leaves_a_robot_that_stands_until_it_is_told_to_end(
-    drive: Callable[..., Stand],
+    drive: Callable[..., Stand], end: Callable[[subprocess.Popen[str]], None]
 ) -> None:
     stand = drive()
     stand.await_run()
     control = stand.control
-    stand.program.kill()
+    others = psutil.Process(stand.program.pid).children(recursive=True)
+    commands = {p.pid: " ".join(p.cmdline()) for p in others}
+    end(stand.program)
     stand.program.wait()
     before = stand.fake.counts.commands
     assert eventually(lambda: stand.fake.counts.commands > before + 50)
     assert stand.holds
+    needed = {control.pid, *(p.pid for p in others if "resource_tracker" in commands[p.pid])}
+    assert not psutil.wait_procs([p for p in others if p.pid not in needed], timeout=60)[1]
     control.terminate()
     assert eventually(lambda: not control.is_running() or control.status() == "zombie")
     assert not stand.holds
+    assert f"kill {control.pid} damps it" in stand.end()
+    assert not psutil.wait_procs(others, timeout=60)[1]
     recording = read_recording(stand.folder / "rollout-0.mcap")
     assert State.RUN in [tick.mode for tick in recording.ticks]
+
+
+def test_an_exception_in_the_planner_leaves_a_robot_that_stands_until_the_second_interrupt(
+    drive: Callable[..., Stand],
+) -> None:
+    stand = drive(before=_STUMBLE)
+    assert eventually(lambda: stand.modes()[-1:] == [State.HOLD])
+    ticks = len(stand.modes())
+    stand.program.send_signal(signal.SIGINT)
+    assert eventually(lambda: len(stand.modes()) > ticks + 25)
+    assert stand.modes()[-1] == State.HOLD
+    assert stand.holds
+    stand.program.send_signal(signal.SIGINT)
+    assert eventually(lambda: not stand.holds)
+    words = stand.end()
+    assert stand.program.returncode == 6, words
+    assert "the planner failed: ZeroDivisionError: a mistake" in words
+    assert "Traceback" not in words
+    report = json.loads((stand.folder / "deploy.json").read_text())
+    assert report["failure"] == "ZeroDivisionError: a mistake"
 
 
 def test_the_first_interrupt_holds_the_second_damps(drive: Callable[..., Stand]) -> None:
@@ -205,3 +255,4 @@ def test_no_robot_there_is_said_at_once(artefact_dir: Path, tmp_path: Path) -> N
     assert result.returncode == 5
     assert "egovcp-fake-g1" in result.stderr
     assert "Traceback" not in result.stderr
+    assert list((tmp_path / "run").iterdir()) == []  # the same command can be repeated

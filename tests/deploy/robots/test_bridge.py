@@ -55,6 +55,24 @@ def test_commands_reach_the_motors(body: BridgeBody, running: Running) -> None:
     assert fake.counts.ignored == fake.counts.garbled == 0
 
 
+def test_a_deaf_body_hears_nothing_more_and_still_reaches_the_motors(
+    body: BridgeBody, running: Running
+) -> None:
+    body.deafen()
+    last, heard = body.read(), body.traffic.readings
+    before = running.fake.counts.commands
+
+    def commanded() -> bool:
+        body.write(hold(body))
+        return running.fake.counts.commands > before + 20
+
+    assert eventually(commanded)
+    assert body.read() is last
+    assert body.traffic.readings == heard
+    assert running.fake.counts.ignored == 0  # it knows the robot's mode
+    body.close()
+
+
 def test_silence_is_not_news(body: BridgeBody, running: Running) -> None:
     running.fake.faults.mute_state = True
     time.sleep(0.1)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import time
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +34,25 @@ def test_a_piece_that_does_not_fit_is_taken_back(small: Path) -> None:
     file.write(b"whole")
     file.flush()
     file.write(bytes(1 << 21))
+    for end in (file.flush, file.flush, file.close):
+        with pytest.raises(OSError, match="No space left"):
+            end()
+        assert (small / "a").read_bytes() == b"whole"
+
+
+def test_a_piece_that_did_not_fit_is_there_once_it_does(small: Path) -> None:
+    filler = small / "filler"
+    filler.write_bytes(bytes(700_000))
+    file = AppendFile(small / "a")
+    file.write(b"x" * 500_000)
     with pytest.raises(OSError, match="No space left"):
         file.flush()
+    file.write(b"y")
+    assert file.tell() == 500_001
+    filler.unlink()
+    file.flush()
     file.close()
-    assert (small / "a").read_bytes() == b"whole"
+    assert (small / "a").read_bytes() == b"x" * 500_000 + b"y"
 
 
 def test_the_disk_is_told_once_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -69,6 +86,60 @@ def test_a_full_disk_keeps_every_whole_tick_and_never_reaches_the_loop(
     assert [tick.index for tick in recording.ticks] == list(range(len(recording.ticks)))
     assert len(recording.ticks) + sink.lost + sink.dropped == index + 1
     assert told[0] == "a.mcap: No space left on device; the run goes on without this log"
+    assert len(told) == 2
+
+
+def test_a_disk_that_is_full_for_10_s_loses_nothing(small: Path, make_tick: Any) -> None:
+    told: list[str] = []
+    sink = BackgroundSink(
+        McapSink(small / "a.mcap"), "a.mcap", close_timeout_s=60.0, tell=told.append
+    )
+    sink.open(RunInfo("ball"))
+    written = 0
+
+    def write(ticks: int) -> None:
+        nonlocal written
+        for _ in range(ticks):
+            sink.write(make_tick(written, bare=True))
+            written += 1
+
+    while not told:
+        write(1)
+        time.sleep(0.002)
+    write(250)  # 10 s at 25 Hz
+    subprocess.run(["mount", "-o", "remount,size=64m", str(small)], check=True)
+    while len(told) < 2:
+        write(1)
+        time.sleep(0.05)
+    sink.close()
+    assert told == [
+        "a.mcap: No space left on device; ticks wait until there is room",
+        "a.mcap: there is room again",
+    ]
+    recording = read_recording(small / "a.mcap")
+    assert recording.complete
+    assert [tick.index for tick in recording.ticks] == list(range(written))
+
+
+def test_a_disk_that_stays_full_is_waited_for_no_longer_than_the_run_lasts(
+    small: Path, make_tick: Any
+) -> None:
+    told: list[str] = []
+    sink = BackgroundSink(
+        McapSink(small / "a.mcap"), "a.mcap", queue_ticks=20, close_timeout_s=0.5, tell=told.append
+    )
+    sink.open(RunInfo("ball"))
+    index = 0
+    while sink.dropped < 50:
+        sink.write(make_tick(index))
+        index += 1
+    sink.close()
+    recording = read_recording(small / "a.mcap")
+    assert not recording.complete
+    assert [tick.index for tick in recording.ticks] == list(range(len(recording.ticks)))
+    assert len(recording.ticks) + sink.lost + sink.dropped == index
+    assert told[0] == "a.mcap: No space left on device; ticks wait until there is room"
+    assert f"{sink.dropped} of {index} ticks were dropped" in told[1]
     assert len(told) == 2
 
 

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -198,7 +199,7 @@ def test_one_that_hangs_does_not_hold_up_its_neighbours(
                        close_timeout_s=0.2, tell=told.append),
         BackgroundSink(DiarySink(tmp_path / "b"), "b", tell=told.append),
     ]  # fmt: skip
-    with BackgroundFanout(sinks) as both:
+    with closing(BackgroundFanout(sinks)) as both:
         both.open(INFO)
         for index in range(3):
             both.write(make_tick(index, bare=True))

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -107,6 +109,48 @@ def test_a_viewer_that_hangs_does_not_hold_up_the_end(web: LiveRerun, make_tick:
     os.kill(web.pid, signal.SIGCONT)
     assert not psutil.pid_exists(pid)
     assert len(told) == 1
+
+
+_RUN = """
+import sys, time
+from contextlib import closing
+from pathlib import Path
+sys.path.insert(0, {tests!r})
+from conftest import _tick
+from egovcp.log.background import BackgroundFanout, BackgroundSink
+from egovcp.log.destination import Viewer
+from egovcp.log.info import RunInfo
+from egovcp.log.live import LiveRerun
+from egovcp.log.mcap import McapSink
+from egovcp.log.rerun import RerunSink
+folder = Path({folder!r})
+with LiveRerun("web", Viewer({address!r}), {port}) as live:
+    sinks = [
+        BackgroundSink(McapSink(folder / "a.mcap"), "a.mcap"),
+        BackgroundSink(RerunSink(folder / "a.rrd"), "a.rrd"),
+        BackgroundSink(RerunSink(live.viewer), "Rerun"),
+    ]
+    with closing(BackgroundFanout(sinks)) as log:
+        log.open(RunInfo("ball"))
+        for index in range(10_000):
+            log.write(_tick(index))
+            print(index, flush=True)
+            time.sleep(0.04)
+"""
+
+
+def test_nothing_outlives_a_run_that_was_killed(tmp_path: Path) -> None:
+    tests, ports = str(Path(__file__).parent), (free_port(), free_port())
+    code = _RUN.format(tests=tests, folder=str(tmp_path), address=address(ports[0]), port=ports[1])
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as run:
+        assert run.stdout is not None
+        while int(run.stdout.readline()) < 20:
+            pass
+        children = psutil.Process(run.pid).children(recursive=True)
+        run.kill()
+        _, left = psutil.wait_procs(children, timeout=30)
+    assert len(children) == 4  # three writers and the server
+    assert left == []
 
 
 def test_nobody_to_connect_to(tmp_path: Path) -> None:

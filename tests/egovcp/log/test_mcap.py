@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import fields, is_dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from egovcp.log.messages import Topic
 from egovcp.log.tick import Tick
 from egovcp.robot.kinematics import LINK_NAMES
 
+ROOT = Path(__file__).parents[3]
 INFO = RunInfo(
     task="ball",
     seed=3,
@@ -111,6 +114,40 @@ def test_a_standard_ros_decoder_reads_every_message(tmp_path: Path, make_tick: A
     assert 2 * np.arctan(24 / camera.k[4]) == pytest.approx(INFO.camera.vertical_fov)
     assert decoded[Topic.LOG].msg == "ball thrown\nsecond line"
     assert [f.name for f in decoded[Topic.CANDIDATES].fields] == ["x", "y", "z", "value"]
+
+
+#: What Foxglove and Rerun decode without plugins; Rerun takes poses from the transforms.
+DISPLAYED = {
+    *("sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/JointState"),
+    *("sensor_msgs/msg/PointCloud2", "tf2_msgs/msg/TFMessage", "std_msgs/msg/Float64MultiArray"),
+    *("geometry_msgs/msg/PoseStamped", "rcl_interfaces/msg/Log"),
+}
+
+
+def test_every_schema_is_one_that_viewers_know(tmp_path: Path, make_tick: Any) -> None:
+    path = record(tmp_path / "a.mcap", [make_tick(1)])
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert reader.get_header().profile == "ros2"
+    assert summary is not None
+    assert {channel.topic for channel in summary.channels.values()} == set(Topic)
+    assert {channel.message_encoding for channel in summary.channels.values()} == {"cdr"}
+    assert {schema.encoding for schema in summary.schemas.values()} == {"ros2msg"}
+    assert {schema.name for schema in summary.schemas.values()} == DISPLAYED
+
+
+def _panels(node: Any) -> list[str]:
+    return [node] if isinstance(node, str) else _panels(node["first"]) + _panels(node["second"])
+
+
+def test_the_foxglove_layout_shows_topics_that_there_are() -> None:
+    layout = json.loads((ROOT / "docs" / "foxglove_layout.json").read_text())
+    panels = layout["configById"]
+    assert sorted(_panels(layout["layout"])) == sorted(panels)
+    named = set(re.findall(r'"(/[a-z_/]+)', json.dumps(panels)))
+    assert named <= set(Topic)
+    assert panels["3D!robot"]["followTf"] in LINK_NAMES
 
 
 def test_a_killed_process_loses_no_written_tick(tmp_path: Path, make_tick: Any) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from typing import Any
 
 import pytest
@@ -32,7 +33,7 @@ class Memory:
 
 def test_every_sink_sees_every_call_in_order(make_tick: Any) -> None:
     sinks = [Memory(), Memory()]
-    with Fanout(sinks) as fanout:
+    with closing(Fanout(sinks)) as fanout:
         fanout.open(RunInfo("ball"))
         fanout.write(make_tick(0, bare=True))
         fanout.write(make_tick(1, bare=True))

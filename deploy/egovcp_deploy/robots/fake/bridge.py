@@ -87,6 +87,7 @@ class FakeBridge:
     ) -> None:
         self._robot = robot
         self.faults = faults or Faults()
+        self.pressed: frozenset[str] = frozenset()
         self.counts = Counts()
         self._announce = announce
         self._rng = np.random.default_rng(0)
@@ -226,7 +227,7 @@ class FakeBridge:
             quaternion_w=seen.quaternion_w,
             angular_velocity=seen.angular_velocity,
             mode=self._mode,
-            remote=Remote.asking_for(self.robot.velocity_wish).to_bytes(),
+            remote=Remote.asking_for(self.robot.velocity_wish, self.pressed).to_bytes(),
         )
         return encode_state(LowState(body, seen.torque, self._sources()), seen.acceleration)
 

@@ -56,7 +56,7 @@ class FakeConfig:
     settle: float = 2.0
     """From there to the beginning of the task, s."""
     pause: float = 2.0
-    """From the end of an episode to the next, which begins on the crane, s."""
+    """From the end of an episode to the next, which begins on the crane, s; at least 1.5."""
     ports: Ports = field(default_factory=Ports)
     """Where to listen."""
     announce: bool = False

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from egovcp_deploy.robots.bridge import BridgeConfig
 from egovcp_deploy.robots.fake.bridge import FakeBridge
 
-PATIENCE_S = 60.0
+PATIENCE_S = 120.0
 
 
 def eventually(condition: Callable[[], bool]) -> bool:

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Final, Protocol
 
 from egovcp.sim.live import LiveRobot, Outcome, Phase
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import PHYSICS_DT
 
+LEAST_PAUSE: Final = 1.5  # s: a robot that is told to hold eases to its neutral pose in 1 s
+
 
 class Plant(Protocol):
     """A simulated robot and whoever passes it its commands."""
+
+    pressed: frozenset[str]
+    """Buttons of the robot's remote control that are held down (`remote.BUTTONS`)."""
 
     @property
     def robot(self) -> LiveRobot:
@@ -43,11 +48,26 @@ class Schedule:
     settle: float = 2.0
     """From there to the beginning of the task."""
     pause: float = 2.0
-    """From the end of an episode to the next, which begins on the crane."""
+    """From the end of an episode to the next, which begins on the crane; never less than
+    `LEAST_PAUSE`."""
+
+
+#: What is pressed in which phase, once an episode is over.
+_HOLD: Final = frozenset({"B"})
+_RUN: Final = frozenset({"start"})
+_BUTTONS: Final = {
+    Phase.OVER: _HOLD,
+    Phase.HELD: _HOLD,
+    Phase.FREE: _RUN,
+    Phase.EPISODE: frozenset[str](),
+}
 
 
 class Stage:
     """Plays one scenario after the other.
+
+    Between two of them it presses the buttons that an operator would: a robot must not be lifted
+    off the ground, nor put down, while a planner moves it.
 
     Args:
         plant: the robot, behind a wire or not.
@@ -84,6 +104,8 @@ class Stage:
 
     def _enter(self, phase: Phase) -> None:
         self._phase, self._since = phase, 0.0
+        if self.outcomes or phase is Phase.OVER:  # before, whoever operates it does all by himself
+            self._plant.pressed = _BUTTONS[phase]
 
     def step(self) -> None:
         """5 ms."""
@@ -99,7 +121,7 @@ class Stage:
             self._wait_for_commands()
         elif self._phase is Phase.FREE and self._since >= self._schedule.settle:
             robot.begin()
-        elif self._phase is Phase.OVER and self._since >= self._schedule.pause:
+        elif self._phase is Phase.OVER and self._since >= max(LEAST_PAUSE, self._schedule.pause):
             self._start()
 
     def _wait_for_commands(self) -> None:

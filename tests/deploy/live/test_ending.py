@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from egovcp_deploy.live.run import _end
+from egovcp_deploy.live.ending import end
 
 
 class Control:
@@ -38,7 +38,7 @@ def test_a_process_is_asked_before_it_is_killed_and_then_the_guard_acts(
 ) -> None:
     planner = SimpleNamespace(quitting=quitting)
     control = Control(hears, planner)
-    _end(control, planner)  # type: ignore[arg-type]
+    end(control, planner)
     assert not control.is_alive()
     assert ("kill" in control.tried) == (hears == "kill")
     assert control.guarded_when_killed == (hears == "kill")

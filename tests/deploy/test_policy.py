@@ -1,0 +1,38 @@
+"""Which arithmetic a policy plans with, by its name."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from egovcp.artefact import load_artefact
+from egovcp.plan.config import BackendName
+from egovcp_deploy.policy import backend_of
+
+
+@pytest.mark.parametrize("backend", ["eager", "float32", "bfloat16"])
+def test_a_backend_that_was_asked_for_is_the_one_that_is_named(
+    artefact_dir: Path, backend: BackendName
+) -> None:
+    artefact = load_artefact(str(artefact_dir))
+    artefact = replace(artefact, planner=replace(artefact.planner, backend=backend))
+    assert backend_of(artefact.make_policy(1, 0)) == backend
+
+
+@pytest.mark.parametrize(
+    ("judge", "name"),
+    [("IntegerJudge", "int8"), ("FloatJudge", "float32"), ("StepByStep", "eager")],
+)
+def test_auto_is_named_by_what_it_took(
+    artefact_dir: Path, monkeypatch: pytest.MonkeyPatch, judge: str, name: str
+) -> None:
+    policy = load_artefact(str(artefact_dir)).make_policy(1, 0)
+    assert policy.config.backend == "auto"
+    monkeypatch.setattr(policy, "prepare", type(judge, (), {}))
+    assert backend_of(policy) == name
+
+
+def test_auto_takes_something_that_has_a_name(artefact_dir: Path) -> None:
+    assert backend_of(load_artefact(str(artefact_dir)).make_policy(1, 0)) in ("int8", "float32")

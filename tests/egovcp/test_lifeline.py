@@ -1,0 +1,28 @@
+"""A child that ends with its parent, also when the parent has no time to say so."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import psutil
+
+_PARENT = """
+import subprocess, sys, time
+from egovcp.lifeline import command
+child = subprocess.Popen(command("/bin/sleep", "1000"), stdin=subprocess.DEVNULL)
+print(child.pid, flush=True)
+time.sleep(1000)
+"""
+
+
+def test_a_killed_parent_takes_its_child_along() -> None:
+    with subprocess.Popen(
+        [sys.executable, "-c", _PARENT], stdout=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdout is not None
+        child = psutil.Process(int(parent.stdout.readline()))
+        while "sleep" not in child.name():  # it has become the program
+            pass
+        parent.kill()
+        child.wait(timeout=60)
