@@ -34,7 +34,12 @@ CHOICES: Final[dict[str, Flags]] = {
     "no_foresight": {"policy.loss.foresight_depth": 0, "policy.loss.foresight_state": 0},
     "near": {"policy.loss.near": 10},
     "no_paint_flight": {"policy.paint_flight": False},
-    "no_motion": {"policy.paint_flight": False, "policy.loss.motion": 0},
+    "not_followed": {"policy.flight.enabled": False},
+    "no_motion": {
+        "policy.flight.enabled": False,
+        "policy.paint_flight": False,
+        "policy.loss.motion": 0,
+    },
     "raw_returns": {"returns.scale": "none"},
     "two_hot": {"policy.value_loss": "two_hot"},
     "five_q_heads": {"policy.q_heads": 5},
