@@ -78,6 +78,52 @@ class PlayConfig:
 
 
 @dataclass(frozen=True)
+class PpoConfig:
+    """The model-free baseline, in ppo and sample-efficiency."""
+
+    steps: int = 200_000
+    """Transitions of a training, rounded to whole updates between policies; 0: no PPO in
+    sample-efficiency."""
+    policies: int = 4
+    """Policies along a training that are played, equally far apart; the last is that of its
+    end."""
+    robots: int = 32
+    """Robots simulated side by side."""
+    ticks: int = 50
+    """Ticks of each robot from one update to the next."""
+    flags: tuple[str, ...] = ()
+    """Further flags of egovcp-train-ppo, '[--ppo.entropy_coef=0.01]'."""
+
+    @property
+    def updates(self) -> int:
+        """Updates from one policy to the next."""
+        return max(1, round(self.steps / (self.policies * self.robots * self.ticks)))
+
+    @property
+    def transitions(self) -> tuple[int, ...]:
+        """What each of the policies has seen."""
+        if not self.steps:
+            return ()
+        each = self.updates * self.robots * self.ticks
+        return tuple(each * (k + 1) for k in range(self.policies))
+
+    def check(self) -> None:
+        """Raise `UsageError` for values that make no sense."""
+        if self.steps < 0 or min(self.policies, self.robots, self.ticks) < 1:
+            raise UsageError(
+                "--ppo.policies, --ppo.robots and --ppo.ticks must be at least 1, --ppo.steps 0 or "
+                "more"
+            )
+        own = ("steps", "robots", "ppo.num_steps_per_env", "save_freq", "max_minutes")
+        for flag in self.flags:
+            if flag.removeprefix("--").split("=", 1)[0] in own:
+                raise UsageError(
+                    f"--ppo.flags holds {flag}, which decides what policies there are; say it with "
+                    "--ppo.steps, --ppo.policies, --ppo.robots and --ppo.ticks"
+                )
+
+
+@dataclass(frozen=True)
 class ExperimentConfig:
     """Run one of the paper's experiments, cell by cell, and write its report.
 
@@ -104,6 +150,8 @@ class ExperimentConfig:
     """Data."""
     train: TrainingConfig = field(default_factory=TrainingConfig)
     """Training."""
+    ppo: PpoConfig = field(default_factory=PpoConfig)
+    """The model-free baseline."""
     play: PlayConfig = field(default_factory=PlayConfig)
     """Closed loop."""
 
@@ -121,6 +169,7 @@ class ExperimentConfig:
         for flag in self.scenes:
             if not flag.startswith("--env."):
                 raise UsageError(f"--scenes holds {flag}; expected --env.NAME=value")
+        self.ppo.check()
 
     def chosen[T](self, variants: dict[str, T]) -> dict[str, T]:
         """Those of the variants that `only` names, or the first `most`.

@@ -4,6 +4,7 @@ collect-TASK-COUNT
 train-TASK-MODEL-sSEED     from the data of a task, or under the task `all` from that of all
 play-TASK-VARIANT-sSEED    the planner with that model
 references-TASK            hold, constant, random and oracle on the same scenarios
+bounds-TASK                the same without constant, whose search costs the most
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from egovcp_experiment.tools import ARTEFACT, COLLECT, PLAY, TRAIN
 ALL: Final = "all"
 #: Controllers of egovcp-eval that need no model.
 REFERENCES: Final = ("hold", "constant", "random", "oracle")
+#: Those of them that need no search either.
+BOUNDS: Final = ("hold", "random", "oracle")
 
 
 @dataclass(frozen=True)
@@ -106,7 +109,7 @@ class Grid:
             learned_from: the task, or `ALL`, that the model was trained on; empty: the one played.
         """
         policy = self.model(learned_from or task, seed, variant.model)
-        flags = {**self._common(task), "controllers": "planner", "policy.path": policy}
+        flags = {**self.scenarios(task), "controllers": "planner", "policy.path": policy}
         name = f"play-{task}-{variant.name}-s{seed}"
         return self.add(Cell(name, PLAY, {**flags, **variant.play}))
 
@@ -125,10 +128,15 @@ class Grid:
             scene: --env.* flags that differ from the configuration's.
             who: controllers of egovcp-eval.
         """
-        flags = {**self._common(task), "controllers": ",".join(who), **(scene or {})}
+        flags = {**self.scenarios(task), "controllers": ",".join(who), **(scene or {})}
         return self.add(Cell(name or f"references-{task}", PLAY, flags))
 
-    def _common(self, task: str) -> Flags:
+    def bounds(self, task: str) -> Cell:
+        """`BOUNDS` on the same scenarios as the planner."""
+        return self.references(task, f"bounds-{task}", who=BOUNDS)
+
+    def scenarios(self, task: str) -> Flags:
+        """Flags of egovcp-eval that say what is played, by whoever it is."""
         config = self.config.play
         named = (*self.config.scenes, *config.flags)
         given = dict(flag.removeprefix("--").split("=", 1) for flag in named)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,8 @@ from egovcp.intervals import Interval, bootstrap, wilson
 from egovcp_experiment.store import Record
 
 type Array = NDArray[np.float64]
+
+_TRIALS: Final = 10  # as the paper counts them
 
 
 @dataclass(frozen=True)
@@ -51,11 +53,26 @@ class Outcome:
         return bootstrap(self._reward_per_step, self.reward.shape[1])
 
     @property
+    def reward_of_seeds(self) -> Array:
+        """(S,) reward per step of each training."""
+        each: Array = self.reward.sum(1) / self.steps.sum(1)
+        return each
+
+    @property
     def reward_spread(self) -> float | None:
         """Standard deviation of reward per step over training seeds; None of one seed."""
-        if len(self.reward) < 2:
+        return float(np.std(self.reward_of_seeds, ddof=1)) if len(self.reward) > 1 else None
+
+    @property
+    def reward_trial_spread(self) -> float | None:
+        """Standard deviation of reward per step over trials, a tenth of the scenarios played with
+        one training each; None of a single scenario."""
+        count = min(_TRIALS, self.reward.shape[1])
+        if count < 2:
             return None
-        return float(np.std(self.reward.sum(1) / self.steps.sum(1), ddof=1))
+        parts = np.array_split(np.arange(self.reward.shape[1]), count)
+        trials = [self.reward[:, p].sum(1) / self.steps[:, p].sum(1) for p in parts]
+        return float(np.std(trials, ddof=1))
 
     def _reward_per_step(self, i: NDArray[np.int64]) -> Array:
         return _mean(self.reward, i) / _mean(self.steps, i)
@@ -83,6 +100,7 @@ class Outcome:
             "reward_mean": self.reward_per_step,
             "reward_ci95": list(self.reward_interval),
             "reward_sd_over_seeds": self.reward_spread,
+            "reward_sd_over_trials": self.reward_trial_spread,
             "plan_ms_p50": list(self.plan_ms),
         }
 
@@ -106,3 +124,11 @@ def outcome(
 
     times = tuple(float(row["plan_ms_p50"]) for row in rows)
     return Outcome(column("reward"), column("steps"), column("success"), times)
+
+
+def side_by_side(
+    records: Mapping[str, Record], cell: str, task: str, controllers: Iterable[str]
+) -> dict[str, Outcome]:
+    """Controllers that one cell played, those that are there."""
+    found = {name: outcome(records, [cell], task, name) for name in controllers}
+    return {name: played for name, played in found.items() if played is not None}

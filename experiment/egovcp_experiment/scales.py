@@ -10,6 +10,7 @@ from egovcp_experiment.config import (
     EpisodesConfig,
     ExperimentConfig,
     PlayConfig,
+    PpoConfig,
     Scale,
     TrainingConfig,
 )
@@ -40,6 +41,7 @@ def smoke() -> ExperimentConfig:
             flags=(
                 "--batch_size=4",
                 "--sampling.length=8",
+                "--policy.loss.autoregressive_steps=4",
                 "--returns.steps=6",
                 "--value_fit.steps=4",
                 "--value_fit.rows=64",
@@ -49,6 +51,13 @@ def smoke() -> ExperimentConfig:
                 "--device=cpu",
                 "--threads=1",
             ),
+        ),
+        ppo=PpoConfig(
+            steps=64,
+            policies=2,
+            robots=4,
+            ticks=8,
+            flags=("--ppo.num_mini_batches=2", "--tensorboard=false", "--threads=1"),
         ),
         play=PlayConfig(
             episodes=4, branches=2, budget_ms=5.0, flags=("--num_workers=1", "--num_envs=4")
@@ -77,6 +86,7 @@ def paper() -> ExperimentConfig:
         train=TrainingConfig(
             steps=100_000, compared_steps=100_000, seeds=(0, 1, 2), flags=("--eval_freq=0",)
         ),
+        ppo=PpoConfig(steps=5_000_000, policies=10),
         play=PlayConfig(episodes=300),
     )
 

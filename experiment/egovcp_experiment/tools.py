@@ -14,10 +14,13 @@ from typing import Any, Final
 from egovcp.artefact import MANIFEST, SEAL
 from egovcp.data.files import sha256
 from egovcp.data.schema import COLLECTION_PATH, HASHES_PATH
+from egovcp.reactive import ReactiveNetwork
 from egovcp_experiment.cell import Flags, Tool
 
 #: Where egovcp-train leaves its artefact, below the folder of the run.
 ARTEFACT: Final = "checkpoints/last/pretrained_model"
+#: The policy in a checkpoint of egovcp-train-ppo.
+PPO_POLICY: Final = "pretrained_model/ppo.safetensors"
 #: The file in which a study of this package leaves its figures.
 RESULT: Final = "result.json"
 
@@ -50,6 +53,18 @@ def _trained(folder: Path) -> dict[str, Any]:
 def artefact_digest(folder: Path) -> str:
     """The SHA-256 that seals an artefact's manifest, and with it all of its files."""
     return str(read_json(folder / MANIFEST)[SEAL])
+
+
+def _trained_ppo(folder: Path) -> dict[str, Any]:
+    policy = ReactiveNetwork.load(folder / "checkpoints" / "last" / PPO_POLICY)
+    return {name: policy.provenance[name] for name in ("steps", "episodes")}
+
+
+def _policies_digest(folder: Path) -> str:
+    """SHA-256 of the list of the SHA-256 of all policies along the run."""
+    checkpoints = sorted(p for p in (folder / "checkpoints").iterdir() if p.name.isdigit())
+    lines = [f"{p.name} {sha256(p / PPO_POLICY)}" for p in checkpoints]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
 
 
 def _played(folder: Path) -> dict[str, Any]:
@@ -89,6 +104,14 @@ TRAIN: Final = Tool(
     digest=lambda folder: artefact_digest(folder / ARTEFACT),
     continued=_resumed,
     prog="egovcp-train",
+)
+TRAIN_PPO: Final = Tool(
+    module="egovcp_train.ppo.train",
+    output="output_dir",
+    figures=_trained_ppo,
+    digest=_policies_digest,
+    continued=_resumed,
+    prog="egovcp-train-ppo",
 )
 PLAY: Final = Tool(
     module="egovcp_deploy.evaluate",

@@ -14,7 +14,15 @@ from egovcp_experiment.report.document import Plot, Report, Table
 from egovcp_experiment.scales import SCALES
 from egovcp_experiment.tools import COLLECT, PLAY
 
-CLOSED_LOOP = ("generalise", "multitask", "planners", "sample-efficiency", "variance")
+CLOSED_LOOP = (
+    "generalise",
+    "multitask",
+    "planners",
+    "ppo",
+    "sample-efficiency",
+    "table1",
+    "variance",
+)
 
 
 def played(cell: Cell) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from egovcp_experiment.tools import COLLECT, PLAY, TRAIN
 CONFIGS = {
     "egovcp_collect.collect": ("egovcp_collect.config", "CollectConfig"),
     "egovcp_train.train": ("egovcp_train.config", "TrainConfig"),
+    "egovcp_train.ppo.train": ("egovcp_train.ppo.config", "PpoTrainConfig"),
     "egovcp_deploy.evaluate": ("egovcp_deploy.evaluate", "EvalConfig"),
 }
 
@@ -91,7 +92,8 @@ def test_every_cell_has_flags_that_its_command_takes() -> None:
     for module, flags in values.items():
         for k in range(max(map(len, flags.values()))):
             argv = [f"{name}={known[k]}" for name, known in flags.items() if k < len(known)]
-            parse_config(_config(tools[module]), argv, "cell")
+            output = f"--{tools[module].tool.output}=x"
+            parse_config(_config(tools[module]), [output, *argv], "cell")
     train = tools[TRAIN.module]
     for argv in trainings.values():
         parse_config(_config(train), ["--output_dir=x", *argv], "train", "", _option_defaults())

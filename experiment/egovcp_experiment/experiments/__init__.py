@@ -12,7 +12,9 @@ from egovcp_experiment.experiments import (
     interpret,
     multitask,
     planners,
+    ppo,
     sample_efficiency,
+    table1,
     variance,
 )
 
@@ -22,6 +24,8 @@ EXPERIMENTS: Final[Mapping[str, Experiment]] = {
     "interpret": interpret.EXPERIMENT,
     "multitask": multitask.EXPERIMENT,
     "planners": planners.EXPERIMENT,
+    "ppo": ppo.EXPERIMENT,
     "sample-efficiency": sample_efficiency.EXPERIMENT,
+    "table1": table1.EXPERIMENT,
     "variance": variance.EXPERIMENT,
 }

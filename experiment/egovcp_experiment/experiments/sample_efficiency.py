@@ -1,6 +1,7 @@
 """Success and reward against the transitions that a model has seen (figure 5).
 
-Models learn from growing first parts of one dataset, each for as long as any other.
+Models learn from growing first parts of one dataset, each for as long as any other; PPO's curve is
+one training, played along its way.
 """
 
 from __future__ import annotations
@@ -10,17 +11,17 @@ from dataclasses import replace
 from typing import Any, Final
 
 from egovcp.spec import TASKS
-from egovcp_experiment.cell import Cell, Given
+from egovcp_experiment import model_free
+from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import EpisodesConfig, ExperimentConfig
 from egovcp_experiment.experiment import Experiment
-from egovcp_experiment.grid import Grid, Model, Variant
-from egovcp_experiment.outcomes import Outcome, outcome
+from egovcp_experiment.grid import BOUNDS, Grid, Model, Variant
+from egovcp_experiment.outcomes import Outcome, outcome, side_by_side
 from egovcp_experiment.report.comparison import comparison
+from egovcp_experiment.report.curves import Curve, transitions_plot
 from egovcp_experiment.report.document import Plot, Report, Table, points_range
-from egovcp_experiment.report.svg import drawn
 from egovcp_experiment.store import Record
-
-_REFERENCES: Final = ("hold", "random", "oracle")
+from egovcp_experiment.transitions import per_episode, steps
 
 
 def _episodes(config: ExperimentConfig, task: str, part: float) -> int:
@@ -51,7 +52,8 @@ def _plays(config: ExperimentConfig, grid: Grid) -> dict[str, dict[float, list[s
             variant = Variant(name, Model(name, flags))
             cells = [grid.play(task, seed, variant).name for seed in config.train.seeds]
             found.setdefault(task, {})[part] = cells
-        grid.references(task, f"bounds-{task}", who=_REFERENCES)
+        grid.bounds(task)
+        model_free.plays(grid, task)
     return found
 
 
@@ -67,25 +69,28 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
     parts: list[str | Table | Plot] = [_training(config)]
     figures: dict[str, Any] = {}
     curves: dict[str, dict[int, Outcome]] = {}
+    ppo: dict[str, dict[int, Outcome]] = {}
     for task, cells in _plays(config, grid).items():
         found = {p: o for p, c in cells.items() if (o := outcome(records, c, task)) is not None}
         if not found:
             continue
-        per_episode = _steps_per_episode(grid, task, records)
-        sizes = {p: round(_episodes(config, task, p) * per_episode) for p in found}
+        of_each = per_episode(grid, task, records)
+        sizes = {p: round(_episodes(config, task, p) * of_each) for p in found}
         curves[task] = {sizes[p]: played for p, played in found.items()}
-        others = {
-            r: o
-            for r in _REFERENCES
-            if (o := outcome(records, [f"bounds-{task}"], task, r)) is not None
-        }
-        named = {_steps(sizes[p]): played for p, played in found.items()}
+        free = model_free.curve(grid, task, records)
+        ppo[task] = free
+        named = {steps(sizes[p]): played for p, played in found.items()}
         largest = list(named)[-1]
-        parts.append(comparison(task, {**named, **others}, largest))
+        shown = {
+            **named,
+            **{f"PPO, {steps(seen)}": played for seen, played in free.items()},
+            **side_by_side(records, f"bounds-{task}", task, BOUNDS),
+        }
+        parts.append(comparison(task, shown, largest))
         shows += _shows(task, named)
-        figures[task] = {name: o.figures() for name, o in {**named, **others}.items()}
+        figures[task] = {name: o.figures() for name, o in shown.items()}
     if curves:
-        parts.insert(1, _plot(curves))
+        parts.insert(1, _plot(curves, ppo))
     title = "Sample efficiency: success against the transitions that a model has seen"
     return Report(title, tuple(shows), tuple(parts), figures)
 
@@ -95,22 +100,10 @@ def _training(config: ExperimentConfig) -> str:
     words = f"{limit:g} minutes" if limit else f"{config.train.steps} gradient steps"
     return (
         f"Every model was trained for {words} on the first episodes of one random dataset, "
-        "whatever their number; a twentieth of them is held out. The model-free baseline (PPO) is "
-        "no part of this report."
+        "whatever their number; a twentieth of them is held out. The model-free baseline (PPO, "
+        "dashed) makes its transitions itself: its curve is one training, which updates "
+        "as it goes."
     )
-
-
-def _steps_per_episode(grid: Grid, task: str, records: Mapping[str, Record]) -> float:
-    """Of the collected data; of a given dataset the scale's, which it is taken to have."""
-    data = grid.data(task)
-    if isinstance(data, Given) or data.cell not in records:
-        return {"arch": 230.0}.get(task, 150.0)
-    figures = records[data.cell]["figures"]
-    return float(figures["steps"] / figures["episodes"])
-
-
-def _steps(count: int) -> str:
-    return f"{count / 1000:.0f}k steps" if count >= 10_000 else f"{count} steps"
 
 
 def _shows(task: str, named: Mapping[str, Outcome]) -> list[str]:
@@ -128,30 +121,13 @@ def _shows(task: str, named: Mapping[str, Outcome]) -> list[str]:
     ]
 
 
-def _plot(curves: Mapping[str, Mapping[int, Outcome]]) -> Plot:
-    def paint(figure: Any) -> None:
-        left, right = figure.subplots(1, 2)
-        for k, (task, row) in enumerate(curves.items()):
-            xs = list(row)
-            colour = f"C{k}"
-            left.plot(
-                xs, [100 * o.success_rate for o in row.values()], "o-", color=colour, label=task
-            )
-            right.plot(
-                xs, [o.reward_per_step for o in row.values()], "o-", color=colour, label=task
-            )
-            for axes, ranges in (
-                (left, [[100 * v for v in o.success_interval] for o in row.values()]),
-                (right, [list(o.reward_interval) for o in row.values()]),
-            ):
-                low, high = zip(*ranges, strict=True)
-                axes.fill_between(xs, low, high, color=colour, alpha=0.15, linewidth=0)
-        for axes, words in ((left, "success, %"), (right, "reward per step")):
-            axes.set_xscale("log")
-            axes.set(xlabel="transitions", ylabel=words)
-        left.legend(fontsize=8)
-
-    return drawn("transitions", "Success and reward against transitions, 95 % intervals", paint)
+def _plot(
+    curves: Mapping[str, Mapping[int, Outcome]], ppo: Mapping[str, Mapping[int, Outcome]]
+) -> Plot:
+    colours = {task: f"C{k}" for k, task in enumerate(curves)}
+    ours = [Curve(task, row, colours[task]) for task, row in curves.items()]
+    free = [Curve(f"{task}, PPO", r, colours[task], "x--") for task, r in ppo.items() if r]
+    return transitions_plot("transitions", "Success and reward against transitions", ours + free)
 
 
 EXPERIMENT: Final = Experiment(

@@ -1,0 +1,135 @@
+"""Claims that one row plays better than another, weighed on the same scenarios."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from egovcp.intervals import Interval
+from egovcp_experiment.outcomes import outcome
+from egovcp_experiment.report.document import points_range
+from egovcp_experiment.store import Record
+
+type Word = Literal["holds", "holds on average only", "contradicted", "undecided"]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """``above`` has more reward than ``below``."""
+
+    above: str
+    below: str
+    tasks: tuple[str, ...]
+    """Where that is claimed."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What the results say of a claim on one task."""
+
+    claim: Claim
+    task: str
+    reward: float
+    """Reward per step of ``above`` minus that of ``below``."""
+    reward_interval: Interval
+    """95 %, over scenarios."""
+    success: float
+    """The same of the success rate."""
+    success_interval: Interval
+    """95 %, over scenarios."""
+    agreeing: int
+    """Trainings in which ``above`` has more reward."""
+    seeds: int
+    """Trainings that both have."""
+
+    @property
+    def word(self) -> Word:
+        """By reward; an interval with zero in it decides nothing."""
+        low, high = self.reward_interval
+        if high < 0:
+            return "contradicted"
+        if low <= 0:
+            return "undecided"
+        return "holds" if self.agreeing == self.seeds else "holds on average only"
+
+    @property
+    def words(self) -> str:
+        """The same with its figures."""
+        low, high = self.reward_interval
+        trainings = "" if self.seeds == 1 else f", in {self.agreeing} of {self.seeds} trainings"
+        return (
+            f"{self.word} ({self.reward:+.4f}, 95 % {low:+.4f} to {high:+.4f}{trainings}; success "
+            f"{100 * self.success:+.1f} points, {points_range(self.success_interval)})"
+        )
+
+    def figures(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "above": self.claim.above,
+            "below": self.claim.below,
+            "task": self.task,
+            "verdict": self.word,
+            "reward_gain": self.reward,
+            "reward_gain_ci95": list(self.reward_interval),
+            "success_gain": self.success,
+            "success_gain_ci95": list(self.success_interval),
+            "seeds_in_favour": self.agreeing,
+            "seeds": self.seeds,
+        }
+
+
+def weigh(
+    claim: Claim,
+    task: str,
+    above: Mapping[int, str],
+    below: Mapping[int, str],
+    records: Mapping[str, Record],
+) -> Verdict | None:
+    """The verdict of the trainings that both have; None if there is none.
+
+    Args:
+        claim: what is claimed.
+        task: what was played.
+        above: training seed -> name of the cell that played it.
+        below: the same of the other.
+        records: results.
+    """
+    both = [s for s in above if above[s] in records and below.get(s) in records]
+    ours = outcome(records, [above[s] for s in both], task)
+    theirs = outcome(records, [below[s] for s in both], task)
+    if ours is None or theirs is None:
+        return None
+    reward, reward_interval = ours.reward_gain(theirs)
+    success, success_interval = ours.success_gain(theirs)
+    each = ours.reward_of_seeds - theirs.reward_of_seeds
+    return Verdict(
+        claim,
+        task,
+        reward,
+        reward_interval,
+        success,
+        success_interval,
+        agreeing=int((each > 0).sum()),
+        seeds=len(both),
+    )
+
+
+def by_chance(verdicts: Sequence[Verdict]) -> str:
+    """How many are of which kind, and how many of them luck alone would bring."""
+    count = len(verdicts)
+    words = [verdict.word for verdict in verdicts]
+    kinds = ", ".join(
+        f"{words.count(word)} {label}"
+        for word, label in (
+            ("holds", "hold"),
+            ("holds on average only", "hold on average only"),
+            ("contradicted", "are contradicted"),
+            ("undecided", "are undecided"),
+        )
+        if word in words
+    )
+    return (
+        f"of {count} claims, one for each task, {kinds} (95 % intervals; were no two rows any "
+        f"different, about {0.025 * count:.1f} would hold and as many be contradicted by chance)"
+    )

@@ -1,0 +1,127 @@
+"""PPO's cells, what is kept of its trainings, and the verdicts on it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from egovcp.errors import UsageError
+from egovcp_experiment.cell import Output
+from egovcp_experiment.config import ExperimentConfig, PpoConfig, TrainingConfig
+from egovcp_experiment.experiments import EXPERIMENTS
+from egovcp_experiment.store import Store
+from egovcp_experiment.tools import PPO_POLICY, TRAIN_PPO
+
+PPO = EXPERIMENTS["ppo"]
+CONFIG = ExperimentConfig(
+    output_dir="out",
+    tasks=("ball",),
+    scenes=("--env.controller=stance",),
+    train=TrainingConfig(seeds=(3,)),
+    ppo=PpoConfig(steps=1000, policies=2, robots=10, ticks=5, flags=("--threads=1",)),
+)
+
+
+def test_policies_are_those_that_the_training_saves() -> None:
+    cells = {cell.name: cell for cell in PPO.cells(CONFIG)}
+    training = cells["ppo-ball-s3"]
+    argv = Store(Path("out")).prepare(training, {})
+    assert argv == [
+        "--output_dir=out/work/ppo-ball-s3",
+        "--task=ball",
+        "--steps=1000",
+        "--robots=10",
+        "--ppo.num_steps_per_env=5",
+        "--save_freq=10",
+        "--seed=3",
+        "--env.controller=stance",
+        "--threads=1",
+    ]
+    plays = [cells[f"play-ball-ppo_{seen}-s3"] for seen in (500, 1000)]
+    assert [play.flags["ppo.path"] for play in plays] == [
+        Output("ppo-ball-s3", f"checkpoints/{iteration}/{PPO_POLICY}")
+        for iteration in ("000010", "000020")
+    ]
+    planner = cells["play-ball-default-s3"]
+    for play in (*plays, cells["bounds-ball"]):
+        assert [play.flags[k] for k in ("task", "episodes", "seed", "env.controller")] == [
+            planner.flags[k] for k in ("task", "episodes", "seed", "env.controller")
+        ]
+
+
+def test_transitions_are_whole_updates_equally_far_apart() -> None:
+    assert PpoConfig(steps=200_000).transitions == (49_600, 99_200, 148_800, 198_400)
+    assert PpoConfig(steps=1, policies=2).transitions == (1600, 3200)
+    assert PpoConfig(steps=0).transitions == ()
+
+
+def test_flags_that_would_move_the_policies_are_refused() -> None:
+    for flag in ("--steps=5", "--robots=2", "--save_freq=1"):
+        ppo = replace(CONFIG.ppo, flags=(flag,))
+        with pytest.raises(UsageError, match=flag):
+            replace(CONFIG, ppo=ppo).check()
+    with pytest.raises(UsageError, match=r"--ppo\.steps=0"):
+        PPO.cells(replace(CONFIG, ppo=PpoConfig(steps=0)))
+
+
+def test_sample_efficiency_shares_the_trainings_and_can_do_without() -> None:
+    ours = {cell.name: cell for cell in PPO.cells(CONFIG)}
+    curves = {cell.name: cell for cell in EXPERIMENTS["sample-efficiency"].cells(CONFIG)}
+    shared = {"ppo-ball-s3", "play-ball-ppo_500-s3", "play-ball-ppo_1000-s3", "bounds-ball"}
+    assert {name for name in curves if "ppo" in name or name in ours} >= shared
+    assert all(curves[name] == ours[name] for name in shared)
+    without = EXPERIMENTS["sample-efficiency"].cells(replace(CONFIG, ppo=PpoConfig(steps=0)))
+    assert not [cell for cell in without if "ppo" in cell.name]
+
+
+def test_any_policy_along_the_way_decides_about_the_hash(tmp_path: Path) -> None:
+    for iteration in ("000010", "000020"):
+        file = tmp_path / "checkpoints" / iteration / PPO_POLICY
+        file.parent.mkdir(parents=True)
+        file.write_text(iteration)
+    (tmp_path / "checkpoints" / "last").symlink_to("000020")
+    before = TRAIN_PPO.digest(tmp_path)
+    assert TRAIN_PPO.digest(tmp_path) == before
+    (tmp_path / "checkpoints" / "000010" / PPO_POLICY).write_text("another")
+    assert TRAIN_PPO.digest(tmp_path) != before
+
+
+def played(name: str, success: int, reward: float) -> Mapping[str, Any]:
+    columns = {
+        "episode": list(range(20)),
+        "steps": [10] * 20,
+        "reward": [reward + 0.01 * (k % 3) for k in range(20)],
+        "success": [k < success for k in range(20)],
+    }
+    return {name: {"plan_ms_p50": 1.0, "played": columns}}
+
+
+def test_verdicts_come_from_the_numbers() -> None:
+    records = {
+        "collect-ball-1334": {"figures": {"episodes": 1334, "steps": 200_100}},
+        "play-ball-default-s3": {"figures": {"ball": played("planner", 18, 1.0)}},
+        "play-ball-ppo_500-s3": {"figures": {"ball": played("ppo", 5, 0.2)}},
+        "play-ball-ppo_1000-s3": {"figures": {"ball": played("ppo", 10, 0.2)}},
+        "bounds-ball": {
+            "figures": {
+                "ball": {
+                    **played("hold", 2, 0.1),
+                    **played("random", 2, 0.0),
+                    **played("oracle", 20, 2.0),
+                }
+            }
+        },
+    }
+    shows = PPO.report(CONFIG, records).shows
+    assert shows[0].startswith(
+        "ball: the planner 90.0 % success from 200k steps, PPO 50.0 % after 1000 steps: PPO is "
+        "worse (reward per step -0.0800, 95 % -0.0800 to -0.0800; success -40.0 points"
+    )
+    assert shows[1].startswith(
+        "ball: beside the neutral pose, PPO is better (reward per step +0.0100"
+    )
+    assert shows[2].startswith("ball: beside its first policy, PPO's last is no different beyond")

@@ -1,0 +1,178 @@
+"""Table I: what its cells run, which of them share a model, and what is made of given numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from egovcp_experiment.cell import Cell, Output
+from egovcp_experiment.claims import Claim, Verdict, by_chance, weigh
+from egovcp_experiment.config import ExperimentConfig, TrainingConfig
+from egovcp_experiment.experiments import EXPERIMENTS
+from egovcp_experiment.report.document import Report, Table
+from egovcp_experiment.scales import SCALES
+from egovcp_experiment.tools import ARTEFACT, PLAY, TRAIN
+
+TABLE1 = EXPERIMENTS["table1"]
+SEEDS = (0, 1)
+COUNT = 40
+CONFIG = ExperimentConfig(
+    tasks=("ball", "wall"), train=TrainingConfig(seeds=SEEDS, max_minutes=10, compared_steps=700)
+)
+CELLS = {cell.name: cell for cell in TABLE1.cells(CONFIG)}
+
+
+def row(name: str, seed: int = 0, task: str = "ball") -> Cell:
+    return CELLS[f"play-{task}-{name}-s{seed}"]
+
+
+def planned(name: str) -> tuple[object, object]:
+    flags = row(name).flags
+    return flags["planner.objective"], flags["planner.horizon"]
+
+
+def test_rows_say_what_is_planned_by() -> None:
+    assert [planned(f"ours_n{n}") for n in range(1, 7)] == [("value", n) for n in range(1, 7)]
+    assert planned("arwm") == ("value", 4)
+    assert planned("rew_mpc") == ("reward", 4)
+    assert planned("td_mpc_mc") == planned("td_mpc_td") == ("td", 4)
+
+
+def test_rows_of_one_training_share_its_model() -> None:
+    ours = Output("train-ball-reward-s1", ARTEFACT)
+    for name in (*(f"ours_n{n}" for n in range(1, 7)), "rew_mpc", "td_mpc_mc"):
+        assert row(name, 1).flags["policy.path"] == ours
+    assert row("arwm", 1).flags["policy.path"] == Output("train-ball-reward_arwm-s1", ARTEFACT)
+    assert row("td_mpc_td", 1).flags["policy.path"] == Output("train-ball-reward_td-s1", ARTEFACT)
+    assert sum(cell.tool is TRAIN for cell in CELLS.values()) == 3 * len(SEEDS) * 2
+
+
+def test_models_differ_in_their_own_flag_only() -> None:
+    joint, arwm, td = (
+        CELLS[f"train-wall-{name}-s0"].flags for name in ("reward", "reward_arwm", "reward_td")
+    )
+    assert joint["policy.loss.reward"] == 1
+    assert (joint["steps"], joint["max_minutes"]) == (700, 0)
+    assert arwm == {**joint, "policy.dynamics": "autoregressive"}
+    assert td == {**joint, "policy.loss.q_target": "td"}
+
+
+def test_all_rows_and_references_play_the_same_scenarios() -> None:
+    plays = [c for c in CELLS.values() if c.tool is PLAY and c.flags["task"] == "ball"]
+    assert len(plays) == 10 * len(SEEDS) + 1
+    assert {(c.flags["episodes"], c.flags["seed"]) for c in plays} == {(100, 0)}
+
+
+def test_a_smoke_run_has_each_of_the_models() -> None:
+    cells = TABLE1.cells(replace(SCALES["smoke"](), tasks=("ball",)))
+    assert [c.name for c in cells if c.tool is TRAIN] == [
+        "train-ball-reward-s0",
+        "train-ball-reward_arwm-s0",
+        "train-ball-reward_td-s0",
+    ]
+
+
+def record(task: str, reward: float, success: float, rng: np.random.Generator) -> Mapping[str, Any]:
+    """Ten ticks an episode, with a little luck in each."""
+    played = {
+        "episode": list(range(COUNT)),
+        "steps": [10] * COUNT,
+        "reward": (10 * reward + rng.normal(0, 0.05, COUNT)).tolist(),
+        "success": [k < success * COUNT for k in range(COUNT)],
+    }
+    return {"figures": {task: {"planner": {"played": played, "plan_ms_p50": 1.0}}}}
+
+
+def results(reward: Callable[[str, str, int], float]) -> dict[str, Mapping[str, Any]]:
+    """Of the plays of all rows: ``reward(task, row, seed)`` per step."""
+    rng = np.random.default_rng(0)
+    found = {}
+    for name, cell in CELLS.items():
+        if cell.tool is PLAY and cell.flags["controllers"] == "planner":
+            _, task, variant, seed = name.split("-")
+            level = reward(task, variant, int(seed[1:]))
+            found[name] = record(task, level, 0.5 + level, rng)
+    return found
+
+
+def as_in_the_paper(task: str, variant: str, seed: int) -> float:
+    """N=4 above all, but for TD-MPC, which is above it on the wall."""
+    best = {"ball": ("ours_n4",), "wall": ("td_mpc_mc", "td_mpc_td")}[task]
+    return 0.2 if variant in best else 0.1 if variant == "ours_n4" else 0.0
+
+
+def report(reward: Callable[[str, str, int], float]) -> Report:
+    return TABLE1.report(CONFIG, results(reward))
+
+
+def words(found: Report) -> set[tuple[str, str, str, str]]:
+    return {(c["above"], c["below"], c["task"], c["verdict"]) for c in found.figures["claims"]}
+
+
+def test_the_papers_ordering_is_recognised() -> None:
+    found = report(as_in_the_paper)
+    assert words(found) == {
+        ("ours_n4", "ours_n1", "ball", "holds"),
+        ("ours_n4", "ours_n1", "wall", "holds"),
+        ("ours_n4", "rew_mpc", "ball", "holds"),
+        ("ours_n4", "rew_mpc", "wall", "holds"),
+        ("ours_n4", "arwm", "ball", "holds"),
+        ("ours_n4", "td_mpc_mc", "ball", "holds"),
+        ("td_mpc_mc", "ours_n4", "wall", "holds"),
+        ("ours_n4", "td_mpc_td", "ball", "holds"),
+        ("td_mpc_td", "ours_n4", "wall", "holds"),
+    }
+    assert found.shows[0].startswith("of 9 claims, one for each task, 9 hold (")
+    assert "the most reward at N=4" in found.shows[-1]
+    assert any(line.startswith("ours, N=4 above ours, N=1: ball holds (") for line in found.shows)
+
+
+def test_the_opposite_is_contradicted_and_no_difference_is_undecided() -> None:
+    opposite = report(lambda *cell: -as_in_the_paper(*cell))
+    assert {word for *_, word in words(opposite)} == {"contradicted"}
+    same = report(lambda *cell: 0.0)
+    assert {word for *_, word in words(same)} == {"undecided"}
+
+
+def test_what_one_training_alone_does_holds_on_average_only() -> None:
+    found = report(lambda task, variant, seed: (0.3, -0.1)[seed] if variant == "ours_n4" else 0.0)
+    assert ("ours_n4", "ours_n1", "ball", "holds on average only") in words(found)
+    assert "in 1 of 2 trainings" in " ".join(found.shows)
+
+
+def test_the_summary_marks_the_best_and_has_the_deviation_of_trainings() -> None:
+    found = report(lambda task, variant, seed: 0.2 + 0.1 * seed if variant == "arwm" else 0.0)
+    summary = next(part for part in found.parts if isinstance(part, Table))
+    (arwm,) = [line for line in summary.rows if line[0] == "ARWM"]
+    mean, _, spread = arwm[1].partition(" ± ")
+    assert float(mean.strip("*")) == pytest.approx(0.25, abs=0.01)
+    assert float(spread) == pytest.approx(0.1 / np.sqrt(2), abs=0.01)
+    assert [line[0] for line in summary.rows if line[1].startswith("**")] == ["ARWM"]
+
+
+def test_a_claim_is_weighed_by_the_trainings_that_both_have() -> None:
+    rng = np.random.default_rng(0)
+    records = {
+        "a0": record("ball", 0.0, 0.5, rng),
+        "a1": record("ball", 0.9, 0.9, rng),
+        "b0": record("ball", 0.0, 0.5, rng),
+    }
+    claim = Claim("a", "b", ("ball",))
+    verdict = weigh(claim, "ball", {0: "a0", 1: "a1"}, {0: "b0", 1: "b1"}, records)
+    assert verdict is not None
+    assert (verdict.seeds, verdict.word, verdict.success) == (1, "undecided", 0.0)
+    assert weigh(claim, "ball", {1: "a1"}, {1: "b1"}, records) is None
+
+
+def test_chance_is_said() -> None:
+    claim = Claim("a", "b", ("ball",))
+    up = Verdict(claim, "ball", 1.0, (0.5, 1.5), 0.0, (0.0, 0.0), agreeing=1, seeds=1)
+    even = replace(up, reward_interval=(-0.1, 0.1))
+    assert by_chance([up] * 3 + [even] * 17).startswith(
+        "of 20 claims, one for each task, 3 hold, 17 are undecided (95 % intervals; were no two "
+        "rows any different, about 0.5 would"
+    )
