@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from egovcp.intervals import Interval
 from egovcp_experiment.outcomes import outcome
@@ -59,7 +59,7 @@ class Verdict:
         low, high = self.reward_interval
         trainings = "" if self.seeds == 1 else f", in {self.agreeing} of {self.seeds} trainings"
         return (
-            f"{self.word} ({self.reward:+.4f}, 95 % {low:+.4f} to {high:+.4f}{trainings}; success "
+            f"{self.word} ({self.reward:+.5f}, 95 % {low:+.5f} to {high:+.5f}{trainings}; success "
             f"{100 * self.success:+.1f} points, {points_range(self.success_interval)})"
         )
 
@@ -119,17 +119,8 @@ def by_chance(verdicts: Sequence[Verdict]) -> str:
     """How many are of which kind, and how many of them luck alone would bring."""
     count = len(verdicts)
     words = [verdict.word for verdict in verdicts]
-    kinds = ", ".join(
-        f"{words.count(word)} {label}"
-        for word, label in (
-            ("holds", "hold"),
-            ("holds on average only", "hold on average only"),
-            ("contradicted", "are contradicted"),
-            ("undecided", "are undecided"),
-        )
-        if word in words
-    )
+    kinds = ", ".join(f"{words.count(w)} {w}" for w in get_args(Word.__value__) if w in words)
     return (
-        f"of {count} claims, one for each task, {kinds} (95 % intervals; were no two rows any "
+        f"of {count} claims, one for each task: {kinds} (95 % intervals; were no two rows any "
         f"different, about {0.025 * count:.1f} would hold and as many be contradicted by chance)"
     )

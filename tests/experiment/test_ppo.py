@@ -119,9 +119,9 @@ def test_verdicts_come_from_the_numbers() -> None:
     shows = PPO.report(CONFIG, records).shows
     assert shows[0].startswith(
         "ball: the planner 90.0 % success from 200k steps, PPO 50.0 % after 1000 steps: PPO is "
-        "worse (reward per step -0.0800, 95 % -0.0800 to -0.0800; success -40.0 points"
+        "worse (reward per step -0.08000, 95 % -0.08000 to -0.08000; success -40.0 points"
     )
     assert shows[1].startswith(
-        "ball: beside the neutral pose, PPO is better (reward per step +0.0100"
+        "ball: beside the neutral pose, PPO is better (reward per step +0.01000"
     )
     assert shows[2].startswith("ball: beside its first policy, PPO's last is no different beyond")

@@ -126,7 +126,7 @@ def test_the_papers_ordering_is_recognised() -> None:
         ("ours_n4", "td_mpc_td", "ball", "holds"),
         ("td_mpc_td", "ours_n4", "wall", "holds"),
     }
-    assert found.shows[0].startswith("of 9 claims, one for each task, 9 hold (")
+    assert found.shows[0].startswith("of 9 claims, one for each task: 9 holds (")
     assert "the most reward at N=4" in found.shows[-1]
     assert any(line.startswith("ours, N=4 above ours, N=1: ball holds (") for line in found.shows)
 
@@ -173,6 +173,6 @@ def test_chance_is_said() -> None:
     up = Verdict(claim, "ball", 1.0, (0.5, 1.5), 0.0, (0.0, 0.0), agreeing=1, seeds=1)
     even = replace(up, reward_interval=(-0.1, 0.1))
     assert by_chance([up] * 3 + [even] * 17).startswith(
-        "of 20 claims, one for each task, 3 hold, 17 are undecided (95 % intervals; were no two "
+        "of 20 claims, one for each task: 3 holds, 17 undecided (95 % intervals; were no two "
         "rows any different, about 0.5 would"
     )

@@ -103,7 +103,7 @@ def _beside(played: Outcome, other: Outcome) -> str:
     success, interval = played.success_gain(other)
     word = "better" if low > 0 else "worse" if high < 0 else "no different beyond chance"
     return (
-        f"{word} (reward per step {reward:+.4f}, 95 % {low:+.4f} to {high:+.4f}; success "
+        f"{word} (reward per step {reward:+.5f}, 95 % {low:+.5f} to {high:+.5f}; success "
         f"{100 * success:+.1f} points, {points_range(interval)})"
     )
 

@@ -201,7 +201,7 @@ def _best_horizon(task: str, rows: Mapping[str, Outcome]) -> list[str]:
         return [many]
     gain, (low, high) = ours[best].reward_gain(rows[OURS])
     beyond = "beyond" if low > 0 else "not beyond"
-    return [f"{many}, {beyond} chance ({gain:+.4f} beside N=4, 95 % {low:+.4f} to {high:+.4f})"]
+    return [f"{many}, {beyond} chance ({gain:+.5f} beside N=4, 95 % {low:+.5f} to {high:+.5f})"]
 
 
 def _summary(found: Played) -> Table:
@@ -216,8 +216,8 @@ def _summary(found: Played) -> Table:
         lines.append((ROWS[name].title, *cells))
     heads = [h for task in found for h in (f"{task}: reward/step", "sd of trials", "success")]
     title = (
-        "Reward per step, mean ± standard deviation over trainings (several seeds); a trial is a "
-        "tenth of the scenarios with one training"
+        "Reward per step, ± its standard deviation over trainings where there are several; a trial "
+        "is a tenth of the scenarios with one training"
     )
     return Table(title, ("", *heads), tuple(lines))
 
