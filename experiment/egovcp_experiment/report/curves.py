@@ -28,6 +28,8 @@ def transitions_plot(name: str, caption: str, curves: Sequence[Curve]) -> Plot:
     """All of them on the same axes, with their 95 % intervals."""
 
     def paint(figure: Any) -> None:
+        from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
+
         left, right = figure.subplots(1, 2)
         for curve in curves:
             outcomes = list(curve.points.values())
@@ -37,6 +39,9 @@ def transitions_plot(name: str, caption: str, curves: Sequence[Curve]) -> Plot:
             _line(right, curve, reward)
         for axes, words in ((left, "success, %"), (right, "reward per step")):
             axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # less than a decade, too
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.xaxis.set_minor_formatter(NullFormatter())
             axes.set(xlabel="transitions", ylabel=words)
         left.legend(fontsize=8)
 
