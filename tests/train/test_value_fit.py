@@ -98,7 +98,7 @@ def test_the_fit_improves_q_and_touches_nothing_else(store: EpisodeStore) -> Non
     before = {k: v.clone() for k, v in model.state_dict().items()}
     rows = _collect(model, store, ahead=3)
     start = _error(model, rows)
-    fit_value(model, _whole(store), ValueFitConfig(steps=60, rows=64), seed=0)
+    fit_value(model, _whole(store), ValueFitConfig(steps=60, told_steps=60, rows=64), seed=0)
     assert _error(model, rows) < 0.5 * start
     changed = {k for k, v in model.state_dict().items() if not torch.equal(v, before[k])}
     assert changed
@@ -120,7 +120,7 @@ def test_what_an_action_earns_is_not_credited_to_the_state_that_goes_with_it() -
     target = -((action[:, 0] - place) ** 2)
     standardised = (target - target.mean()) / target.std()
     rows = Rows(h, z, told, action, standardised, torch.zeros(count))
-    _fit_heads(model, rows, ValueFitConfig(steps=300, rows=512, lr=3e-3), rng)
+    _fit_heads(model, rows, ValueFitConfig(steps=300, told_steps=300, rows=512, lr=3e-3), rng)
     with torch.no_grad():
         good, bad = action.clone(), action.clone()
         good[:, 0], bad[:, 0] = place, torch.where(place > 0, -1.0, 1.0)
@@ -133,7 +133,12 @@ def test_what_an_action_earns_is_not_credited_to_the_state_that_goes_with_it() -
 def test_a_seed_repeats_the_fit_and_no_steps_leave_the_model_alone(store: EpisodeStore) -> None:
     def fitted(steps: int, seed: int) -> dict[str, Tensor]:
         model = toy_model()
-        fit_value(model, _whole(store, mirror=True), ValueFitConfig(steps, rows=16), seed)
+        fit_value(
+            model,
+            _whole(store, mirror=True),
+            ValueFitConfig(steps, told_steps=steps, rows=16),
+            seed,
+        )
         return model.state_dict()
 
     def same(a: dict[str, Tensor], b: dict[str, Tensor]) -> bool:

@@ -9,7 +9,7 @@ explains on held-out episodes doubled (0.04 to 0.08).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -28,13 +28,20 @@ class ValueFitConfig:
     """Fit of the value head on fixed states at the end of training."""
 
     steps: int = 600
-    """Gradient steps; 0: no fit."""
+    """Gradient steps of the part of Q that reads the state, and of the reward; 0: no fit at all."""
     imagined_steps: int = 3
     """States are imagined 0 to this many ticks ahead, as far as the planner looks."""
     rows: int = 1024
     """States per step."""
     lr: float = 1e-3
     """Peak learning rate; one cycle."""
+    told_steps: int = 2500
+    """Gradient steps of the part of Q that reads what is told of a flight: few numbers, from which
+    there is more to be learned than from the state, which is soon known by heart (docs/log.md)."""
+    told_rows: int = 2048
+    """States per step of that part."""
+    told_lr: float = 2e-3
+    """Peak learning rate of that part."""
     weight_decay: float = 0.1
     """Decoupled weight decay."""
     dropout: float = 0.5
@@ -113,7 +120,10 @@ def _fit_q(
         def told_error(x: Rows, known: Tensor | None) -> Tensor:
             return value.error(told(x), x.target, kind).mean()
 
-        _descend(passing, told_error, rows, None, config, generator)
+        thorough = replace(
+            config, steps=config.told_steps, rows=config.told_rows, lr=config.told_lr
+        )
+        _descend(passing, told_error, rows, None, thorough, generator)
         with torch.no_grad():
             chunks = torch.split(torch.arange(len(rows.target)), 65536)
             known = torch.cat([told(_pick(rows, some, _device(passing))).cpu() for some in chunks])
