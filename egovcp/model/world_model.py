@@ -174,12 +174,8 @@ class WorldModel(nn.Module):
                 head.start_at_zero()
 
     # --- observation -----------------------------------------------------------------
-    def embed(self, depth: Tensor, state: Tensor) -> Tensor:
-        """Raw depth (B, 48, 64) mm and state (B, 74) -> embedding (B, units)."""
-        return self.embed_near(nearness(depth, self.config.depth_max_m), self.standardise(state))
-
     def embed_near(self, near: Tensor, standardised: Tensor) -> Tensor:
-        """The same from nearness (B, 48, 64) and standardised state (B, 74)."""
+        """Nearness (B, 48, 64) and standardised state (B, 74) -> embedding (B, units)."""
         image = self.encode_depth(network_image(near))
         embedding: Tensor = self.embed_observation(image, self.encode_state(standardised))
         return embedding

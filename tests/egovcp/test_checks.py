@@ -53,8 +53,8 @@ class _ChangesItsInput(WorldModel):
 
 
 class _MixesRows(WorldModel):
-    def embed(self, depth: Tensor, state: Tensor) -> Tensor:
-        embedding = super().embed(depth, state)
+    def embed_near(self, near: Tensor, standardised: Tensor) -> Tensor:
+        embedding = super().embed_near(near, standardised)
         return embedding - embedding.mean(0)
 
 
@@ -62,8 +62,8 @@ class _DrawsAtRandom(WorldModel):
     def observe(
         self, carry: Carry, action: Tensor, depth: Tensor, state: Tensor, is_first: Tensor
     ) -> Carry:
-        h, z = super().observe(carry, action, depth, state, is_first)
-        return Carry(h, z + torch.randn_like(z))
+        found = super().observe(carry, action, depth, state, is_first)
+        return found._replace(z=found.z + torch.randn_like(found.z))
 
 
 class _AnswersLogits(WorldModel):
