@@ -19,7 +19,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import draccus
 from safetensors import SafetensorError
@@ -34,6 +34,9 @@ from egovcp.plan import PlannerConfig, Policy, require_answers
 from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
 
 SCHEMA_VERSION = 2
+_NONE: Final[Mapping[str, Any]] = {}
+#: Options of models made before there were these, where the default is another.
+_BEFORE: Final[Mapping[str, Any]] = {"flight": {"enabled": False}}
 SEAL = "manifest_sha256"
 CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
 _PATTERNS = ("*.json", "*.safetensors")
@@ -192,7 +195,7 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
     _check_manifest(folder, manifest)
     config = _read_json(folder / CONFIG)
     try:
-        model = WorldModel(_decode(WorldModelConfig, config, "world_model"))
+        model = WorldModel(_decode(WorldModelConfig, config, "world_model", _BEFORE))
         planner = _decode(PlannerConfig, config, "planner")
         require_answers(model.config, planner)
         model.load_state_dict(load_file(folder / WEIGHTS))
@@ -210,14 +213,17 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
     return Artefact(folder, model.eval(), planner, manifest)
 
 
-def _decode[C](config_class: type[C], config: dict[str, Any], key: str) -> C:
-    """The dataclass under ``key``; raises KeyError, TypeError, UsageError or DraccusException."""
+def _decode[C](
+    config_class: type[C], config: dict[str, Any], key: str, absent: Mapping[str, Any] = _NONE
+) -> C:
+    """The dataclass under ``key``; raises KeyError, TypeError, UsageError or DraccusException.
+
+    Options that are ``absent`` have the values given there, others their defaults.
+    """
     values = config[key]
     if not isinstance(values, dict):
         raise TypeError(f"{key} is {type(values).__name__}, expected an object")
-    if config_class is WorldModelConfig:  # made before flights were followed: it does not
-        values = {"flight": {"enabled": False}} | values
-    decoded: C = draccus.decode(config_class, values)
+    decoded: C = draccus.decode(config_class, {**absent, **values})
     return decoded
 
 
