@@ -143,6 +143,10 @@ class FlightConfig:
     """The variance of a crossing is this many times what independent sightings would give."""
     gate: float = 0.5
     """A sighting farther than this from the path of three or more is not its own, m."""
+    sure_offset: float = -1.0
+    """Added to how sure the path is, where Q is told of it. Zeros for nothing on its way would
+    leave the first layer, normalised and without a bias, nothing but the direction of the action:
+    a hand a little way out and one far out would be worth the same."""
     painted: float = 0.5
     """A path at least so sure says where it is painted (`paint_flight`); else `motion` does."""
     forget: float = 0.5

@@ -97,6 +97,14 @@ def _followed(
     memory = start.flight
     if memory is None:
         return None
+    # Metres in eight bits would be off by a hand's breadth.
+    with torch.autocast(near.device.type, enabled=False):
+        return _follow(model, batch, near, embedding.float(), memory)
+
+
+def _follow(
+    model: WorldModel, batch: Batch, near: Tensor, embedding: Tensor, memory: Tensor
+) -> Tensor:
     size, length = batch.valid.shape
     look = model.look(near, batch.state.flatten(0, 1), embedding.flatten(0, 1))
     point, weight, axes, position, rate = (

@@ -357,11 +357,12 @@ class WorldModel(nn.Module):
     def passing(self, carry: Carry) -> Tensor:
         """Is something on its way, and if so where and when will it pass, (..., 4).
 
-        The probability p, and p times y, z and time left in `PASSING_UNIT`: a smooth summary
-        that is zero where nothing comes.
+        Where a flight is followed: how sure its path is (plus `FlightConfig.sure_offset`), y, z and
+        time left in `PASSING_UNIT`. Else the probability p that something comes, and p times
+        these: a smooth summary that is zero where nothing does.
         """
         if carry.flight is not None:
-            return flight.told(carry.flight, PASSING_UNIT)
+            return flight.told(carry.flight, PASSING_UNIT, self.config.flight.sure_offset)
         out: Tensor = self.decode_passing(carry.h, carry.z)
         out = out.detach()  # what is on its way is learned from labels, not from returns
         coming = torch.sigmoid(out[..., 3:])

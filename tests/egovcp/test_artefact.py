@@ -139,6 +139,16 @@ def test_a_model_from_before_flights_were_followed_does_not_follow_them(folder: 
     assert not load_artefact(str(folder)).world_model.config.follows_flight
 
 
+def test_a_model_keeps_the_units_of_what_it_was_told(folder: Path) -> None:
+    """Q learned zeros for nothing on its way before there was an offset."""
+    assert load_artefact(str(folder)).world_model.config.flight.sure_offset == -1
+    _edit(folder / CONFIG, lambda config: config["world_model"]["flight"].pop("sure_offset"))
+    _sign(folder)
+    older = load_artefact(str(folder)).world_model.config
+    assert older.follows_flight
+    assert older.flight.sure_offset == 0
+
+
 def test_options_that_the_weights_contradict_are_refused(folder: Path) -> None:
     _edit(folder / CONFIG, lambda config: config["world_model"].update(q_heads=2))
     _sign(folder)

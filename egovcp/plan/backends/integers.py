@@ -36,6 +36,7 @@ class Shared(NamedTuple):
     description: library.Root
     tensors: tuple[object, ...]
     root: Root
+    told: dict[int, Tensor | None]  # by number of steps, see `_told`
 
 
 class IntegerNetwork:
@@ -60,7 +61,7 @@ class IntegerNetwork:
         pointers = (ctypes.c_void_p * len(values))(*(x.data_ptr() for x in values))
         addresses = (x.data_ptr() for x in (h, mix, gates))
         description = library.Root(*addresses, ctypes.cast(pointers, ctypes.c_void_p), None)
-        return Shared(description, (h, mix, gates, values, pointers), root)
+        return Shared(description, (h, mix, gates, values, pointers), root, {})
 
     def outputs(
         self, shared: Shared, actions: Tensor, noise: Tensor | None, threads: library.Threads
@@ -75,7 +76,9 @@ class IntegerNetwork:
         q = torch.zeros(plans, steps, self._heads, self._width)
         dead = torch.zeros(plans, steps)
         following = ctypes.c_int32(0)
-        told = _told(shared.root, steps)
+        if steps not in shared.told:  # the same for every iteration of a search
+            shared.told[steps] = _told(shared.root, steps)
+        told = shared.told[steps]
         shared.description.told = None if told is None else told.data_ptr()
         kept = (actions.contiguous(), None if noise is None else noise.contiguous())
         arguments = (

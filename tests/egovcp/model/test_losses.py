@@ -109,6 +109,18 @@ def test_rows_without_a_complete_return_do_not_train_the_value(
     assert _loss(model, masked) != _loss(model, batch)
 
 
+def test_metres_are_never_in_eight_bits(model: WorldModel, batch: Batch) -> None:
+    """A path is followed in float32, whatever the precision of the products."""
+    with torch.autocast("cpu", torch.bfloat16):
+        followed = filter_sequence(model, batch).carry.flight
+    exact = filter_sequence(model, batch).carry.flight
+    assert followed is not None
+    assert exact is not None
+    assert followed.dtype == torch.float32
+    where = slice(8, 20)  # heading, axes and position of the camera: of proprioception alone
+    assert torch.equal(followed[..., where], exact[..., where])
+
+
 def test_burn_in_rows_fill_the_memory_but_are_not_trained_on(
     model: WorldModel, batch: Batch
 ) -> None:

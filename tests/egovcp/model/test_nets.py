@@ -47,3 +47,15 @@ def test_nothing_is_painted_where_nothing_teaches_the_place(config, message):
 def test_q_has_a_part_for_what_is_on_its_way_only_if_told(told):
     model = WorldModel(WorldModelConfig(value_of_passing=told))
     assert (model.passing_value_head is not None) == told
+
+
+def test_where_nothing_comes_it_still_counts_how_far_out_a_hand_is():
+    """Not its direction alone: the first layer is normalised and has no bias."""
+    torch.manual_seed(0)
+    model = WorldModel(WorldModelConfig()).eval()
+    head = model.passing_value_head
+    torch.nn.init.normal_(head.rest[-1].weight)
+    told = model.passing(model.initial(1))
+    action = torch.tensor([[0.2, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0]])
+    near, far = (float(head(told, k * action).detach()) for k in (1, 2))
+    assert abs(near - far) > 1e-3
