@@ -76,9 +76,13 @@ def _played(folder: Path) -> dict[str, Any]:
     }
 
 
-def _columns(episodes: list[Mapping[str, Any]]) -> dict[str, list[Any]]:
+def _columns(episodes: list[Mapping[str, Any]]) -> dict[str, Any]:
     names = ("episode", "steps", "reward", "success")
-    return {name: [episode[name] for episode in episodes] for name in names}
+    columns: dict[str, Any] = {name: [episode[name] for episode in episodes] for name in names}
+    if "parts" in episodes[0]:
+        parts = episodes[0]["parts"]
+        columns["parts"] = {part: [e["parts"][part] for e in episodes] for part in parts}
+    return columns
 
 
 def _resumed(folder: Path) -> Flags | None:
