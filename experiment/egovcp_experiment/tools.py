@@ -108,6 +108,7 @@ TRAIN: Final = Tool(
     digest=lambda folder: artefact_digest(folder / ARTEFACT),
     continued=_resumed,
     prog="egovcp-train",
+    learns=True,
 )
 TRAIN_PPO: Final = Tool(
     module="egovcp_train.ppo.train",
@@ -116,6 +117,7 @@ TRAIN_PPO: Final = Tool(
     digest=_policies_digest,
     continued=_resumed,
     prog="egovcp-train-ppo",
+    learns=True,
 )
 PLAY: Final = Tool(
     module="egovcp_deploy.evaluate",
