@@ -1,36 +1,29 @@
-"""Workers as actors of a Ray cluster; their episodes come back sealed.
+"""Workers as actors of a Ray cluster (`egovcp.cluster`); their episodes come back sealed.
 
-The cluster is the one of ``RAY_ADDRESS``, or one that is started on this machine for the occasion.
 Every node needs this package, and nothing of this machine's disk.
 """
 
 from __future__ import annotations
 
-import importlib
 import logging
-import os
 from collections.abc import Sequence
 from typing import Any, Final
 
+from egovcp.cluster import connect, ray_package
 from egovcp.data.spool import SealedEpisode
-from egovcp.errors import EnvironmentFailure
 from egovcp.sim.scenario import Scenario
 from egovcp_collect.backend import Brief, Report, encode_numbered, portable
 from egovcp_collect.config import CollectConfig
 from egovcp_collect.simulation import Simulation
 
 _LOG = logging.getLogger(__name__)
+_DISTRIBUTION: Final = "egovcp-collect"
 _REPORT_EVERY: Final = 1.0  # s; each report is a round trip
 
 
 def _ray() -> Any:
     """The package, which only this backend needs."""
-    try:
-        return importlib.import_module("ray")
-    except ModuleNotFoundError as error:
-        raise EnvironmentFailure(
-            "--backend=ray needs Ray: pip install 'egovcp-collect[ray]'"
-        ) from error
+    return ray_package(_DISTRIBUTION)
 
 
 class RemoteSimulation:
@@ -113,17 +106,7 @@ class RayBackend:
     """
 
     def __init__(self, config: CollectConfig) -> None:
-        ray = _ray()
-        address = os.environ.get("RAY_ADDRESS")
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is reported home
-        own = {} if address else {"include_dashboard": False, "_node_ip_address": "127.0.0.1"}
-        try:
-            ray.init(address, log_to_driver=False, logging_level="warning", **own)
-        except (ConnectionError, RuntimeError, ValueError) as error:
-            raise EnvironmentFailure(
-                f"cannot reach the Ray cluster at {address or 'this machine'}: {error}; check "
-                "RAY_ADDRESS"
-            ) from error
+        connect(_DISTRIBUTION)
         self._config = config
         self._workers: list[RayWorker] = []
 

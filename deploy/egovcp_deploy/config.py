@@ -72,7 +72,8 @@ class DeployConfig:
     dry_run: bool = False
     """Only check what a run needs, line by line, and say go or no-go; nothing moves."""
     task: str = "ball"
-    """Scene of the simulated robot: ball, wall or arch. The policy is not told."""
+    """Scene of the simulated robot: ball, wall, arch, or sequence (several in one episode,
+    --env.sequence.parts). The policy is not told."""
     episodes: int = 3
     """Number of rollouts."""
     seed: int = 0

@@ -31,6 +31,7 @@ _GRIDS: Final[dict[str, tuple[tuple[float, ...], ...]]] = {
     "ball": ((0.2, 0.45, 0.8), (0.0, -0.3, -0.6), (0.35, 0.6, 0.85), (0.0,)),
     "wall": ((0.4, 0.8, 1.0), (0.0, -0.3), (0.3, 0.55, 0.8), (0.0,)),
     "arch": ((0.0,), (0.0,), (0.0,), (0.0, -0.2, -0.4, -0.6, -0.8, -1.0)),
+    "sequence": ((0.2, 0.45), (0.0, -0.3), (0.35, 0.6), (0.0, -0.6, -1.0)),
 }
 _KEEP: Final = 4  # a quarter goes on to the next round
 _FIRST_ROUND: Final = 6  # scenarios that every candidate plays

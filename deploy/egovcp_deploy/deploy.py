@@ -9,7 +9,7 @@ from typing import Final
 from egovcp.artefact import Artefact
 from egovcp.cli import run_command
 from egovcp.errors import EgovcpError, UsageError
-from egovcp.spec import TASKS
+from egovcp.sim.scenario import PLAYABLE
 from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.drive import check_live, drive, drive_simulated, examine_hardware
@@ -72,7 +72,7 @@ def deploy(config: DeployConfig) -> None:
 
 
 def _check(config: DeployConfig) -> None:
-    check_choice("--task", config.task, TASKS)
+    check_choice("--task", config.task, PLAYABLE)
     check_choice("--robot.type", config.robot.type, ROBOTS)
     check_choice("--controller", config.controller, DRIVERS)
     check_positive("--episodes", config.episodes)

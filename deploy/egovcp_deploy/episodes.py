@@ -108,6 +108,7 @@ def play(
         tally.rewards += np.where(live, result.reward, 0.0)
         tally.steps += live
         tally.success, tally.terminated = result.success, result.terminated
+        tally.parts = result.parts
         observation = result.observation
     return tally.scores(scenarios)
 
@@ -120,6 +121,7 @@ class _Tally:
         self.steps = np.zeros(rows, np.int64)
         self.success: NDArray[np.bool_] = np.zeros(rows, np.bool_)
         self.terminated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
+        self.parts: tuple[dict[str, bool], ...] = ({},) * rows
         self.plan_ms: list[float] = []
 
     def scores(self, scenarios: Sequence[Scenario]) -> list[EpisodeScore]:
@@ -131,6 +133,7 @@ class _Tally:
                 reward=float(self.rewards[i]),
                 success=bool(self.success[i]),
                 terminated=bool(self.terminated[i]),
+                parts=self.parts[i],
                 plan_ms=self.plan_ms[: int(self.steps[i])],
             )
             for i, scenario in enumerate(scenarios)

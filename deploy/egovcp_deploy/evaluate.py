@@ -20,7 +20,7 @@ from egovcp.reactive import ReactiveNetwork
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.env import decided
-from egovcp.sim.scenario import Scenario
+from egovcp.sim.scenario import PLAYABLE, Scenario
 from egovcp.spec import TASKS
 from egovcp_deploy.constant_search import Action, BestConstant, load_constants, search_constant
 from egovcp_deploy.controllers import CONTROLLERS, PPO
@@ -46,7 +46,8 @@ _EPILOG: Final = (
     "All controllers play the same scenarios, which no collection ever plays (seeds are "
     "offset), each with an event: no empty scenes unless --env.*_episode.empty_probability "
     "says so. Success: ball blocked by a hand and not hit elsewhere; wall still up and touched "
-    "by hands only; arch passed untouched. 'constant' is the best fixed action of a grid, "
+    "by hands only; arch passed untouched; sequence: all of its parts, whose shares stand "
+    "beneath. 'constant' is the best fixed action of a grid, "
     "chosen on scenarios of its own. plan_ms is the time per robot when num_envs robots are "
     "planned together; --num_envs=1 --num_workers=1 gives the latency of one. Writes eval.json "
     "(figures), eval_run.json (config and every episode) and constant.json."
@@ -80,7 +81,8 @@ class EvalConfig:
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     """Changes to the artefact's planner."""
     task: str = "ball"
-    """ball, wall, arch, or all."""
+    """ball, wall, arch, all (these three), or sequence: several in one episode, by default an arch
+    and then a throw (--env.sequence.parts)."""
     episodes: int = 80
     """Scenarios per task."""
     seed: int = 0
@@ -114,7 +116,7 @@ class EvalConfig:
 
     def check(self) -> None:
         """Raise `UsageError` for values that make no sense."""
-        check_choice("--task", self.task, (*TASKS, _ALL))
+        check_choice("--task", self.task, (*PLAYABLE, _ALL))
         for name in self.players:
             check_choice("--controllers", name, (*CONTROLLERS, PPO))
         for flag in ("episodes", "num_envs"):
@@ -278,7 +280,8 @@ def _record(
 
 
 def _brief(score: EpisodeScore) -> dict[str, Any]:
-    return {name: value for name, value in asdict(score).items() if name != "plan_ms"}
+    left_out = {"plan_ms"} if score.parts else {"plan_ms", "parts"}
+    return {name: value for name, value in asdict(score).items() if name not in left_out}
 
 
 if __name__ == "__main__":

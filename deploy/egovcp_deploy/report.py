@@ -41,19 +41,31 @@ def _rate(scores: Sequence[EpisodeScore]) -> float:
 
 def table(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
     """The figures for reading: one line per task and controller, columns aligned."""
-    lines = [_HEAD, *(_line(t, n, f) for t, row in figures.items() for n, f in row.items())]
+    lines: list[tuple[str, ...]] = [_HEAD]
+    for task, row in figures.items():
+        for name, played in row.items():
+            lines += [_line(task, name, played), *_parts(played.get("parts", {}))]
     widths = [max(len(line[i]) for line in lines) for i in range(len(_HEAD))]
     return "\n".join(_aligned(line, widths) for line in lines)
 
 
-def _line(task: str, name: str, figures: Mapping[str, Any]) -> tuple[str, ...]:
+def _parts(parts: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Lines of the parts of a sequence, which have a success only."""
+    blank = ("",) * (len(_HEAD) - 4)
+    return [("", f"- {part}", *_success(figures), *blank) for part, figures in parts.items()]
+
+
+def _success(figures: Mapping[str, Any]) -> tuple[str, str]:
     low, high = figures["success_ci95"]
+    return f"{figures['success_rate']:.1%}", f"{low:.1%} to {high:.1%}"
+
+
+def _line(task: str, name: str, figures: Mapping[str, Any]) -> tuple[str, ...]:
     worst, best = figures["reward_ci95"]
     return (
         task,
         name,
-        f"{figures['success_rate']:.1%}",
-        f"{low:.1%} to {high:.1%}",
+        *_success(figures),
         f"{figures['reward_mean']:+.5f}",
         f"{worst:+.5f} to {best:+.5f}",
         f"{figures['plan_ms_p50']:.2f}",

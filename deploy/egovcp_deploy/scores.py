@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,8 @@ class EpisodeScore:
     terminated: bool
     plan_ms: list[float] = field(default_factory=list)
     """Time per tick to decide on one action, ms; shared by robots planned together."""
+    parts: dict[str, bool] = field(default_factory=dict)
+    """Success of each part of a sequence of tasks; of a single task, nothing."""
 
 
 def reward_per_step(scores: Sequence[EpisodeScore]) -> float:
@@ -45,16 +48,25 @@ def success_gain(scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore])
     return bootstrap(lambda i: gains[i].mean(axis=1), len(gains))
 
 
-def summarise(scores: Sequence[EpisodeScore]) -> dict[str, float | int | list[float]]:
-    """The figures of one controller on one task, under the keys of ``eval.json``."""
-    successes = sum(score.success for score in scores)
+def summarise(scores: Sequence[EpisodeScore]) -> dict[str, Any]:
+    """The figures of one controller on one task, under the keys of ``eval.json``; of a sequence
+    also ``parts``: part -> ``success_rate`` and ``success_ci95``."""
     plan_ms = np.concatenate([score.plan_ms for score in scores])
+    parts = {name: _successes([score.parts[name] for score in scores]) for name in scores[0].parts}
     return {
         "episodes": len(scores),
-        "success_rate": successes / len(scores),
-        "success_ci95": list(wilson(successes, len(scores))),
+        **_successes([score.success for score in scores]),
         "reward_mean": reward_per_step(scores),
         "reward_ci95": list(reward_interval(scores)),
         "plan_ms_p50": float(np.percentile(plan_ms, 50)),
         "plan_ms_p99": float(np.percentile(plan_ms, 99)),
+        **({"parts": parts} if parts else {}),
+    }
+
+
+def _successes(each: Sequence[bool]) -> dict[str, Any]:
+    count = sum(each)
+    return {
+        "success_rate": count / len(each),
+        "success_ci95": list(wilson(count, len(each))),
     }

@@ -10,6 +10,7 @@ from dataclasses import dataclass, is_dataclass, replace
 from typing import Literal
 
 from egovcp.errors import UsageError, suggest
+from egovcp.spec import TASKS
 
 Range = tuple[float, float]
 #: m/s towards the wall, calibrated with ``benchmarks/tasks.py`` for controllers that do not step
@@ -21,10 +22,11 @@ STEPPING_PUSHES: Range = (0.80, 1.20)
 def _check_ranges(where: str, part: object) -> None:
     """Refuse a (low, high) pair that is the wrong way round."""
     for name, value in vars(part).items():
-        if isinstance(value, tuple) and len(value) == 2 and value[0] > value[1]:
-            raise UsageError(
-                f"expected low <= high, found {value[0]} > {value[1]} in env.{where}.{name}"
-            )
+        match value:
+            case (int() | float() as low, int() | float() as high) if low > high:
+                raise UsageError(
+                    f"expected low <= high, found {low} > {high} in env.{where}.{name}"
+                )
 
 
 @dataclass(frozen=True)
@@ -157,6 +159,34 @@ class ArchConfig:
 
 
 @dataclass(frozen=True)
+class SequenceConfig:
+    """Several tasks in one episode, one after the other (--task=sequence)."""
+
+    parts: tuple[str, ...] = ("arch", "ball")
+    """Its tasks in their order, each at most once. The wall can only be the last: it would stand in
+    the way of what comes next, and the robot leans on it."""
+    pause_ticks: int = 25
+    """Planner ticks from the moment that decides a part (arch passed, ball on the floor) until its
+    object is taken away and the next part begins; a part that remains undecided ends after the
+    ticks of its own episodes."""
+
+    def __post_init__(self) -> None:
+        for name in self.parts:
+            if name not in TASKS:
+                known = suggest(name, TASKS)
+                raise UsageError(f"unknown task {name!r} in env.sequence.parts{known}")
+        if not self.parts or len(set(self.parts)) < len(self.parts) or "wall" in self.parts[:-1]:
+            raise UsageError(
+                f"env.sequence.parts={list(self.parts)}: expected at least one task, each at most "
+                "once, and wall only at the end"
+            )
+        if self.pause_ticks < 0:
+            raise UsageError(
+                f"env.sequence.pause_ticks={self.pause_ticks}: expected a number of ticks from 0"
+            )
+
+
+@dataclass(frozen=True)
 class CameraConfig:
     """Depth camera on the head, and the noise of its pictures."""
 
@@ -234,6 +264,8 @@ class EnvConfig:
     """Length and timing of wall episodes."""
     arch_episode: EpisodeConfig = EpisodeConfig(ticks=230, event_ticks=(5, 25))
     """Length and timing of arch episodes; the default covers the slowest passage."""
+    sequence: SequenceConfig = SequenceConfig()
+    """Several tasks in one episode, whose lengths and timings are those of the three above."""
     controller: str = "walk"
     """Low-level controller: walk (trained, ships with the package), stance (LQR, does not step), or
     the walk.safetensors or walk.onnx of egovcp-train-lowlevel."""
@@ -277,7 +309,8 @@ class EnvConfig:
         )
 
     def episode(self, task: str) -> EpisodeConfig:
-        """Length and timing of an episode of ``task``.
+        """Length and timing of an episode of ``task``; of a sequence, the length of all its parts
+        and the timing of the first.
 
         Raises:
             UsageError: the task is unknown.
@@ -287,6 +320,8 @@ class EnvConfig:
             "wall": self.wall_episode,
             "arch": self.arch_episode,
         }
+        parts = [episodes[name] for name in self.sequence.parts]
+        episodes["sequence"] = replace(parts[0], ticks=sum(part.ticks for part in parts))
         if task not in episodes:
             raise UsageError(f"unknown task {task!r}{suggest(task, episodes)}")
         return episodes[task]

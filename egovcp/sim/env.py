@@ -66,6 +66,8 @@ class StepResult:
     """(B,) whether the task would count as achieved if the episode ended now."""
     sent_action: Array
     """(B, 7) after the rate limit and the box."""
+    parts: tuple[dict[str, bool], ...]
+    """(B,) ``success`` of each part of a sequence; empty in a row of a single task."""
 
 
 def decided(config: EnvConfig) -> EnvConfig:
@@ -230,6 +232,7 @@ class VectorEnv:
             truncated=np.array([lane.truncated for lane in self.lanes]),
             success=np.array([lane.task.success for lane in self.lanes]),
             sent_action=self.sent_action,
+            parts=tuple(lane.task.parts for lane in self.lanes),
         )
 
     def _advance(self, targets: Array) -> None:

@@ -122,7 +122,7 @@ class ArchOracle:
 
 
 class Oracle:
-    """The scripted solution of each row's task."""
+    """The scripted solution of the task that each row plays now."""
 
     def __init__(self) -> None:
         self._by_task: dict[str, TaskOracle] = {
@@ -141,5 +141,5 @@ class Oracle:
         """(B, 7) normalised actions."""
         truth = env.snapshot()
         return np.array(
-            [self._by_task[s.task].act(truth, row) for row, s in enumerate(env.scenarios)]
+            [self._by_task[name].act(truth, row) for row, name in enumerate(truth.task)]
         )

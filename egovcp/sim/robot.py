@@ -51,12 +51,12 @@ class SimulatedRobot:
         self._wrench = np.zeros(6)
 
     def shape_geom(self, geom: int, size: Sequence[float], centre: Sequence[float]) -> None:
-        """Give a sphere or box of the object another size (m) and place in its body's frame.
+        """Give a sphere or box of an object another size (m) and place in its body's frame.
 
         Everything that the compiler derived from the size is kept consistent: contacts and
         rays skip what these bounds exclude.
         """
-        model, body = self.model, self.index.object_body
+        model, body = self.model, self.model.geom_bodyid[geom]
         extent = np.resize(np.asarray(size, dtype=np.float64), 3)
         model.geom_size[geom, : len(size)] = size
         model.geom_pos[geom] = centre

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
 from egovcp.errors import UsageError, suggest
 from egovcp.spec import TASKS
+
+#: Several tasks in one episode, for evaluation: nothing is collected from it, nothing learns it.
+SEQUENCE: Final = "sequence"
+#: What an episode can be of. Their order is part of what is drawn: new ones come last.
+PLAYABLE: Final = (*TASKS, SEQUENCE)
 
 
 @dataclass(frozen=True)
@@ -20,15 +26,15 @@ class Scenario:
     """
 
     task: str
-    """One of `spec.TASKS`."""
+    """One of `PLAYABLE`."""
     seed: int
     """Seed of the whole collection or evaluation."""
     episode: int
     """Index of the episode under that seed."""
 
     def __post_init__(self) -> None:
-        if self.task not in TASKS:
-            raise UsageError(f"unknown task {self.task!r}{suggest(self.task, TASKS)}")
+        if self.task not in PLAYABLE:
+            raise UsageError(f"unknown task {self.task!r}{suggest(self.task, PLAYABLE)}")
         if self.seed < 0 or self.episode < 0:
             raise UsageError(
                 f"seed and episode count from 0, found seed={self.seed} episode={self.episode}"
@@ -40,6 +46,6 @@ class Scenario:
         Streams of different names, episodes, seeds and tasks are independent, so a new
         random quantity leaves all others as they were.
         """
-        key = (self.episode, TASKS.index(self.task), zlib.crc32(name.encode()))
+        key = (self.episode, PLAYABLE.index(self.task), zlib.crc32(name.encode()))
         entropy = np.random.SeedSequence(self.seed, spawn_key=key)
         return np.random.Generator(np.random.PCG64(entropy))

@@ -1,4 +1,4 @@
-"""Composes the MuJoCo model of a task: robot, floor, and ball, wall or arch.
+"""Composes the MuJoCo model of a task: robot, floor, and ball, wall or arch, or all of them.
 
 A model is compiled once per task and foot model; each simulated robot owns a copy, whose
 fields the episode's randomisation edits. Visual meshes are left out: rays and contacts
@@ -10,15 +10,17 @@ Geom groups: 0 floor and objects, 3 robot. Robot geoms meet the geoms with conty
 from __future__ import annotations
 
 import copy
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Final, Literal
+from typing import Final
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.mjcf import FootModel, robot_spec
+from egovcp.sim.scenario import SEQUENCE
 from egovcp.spec import JOINT_NAMES
 
 FLOOR: Final = "floor"
@@ -75,8 +77,6 @@ class SceneIndex:
     """Joint positions in ``qpos``, ``JOINT_NAMES`` order."""
     joint_qvel: slice
     """Joint velocities in ``qvel``, ``JOINT_NAMES`` order."""
-    object_body: int
-    """Body id of ball, wall or arch."""
 
 
 @dataclass(frozen=True)
@@ -92,18 +92,20 @@ class Scene:
 
 
 @cache
-def build_scene(task: Literal["ball", "wall", "arch"] | str, feet: FootModel) -> Scene:
-    """The scene of ``task``, compiled once per process."""
+def build_scene(task: str, feet: FootModel) -> Scene:
+    """The scene of ``task``, compiled once per process; that of a sequence holds all objects."""
     spec = robot_spec(feet)
     strip_visuals(spec)
     spec.worldbody.add_geom(
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0
     )
-    {BALL: _add_ball, WALL: _add_wall, ARCH: _add_arch}[task](spec)
+    objects = tuple(_ADD) if task == SEQUENCE else (task,)
+    for name in objects:
+        _ADD[name](spec)
     # proprioception reads the state itself; the model's own sensors would cost accelerations
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
     model = spec.compile()
-    return Scene(model, _index(model, task))
+    return Scene(model, _index(model, objects))
 
 
 def strip_visuals(spec: mujoco.MjSpec) -> None:
@@ -153,15 +155,23 @@ def _add_arch(spec: mujoco.MjSpec) -> None:
         )
 
 
-def _index(model: mujoco.MjModel, task: str) -> SceneIndex:
+#: In this order a ball, which alone has joints, has the last of them.
+_ADD: Final[dict[str, Callable[[mujoco.MjSpec], None]]] = {
+    ARCH: _add_arch,
+    WALL: _add_wall,
+    BALL: _add_ball,
+}
+
+
+def _index(model: mujoco.MjModel, objects: Sequence[str]) -> SceneIndex:
     names = [model.geom(i).name for i in range(model.ngeom)]
-    object_body = model.body(task).id
-    bodies = [i for i in range(1, model.nbody) if i != object_body]
+    object_bodies = [model.body(name).id for name in objects]
+    bodies = [i for i in range(1, model.nbody) if i not in object_bodies]
     first = model.joint(JOINT_NAMES[0])
     qpos, qvel = int(first.qposadr[0]), int(first.dofadr[0])
     return SceneIndex(
         part=np.array([_part(name) for name in names], dtype=np.int8),
-        is_object=np.array([model.geom_bodyid[i] == object_body for i in range(model.ngeom)]),
+        is_object=np.isin(model.geom_bodyid, object_bodies),
         floor=model.geom(FLOOR).id,
         foot_geoms=np.array([i for i, name in enumerate(names) if "_foot" in name]),
         robot_bodies=np.array(bodies),
@@ -170,7 +180,6 @@ def _index(model: mujoco.MjModel, task: str) -> SceneIndex:
         palm_sites=np.array([model.site(f"{side}_palm").id for side in ("left", "right")]),
         joint_qpos=slice(qpos, qpos + len(JOINT_NAMES)),
         joint_qvel=slice(qvel, qvel + len(JOINT_NAMES)),
-        object_body=object_body,
     )
 
 

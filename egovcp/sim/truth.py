@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 class Truth:
     """State of all rows at a planner tick. ``_w`` world, ``_b`` pelvis heading frame."""
 
+    task: tuple[str, ...]
+    """(B,) the task that is played now; in a sequence it changes."""
     time: Array
     """(B,) s since the start of the episode."""
     since_event: Array
@@ -75,6 +77,7 @@ def snapshot(lanes: Sequence[Lane]) -> Truth:
     pelvis = np.array([data.qpos[:7] for data in datas])
     bodies = [lane.robot.index.robot_bodies for lane in lanes]
     return Truth(
+        task=tuple(lane.task.present for lane in lanes),
         time=np.array([lane.task.time for lane in lanes]),
         since_event=np.array([lane.task.since_event for lane in lanes]),
         pelvis_w=pelvis,

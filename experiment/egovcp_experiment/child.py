@@ -24,6 +24,7 @@ def main() -> int:
     """Entry point; returns the exit code of the command."""
     module, *argv = sys.argv[1:]
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # Ray's workers block it
     threading.Thread(target=_interrupt_at_end_of_input, daemon=True).start()
     sys.argv = [module, *argv]
     try:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
@@ -14,9 +15,12 @@ import draccus
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
 from egovcp_experiment.cell import in_order
+from egovcp_experiment.cluster import RayRunner
 from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.experiments import EXPERIMENTS
+from egovcp_experiment.local import LocalRunner
 from egovcp_experiment.report.publish import publish
+from egovcp_experiment.runner import Runner
 from egovcp_experiment.scales import SCALES
 from egovcp_experiment.schedule import Schedule
 from egovcp_experiment.store import Store
@@ -75,8 +79,9 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
     experiment = EXPERIMENTS[name]
     cells = in_order(experiment.cells(config))
     store = Store(Path(config.output_dir))
-    with store.locked():
-        schedule = Schedule(cells, store, config.jobs, partial(print, flush=True))
+    say = partial(print, flush=True)
+    with store.locked(), closing(_runner(config, say)) as runner:
+        schedule = Schedule(cells, store, config.jobs, say, runner)
         print(f"{PROG} {name}: {len(cells)} cells, {len(schedule.records)} complete", flush=True)
         try:
             schedule.run()
@@ -91,6 +96,10 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
     for line in report.shows:
         print(f"- {line}")
     print(f"report: {store.folder / name}.html, .md, .json")
+
+
+def _runner(config: ExperimentConfig, say: Callable[[str], None]) -> Runner:
+    return RayRunner(config.ray, say) if config.backend == "ray" else LocalRunner(config.jobs)
 
 
 def _help() -> str:

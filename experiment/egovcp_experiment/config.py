@@ -124,6 +124,25 @@ class PpoConfig:
 
 
 @dataclass(frozen=True)
+class RayConfig:
+    """What a cell is given on a Ray cluster."""
+
+    cpus: float = 1.0
+    """Processor cores that are set aside for it. Commands see all cores of their node none the
+    less: tell them with '--data.flags=[--num_workers=8]', '--train.flags=[--threads=8]'."""
+    gpus: float = 0.0
+    """GPUs that are set aside for a training; other cells get none."""
+
+    def check(self) -> None:
+        """Raise `UsageError` for values that make no sense."""
+        if self.cpus <= 0 or self.gpus < 0:
+            raise UsageError(
+                f"--ray.cpus={self.cpus:g} --ray.gpus={self.gpus:g}: expected more than 0 cores "
+                "and at least 0 GPUs"
+            )
+
+
+@dataclass(frozen=True)
 class ExperimentConfig:
     """Run one of the paper's experiments, cell by cell, and write its report.
 
@@ -136,8 +155,13 @@ class ExperimentConfig:
     """Folder of cells and reports; may hold those of other experiments of the same options."""
     scale: Scale = "small"
     """smoke: minutes, the figures mean nothing; small: hours on two cores; paper: the paper's."""
+    backend: Literal["local", "ray"] = "local"
+    """Where cells run: processes of this machine; or the Ray cluster of RAY_ADDRESS, all of whose
+    nodes must have --output_dir under the same path."""
     jobs: int = 1
-    """Cells that run side by side, each on its share of the processor cores."""
+    """Cells that run side by side; here each on its share of the processor cores."""
+    ray: RayConfig = field(default_factory=RayConfig)
+    """Each cell's share of a Ray cluster."""
     tasks: tuple[str, ...] = TASKS
     """Tasks to learn and play."""
     only: tuple[str, ...] = ()
@@ -170,6 +194,7 @@ class ExperimentConfig:
             if not flag.startswith("--env."):
                 raise UsageError(f"--scenes holds {flag}; expected --env.NAME=value")
         self.ppo.check()
+        self.ray.check()
 
     def chosen[T](self, variants: dict[str, T]) -> dict[str, T]:
         """Those of the variants that `only` names, or the first `most`.

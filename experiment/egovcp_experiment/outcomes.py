@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
@@ -29,11 +29,18 @@ class Outcome:
     """(S, E) 0 or 1."""
     plan_ms: tuple[float, ...] = ()
     """(S,) median time per plan and robot, ms."""
+    parts: Mapping[str, Array] = field(default_factory=dict)
+    """(S, E) 0 or 1 for each part of a sequence of tasks; of a single task, nothing."""
 
     @property
     def success_rate(self) -> float:
         """Mean over seeds and scenarios."""
         return float(self.success.mean())
+
+    @property
+    def part_rates(self) -> dict[str, float]:
+        """Success of each part of a sequence, mean over seeds and scenarios."""
+        return {name: float(each.mean()) for name, each in self.parts.items()}
 
     @property
     def success_interval(self) -> Interval:
@@ -102,6 +109,7 @@ class Outcome:
             "reward_sd_over_seeds": self.reward_spread,
             "reward_sd_over_trials": self.reward_trial_spread,
             "plan_ms_p50": list(self.plan_ms),
+            **({"parts": self.part_rates} if self.parts else {}),
         }
 
 
@@ -123,7 +131,11 @@ def outcome(
         return np.array([row["played"][name] for row in rows], np.float64)
 
     times = tuple(float(row["plan_ms_p50"]) for row in rows)
-    return Outcome(column("reward"), column("steps"), column("success"), times)
+    parts = {
+        part: np.array([row["played"]["parts"][part] for row in rows], np.float64)
+        for part in rows[0]["played"].get("parts", ())
+    }
+    return Outcome(column("reward"), column("steps"), column("success"), times, parts)
 
 
 def side_by_side(

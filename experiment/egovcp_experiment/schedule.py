@@ -1,38 +1,34 @@
-"""Runs the cells that are missing, some side by side, each in a process of its own."""
+"""Runs the cells that are missing, some side by side, wherever a `Runner` puts them."""
 
 from __future__ import annotations
 
-import os
 import signal
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Final
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.hardware import hardware
 from egovcp_experiment.cell import Cell, in_order
+from egovcp_experiment.local import LocalRunner
+from egovcp_experiment.runner import INTERRUPTED, Run, Runner
 from egovcp_experiment.store import Record, Store
 
 _POLL_S: Final = 0.05
 _MINUTE: Final = 60.0
-_INTERRUPTED: Final = 130  # exit code
 
 
 @dataclass
 class _Running:
-    """A cell whose process runs."""
+    """A cell whose command runs."""
 
     cell: Cell
     argv: list[str]
-    process: subprocess.Popen[bytes]
+    run: Run
     start: float
-    slot: int
 
 
 class Schedule:
@@ -41,8 +37,9 @@ class Schedule:
     Args:
         cells: every one after those it needs.
         store: where results are kept.
-        jobs: cells that run side by side; each has its share of the processor cores.
+        jobs: cells that run side by side.
         say: takes the lines of progress.
+        runner: runs them; None: processes of this machine.
 
     Raises:
         UsageError: a result is there that was made with other settings.
@@ -54,16 +51,17 @@ class Schedule:
         store: Store,
         jobs: int = 1,
         say: Callable[[str], None] = print,
+        runner: Runner | None = None,
     ) -> None:
         if jobs < 1:
             raise UsageError(f"--jobs={jobs}: expected at least 1")
         self._cells = in_order(cells)
         self._store, self._jobs, self._say = store, jobs, say
+        self._runner = runner or LocalRunner(jobs)
         self.records: dict[str, Record] = {}
         self.failed: dict[str, str] = {}
         self._running: list[_Running] = []
         self._stopping = False
-        self._machine = {k: v for k, v in hardware().items() if k.startswith("hardware")}
         for cell in self._cells:  # before anything runs: all that can be refused
             if all(name in self.records for name in cell.needs):
                 self._recall(cell)
@@ -80,7 +78,7 @@ class Schedule:
         Raises:
             UsageError: as above, for a cell that could not be looked at earlier.
             EnvironmentFailure: cells failed; all that do not need them are complete.
-            KeyboardInterrupt: after SIGINT or SIGTERM, once the processes have ended.
+            KeyboardInterrupt: after SIGINT or SIGTERM, once the commands have ended.
         """
         with _stop_on_signal() as stopped:
             try:
@@ -118,43 +116,38 @@ class Schedule:
 
     def _start(self, cell: Cell) -> None:
         argv = self._store.prepare(cell, self.records)
-        slot = min(set(range(self._jobs)) - {running.slot for running in self._running})
         self._progress(cell, "begins")
-        with self._store.log(cell).open("ab") as log:
-            process = subprocess.Popen(
-                [sys.executable, "-m", "egovcp_experiment.child", cell.tool.module, *argv],
-                stdin=subprocess.PIPE,
-                stdout=log,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,  # Ctrl-C is answered here
-                env=os.environ | {"PYTHONUNBUFFERED": "1"},
-            )
-        _pin(process.pid, slot, self._jobs)
-        self._running.append(_Running(cell, argv, process, time.monotonic(), slot))
+        run = self._runner.start(cell.tool, argv, self._store.log(cell))
+        self._running.append(_Running(cell, argv, run, time.monotonic()))
 
     def _collect(self) -> None:
-        """Keep the results of processes that have ended."""
+        """Keep the results of commands that have ended."""
         for running in list(self._running):
-            code = running.process.poll()
-            if code is None:
-                continue
-            self._running.remove(running)
-            assert running.process.stdin is not None
-            running.process.stdin.close()
             minutes = (time.monotonic() - running.start) / _MINUTE
             cell = running.cell
-            if code == _INTERRUPTED and self._stopping:
+            try:
+                end = running.run.ended()
+            except EnvironmentFailure as error:
+                self._running.remove(running)
+                self._fail(cell, minutes, str(error))
+                continue
+            if end is None:
+                continue
+            self._running.remove(running)
+            if end.code == INTERRUPTED and self._stopping:
                 self._progress(cell, f"stopped after {minutes:.1f} min")
-                continue
-            if code != 0:
-                self.failed[cell.name] = _last_line(self._store.log(cell)) or f"exit code {code}"
-                self._progress(cell, f"failed after {minutes:.1f} min: {self.failed[cell.name]}")
-                continue
-            now = {"date": datetime.now(UTC).isoformat(timespec="seconds"), **self._machine}
-            self.records[cell.name] = self._store.keep(
-                cell, self.records, running.argv, minutes, now
-            )
-            self._progress(cell, f"done in {minutes:.1f} min")
+            elif end.code != 0:
+                said = _last_line(self._store.log(cell))
+                self._fail(cell, minutes, said or f"exit code {end.code}")
+            else:
+                now = {"date": datetime.now(UTC).isoformat(timespec="seconds"), **end.machine}
+                record = self._store.keep(cell, self.records, running.argv, minutes, now)
+                self.records[cell.name] = record
+                self._progress(cell, f"done in {minutes:.1f} min")
+
+    def _fail(self, cell: Cell, minutes: float, why: str) -> None:
+        self.failed[cell.name] = why
+        self._progress(cell, f"failed after {minutes:.1f} min: {why}")
 
     def _progress(self, cell: Cell, what: str) -> None:
         number = [c.name for c in self._cells].index(cell.name) + 1
@@ -162,12 +155,11 @@ class Schedule:
         self._say(f"cell {number} of {len(self._cells)}, {cell.name}: {what}; {left} to go")
 
     def _stop(self, stopped: Sequence[int]) -> None:
-        """Interrupt all processes and wait for them; a second signal kills them."""
+        """Interrupt all commands and wait for them; a second signal kills them."""
         self._stopping = True
         self._say(f"stopping {len(self._running)} processes; once more to kill them")
         for running in self._running:
-            assert running.process.stdin is not None
-            running.process.stdin.close()
+            running.run.interrupt()
         while self._running and len(stopped) < 2:
             self._collect()
             time.sleep(_POLL_S)
@@ -176,9 +168,7 @@ class Schedule:
     def _kill(self) -> None:
         """Leave no process behind."""
         for running in self._running:
-            with suppress(ProcessLookupError):
-                os.killpg(running.process.pid, signal.SIGKILL)
-            running.process.wait()
+            running.run.kill()
         self._running = []
 
     def _failures(self) -> str:
@@ -205,15 +195,6 @@ def _stop_on_signal() -> Iterator[list[int]]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def _pin(pid: int, slot: int, jobs: int) -> None:
-    """Give a process its share of the cores, where the system can."""
-    if jobs == 1 or not hasattr(os, "sched_setaffinity"):
-        return
-    cores = sorted(os.sched_getaffinity(0))
-    with suppress(OSError):  # it may have ended already
-        os.sched_setaffinity(pid, cores[slot::jobs] or cores)
 
 
 def _last_line(log: Path) -> str:

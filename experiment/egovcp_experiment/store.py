@@ -27,8 +27,12 @@ type Record = Mapping[str, Any]
 """The result of a cell."""
 
 _CELLS: Final = "cells"
-#: What decides about figures beside the flags.
 _PACKAGES: Final = ("egovcp", "torch", "numpy", "mujoco")
+
+
+def versions() -> dict[str, str]:
+    """What decides about figures beside the flags: package -> version."""
+    return {name: version(name) for name in _PACKAGES}
 
 
 class Store:
@@ -103,7 +107,7 @@ class Store:
             "module": cell.tool.module,
             "flags": filled(cell.flags, identity),
             "extra": list(cell.extra),
-            "versions": {name: version(name) for name in _PACKAGES},
+            "versions": versions(),
         }
         through_json: dict[str, Any] = json.loads(json.dumps(settings))
         return through_json

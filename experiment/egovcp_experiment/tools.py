@@ -76,9 +76,13 @@ def _played(folder: Path) -> dict[str, Any]:
     }
 
 
-def _columns(episodes: list[Mapping[str, Any]]) -> dict[str, list[Any]]:
+def _columns(episodes: list[Mapping[str, Any]]) -> dict[str, Any]:
     names = ("episode", "steps", "reward", "success")
-    return {name: [episode[name] for episode in episodes] for name in names}
+    columns: dict[str, Any] = {name: [episode[name] for episode in episodes] for name in names}
+    if "parts" in episodes[0]:
+        parts = episodes[0]["parts"]
+        columns["parts"] = {part: [e["parts"][part] for e in episodes] for part in parts}
+    return columns
 
 
 def _resumed(folder: Path) -> Flags | None:
@@ -104,6 +108,7 @@ TRAIN: Final = Tool(
     digest=lambda folder: artefact_digest(folder / ARTEFACT),
     continued=_resumed,
     prog="egovcp-train",
+    learns=True,
 )
 TRAIN_PPO: Final = Tool(
     module="egovcp_train.ppo.train",
@@ -112,6 +117,7 @@ TRAIN_PPO: Final = Tool(
     digest=_policies_digest,
     continued=_resumed,
     prog="egovcp-train-ppo",
+    learns=True,
 )
 PLAY: Final = Tool(
     module="egovcp_deploy.evaluate",

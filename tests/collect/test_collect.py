@@ -83,6 +83,7 @@ def test_the_last_line_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     ("flags", "message"),
     [
         (["--task=bal"], "did you mean 'ball'"),
+        (["--task=sequence"], "choose from: all, arch, ball, wall"),
         (["--episodes=0"], "--episodes=0: expected at least 1"),
         (["--num_workers=-1"], "expected at least 0"),
         (["--seed=-1"], "expected at least 0"),

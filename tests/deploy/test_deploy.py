@@ -142,6 +142,21 @@ def test_each_event_of_an_episode_is_told_once(tmp_path: Path, artefact_dir: Pat
         assert first is None or text in first.events
 
 
+def test_the_events_of_a_sequence_are_those_of_its_parts(tmp_path: Path) -> None:
+    flags = ["--env.controller=stance", "--env.arch.distance_range=[0.6,0.6]"]
+    flags += ["--env.arch_episode.event_ticks=[2,2]", "--env.sequence.pause_ticks=5"]
+    flags += ["--env.ball_episode.ticks=40", "--env.ball_episode.event_ticks=[2,2]"]
+    played = ["--task=sequence", "--controller=oracle", "--episodes=1", "--seed=3"]
+    assert run(*played, *flags, f"--output_dir={tmp_path / 'out'}") == 0
+    ticks = read_recording(tmp_path / "out" / "rollout-0.mcap").ticks
+    assert [event for tick in ticks for event in tick.events] == [
+        "passage begins",
+        "arch passed",
+        "ball thrown",
+        "ball blocked by a hand",
+    ]
+
+
 def test_a_reference_needs_no_artefact_and_leaves_no_plan(
     tmp_path: Path, short: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -11,7 +11,7 @@ import pytest
 from egovcp.robot.stance import StanceController
 from egovcp.spec import ACTION_DIM
 from egovcp.testing import toy_reactive
-from egovcp_deploy.evaluate import main
+from egovcp_deploy.evaluate import EvalConfig, main
 
 KEYS = {
     "episodes",
@@ -94,6 +94,37 @@ def test_results_do_not_depend_on_how_episodes_are_grouped(
                 b["success"],
             )
             assert a["reward"] == pytest.approx(b["reward"], rel=1e-3, abs=1e-6)
+
+
+def test_a_sequence_is_played_by_all_and_its_parts_are_told_apart(
+    tmp_path: Path, artefact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    best = {"action": [0.2] * ACTION_DIM, "reward_mean": 0.0, "success_rate": 0.5, "episodes": 9}
+    (tmp_path / "constant.json").write_text(json.dumps({"sequence": best}))
+    flags = [
+        "--task=sequence",
+        f"--policy.path={artefact_dir}",
+        f"--constant.path={tmp_path / 'constant.json'}",
+        "--episodes=2",
+        "--env.arch_episode.ticks=8",
+        "--env.sequence.parts=[arch,ball,wall]",
+        "--env.wall_episode.ticks=6",
+        *short,
+    ]
+    assert run(tmp_path / "out", *flags) == 0, capsys.readouterr().err
+    figures = json.loads((tmp_path / "out" / "eval.json").read_text())["sequence"]
+    assert set(figures) == {"planner", "hold", "constant", "random", "oracle"}
+    for row in figures.values():
+        assert set(row) == KEYS | {"parts"}
+        assert set(row["parts"]) == {"arch", "ball", "wall"}
+    for scores in played(tmp_path / "out")["sequence"].values():
+        assert all(score["steps"] == 8 + 15 + 6 or score["terminated"] for score in scores)
+        assert all(score["success"] == all(score["parts"].values()) for score in scores)
+    assert "- arch" in capsys.readouterr().out
+
+
+def test_all_are_the_tasks_that_models_are_trained_on() -> None:
+    assert EvalConfig(task="all").tasks == ("ball", "wall", "arch")
 
 
 def test_worker_processes_give_the_same_scores(tmp_path: Path, short: list[str]) -> None:

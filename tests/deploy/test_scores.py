@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -62,6 +64,23 @@ def test_the_table_has_one_aligned_line_per_controller() -> None:
     assert len(lines) == 3
     assert lines[1].split()[:3] == ["ball", "planner", "100.0%"]
     assert len({len(line) for line in lines}) == 1
+
+
+def test_parts_of_a_sequence_have_shares_of_their_own() -> None:
+    won = [replace(score(i, i > 1), parts={"arch": i > 0, "ball": i > 1}) for i in range(4)]
+    figures = summary({"sequence": {"hold": won}})
+    parts = figures["sequence"]["hold"]["parts"]
+    assert {name: part["success_rate"] for name, part in parts.items()} == {
+        "arch": 0.75,
+        "ball": 0.5,
+    }
+    assert parts["arch"]["success_ci95"][0] < 0.75 < parts["arch"]["success_ci95"][1]
+    lines = [line.split()[:3] for line in table(figures).splitlines()]
+    assert lines[1:] == [
+        ["sequence", "hold", "50.0%"],
+        ["-", "arch", "75.0%"],
+        ["-", "ball", "50.0%"],
+    ]
 
 
 def test_gains_compare_the_planner_with_every_reference() -> None:

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from egovcp_experiment.cell import Cell
+from egovcp_experiment.cell import Cell, Output
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.report.document import Plot, Report, Table
 from egovcp_experiment.scales import SCALES
-from egovcp_experiment.tools import COLLECT, PLAY
+from egovcp_experiment.tools import ARTEFACT, COLLECT, PLAY
+
+_PARTS = "env.sequence.parts"
 
 CLOSED_LOOP = (
     "generalise",
@@ -29,6 +32,7 @@ def played(cell: Cell) -> dict[str, Any]:
     """What a play might have been: who plays better in some cells than in others."""
     rng = np.random.default_rng(sum(map(ord, cell.name)))
     count = 20
+    parts = {part: (rng.random(count) < 0.7).tolist() for part in cell.flags.get(_PARTS, ())}
     return {
         cell.flags["task"]: {
             name: {
@@ -38,6 +42,7 @@ def played(cell: Cell) -> dict[str, Any]:
                     "steps": [10] * count,
                     "reward": rng.normal(size=count).tolist(),
                     "success": (rng.random(count) < 0.5).tolist(),
+                    **({"parts": parts} if parts else {}),
                 },
             }
             for name in cell.flags["controllers"].split(",")
@@ -97,3 +102,48 @@ def test_a_loss_is_called_one() -> None:
     shows = EXPERIMENTS["generalise"].report(SCALES["small"](), found).shows
     assert "ball: worse by more than chance, points: `box` -50" in shows
     assert not [line for line in shows if line.startswith("wall: worse")]
+
+
+def generalised(**options: Any) -> list[Cell]:
+    return EXPERIMENTS["generalise"].cells(replace(SCALES["small"](), **options))
+
+
+def test_a_sequence_is_played_by_the_model_of_all_tasks() -> None:
+    plays = [c for c in generalised() if c.tool is PLAY and c.flags["task"] == "sequence"]
+    planners = {c.name: c for c in plays if c.flags["controllers"] == "planner"}
+    assert set(planners) == {
+        "play-sequence-in_arch_then_ball-s0",
+        "play-sequence-in_arch_then_box-s0",
+        "play-sequence-in_arch_then_box_then_wall-s0",
+    }
+    assert len(plays) == 2 * len(planners)
+    for cell in planners.values():
+        assert cell.flags["policy.path"] == Output("train-all-default-s0", ARTEFACT)
+    box = planners["play-sequence-in_arch_then_box-s0"].flags
+    assert (box[_PARTS], box["env.ball.shape"]) == (["arch", "ball"], "box")
+
+
+def test_sequences_need_the_tasks_they_are_made_of() -> None:
+    def played(*tasks: str) -> set[str]:
+        cells = generalised(tasks=tasks)
+        return {c.name for c in cells if c.name.startswith("play-sequence")}
+
+    assert played("ball", "wall") == set()
+    assert len(played("ball", "arch")) == 2
+    assert len(played("ball", "arch", "wall")) == 3
+
+
+def test_only_what_is_asked_for_is_played_beside_what_it_is_compared_with() -> None:
+    plays = [c for c in generalised(only=("arch_then_box",)) if c.tool is PLAY]
+    assert {c.flags["task"] for c in plays} == {"sequence"}
+    assert len(plays) == 4
+    assert {c.flags["task"] for c in generalised(only=("small",)) if c.tool is PLAY} == {"ball"}
+
+
+def test_the_report_tells_the_parts_of_a_sequence_apart() -> None:
+    found = report("generalise", 1.0)
+    assert [line for line in found.shows if line.startswith("sequence: parts won in")]
+    table = next(p for p in found.parts if isinstance(p, Table) and p.title.startswith("sequence"))
+    assert {"planner's arch", "planner's ball", "planner's wall"} <= set(table.head)
+    wall = table.head.index("planner's wall")
+    assert [row[wall] == "-" for row in table.rows] == [True, True, False]

@@ -44,6 +44,20 @@ def test_paired_intervals_cover_about_as_often_as_they_say() -> None:
     assert 50 <= covered <= 60
 
 
+def test_parts_of_a_sequence_have_rates_of_their_own() -> None:
+    def record(ball: list[bool]) -> dict[str, object]:
+        parts = {"arch": [True, True], "ball": ball}
+        played = {"episode": [0, 1], "steps": [5, 5], "reward": [1.0, 2.0], "success": ball}
+        row = {"played": {**played, "parts": parts}, "plan_ms_p50": 3.0}
+        return {"figures": {"sequence": {"planner": row}}}
+
+    records = {"a": record([True, False]), "b": record([False, False])}
+    found = outcome(records, ["a", "b"], "sequence")
+    assert found is not None
+    assert found.part_rates == found.figures()["parts"] == {"arch": 1.0, "ball": 0.25}
+    assert "parts" not in made(np.ones((1, 4))).figures()
+
+
 def test_seeds_that_are_not_there_are_left_out() -> None:
     played = {"episode": [0, 1], "steps": [5, 5], "reward": [1.0, 2.0], "success": [True, False]}
     record = {"figures": {"ball": {"planner": {"played": played, "plan_ms_p50": 3.0}}}}

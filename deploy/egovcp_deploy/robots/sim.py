@@ -91,8 +91,9 @@ class SimRobot:
 
     def _events(self, terms: dict[str, float]) -> list[str]:
         """What happened for the first time in this episode."""
-        begun = float(self._env.snapshot().since_event[0]) > 0.0
-        happened = [_BEGINS[self._task]] if begun else []
+        truth = self._env.snapshot()
+        begun = float(truth.since_event[0]) > 0.0
+        happened = [_BEGINS[truth.task[0]]] if begun else []
         happened += [text for name, text in _MEANS.items() if terms.get(name, 0.0) != 0.0]
         fresh = [text for text in happened if text not in self._reported]
         self._reported.update(fresh)

@@ -1,4 +1,4 @@
-"""The contact tasks: ball, wall and arch."""
+"""The contact tasks: ball, wall and arch, and several of them in one episode."""
 
 from __future__ import annotations
 
@@ -6,13 +6,11 @@ from typing import Final
 
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.robot import SimulatedRobot
-from egovcp.sim.scenario import Scenario
-from egovcp.sim.tasks.arch import ArchTask
-from egovcp.sim.tasks.ball import BallTask
+from egovcp.sim.scenario import SEQUENCE, Scenario
 from egovcp.sim.tasks.base import Task
-from egovcp.sim.tasks.wall import WallTask
+from egovcp.sim.tasks.sequence import SINGLE, SequenceTask
 
-_TASKS: Final[dict[str, type[Task]]] = {"ball": BallTask, "wall": WallTask, "arch": ArchTask}
+_TASKS: Final[dict[str, type[Task]]] = {**SINGLE, SEQUENCE: SequenceTask}
 
 
 def make_task(config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> Task:

@@ -16,7 +16,7 @@ import numpy as np
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.robot import SimulatedRobot, Touch
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.scene import ARCH_GEOMS, HEAD, PARTS
+from egovcp.sim.scene import ARCH, ARCH_GEOMS, HEAD, PARTS
 from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
 from egovcp.spec import PHYSICS_DT
 
@@ -49,6 +49,8 @@ class ArchTask(Task):
         self._touched = False
         self._passed = False
         self._progress = 0.0  # m in this tick
+        self._body = robot.model.body(ARCH)
+        self._mocap = int(self._body.mocapid[0])
         self._shape_arch()
 
     @property
@@ -85,11 +87,16 @@ class ArchTask(Task):
         self._origin = pelvis + heading @ np.array([0.0, self._lateral, 0.0])
         self._origin[2] = 0.0
         turn = math.atan2(heading[1, 0], heading[0, 0])
-        self.robot.data.mocap_quat[0] = [math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]
+        quaternion = (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
+        self.robot.data.mocap_quat[self._mocap] = quaternion
         self._put()
 
     def _put(self) -> None:
-        self.robot.data.mocap_pos[0] = self._origin + self._ahead * self._direction
+        self.robot.data.mocap_pos[self._mocap] = self._origin + self._ahead * self._direction
+
+    def park(self) -> None:
+        """Stand the arch where the model has it, far away."""
+        self.robot.data.mocap_pos[self._mocap] = self._body.pos
 
     @property
     def moving(self) -> bool:
@@ -128,7 +135,7 @@ class ArchTask(Task):
         """Move the arch along the rail, or see how far the robot has walked."""
         before = self._ahead
         if self._walks:
-            arch = self.robot.data.mocap_pos[0]
+            arch = self.robot.data.mocap_pos[self._mocap]
             self._ahead = float((arch - self.robot.data.qpos[:3]) @ self._direction)
         elif self.moving:
             self._ahead -= self.speed * PHYSICS_DT
@@ -167,10 +174,15 @@ class ArchTask(Task):
         """Passed untouched; in an empty episode the arch never comes."""
         return not self._touched and (self.event_tick is None or self._passed)
 
+    @property
+    def settled(self) -> bool:
+        """Whether the arch lies behind."""
+        return self._passed
+
     def state(self) -> ObjectState:
         """Arch centre on the ground; active until it has been passed."""
         velocity = -self.speed * (self.moving and not self._walks) * self._direction
-        position = self.robot.data.mocap_pos[0].copy()
+        position = self.robot.data.mocap_pos[self._mocap].copy()
         return ObjectState(position, velocity, self.clearance, self.moving and not self._passed)
 
     def solids(self) -> tuple[Solid, ...]:
@@ -180,8 +192,6 @@ class ArchTask(Task):
         for name in ARCH_GEOMS:
             geom = model.geom(name).id
             size = tuple(float(s) for s in model.geom_size[geom])
-            centre = data.geom_xpos[geom].copy()
-            found.append(
-                Solid(name, "box", (size[0], size[1], size[2]), centre, data.mocap_quat[0].copy())
-            )
+            centre, turn = data.geom_xpos[geom].copy(), data.mocap_quat[self._mocap].copy()
+            found.append(Solid(name, "box", (size[0], size[1], size[2]), centre, turn))
         return tuple(found)

@@ -87,7 +87,8 @@ class BallTask(Task):
         return (half, half, half)
 
     def _shape_ball(self) -> None:
-        model, body = self.robot.model, self.robot.index.object_body
+        model = self.robot.model
+        body = model.body(BALL).id
         geom, size = int(model.body_geomadr[body]), self._half_sizes
         kinds = mujoco.mjtGeom
         model.geom_type[geom] = kinds.mjGEOM_BOX if self._is_box else kinds.mjGEOM_SPHERE
@@ -97,7 +98,11 @@ class BallTask(Task):
         model.body_inertia[body] = share * self._mass * size[0] ** 2
 
     def place(self) -> None:
-        """Park the ball out of sight."""
+        """Park the ball: nothing is to be seen of it before the throw."""
+        self.park()
+
+    def park(self) -> None:
+        """Hold the ball behind the robot, far away."""
         self._set_ball(_PARKED, _AT_REST)
 
     def _set_ball(self, pose: Array, velocity: Array) -> None:
@@ -109,7 +114,7 @@ class BallTask(Task):
         if self._thrown:
             return
         if self.since_event < 0:
-            self.place()
+            self.park()
             return
         self._thrown = True
         start, velocity = self._throw()
@@ -170,6 +175,11 @@ class BallTask(Task):
     def hit(self) -> bool:
         """Whether the ball met torso, head or leg."""
         return self._hit
+
+    @property
+    def settled(self) -> bool:
+        """Whether the ball has met the floor."""
+        return self._dead
 
     def state(self) -> ObjectState:
         """Ball centre and velocity; active from the throw to the first contact or floor."""

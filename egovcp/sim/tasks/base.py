@@ -60,6 +60,7 @@ class Task(ABC):
     """Names of the reward terms."""
 
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
+        self.name = scenario.task
         self.robot = robot
         episode = config.episode(scenario.task)
         rng = scenario.rng("event")
@@ -85,6 +86,11 @@ class Task(ABC):
         return (self.physics_steps - self.event_tick * PHYSICS_STEPS_PER_TICK) * PHYSICS_DT
 
     @property
+    def present(self) -> str:
+        """Name of the task that is played now, of which `state` tells the truth."""
+        return self.name
+
+    @property
     def velocity_command(self) -> Array:
         """(3,) commanded vx, vy (m/s) and yaw rate (rad/s)."""
         return np.zeros(3)
@@ -96,7 +102,10 @@ class Task(ABC):
     def step(self) -> None:
         """Act on the scene, do one physics step and look at its contacts."""
         self.act()
-        touches = self.robot.step()
+        self.see(self.robot.step())
+
+    def see(self, touches: Sequence[Touch]) -> None:
+        """Count a physics step that has been done, and look at its contacts."""
         self.physics_steps += 1
         for touch in touches:
             self.forces[touch.part] = max(self.forces[touch.part], touch.force)
@@ -122,6 +131,16 @@ class Task(ABC):
         return self.achieved and not self.fallen
 
     @property
+    def parts(self) -> dict[str, bool]:
+        """Of several tasks in one episode, the success of each; of a single task, nothing."""
+        return {}
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing that happens to the object from now on is likely to matter."""
+        return False
+
+    @property
     @abstractmethod
     def fall_cost(self) -> float:
         """Cost of a fall."""
@@ -139,6 +158,11 @@ class Task(ABC):
     @abstractmethod
     def place(self) -> None:
         """Put the objects where the episode starts; the robot already stands."""
+
+    @abstractmethod
+    def park(self) -> None:
+        """Take the objects out of the robot's sight and reach; they stay there if this is called
+        before every physics step."""
 
     @abstractmethod
     def act(self) -> None:

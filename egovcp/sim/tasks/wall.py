@@ -41,7 +41,9 @@ class WallTask(Task):
         speed = c.away_speed_range if self.away else towards
         self.push_speed = float(push.uniform(*speed))
         self._touched_otherwise = False
-        robot.model.geom_friction[robot.index.is_object, 0] = self._friction
+        self._body = robot.model.body(WALL)
+        self._mocap = int(self._body.mocapid[0])
+        robot.model.geom(WALL).friction[0] = self._friction
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -60,9 +62,13 @@ class WallTask(Task):
         self._surface = pelvis + heading @ np.array([self.distance, 0.0, 0.0])
         self._surface[2] = 0.0
         turn = math.atan2(heading[1, 0], heading[0, 0]) + self._yaw
-        self.robot.data.mocap_pos[0] = self._surface
-        self.robot.data.mocap_quat[0] = [math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2)]
+        data, quaternion = self.robot.data, (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
+        data.mocap_pos[self._mocap], data.mocap_quat[self._mocap] = self._surface, quaternion
         self._normal = np.array([math.cos(turn), math.sin(turn), 0.0])
+
+    def park(self) -> None:
+        """Stand the wall where the model has it, far away."""
+        self.robot.data.mocap_pos[self._mocap] = self._body.pos
 
     def act(self) -> None:
         """Push: the base gains ``push_speed`` in equal parts over ``push_time``."""
@@ -119,4 +125,5 @@ class WallTask(Task):
         """The wall."""
         centre = self._surface + WALL_HALF_SIZE[0] * self._normal
         centre[2] = WALL_HALF_SIZE[2]
-        return (Solid(WALL, "box", WALL_HALF_SIZE, centre, self.robot.data.mocap_quat[0].copy()),)
+        quaternion = self.robot.data.mocap_quat[self._mocap].copy()
+        return (Solid(WALL, "box", WALL_HALF_SIZE, centre, quaternion),)

@@ -1,4 +1,5 @@
-"""Scenes that no model was trained on: other things, other sizes, noise and delay (figure 4a)."""
+"""Scenes that no model was trained on: other things, other sizes, noise and delay, and several
+tasks in one episode (figure 4a)."""
 
 from __future__ import annotations
 
@@ -8,10 +9,11 @@ from typing import Any, Final
 
 from egovcp.robot.controllers import WALK, make_controller
 from egovcp.sim.config import STANDING_PUSHES, STEPPING_PUSHES
+from egovcp.sim.scenario import SEQUENCE
 from egovcp_experiment.cell import Cell, Flags
 from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.experiment import Experiment
-from egovcp_experiment.grid import Grid, Variant
+from egovcp_experiment.grid import ALL, Grid, Variant
 from egovcp_experiment.outcomes import Outcome, outcome
 from egovcp_experiment.report.document import (
     Plot,
@@ -24,7 +26,7 @@ from egovcp_experiment.report.document import (
 from egovcp_experiment.report.svg import drawn
 from egovcp_experiment.store import Record
 
-#: What every condition is compared with.
+#: What the conditions of a task are compared with: the first of them.
 TRAINED: Final = "as_trained"
 _REFERENCES: Final = ("hold", "oracle")
 
@@ -65,6 +67,15 @@ _OWN: Final[dict[str, dict[str, Flags]]] = {
         "faster": {"env.arch.speed_range": [0.55, 0.65]},
     },
 }
+#: Conditions of a sequence, which no model is trained on: the first is made of scenes that one is.
+_SEQUENCES: Final[dict[str, Flags]] = {
+    "arch_then_ball": {"env.sequence.parts": ["arch", "ball"]},
+    "arch_then_box": {"env.sequence.parts": ["arch", "ball"], "env.ball.shape": "box"},
+    "arch_then_box_then_wall": {
+        "env.sequence.parts": ["arch", "ball", "wall"],
+        "env.ball.shape": "box",
+    },
+}
 
 
 @dataclass(frozen=True)
@@ -76,7 +87,14 @@ class _Played:
 
 
 def conditions(config: ExperimentConfig, task: str) -> dict[str, Flags]:
-    """Condition -> the flags of scenes in which it differs from training."""
+    """Condition -> the flags of scenes in which it differs from training, the first not at all; of
+    a sequence those whose parts are all among the tasks."""
+    if task == SEQUENCE:
+        return {
+            name: flags
+            for name, flags in _SEQUENCES.items()
+            if set(flags["env.sequence.parts"]) <= set(config.tasks)
+        }
     own = {TRAINED: {}, **_OWN[task]}
     if task == "wall":
         low, high = _pushes(config)
@@ -92,14 +110,15 @@ def _pushes(config: ExperimentConfig) -> tuple[float, float]:
 
 
 def _chosen(config: ExperimentConfig) -> dict[str, dict[str, Flags]]:
-    """Task -> its conditions that are asked for, `TRAINED` always among them."""
-    every = {task: conditions(config, task) for task in config.tasks}
+    """Task -> its conditions that are asked for and the first, unless none is."""
+    every = {task: conditions(config, task) for task in (*config.tasks, SEQUENCE)}
     if not config.only:
-        return {task: config.chosen(row) for task, row in every.items()}
+        return {task: config.chosen(row) for task, row in every.items() if row}
     wanted = config.chosen({name: 0 for row in every.values() for name in row})
     return {
-        task: {name: flags for name, flags in row.items() if name in wanted or name == TRAINED}
+        task: {name: row[name] for k, name in enumerate(row) if name in wanted or k == 0}
         for task, row in every.items()
+        if wanted.keys() & row.keys()
     }
 
 
@@ -109,7 +128,8 @@ def _plays(config: ExperimentConfig, grid: Grid) -> dict[tuple[str, str], tuple[
     for task, row in _chosen(config).items():
         for name, flags in row.items():
             variant = Variant(f"in_{name}", play=flags)
-            planner = [grid.play(task, seed, variant).name for seed in config.train.seeds]
+            model = ALL if task == SEQUENCE else task
+            planner = [grid.play(task, seed, variant, model).name for seed in config.train.seeds]
             others = grid.references(task, f"references-{task}-{name}", flags, _REFERENCES)
             found[task, name] = (planner, others.name)
     return found
@@ -128,6 +148,12 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
         "differences are paired. `hold` and `oracle` (scripted, sees the truth, same delays) say "
         "what a condition asks for: where the oracle fails, too, it may be out of reach."
     ]
+    if SEQUENCE in _chosen(config):
+        parts.append(
+            "A sequence is several tasks in one episode, and won if each of them is. It is played "
+            "by the model of all tasks, which is told neither what comes nor when. Each part draws "
+            "what its task draws alone; what a fall keeps from beginning is lost."
+        )
     figures: dict[str, Any] = {}
     plays = _plays(config, Grid(config))
     for task, row in _chosen(config).items():
@@ -139,7 +165,7 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
                 known = {r: outcome(records, [others], task, r) for r in _REFERENCES}
                 references = {r: o for r, o in known.items() if o is not None}
                 found[name] = _Played(played, references)
-        if TRAINED in found:
+        if next(iter(row)) in found:
             parts += [_table(task, found, row), _plot(task, found)]
             shows += _shows(task, found)
         figures[task] = {
@@ -154,22 +180,28 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
 
 
 def _table(task: str, found: Mapping[str, _Played], flags: Mapping[str, Flags]) -> Table:
-    trained = found[TRAINED].planner
+    base = next(iter(flags))
+    trained = found[base].planner
+    kinds = list(dict.fromkeys(part for p in found.values() for part in p.planner.parts))
     rows = []
     for name, played in found.items():
         gain, interval = played.planner.success_gain(trained)
-        beside = ("", "") if name == TRAINED else (f"{100 * gain:+.1f}", points_range(interval))
+        beside = ("", "") if name == base else (f"{100 * gain:+.1f}", points_range(interval))
+        shares = played.planner.part_rates
         rows.append(
             (
                 name,
                 percent(played.planner.success_rate),
                 percent_range(played.planner.success_interval),
                 *beside,
+                *(percent(shares.get(kind)) for kind in kinds),
                 *(_rate(played.references.get(r)) for r in _REFERENCES),
                 " ".join(f"`{k}={v}`" for k, v in flags[name].items()),
             )
         )
-    head = ("condition", "planner", "95 %", f"- {TRAINED} (points)", "95 %", *_REFERENCES, "scene")
+    won = (f"planner's {kind}" for kind in kinds)
+    beside = (f"- {base} (points)", "95 %")
+    head = ("condition", "planner", "95 %", *beside, *won, *_REFERENCES, "scene")
     return Table(f"{task}: success", head, tuple(rows))
 
 
@@ -201,17 +233,21 @@ def _plot(task: str, found: Mapping[str, _Played]) -> Plot:
 
 
 def _shows(task: str, found: Mapping[str, _Played]) -> list[str]:
-    trained = found[TRAINED].planner
+    (base, first), *others = found.items()
+    trained = first.planner
     worse, same = [], []
-    for name, played in found.items():
-        if name == TRAINED:
-            continue
+    for name, played in others:
         gain, (_, high) = played.planner.success_gain(trained)
         if high < 0:
             worse.append(f"`{name}` {100 * gain:+.0f}")
         else:
             same.append(f"`{name}`")
-    lines = [f"{task}: {percent(trained.success_rate)} of scenes as trained"]
+    scenes = "scenes as trained" if base == TRAINED else f"episodes of `{base}`"
+    lines = [f"{task}: {percent(trained.success_rate)} of {scenes}"]
+    for name, played in found.items():
+        shares = (f"{kind} {percent(r)}" for kind, r in played.planner.part_rates.items())
+        if played.planner.parts:
+            lines.append(f"{task}: parts won in `{name}`: {', '.join(shares)}")
     if worse:
         lines.append(f"{task}: worse by more than chance, points: {', '.join(worse)}")
     if same:
@@ -220,5 +256,8 @@ def _shows(task: str, found: Mapping[str, _Played]) -> list[str]:
 
 
 EXPERIMENT: Final = Experiment(
-    "unseen boxes, sizes, speeds, walls and arches; noise and delay (fig. 4a)", _cells, _report
+    "unseen boxes, sizes, speeds, walls and arches; noise and delay; several tasks in one episode "
+    "(fig. 4a)",
+    _cells,
+    _report,
 )

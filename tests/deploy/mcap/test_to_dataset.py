@@ -108,6 +108,7 @@ def test_a_pause_is_a_gap(
     [
         (replace(INFO, hashes={}), "does not say which low-level controller"),
         (replace(INFO, task="juggle"), "its task is 'juggle'"),
+        (replace(INFO, task="sequence"), "its task is 'sequence'"),
     ],
 )
 def test_what_a_dataset_needs_to_know(

@@ -30,11 +30,17 @@ def test_every_parameter_is_a_dotted_flag() -> None:
     assert env.feet == "stock"
 
 
+def test_parts_of_a_sequence_are_a_flag() -> None:
+    env = parse_config(Command, ["--env.sequence.parts=[arch,ball,wall]"], "test").env
+    assert env.sequence.parts == ("arch", "ball", "wall")
+    assert env.episode("sequence").ticks == 230 + 150 + 150
+
+
 def test_a_range_the_wrong_way_round_is_refused_by_name() -> None:
     with pytest.raises(UsageError, match=r"0.3 > 0.2 in env.ball.radius_range"):
         EnvConfig(ball=BallConfig(radius_range=(0.3, 0.2)))
 
 
 def test_an_unknown_task_has_no_episode() -> None:
-    with pytest.raises(UsageError, match="choose from: arch, ball, wall"):
+    with pytest.raises(UsageError, match="choose from: arch, ball, sequence, wall"):
         EnvConfig().episode("stairs")

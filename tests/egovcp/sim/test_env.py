@@ -50,7 +50,7 @@ def test_shapes_and_types(env: VectorEnv) -> None:
     assert observation.state.dtype == np.float32
 
 
-@pytest.mark.parametrize("task", ["ball", "wall", "arch"])
+@pytest.mark.parametrize("task", ["ball", "wall", "arch", "sequence"])
 def test_an_episode_repeats_bit_for_bit_whoever_its_neighbours_are(
     env: VectorEnv, config: EnvConfig, task: str
 ) -> None:
@@ -74,9 +74,10 @@ def test_threads_change_nothing(env: VectorEnv, config: EnvConfig, task: str) ->
 
 
 def test_tasks_may_be_mixed_in_a_batch(env: VectorEnv) -> None:
-    mixed = [Scenario(task, 1, 0) for task in ("ball", "wall", "arch", "ball")]
+    mixed = [Scenario(task, 1, 0) for task in ("ball", "wall", "arch", "sequence")]
     together = roll(env, mixed, 12)[-1]
     assert {"block", "brace", "head"} <= set(together.reward_terms)
+    assert together.parts == ({}, {}, {}, {"arch": False, "ball": False})
     apart = roll(env, [Scenario("wall", 1, i) for i in range(4)], 12)[-1]
     np.testing.assert_array_equal(together.observation.state[1], apart.observation.state[0])
 

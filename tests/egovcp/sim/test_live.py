@@ -49,7 +49,7 @@ class Loop:
             self.live.advance(4)
 
 
-@pytest.mark.parametrize("task", ["ball", "wall", "arch"])
+@pytest.mark.parametrize("task", ["ball", "wall", "arch", "sequence"])
 def test_it_is_the_episode_of_the_environment(
     live: LiveRobot, config: EnvConfig, task: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -5,6 +5,7 @@ import pytest
 
 from egovcp.errors import UsageError
 from egovcp.sim.scenario import Scenario
+from egovcp.spec import TASKS
 
 
 def draw(scenario: Scenario, name: str) -> list[float]:
@@ -20,6 +21,11 @@ def test_equal_scenarios_draw_equal_numbers() -> None:
 )
 def test_any_other_scenario_draws_other_numbers(other: Scenario) -> None:
     assert not np.isin(draw(other, "x"), draw(Scenario("ball", 3, 5), "x")).any()
+
+
+def test_scenarios_that_data_and_results_exist_of_draw_what_they_always_drew() -> None:
+    drawn = [Scenario(task, 3, 5).rng("geometry").integers(10**6) for task in TASKS]
+    assert drawn == [752199, 214740, 172848]
 
 
 def test_streams_of_different_names_differ() -> None:

@@ -49,7 +49,9 @@ class _Fake:
         fallen = falls & (self._ticks == 2)
         late = self._ticks == LIMIT
         reward = action[:, 0].astype(np.float64)
-        return StepResult(self._observe(), reward, {}, fallen, late, late, action)
+        return StepResult(
+            self._observe(), reward, {}, fallen, late, late, action, ({},) * len(late)
+        )
 
     def _observe(self) -> Observation:
         depth = 1000 * (1 + self._ticks[:, None, None])

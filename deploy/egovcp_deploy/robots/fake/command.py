@@ -43,7 +43,7 @@ class FakeConfig:
     """
 
     task: str = "ball"
-    """Scene: ball, wall or arch."""
+    """Scene: ball, wall, arch, or sequence (several in one episode, --env.sequence.parts)."""
     seed: int = 0
     """Which held-out scenarios, the same that egovcp-eval plays."""
     episode: int = 0
