@@ -36,7 +36,7 @@ from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
 SCHEMA_VERSION = 2
 _NONE: Final[Mapping[str, Any]] = {}
 #: Options of models made before there were these, where the default is another.
-_BEFORE: Final[Mapping[str, Any]] = {"flight": {"enabled": False, "sure_offset": 0.0}}
+_BEFORE: Final[Mapping[str, Any]] = {"flight": {"enabled": False, "only_in_flight": False}}
 SEAL = "manifest_sha256"
 CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
 _PATTERNS = ("*.json", "*.safetensors")

@@ -143,10 +143,9 @@ class FlightConfig:
     """The variance of a crossing is this many times what independent sightings would give."""
     gate: float = 0.5
     """A sighting farther than this from the path of three or more is not its own, m."""
-    sure_offset: float = -1.0
-    """Added to how sure the path is, where Q is told of it. Zeros for nothing on its way would
-    leave the first layer, normalised and without a bias, nothing but the direction of the action:
-    a hand a little way out and one far out would be worth the same."""
+    only_in_flight: bool = True
+    """The part of Q that is told of a flight counts only while there is one. Without one it would
+    judge an action by all that ever followed on it, which past actions like it had a share in."""
     painted: float = 0.5
     """A path at least so sure says where it is painted (`paint_flight`); else `motion` does."""
     forget: float = 0.5
@@ -223,6 +222,11 @@ class WorldModelConfig:
     def follows_flight(self) -> bool:
         """Whether there is a filter."""
         return self.flight.enabled and self.value_of_passing
+
+    @property
+    def told_only_in_flight(self) -> bool:
+        """Whether the part of Q that is told of a flight is silent without one."""
+        return self.follows_flight and self.flight.only_in_flight
 
 
 def require_longer(window: int, steps: int, flag: str) -> None:

@@ -236,6 +236,6 @@ def in_picture(memory: Tensor, pose: CameraPose, max_m: float, config: FlightCon
     return torch.stack([column, row, 1 - (x - config.radius) / max_m, known * 40.0 - 20.0], -1)
 
 
-def told(memory: Tensor, unit: tuple[float, float, float], offset: float) -> Tensor:
-    """`TOLD` (..., 4) of a memory (..., n), in units; see `FlightConfig.sure_offset`."""
-    return torch.cat([memory[..., :1] + offset, memory[..., 1:4] / memory.new_tensor(unit)], -1)
+def told(memory: Tensor, unit: tuple[float, float, float]) -> Tensor:
+    """`TOLD` (..., 4) of a memory (..., n), in units."""
+    return torch.cat([memory[..., :1], memory[..., 1:4] / memory.new_tensor(unit)], -1)

@@ -332,8 +332,8 @@ class WorldModel(nn.Module):
         outputs = []
         for head in heads:
             q: Tensor = head.state(carry.h, carry.z, action)
-            if head.passing is not None:
-                q = q + head.passing(told, action)
+            if head.passing is not None and told is not None:
+                q = q + self.heard(told) * head.passing(told, action)
             outputs.append(q)
         return outputs
 
@@ -357,16 +357,20 @@ class WorldModel(nn.Module):
     def passing(self, carry: Carry) -> Tensor:
         """Is something on its way, and if so where and when will it pass, (..., 4).
 
-        Where a flight is followed: how sure its path is (plus `FlightConfig.sure_offset`), y, z and
-        time left in `PASSING_UNIT`. Else the probability p that something comes, and p times
+        Where a flight is followed: how sure its path is, y, z and time left in
+        `PASSING_UNIT`, zeros without one. Else the probability p that something comes, and p times
         these: a smooth summary that is zero where nothing does.
         """
         if carry.flight is not None:
-            return flight.told(carry.flight, PASSING_UNIT, self.config.flight.sure_offset)
+            return flight.told(carry.flight, PASSING_UNIT)
         out: Tensor = self.decode_passing(carry.h, carry.z)
         out = out.detach()  # what is on its way is learned from labels, not from returns
         coming = torch.sigmoid(out[..., 3:])
         return torch.cat([coming, coming * out[..., :3]], -1)
+
+    def heard(self, told: Tensor) -> Tensor | float:
+        """How much the part of Q counts that is ``told`` (..., 4) of a flight, (..., 1) or 1."""
+        return (told[..., :1] > 0).to(told.dtype) if self.config.told_only_in_flight else 1.0
 
     def termination_logit(self, carry: Carry) -> Tensor:
         """Log-odds that the episode has failed at this state, (...,); equation 4."""

@@ -139,14 +139,13 @@ def test_a_model_from_before_flights_were_followed_does_not_follow_them(folder: 
     assert not load_artefact(str(folder)).world_model.config.follows_flight
 
 
-def test_a_model_keeps_the_units_of_what_it_was_told(folder: Path) -> None:
-    """Q learned zeros for nothing on its way before there was an offset."""
-    assert load_artefact(str(folder)).world_model.config.flight.sure_offset == -1
-    _edit(folder / CONFIG, lambda config: config["world_model"]["flight"].pop("sure_offset"))
+def test_a_model_whose_told_part_always_counted_keeps_it(folder: Path) -> None:
+    assert load_artefact(str(folder)).world_model.config.told_only_in_flight
+    _edit(folder / CONFIG, lambda config: config["world_model"]["flight"].pop("only_in_flight"))
     _sign(folder)
     older = load_artefact(str(folder)).world_model.config
     assert older.follows_flight
-    assert older.flight.sure_offset == 0
+    assert not older.told_only_in_flight
 
 
 def test_options_that_the_weights_contradict_are_refused(folder: Path) -> None:

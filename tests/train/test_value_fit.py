@@ -130,6 +130,34 @@ def test_what_an_action_earns_is_not_credited_to_the_state_that_goes_with_it() -
     assert better.float().mean() > 0.95
 
 
+def test_what_is_told_of_flights_is_learned_from_flights_alone(store: EpisodeStore) -> None:
+    """Without any the part that is told of them answers zero; else rows without one teach it
+    nothing."""
+    model = toy_model()
+    rows = _collect(model, store, ahead=0)
+    told, action = torch.zeros(64, 4), torch.rand(64, 7)
+    told[:, 0] = 1.0
+    (head,) = model.q_heads
+    assert head.passing is not None
+
+    def learned(rows: Rows) -> Tensor:
+        torch.manual_seed(0)
+        config = ValueFitConfig(steps=1, told_steps=30, told_rows=64, rows=16)
+        _fit_heads(model, rows, config, torch.Generator().manual_seed(0))
+        with torch.no_grad():
+            return head.passing(told, action)  # type: ignore[no-any-return, misc]
+
+    nothing = rows._replace(told=torch.zeros_like(rows.told))
+    assert not learned(nothing).any()
+    flies = nothing.told.clone()
+    flies[::2, 0] = 0.8
+    some = nothing._replace(told=flies)
+    expected = learned(some)
+    assert expected.any()
+    other = torch.where(flies[:, 0] > 0, rows.target, 100.0)
+    assert torch.equal(learned(some._replace(target=other)), expected)
+
+
 def test_a_seed_repeats_the_fit_and_no_steps_leave_the_model_alone(store: EpisodeStore) -> None:
     def fitted(steps: int, seed: int) -> dict[str, Tensor]:
         model = toy_model()

@@ -68,9 +68,9 @@ def fit_value(
     Under ``q_target=td`` the targets are what the Q that training has found says of the next
     rows: one more round of fitted Q evaluation.
 
-    First the part that sees only what is on its way, then the part that sees the whole state,
-    to what the first leaves unexplained. Fitted together, the second, which sees where the
-    hands are going anyway, takes over what belongs to the action.
+    First the part that sees only what is on its way, on the rows where it counts, then the part
+    that sees the whole state, to what the first leaves unexplained. Fitted together, the second,
+    which sees where the hands are going anyway, takes over what belongs to the action.
 
     Args:
         model: the finished world model.
@@ -123,10 +123,17 @@ def _fit_q(
         thorough = replace(
             config, steps=config.told_steps, rows=config.told_rows, lr=config.told_lr
         )
-        _descend(passing, told_error, rows, None, thorough, generator)
+        heard = torch.ones(len(rows.target), 1) * model.heard(rows.told)
+        counts = heard[:, 0].nonzero()[:, 0]
+        if len(counts):
+            of_a_flight = Rows(*(x[counts] for x in rows))
+            _descend(passing, told_error, of_a_flight, None, thorough, generator)
+        else:
+            passing.restart()
         with torch.no_grad():
             chunks = torch.split(torch.arange(len(rows.target)), 65536)
             known = torch.cat([told(_pick(rows, some, _device(passing))).cpu() for some in chunks])
+            known = known * heard
 
     def judged(x: Rows, known: Tensor | None) -> Tensor:
         q: Tensor = head.state(*_hidden(x, config), x.action)

@@ -59,6 +59,7 @@ typedef struct {
 
 typedef struct {
     int32_t hidden, latent, actions, heads;
+    int32_t only_in_flight; /* what a head says that is told counts only while something is on its way */
     Layer mix, gru, prior, termination, told;
     Wide prior_top;         /* [outputs] means, then raw deviations if they are wanted */
     const float *prior_bias; /* [MOST_FEW] */
@@ -420,6 +421,7 @@ static void block(const Network *net, const Root *root, int steps, const float *
             else if (net->told_top.outputs)
                 tell(net, &h_bytes, &z_bytes, &told);
         }
+        const int silent = net->only_in_flight && root->told && root->told[k * TOLD] <= 0.0f;
         const float *const *add = root->values;
         for (int i = 0; i < net->heads; i++) {
             const Head *head = net->head + i;
@@ -440,7 +442,7 @@ static void block(const Network *net, const Root *root, int steps, const float *
                 in = (Inputs){.action = action};
                 if (k == 0) in.from = *add++;
                 else in.few = &told;
-                mlp(&head->passing, in, to, q_stride);
+                if (!silent) mlp(&head->passing, in, to, q_stride);
             }
         }
         if (k == steps - 1) break; /* nothing follows the last step */

@@ -51,13 +51,21 @@ class _Head:
         self._state = _QNetwork(head.state.mlp, self._reduced is None, dtype)
         self._passing = None if head.passing is None else _QNetwork(head.passing, False, dtype)
 
-    def start(self, add: list[Tensor], action: Tensor) -> Tensor:
+    def start(self, add: list[Tensor], heard: Tensor | float, action: Tensor) -> Tensor:
         """(..., width) at k = 0; takes its sums from the front of ``add``."""
         q = self._state.start(add.pop(0), action)
-        return q if self._passing is None else q + self._passing.start(add.pop(0), action)
+        if self._passing is None:
+            return q
+        return q + heard * self._passing.start(add.pop(0), action)
 
     def later(
-        self, wide_h: Tensor, h: Tensor, z: Tensor, told: Tensor | None, action: Tensor
+        self,
+        wide_h: Tensor,
+        h: Tensor,
+        z: Tensor,
+        told: Tensor | None,
+        heard: Tensor | float,
+        action: Tensor,
     ) -> Tensor:
         """(..., width) at k > 0."""
         if self._reduced is None:
@@ -67,7 +75,7 @@ class _Head:
         if self._passing is None or told is None:
             return q
         told = told.expand(*action.shape[:-1], -1)
-        return q + self._passing.later(None, torch.cat([told, action], -1))
+        return q + heard * self._passing.later(None, torch.cat([told, action], -1))
 
 
 class PlanningNetwork:
@@ -95,7 +103,8 @@ class PlanningNetwork:
         each = actions.unbind(-2)
         tally = Tally(self._config, self._model.return_floor)
         sums = list(root.values)
-        tally.value(self._read([head.start(sums, each[0]) for head in self._heads]))
+        heard = self._heard(root.told(0))
+        tally.value(self._read([head.start(sums, heard, each[0]) for head in self._heads]))
         x = self._mix_start.between(None, each[0], root.mix)
         wide_h: Tensor | None = None
         h, add = root.h, root.gates
@@ -103,13 +112,17 @@ class PlanningNetwork:
             h, wide_h = self._recur(x, wide_h, add if k == 1 else None, h)
             z = self._next_z(wide_h, None if noise is None else noise[k - 1])
             told = self._told(wide_h, z) if root.flight is None else root.told(k)
-            q = [head.later(wide_h, h, z, told, each[k]) for head in self._heads]
+            heard = self._heard(told)
+            q = [head.later(wide_h, h, z, told, heard, each[k]) for head in self._heads]
             tally.value(self._read(q))
             if k == len(each) - 1:
                 break  # nothing follows the last step
             tally.risk(torch.sigmoid(self._termination.last(wide_h, z, None)[..., 0]))
             x = self._mix.between(None, torch.cat([z, each[k]], -1), None)
         return tally.mean(len(each))
+
+    def _heard(self, told: Tensor | None) -> Tensor | float:
+        return 1.0 if told is None else self._model.heard(told)
 
     def _next_z(self, wide_h: Tensor, noise: Tensor | None) -> Tensor:
         out = self._prior.last(wide_h, None, None)

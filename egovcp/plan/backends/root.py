@@ -20,13 +20,12 @@ class Root(NamedTuple):
     gates: Tensor  # sums of the GRU's gates
     values: tuple[Tensor, ...]  # sums of the first layers of Q, two for a head that is told
     flight: Tensor | None  # what is remembered of a flight
-    sure_offset: float  # see `FlightConfig`
 
     def told(self, k: int) -> Tensor | None:
         """(E, 1, 4) what Q is told of it at step k, whatever the robot does meanwhile."""
         if self.flight is None:
             return None
-        return flight.told(flight.later(self.flight, k), PASSING_UNIT, self.sure_offset)
+        return flight.told(flight.later(self.flight, k), PASSING_UNIT)
 
 
 def root_of(model: WorldModel, carry: Carry) -> Root:
@@ -42,8 +41,7 @@ def root_of(model: WorldModel, carry: Carry) -> Root:
             values.append(_but_action(head.passing, told))
     mix, gates = model.mix.parts[0](carry.z), model.gru.project.parts[1](carry.h)
     followed = carry.flight if model.passing_value_head is not None else None
-    offset = model.config.flight.sure_offset
-    return Root(carry.h, mix, gates, tuple(values), followed, offset)
+    return Root(carry.h, mix, gates, tuple(values), followed)
 
 
 def _but_action(mlp: SplitMlp, *state: Tensor) -> Tensor:

@@ -49,13 +49,12 @@ def test_q_has_a_part_for_what_is_on_its_way_only_if_told(told):
     assert (model.passing_value_head is not None) == told
 
 
-def test_where_nothing_comes_it_still_counts_how_far_out_a_hand_is():
-    """Not its direction alone: the first layer is normalised and has no bias."""
+def test_the_part_that_is_told_of_a_flight_is_silent_without_one():
     torch.manual_seed(0)
-    model = WorldModel(WorldModelConfig()).eval()
-    head = model.passing_value_head
-    torch.nn.init.normal_(head.rest[-1].weight)
-    told = model.passing(model.initial(1))
-    action = torch.tensor([[0.2, 0.0, 0.1, 0.0, 0.0, 0.0, 0.0]])
-    near, far = (float(head(told, k * action).detach()) for k in (1, 2))
-    assert abs(near - far) > 1e-3
+    model = WorldModel(WorldModelConfig()).eval().requires_grad_(False)
+    carry, action = model.initial(1), torch.rand(1, 7)
+    without = model.value(carry, action)
+    torch.nn.init.normal_(model.passing_value_head.rest[-1].weight)
+    assert torch.equal(model.value(carry, action), without)
+    carry.flight[:, :4] = torch.tensor([0.9, 0.1, 0.4, 0.3])
+    assert not torch.equal(model.value(carry, action), without)

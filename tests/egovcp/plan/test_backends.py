@@ -30,6 +30,7 @@ MODELS = [
     {"value_state": 0},
     {"value_of_passing": False},
     {"flight": FlightConfig(enabled=False)},
+    {"flight": FlightConfig(only_in_flight=False)},
     {"q_heads": 3},
     {"value_loss": "two_hot"},
     {"hidden": 48, "units": 64, "latent": 12},
@@ -59,6 +60,7 @@ def _carry(model: WorldModel, robots: int = 3, seed: int = 0) -> Carry:
         return Carry(h, z)
     memory = torch.rand(robots, flight.SIZE, generator=rng)
     memory[:, 3] *= 0.3  # s: some of it passes within the plan
+    memory[0, :4] = 0.0  # nothing flies at the first robot
     return Carry(h, z, memory)
 
 
