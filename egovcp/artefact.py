@@ -36,7 +36,7 @@ from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
 SCHEMA_VERSION = 2
 _NONE: Final[Mapping[str, Any]] = {}
 #: Options of models made before there were these, where the default is another.
-_BEFORE: Final[Mapping[str, Any]] = {"flight": {"enabled": False, "only_in_flight": False}}
+_BEFORE: Final[Mapping[str, Any]] = {"flight": {"enabled": False}}
 SEAL = "manifest_sha256"
 CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
 _PATTERNS = ("*.json", "*.safetensors")
@@ -223,18 +223,8 @@ def _decode[C](
     values = config[key]
     if not isinstance(values, dict):
         raise TypeError(f"{key} is {type(values).__name__}, expected an object")
-    decoded: C = draccus.decode(config_class, _filled(values, absent))
+    decoded: C = draccus.decode(config_class, {**absent, **values})
     return decoded
-
-
-def _filled(values: Mapping[str, Any], absent: Mapping[str, Any]) -> dict[str, Any]:
-    """With what is absent, at any depth."""
-    deeper = {
-        key: _filled(values[key], value)
-        for key, value in absent.items()
-        if isinstance(value, Mapping) and isinstance(values.get(key), Mapping)
-    }
-    return {**absent, **values, **deeper}
 
 
 def _locate(path: str, revision: str, patience: Patience) -> Path:

@@ -143,9 +143,10 @@ class FlightConfig:
     """The variance of a crossing is this many times what independent sightings would give."""
     gate: float = 0.5
     """A sighting farther than this from the path of three or more is not its own, m."""
-    only_in_flight: bool = True
-    """The part of Q that is told of a flight counts only while there is one. Without one it would
-    judge an action by all that ever followed on it, which past actions like it had a share in."""
+    only_in_flight: bool = False
+    """The part of Q that is told of a flight counts only while there is one. Otherwise it judges
+    an action by all that ever followed on actions like it. For several heads of Q and
+    ensemble=min: a single head of the other part alone is no better guide (docs/log.md)."""
     painted: float = 0.5
     """A path at least so sure says where it is painted (`paint_flight`); else `motion` does."""
     forget: float = 0.5

@@ -139,15 +139,6 @@ def test_a_model_from_before_flights_were_followed_does_not_follow_them(folder: 
     assert not load_artefact(str(folder)).world_model.config.follows_flight
 
 
-def test_a_model_whose_told_part_always_counted_keeps_it(folder: Path) -> None:
-    assert load_artefact(str(folder)).world_model.config.told_only_in_flight
-    _edit(folder / CONFIG, lambda config: config["world_model"]["flight"].pop("only_in_flight"))
-    _sign(folder)
-    older = load_artefact(str(folder)).world_model.config
-    assert older.follows_flight
-    assert not older.told_only_in_flight
-
-
 def test_options_that_the_weights_contradict_are_refused(folder: Path) -> None:
     _edit(folder / CONFIG, lambda config: config["world_model"].update(q_heads=2))
     _sign(folder)

@@ -1,5 +1,6 @@
 """The final fit of Q: which states it sees, what it changes, and that it helps."""
 
+import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from egovcp.data import (
     SequenceStream,
     StreamConfig,
 )
-from egovcp.model import Batch, Carry, WorldModel
+from egovcp.model import PRESETS, Batch, Carry, WorldModel
+from egovcp.model.config import FlightConfig
 from egovcp.testing import CountingModel, toy_model
 from egovcp_train.batches import set_normalisation, to_tensors, whole_episodes
 from egovcp_train.value_fit import Rows, ValueFitConfig, _fit_heads, collect_rows, fit_value
@@ -133,7 +135,8 @@ def test_what_an_action_earns_is_not_credited_to_the_state_that_goes_with_it() -
 def test_what_is_told_of_flights_is_learned_from_flights_alone(store: EpisodeStore) -> None:
     """Without any the part that is told of them answers zero; else rows without one teach it
     nothing."""
-    model = toy_model()
+    config = dataclasses.replace(PRESETS["debug"], flight=FlightConfig(only_in_flight=True))
+    model = toy_model(config)
     rows = _collect(model, store, ahead=0)
     told, action = torch.zeros(64, 4), torch.rand(64, 7)
     told[:, 0] = 1.0
@@ -142,8 +145,8 @@ def test_what_is_told_of_flights_is_learned_from_flights_alone(store: EpisodeSto
 
     def learned(rows: Rows) -> Tensor:
         torch.manual_seed(0)
-        config = ValueFitConfig(steps=1, told_steps=30, told_rows=64, rows=16)
-        _fit_heads(model, rows, config, torch.Generator().manual_seed(0))
+        fit = ValueFitConfig(steps=1, told_steps=30, told_rows=64, rows=16)
+        _fit_heads(model, rows, fit, torch.Generator().manual_seed(0))
         with torch.no_grad():
             return head.passing(told, action)  # type: ignore[no-any-return, misc]
 

@@ -7,6 +7,7 @@ import torch
 
 from egovcp.errors import UsageError
 from egovcp.model import LossConfig, WorldModel, WorldModelConfig
+from egovcp.model.config import FlightConfig
 from egovcp.model.nets import SplitMlp
 
 
@@ -51,7 +52,8 @@ def test_q_has_a_part_for_what_is_on_its_way_only_if_told(told):
 
 def test_the_part_that_is_told_of_a_flight_is_silent_without_one():
     torch.manual_seed(0)
-    model = WorldModel(WorldModelConfig()).eval().requires_grad_(False)
+    config = WorldModelConfig(flight=FlightConfig(only_in_flight=True))
+    model = WorldModel(config).eval().requires_grad_(False)
     carry, action = model.initial(1), torch.rand(1, 7)
     without = model.value(carry, action)
     torch.nn.init.normal_(model.passing_value_head.rest[-1].weight)
