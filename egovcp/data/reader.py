@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Any, Self
 
 import numpy as np
@@ -54,6 +55,8 @@ class DatasetReader:
         self.chosen = select_episodes(episodes, len(self))
         """The numbers of the episodes that are asked for, ascending."""
         self._open_file = lru_cache(maxsize=_OPEN_FILES)(self._opened)
+        # A batch is made ahead in a thread; two that read one open file find it damaged.
+        self._reading = Lock()
 
     @classmethod
     def open(cls, config: DatasetConfig) -> Self:
@@ -294,11 +297,12 @@ class DatasetReader:
 
     def _rows(self, path: Path, index: int, names: Sequence[str]) -> pa.Table:
         """The rows of an episode, from the row groups that hold them."""
-        file, edges = self._open_file(path)
         first = int(self._table.start[index] - self._file_start[index])
         last = first + int(self._table.length[index])
-        touched = np.flatnonzero((edges[:-1] < last) & (edges[1:] > first))
-        table = file.read_row_groups(touched.tolist(), columns=_parts(names), use_threads=False)
+        with self._reading:
+            file, edges = self._open_file(path)
+            touched = np.flatnonzero((edges[:-1] < last) & (edges[1:] > first))
+            table = file.read_row_groups(touched.tolist(), columns=_parts(names), use_threads=False)
         offset = first - int(edges[touched[0]]) if len(touched) else 0
         return table.slice(offset, last - first)
 

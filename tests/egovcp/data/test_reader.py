@@ -1,6 +1,7 @@
 import json
 import shutil
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader
+from egovcp.data.columns import EPISODE_FEATURES
 from egovcp.errors import DataError, UsageError
 
 _DATA = "data/chunk-000/file-000.parquet"
@@ -138,6 +140,17 @@ def test_columns_are_the_episodes_one_after_the_other(reader: DatasetReader) -> 
     )
     with pytest.raises(DataError, match="did you mean 'action'"):
         reader.read_columns(["actions"])
+
+
+def test_threads_may_read_at_once(reader: DatasetReader) -> None:
+    """As training does, which makes a batch ahead while held-out episodes are read."""
+    names = tuple(EPISODE_FEATURES.values())
+    expected = [reader.read_episode_columns(k, names) for k in range(len(reader))]
+    asked = [k for _ in range(40) for k in range(len(reader))]
+    with ThreadPoolExecutor(4) as threads:
+        found = list(threads.map(lambda k: reader.read_episode_columns(k, names), asked))
+    for k, columns in zip(asked, found, strict=True):
+        assert all(np.array_equal(columns[name], expected[k][name]) for name in names)
 
 
 def test_an_episode_out_of_range_is_an_index_error(reader: DatasetReader) -> None:
