@@ -126,7 +126,8 @@ def _fit_q(
         heard = torch.ones(len(rows.target), 1) * model.heard(rows.told)
         counts = heard[:, 0].nonzero()[:, 0]
         if len(counts):
-            of_a_flight = Rows(*(x[counts] for x in rows))
+            every = len(counts) == len(rows.target)  # h of all rows is not small: no copy of it
+            of_a_flight = rows if every else Rows(*(x[counts] for x in rows))
             _descend(passing, told_error, of_a_flight, None, thorough, generator)
         else:
             passing.restart()
