@@ -184,6 +184,8 @@ class WorldModelConfig:
     symlog returns, fitted by cross entropy, whose mean is the number."""
     q_heads: int = 1
     """Heads of Q that differ in their start; Q is their mean unless the planner wants the least."""
+    value_units: int = 256
+    """Width of a head of Q; half of it where it reads what is on its way."""
     flight: FlightConfig = field(default_factory=FlightConfig)
     """Follows what is thrown at the robot; only where `value_of_passing`."""
     min_std: float = 0.1
@@ -267,5 +269,5 @@ PRESETS = {
         flight=FlightConfig(enabled=False),
         loss=PAPER_LOSS,
     ),
-    "debug": WorldModelConfig(hidden=32, latent=8, units=32, channels=(4, 8, 8)),
+    "debug": WorldModelConfig(hidden=32, latent=8, units=32, value_units=32, channels=(4, 8, 8)),
 }

@@ -160,10 +160,10 @@ class WorldModel(nn.Module):
     def _new_value_head(self) -> ValueHead:
         c = self.config
         outputs = value.width(c.value_loss)
-        return ValueHead((c.hidden, c.latent), c.value_state, c.units, outputs)
+        return ValueHead((c.hidden, c.latent), c.value_state, c.value_units, outputs)
 
     def _new_passing_value_head(self) -> SplitMlp:
-        units, outputs = self.config.units // 2, value.width(self.config.value_loss)
+        units, outputs = self.config.value_units // 2, value.width(self.config.value_loss)
         return SplitMlp((4, spec.ACTION_DIM), units, outputs, hidden_layers=2)
 
     def _start_at_zero(self) -> None:
