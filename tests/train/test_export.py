@@ -245,13 +245,34 @@ def test_a_q_of_bins_and_heads_and_a_reward_are_exported(tmp_path: Path) -> None
     assert json.loads((tmp_path / "onnx" / REPORT).read_text())["networks"].keys() == errors.keys()
 
 
-@pytest.mark.parametrize("planner", [{"latent": "sample"}, {"ensemble": "min"}])
-def test_a_planner_that_asks_for_more_than_means_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], planner: dict[str, Any]
+def test_of_several_heads_what_the_planner_asks_for_is_exported(tmp_path: Path) -> None:
+    torch.manual_seed(0)
+    model = _lively(WorldModel(dataclasses.replace(PRESETS["debug"], q_heads=3)))
+    inputs = golden_inputs(model, 5, seed=3)
+    said = {}
+    for ensemble in ("mean", "min"):
+        planner = PlannerConfig(ensemble=ensemble)
+        save_artefact(tmp_path / ensemble, model, planner, {"controller_id": "s-1"})
+        argv = [
+            f"--policy.path={tmp_path / ensemble}",
+            f"--output_dir={tmp_path / 'onnx' / ensemble}",
+        ]
+        assert main(argv) == 0
+        session = onnxruntime.InferenceSession(tmp_path / "onnx" / ensemble / "value.onnx")
+        given = {x.name: inputs[x.name].numpy() for x in session.get_inputs()}
+        said[ensemble] = torch.from_numpy(session.run(None, given)[0])
+    carry = Carry(inputs["h"], inputs["z"], inputs["flight"])
+    torch.testing.assert_close(said["mean"], model.value(carry, inputs["action"]))
+    torch.testing.assert_close(said["min"], model.lowest_value(carry, inputs["action"]))
+    assert bool((said["min"] < said["mean"]).all())
+
+
+def test_a_planner_that_draws_latents_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     model = WorldModel(PRESETS["debug"])
     provenance = {"controller_id": "s-1"}
-    save_artefact(tmp_path / "policy", model, PlannerConfig(**planner), provenance)
+    save_artefact(tmp_path / "policy", model, PlannerConfig(latent="sample"), provenance)
     argv = [f"--policy.path={tmp_path / 'policy'}", f"--output_dir={tmp_path / 'onnx'}"]
     assert main(argv) == 4
     assert "--planner.latent=mean" in capsys.readouterr().err

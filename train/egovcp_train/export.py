@@ -108,13 +108,13 @@ def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:
         ArtefactError: a network does not say what the original says, or the planner would ask for
             more than they say.
     """
-    model = artefact.world_model
+    model, ensemble = artefact.world_model, artefact.planner.ensemble
     _require_exportable(artefact)
-    for name, network in networks_of(model).items():
+    for name, network in networks_of(model, ensemble).items():
         write_graph(network(model), golden_inputs(model, _TRACED_ROWS, 1), folder / f"{name}.onnx")
     inputs = golden_inputs(model, _ROWS)
     golden = {f"inputs/{name}": tensor for name, tensor in inputs.items()}
-    for name, outputs in reference(model, inputs).items():
+    for name, outputs in reference(model, inputs, ensemble).items():
         golden |= {f"outputs/{name}/{key}": tensor for key, tensor in outputs.items()}
     save_file({name: t.contiguous() for name, t in golden.items()}, folder / GOLDEN)
     errors = verify(folder)
@@ -127,11 +127,10 @@ def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:
 def _require_exportable(artefact: Artefact) -> None:
     """Raise `ArtefactError` for a planner that asks what the networks do not answer."""
     planner = artefact.planner
-    if (planner.latent, planner.ensemble) != ("mean", "mean"):
+    if planner.latent != "mean":
         raise ArtefactError(
-            f"{artefact.path}: its planner has latent={planner.latent} and "
-            f"ensemble={planner.ensemble}; the networks written here give the mean of each, and "
-            "another plan: train with --planner.latent=mean --planner.ensemble=mean"
+            f"{artefact.path}: its planner has latent={planner.latent}; the networks written here "
+            "give the mean, and another plan: train with --planner.latent=mean"
         )
 
 
@@ -187,8 +186,8 @@ def _largest_error(folder: Path, name: str, golden: Mapping[str, torch.Tensor]) 
 def _report(artefact: Artefact, folder: Path, golden: dict[str, torch.Tensor]) -> dict[str, Any]:
     """What another runtime must know besides the graphs."""
 
-    model = artefact.world_model
-    networks = {name: network(model) for name, network in networks_of(model).items()}
+    model, ensemble = artefact.world_model, artefact.planner.ensemble
+    networks = {name: network(model) for name, network in networks_of(model, ensemble).items()}
 
     def described(key: str) -> dict[str, Any]:
         tensor = golden[key]

@@ -9,6 +9,7 @@
 A model that follows flights (`egovcp.model.flight`) has a third part of its memory, `flight`, which
 observe, imagine and value read and the first two hand on.
 
+Of several heads of Q, `value` is their mean or the least of them, as the artefact's planner has it.
 Normalisation is inside: depth comes in millimetres, proprioception in SI units, and values go out
 in units of return. A planner repeats the row of a robot for each of its candidates.
 """
@@ -28,6 +29,7 @@ from torch import Tensor, nn
 from egovcp import spec
 from egovcp.model import Carry, WorldModel, flight
 from egovcp.model.camera_pose import camera_pose
+from egovcp.plan.choices import Ensemble, judge_of
 
 OPSET: Final = 17
 
@@ -104,6 +106,13 @@ class Value(Following):
         return self.model.value(Carry(h, z, *flight), action)
 
 
+class LeastValue(Value):
+    """`WorldModel.lowest_value`, (B,)."""
+
+    def forward(self, h: Tensor, z: Tensor, action: Tensor, *flight: Tensor) -> Tensor:
+        return self.model.lowest_value(Carry(h, z, *flight), action)
+
+
 class Termination(Network):
     """`WorldModel.termination`, (B,)."""
 
@@ -134,12 +143,14 @@ NETWORKS: Final[Mapping[str, type[Network]]] = {
     "value": Value,
     "termination": Termination,
 }
+LEAST: Final[Mapping[str, type[Network]]] = {"value": LeastValue}
 REWARD: Final[Mapping[str, type[Network]]] = {"reward": Reward}
 
 
-def networks_of(model: WorldModel) -> Mapping[str, type[Network]]:
-    """What there is of this model, by name."""
-    return NETWORKS if model.reward_head is None else {**NETWORKS, **REWARD}
+def networks_of(model: WorldModel, ensemble: Ensemble) -> Mapping[str, type[Network]]:
+    """What there is of this model, by name; `value` is that which the planner asks for."""
+    least = LEAST if ensemble == "min" else {}
+    return {**NETWORKS, **least, **({} if model.reward_head is None else REWARD)}
 
 
 def pooled_nearness(depth_mm: Tensor, max_m: float) -> Tensor:
@@ -192,7 +203,7 @@ def _golden_memory(model: WorldModel, batch: int, seed: int) -> Tensor:
 
 
 @torch.no_grad()
-def reference(model: WorldModel, inputs: Tensors) -> dict[str, Tensors]:
+def reference(model: WorldModel, inputs: Tensors, ensemble: Ensemble) -> dict[str, Tensors]:
     """Network -> its outputs, computed by the world model itself, not by what is exported."""
     carry = Carry(inputs["h"], inputs["z"], inputs.get("flight"))
     depth = inputs["depth"].to(torch.int32)  # as on the robot
@@ -202,7 +213,7 @@ def reference(model: WorldModel, inputs: Tensors) -> dict[str, Tensors]:
     answers = {
         "observe": _named(observed),
         "imagine": _named(imagined),
-        "value": {"value": model.value(carry, action)},
+        "value": {"value": judge_of(model, model.value, ensemble)(carry, action)},
         "termination": {"termination": model.termination(carry)},
     }
     if model.reward_head is not None:
