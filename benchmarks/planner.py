@@ -65,7 +65,7 @@ def needed_gflop(model: WorldModel, config: PlannerConfig) -> float:
     def state_parts(module: nn.Module) -> int:
         return macs(*list(module.parts)[:-1])  # type: ignore[arg-type]
 
-    heads = [part for head in model.q_heads for part in head if part is not None]
+    heads = model.q_heads.parts
     mlps = [getattr(part, "mlp", part) for part in heads]
     asked = model.passing_value_head is not None and not model.config.follows_flight
     told = model.decode_passing if asked else None

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 from torch import Tensor
 
@@ -11,14 +9,14 @@ from egovcp.model import losses
 from egovcp.model.foresight import autoregressive_losses, foresight_losses
 from egovcp.model.losses import Batch
 from egovcp.model.outcomes import value_and_termination_losses
-from egovcp.model.world_model import QHead, WorldModel
+from egovcp.model.world_model import QHeads, WorldModel
 
 
 def world_model_loss(
     model: WorldModel,
     batch: Batch,
     generator: torch.Generator | None = None,
-    heads: Sequence[QHead] | None = None,
+    heads: QHeads | None = None,
 ) -> tuple[Tensor, dict[str, Tensor]]:
     """Total loss of equation 6 and its terms (scalars, detached).
 

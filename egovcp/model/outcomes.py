@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 import torch.nn.functional as F
 from torch import Tensor
@@ -11,11 +9,11 @@ from torch import Tensor
 from egovcp.model.config import LossConfig
 from egovcp.model.losses import Batch, Rollout, masked_mean, unbroken
 from egovcp.model.td import td_target
-from egovcp.model.world_model import Carry, QHead, WorldModel
+from egovcp.model.world_model import Carry, QHeads, WorldModel
 
 
 def value_target(
-    model: WorldModel, carry: Carry, batch: Batch, heads: Sequence[QHead] | None = None
+    model: WorldModel, carry: Carry, batch: Batch, heads: QHeads | None = None
 ) -> tuple[Tensor, Tensor]:
     """What Q is fitted to at each row (B, T), in deviations of the return from its mean, and the
     rows (B, T) at which that is known.
@@ -38,7 +36,7 @@ def value_and_termination_losses(
     rollout: Rollout,
     batch: Batch,
     config: LossConfig,
-    heads: Sequence[QHead] | None = None,
+    heads: QHeads | None = None,
 ) -> dict[str, Tensor]:
     """Equations 9 and 7b, on the posterior and on states imagined from it.
 

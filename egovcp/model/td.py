@@ -9,15 +9,15 @@ do: the random walk, here without a horizon. d_t: a_t ended the episode in failu
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
 from egovcp.model.losses import Batch, unbroken
-from egovcp.model.nets import SplitMlp, ValueHead
-from egovcp.model.world_model import Carry, QHead, WorldModel
+from egovcp.model.nets import ValueHead
+from egovcp.model.world_model import Carry, QHeads, WorldModel
 
 
 class SlowHeads(nn.Module):
@@ -26,17 +26,15 @@ class SlowHeads(nn.Module):
 
     def __init__(self, model: WorldModel) -> None:
         super().__init__()
-        self._state = nn.ModuleList(copy.deepcopy(head.state) for head in model.q_heads)
-        told = [head.passing for head in model.q_heads if head.passing is not None]
-        self._passing = nn.ModuleList(copy.deepcopy(part) for part in told)
+        self._states = nn.ModuleList(copy.deepcopy(head) for head in model.q_heads.states)
+        self._passing = copy.deepcopy(model.q_heads.passing)
         self.requires_grad_(False)
 
     @property
-    def heads(self) -> list[QHead]:
+    def heads(self) -> QHeads:
         """To be asked through `WorldModel.value`."""
-        state: list[ValueHead] = list(self._state)  # type: ignore[arg-type]
-        passing: list[SplitMlp | None] = list(self._passing)  # type: ignore[arg-type]
-        return [QHead(*parts) for parts in zip(state, passing or [None] * len(state), strict=True)]
+        states: list[ValueHead] = list(self._states)  # type: ignore[arg-type]
+        return QHeads(tuple(states), self._passing)
 
     @torch.no_grad()
     def follow(self, model: WorldModel, decay: float) -> None:
@@ -45,14 +43,14 @@ class SlowHeads(nn.Module):
         torch._foreach_lerp_(own, [*_parameters(model.q_heads)], 1 - decay)
 
 
-def _parameters(heads: Sequence[QHead]) -> Iterator[Tensor]:
-    for part in (part for head in heads for part in head if part is not None):
+def _parameters(heads: QHeads) -> Iterator[Tensor]:
+    for part in heads.parts:
         yield from part.parameters()
 
 
 @torch.no_grad()
 def td_target(
-    model: WorldModel, carry: Carry, batch: Batch, heads: Sequence[QHead] | None = None
+    model: WorldModel, carry: Carry, batch: Batch, heads: QHeads | None = None
 ) -> tuple[Tensor, Tensor]:
     """Targets (B, T) in units of return, and the rows that have one.
 

@@ -97,13 +97,18 @@ def _later(carry: Carry) -> Tensor | None:
     return None if carry.flight is None else flight.later(carry.flight)
 
 
-class QHead(NamedTuple):
-    """The parts of one head of Q, whose outputs add up."""
+class QHeads(NamedTuple):
+    """The heads of Q: each answers with the sum of a part of its own and one that all share."""
 
-    state: ValueHead
-    """Reads (h, z) and the action."""
+    states: tuple[ValueHead, ...]
+    """Each reads (h, z) and the action."""
     passing: SplitMlp | None
-    """Reads what is on its way and the action."""
+    """Reads what is on its way and the action: few numbers, of which there are no two views."""
+
+    @property
+    def parts(self) -> tuple[ValueHead | SplitMlp, ...]:
+        """All of them, the shared one last."""
+        return (*self.states, *(() if self.passing is None else (self.passing,)))
 
 
 def _fill_discount(model: WorldModel, state: dict[str, Any], prefix: str, *unused: object) -> None:
@@ -141,12 +146,8 @@ class WorldModel(nn.Module):
         self.termination_head = SplitMlp(state, c.units, 1)
         self.value_head = self._new_value_head()
         self.passing_value_head = self._new_passing_value_head() if c.value_of_passing else None
-        self.more_value_heads = nn.ModuleList()
-        self.more_passing_value_heads = nn.ModuleList()
-        for _ in range(c.q_heads - 1):
-            self.more_value_heads.append(self._new_value_head())
-            if c.value_of_passing:
-                self.more_passing_value_heads.append(self._new_passing_value_head())
+        more = (self._new_value_head() for _ in range(c.q_heads - 1))
+        self.more_value_heads = nn.ModuleList(more)
         self.reward_head = ValueHead(state, c.value_state, c.units) if c.loss.reward > 0 else None
         self._start_at_zero()
         self.register_buffer("state_mean", torch.zeros(spec.STATE_DIM))
@@ -169,7 +170,7 @@ class WorldModel(nn.Module):
     def _start_at_zero(self) -> None:
         """Value and termination start as constants, so that early plans are not random."""
         self.termination_head.start_at_zero()
-        for head in (*(part for q in self.q_heads for part in q), self.reward_head):
+        for head in (*self.q_heads.parts, self.reward_head):
             if head is not None:
                 head.start_at_zero()
 
@@ -285,7 +286,7 @@ class WorldModel(nn.Module):
         """Q(h, z, a) in units of return, (...,); equation 5."""
         return self.standardised_value(carry, action) * self.return_std + self.return_mean
 
-    def value_by(self, heads: Sequence[QHead], carry: Carry, action: Tensor) -> Tensor:
+    def value_by(self, heads: QHeads, carry: Carry, action: Tensor) -> Tensor:
         """The same by other heads than the model's own."""
         q = self._read_values(self._value_outputs(carry, action, heads)).mean(0)
         return q * self.return_std + self.return_mean
@@ -311,13 +312,10 @@ class WorldModel(nn.Module):
         return torch.stack([value.error(q, target, kind) for q in outputs]).mean(0)
 
     @property
-    def q_heads(self) -> list[QHead]:
-        """The heads of Q; the first one alone unless `q_heads` asks for more."""
-        state = (self.value_head, *self.more_value_heads)
-        passing = (self.passing_value_head, *self.more_passing_value_heads)
-        if self.passing_value_head is None:
-            passing = (None,) * len(state)
-        return [QHead(*parts) for parts in zip(state, passing, strict=True)]
+    def q_heads(self) -> QHeads:
+        """The heads of Q."""
+        more: list[ValueHead] = list(self.more_value_heads)  # type: ignore[arg-type]
+        return QHeads((self.value_head, *more), self.passing_value_head)
 
     def _all_values(self, carry: Carry, action: Tensor) -> Tensor:
         """Of each head, in units of the return's deviation from its mean, (heads, ...)."""
@@ -326,16 +324,14 @@ class WorldModel(nn.Module):
     def _read_values(self, outputs: Sequence[Tensor]) -> Tensor:
         return torch.stack([value.read(q, self.config.value_loss) for q in outputs])
 
-    def _value_outputs(self, carry: Carry, action: Tensor, heads: Sequence[QHead]) -> list[Tensor]:
+    def _value_outputs(self, carry: Carry, action: Tensor, heads: QHeads) -> list[Tensor]:
         """Of each head, (..., width of `egovcp.model.value`)."""
-        told = None if self.passing_value_head is None else self.passing(carry)
-        outputs = []
-        for head in heads:
-            q: Tensor = head.state(carry.h, carry.z, action)
-            if head.passing is not None and told is not None:
-                q = q + self.heard(told) * head.passing(told, action)
-            outputs.append(q)
-        return outputs
+        outputs = [head(carry.h, carry.z, action) for head in heads.states]
+        if heads.passing is None:
+            return outputs
+        told = self.passing(carry)
+        shared = self.heard(told) * heads.passing(told, action)
+        return [q + shared for q in outputs]
 
     def reward(self, carry: Carry, action: Tensor) -> Tensor:
         """The reward that a (..., 7) earns at this state, in units of reward, (...,).

@@ -20,8 +20,7 @@ def toy_model(preset: str | WorldModelConfig = "debug", seed: int = 0) -> WorldM
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = WorldModel(PRESETS[preset] if isinstance(preset, str) else preset)
-        values = [part for head in model.q_heads for part in head]
-        for head in (*values, model.termination_head, model.reward_head):
+        for head in (*model.q_heads.parts, model.termination_head, model.reward_head):
             if head is None:
                 continue
             last = (head.mlp if isinstance(head, ValueHead) else head).rest[-1]

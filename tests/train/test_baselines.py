@@ -83,7 +83,7 @@ def test_the_slow_heads_stay_in_the_checkpoint(
     model = load_training_state(tmp_path / "td")["learner"]["model"]
     heads = {name: value for name, value in model.items() if name.startswith("value_head.")}
     slow = _slow(tmp_path / "td")
-    behind = [slow[name.replace("value_head.", "_state.0.")] - x for name, x in heads.items()]
+    behind = [slow[name.replace("value_head.", "_states.0.")] - x for name, x in heads.items()]
     assert any(difference.any() for difference in behind)
 
 

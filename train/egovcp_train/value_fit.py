@@ -20,7 +20,6 @@ from egovcp.model import Batch, Carry, WorldModel, value
 from egovcp.model.losses import filter_sequence
 from egovcp.model.nets import SplitMlp, ValueHead
 from egovcp.model.outcomes import value_target
-from egovcp.model.world_model import QHead
 
 
 @dataclass(frozen=True)
@@ -92,8 +91,9 @@ def _fit_heads(
     model: WorldModel, rows: Rows, config: ValueFitConfig, generator: torch.Generator
 ) -> None:
     """Each head of Q, and that of the reward if there is one."""
-    for head in model.q_heads:
-        _fit_q(model, head, rows, config, generator)
+    known = _fit_told(model, rows, config, generator)
+    for head in model.q_heads.states:
+        _fit_state(model, head, rows, known, config, generator)
     if (reward := model.reward_head) is not None:
 
         def earned(x: Rows, known: Tensor | None) -> Tensor:
@@ -103,46 +103,58 @@ def _fit_heads(
         _descend(reward, earned, rows, None, config, generator)
 
 
-def _fit_q(
+def _fit_told(
+    model: WorldModel, rows: Rows, config: ValueFitConfig, generator: torch.Generator
+) -> Tensor | None:
+    """The part of Q that is told of a flight, on the rows where it counts.
+
+    Returns:
+        What it says of all rows, (R, outputs); None without such a part.
+    """
+    kind, passing = model.config.value_loss, model.q_heads.passing
+    if passing is None:
+        return None
+
+    def told(x: Rows) -> Tensor:
+        q: Tensor = passing(x.told, x.action)
+        return q
+
+    def told_error(x: Rows, known: Tensor | None) -> Tensor:
+        return value.error(told(x), x.target, kind).mean()
+
+    thorough = replace(config, steps=config.told_steps, rows=config.told_rows, lr=config.told_lr)
+    heard = torch.ones(len(rows.target), 1) * model.heard(rows.told)
+    counts = heard[:, 0].nonzero()[:, 0]
+    if len(counts):
+        every = len(counts) == len(rows.target)  # h of all rows is not small: no copy of it
+        of_a_flight = rows if every else Rows(*(x[counts] for x in rows))
+        _descend(passing, told_error, of_a_flight, None, thorough, generator)
+    else:
+        passing.restart()
+    with torch.no_grad():
+        chunks = torch.split(torch.arange(len(rows.target)), 65536)
+        said = torch.cat([told(_pick(rows, some, _device(passing))).cpu() for some in chunks])
+        return said * heard
+
+
+def _fit_state(
     model: WorldModel,
-    head: QHead,
+    head: ValueHead,
     rows: Rows,
+    known: Tensor | None,
     config: ValueFitConfig,
     generator: torch.Generator,
 ) -> None:
-    kind, known = model.config.value_loss, None
-    if (passing := head.passing) is not None:
-
-        def told(x: Rows) -> Tensor:
-            q: Tensor = passing(x.told, x.action)
-            return q
-
-        def told_error(x: Rows, known: Tensor | None) -> Tensor:
-            return value.error(told(x), x.target, kind).mean()
-
-        thorough = replace(
-            config, steps=config.told_steps, rows=config.told_rows, lr=config.told_lr
-        )
-        heard = torch.ones(len(rows.target), 1) * model.heard(rows.told)
-        counts = heard[:, 0].nonzero()[:, 0]
-        if len(counts):
-            every = len(counts) == len(rows.target)  # h of all rows is not small: no copy of it
-            of_a_flight = rows if every else Rows(*(x[counts] for x in rows))
-            _descend(passing, told_error, of_a_flight, None, thorough, generator)
-        else:
-            passing.restart()
-        with torch.no_grad():
-            chunks = torch.split(torch.arange(len(rows.target)), 65536)
-            known = torch.cat([told(_pick(rows, some, _device(passing))).cpu() for some in chunks])
-            known = known * heard
+    """A part of Q that reads the state, to what is ``known`` leaves unexplained."""
+    kind = model.config.value_loss
 
     def judged(x: Rows, known: Tensor | None) -> Tensor:
-        q: Tensor = head.state(*_hidden(x, config), x.action)
+        q: Tensor = head(*_hidden(x, config), x.action)
         if known is None:
             return value.error(q, x.target, kind).mean()
         return value.error_beyond(q, known, x.target, kind).mean()
 
-    _descend(head.state, judged, rows, known, config, generator)
+    _descend(head, judged, rows, known, config, generator)
 
 
 def _hidden(x: Rows, config: ValueFitConfig) -> tuple[Tensor, Tensor]:

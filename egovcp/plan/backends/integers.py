@@ -15,8 +15,7 @@ from torch import Tensor, nn
 from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import WorldModel, value
-from egovcp.model.nets import SplitLinear, SplitMlp
-from egovcp.model.world_model import QHead
+from egovcp.model.nets import SplitLinear, SplitMlp, ValueHead
 from egovcp.plan.backends import library
 from egovcp.plan.backends.layers import first_outputs, gru_layer, linears_of, norms_of, weight_of
 from egovcp.plan.backends.root import Root
@@ -49,9 +48,10 @@ class IntegerNetwork:
 
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
         self._kernel = library.library()
-        self._heads = len(model.q_heads)
+        self._heads = len(model.q_heads.states)
         self._outputs = value.width(model.config.value_loss)
         self._width = 1 if self._outputs == 1 else _whole(self._outputs)
+        assert self._width <= MOST_FEW
         self._packed = _Packed(model, drawn=config.latent == "sample")
 
     def shared(self, root: Root) -> Shared:
@@ -59,9 +59,16 @@ class IntegerNetwork:
         h, mix, gates = root.h.flatten().contiguous(), _centred(root.mix), _centred(root.gates)
         values = [_centred(x) for x in root.values]
         pointers = (ctypes.c_void_p * len(values))(*(x.data_ptr() for x in values))
-        addresses = (x.data_ptr() for x in (h, mix, gates))
-        description = library.Root(*addresses, ctypes.cast(pointers, ctypes.c_void_p), None)
-        return Shared(description, (h, mix, gates, values, pointers), root, {})
+        passing = None if root.passing is None else _centred(root.passing)
+        description = library.Root(
+            h.data_ptr(),
+            mix.data_ptr(),
+            gates.data_ptr(),
+            ctypes.cast(pointers, ctypes.c_void_p),
+            None if passing is None else passing.data_ptr(),
+            None,
+        )
+        return Shared(description, (h, mix, gates, values, pointers, passing), root, {})
 
     def outputs(
         self, shared: Shared, actions: Tensor, noise: Tensor | None, threads: library.Threads
@@ -136,10 +143,11 @@ class _Packed:
         self._prior_top(first_outputs(top, None if drawn else c.latent))
         n.termination, top = self._one_hidden(model.termination_head)
         n.termination_top = self._linear(top.weight, top.bias)
-        if model.passing_value_head is not None:
+        if (shared := model.q_heads.passing) is not None:
+            n.passing = self._mlp(shared, wide=False)
             n.told, top = self._one_hidden(model.decode_passing)
             n.told_top = self._linear(top.weight, top.bias)
-        heads = (library.Head * c.q_heads)(*map(self._head, model.q_heads))
+        heads = (library.Head * c.q_heads)(*map(self._head, model.q_heads.states))
         n.head = ctypes.cast(heads, ctypes.c_void_p)
         self._kept.append(heads)
         self.address = ctypes.byref(n)
@@ -150,14 +158,11 @@ class _Packed:
         self._kept.append(copy)
         return copy.data_ptr()
 
-    def _head(self, head: QHead) -> library.Head:
+    def _head(self, head: ValueHead) -> library.Head:
         packed = library.Head()
-        reduce = head.state.reduce
-        if reduce is not None:
-            packed.reduce_h, packed.reduce_z = self._reduced(reduce)
-        packed.state = self._mlp(head.state.mlp, wide=reduce is None)
-        if head.passing is not None:
-            packed.passing = self._mlp(head.passing, wide=False)
+        if head.reduce is not None:
+            packed.reduce_h, packed.reduce_z = self._reduced(head.reduce)
+        packed.state = self._mlp(head.mlp, wide=head.reduce is None)
         return packed
 
     def _reduced(self, reduce: SplitLinear) -> list[library.Linear]:

@@ -54,12 +54,12 @@ typedef struct {
 
 typedef struct {
     Linear reduce_h, reduce_z; /* to what `state` reads in place of h and z, if there are any */
-    Mlp state, passing;        /* the second reads what is on its way, if its top has outputs */
+    Mlp state;
 } Head;
 
 typedef struct {
     int32_t hidden, latent, actions, heads;
-    int32_t only_in_flight; /* what a head says that is told counts only while something is on its way */
+    int32_t only_in_flight; /* `passing` counts only while something is on its way */
     Layer mix, gru, prior, termination, told;
     Wide prior_top;         /* [outputs] means, then raw deviations if they are wanted */
     const float *prior_bias; /* [MOST_FEW] */
@@ -67,13 +67,15 @@ typedef struct {
     Linear termination_top, told_top;
     float min_std;
     const Head *head; /* [heads] */
+    Mlp passing;      /* reads what is on its way, is added to each head; none if its top has no outputs */
 } Network;
 
 typedef struct {
     const float *h;      /* [hidden] */
     const float *mix;    /* sums of the first layers that do not depend on the candidate */
     const float *gates;
-    const float *const *values; /* of the heads, two for one that is told */
+    const float *const *values; /* of the heads */
+    const float *passing;       /* of what they share */
     const float *told;          /* [steps][TOLD] what is on its way, if it is followed; else null */
 } Root;
 
@@ -422,14 +424,21 @@ static void block(const Network *net, const Root *root, int steps, const float *
                 tell(net, &h_bytes, &z_bytes, &told);
         }
         const int silent = net->only_in_flight && root->told && root->told[k * TOLD] <= 0.0f;
-        const float *const *add = root->values;
+        const int shared = net->passing.top.outputs && !silent;
+        float both[ROWS * MOST_FEW] = {0}; /* what the heads share, [ROWS][width] */
+        if (shared) {
+            Inputs in = {.action = action};
+            if (k == 0) in.from = root->passing;
+            else in.few = &told;
+            mlp(&net->passing, in, both, width);
+        }
         for (int i = 0; i < net->heads; i++) {
             const Head *head = net->head + i;
             float *to = q + k * per_step + i * width;
             Inputs in = {.action = action};
             Few reduced = {{{0}}};
             if (k == 0) {
-                in.from = *add++;
+                in.from = root->values[i];
             } else if (head->reduce_h.outputs) {
                 linear(&head->reduce_h, h, reduced.values[0], MOST_FEW);
                 linear(&head->reduce_z, z, reduced.values[0], MOST_FEW);
@@ -438,12 +447,8 @@ static void block(const Network *net, const Root *root, int steps, const float *
                 in.wide = &h_bytes, in.beside = &z_bytes;
             }
             mlp(&head->state, in, to, q_stride);
-            if (head->passing.top.outputs) {
-                in = (Inputs){.action = action};
-                if (k == 0) in.from = *add++;
-                else in.few = &told;
-                if (!silent) mlp(&head->passing, in, to, q_stride);
-            }
+            for (int r = 0; shared && r < ROWS; r++)
+                for (int j = 0; j < width; j++) to[r * q_stride + j] += both[r * width + j];
         }
         if (k == steps - 1) break; /* nothing follows the last step */
         if (k > 0) {

@@ -75,7 +75,7 @@ class Mlp(ctypes.Structure):
 
 
 class Head(ctypes.Structure):
-    _fields_ = (("reduce_h", Linear), ("reduce_z", Linear), ("state", Mlp), ("passing", Mlp))
+    _fields_ = (("reduce_h", Linear), ("reduce_z", Linear), ("state", Mlp))
 
 
 class Network(ctypes.Structure):
@@ -89,11 +89,14 @@ class Network(ctypes.Structure):
         *((name, Linear) for name in ("termination_top", "told_top")),
         ("min_std", ctypes.c_float),
         ("head", ctypes.c_void_p),
+        ("passing", Mlp),
     )
 
 
 class Root(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_void_p) for name in ("h", "mix", "gates", "values", "told"))
+    _fields_ = tuple(
+        (name, ctypes.c_void_p) for name in ("h", "mix", "gates", "values", "passing", "told")
+    )
 
 
 class Threads:

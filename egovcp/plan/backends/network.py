@@ -13,8 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from egovcp.model import WorldModel
-from egovcp.model.nets import SplitMlp
-from egovcp.model.world_model import QHead
+from egovcp.model.nets import SplitMlp, ValueHead
 from egovcp.plan.backends.floats import FloatHidden, FloatLinear, FloatRecurrence
 from egovcp.plan.backends.layers import HiddenLayer, gru_layer, hidden_layers, weight_of
 from egovcp.plan.backends.reading import q_of
@@ -42,40 +41,20 @@ class _QNetwork:
 
 
 class _Head:
-    """One head of Q."""
+    """What a head of Q does not share with the others."""
 
-    def __init__(self, head: QHead, dtype: torch.dtype) -> None:
+    def __init__(self, head: ValueHead, dtype: torch.dtype) -> None:
         self._reduced: FloatLinear | None = None
-        if head.state.reduce is not None:
-            self._reduced = FloatLinear(*map(weight_of, head.state.reduce.parts))
-        self._state = _QNetwork(head.state.mlp, self._reduced is None, dtype)
-        self._passing = None if head.passing is None else _QNetwork(head.passing, False, dtype)
+        if head.reduce is not None:
+            self._reduced = FloatLinear(*map(weight_of, head.reduce.parts))
+        self._network = _QNetwork(head.mlp, self._reduced is None, dtype)
+        self.start = self._network.start
 
-    def start(self, add: list[Tensor], heard: Tensor | float, action: Tensor) -> Tensor:
-        """(..., width) at k = 0; takes its sums from the front of ``add``."""
-        q = self._state.start(add.pop(0), action)
-        if self._passing is None:
-            return q
-        return q + heard * self._passing.start(add.pop(0), action)
-
-    def later(
-        self,
-        wide_h: Tensor,
-        h: Tensor,
-        z: Tensor,
-        told: Tensor | None,
-        heard: Tensor | float,
-        action: Tensor,
-    ) -> Tensor:
+    def later(self, wide_h: Tensor, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
         """(..., width) at k > 0."""
         if self._reduced is None:
-            q = self._state.later(wide_h, torch.cat([z, action], -1))
-        else:
-            q = self._state.later(None, torch.cat([self._reduced(h, z), action], -1))
-        if self._passing is None or told is None:
-            return q
-        told = told.expand(*action.shape[:-1], -1)
-        return q + heard * self._passing.later(None, torch.cat([told, action], -1))
+            return self._network.later(wide_h, torch.cat([z, action], -1))
+        return self._network.later(None, torch.cat([self._reduced(h, z), action], -1))
 
 
 class PlanningNetwork:
@@ -93,36 +72,51 @@ class PlanningNetwork:
         wanted = None if config.latent == "sample" else model.config.latent
         self._prior = FloatHidden(hidden_layers(model.prior, True, wanted)[0], dtype)
         self._termination = FloatHidden(hidden_layers(model.termination_head, True)[0], dtype)
-        self._heads = [_Head(head, dtype) for head in model.q_heads]
-        self._passing: FloatHidden | None = None
-        if model.passing_value_head is not None:
+        self._heads = [_Head(head, dtype) for head in model.q_heads.states]
+        self._shared: _QNetwork | None = None
+        if (shared := model.q_heads.passing) is not None:
+            self._shared = _QNetwork(shared, False, dtype)
             self._passing = FloatHidden(hidden_layers(model.decode_passing, True)[0], dtype)
 
     def worth(self, root: Root, actions: Tensor, noise: Tensor | None) -> Tensor:
         """J (...) of plans (..., N, 7); noise (N - 1, latent) under ``latent=sample``."""
         each = actions.unbind(-2)
         tally = Tally(self._config, self._model.return_floor)
-        sums = list(root.values)
-        heard = self._heard(root.told(0))
-        tally.value(self._read([head.start(sums, heard, each[0]) for head in self._heads]))
+        own = [head.start(add, each[0]) for head, add in zip(self._heads, root.values, strict=True)]
+        tally.value(self._read(own, self._shared_start(root, each[0])))
         x = self._mix_start.between(None, each[0], root.mix)
         wide_h: Tensor | None = None
         h, add = root.h, root.gates
         for k in range(1, len(each)):
             h, wide_h = self._recur(x, wide_h, add if k == 1 else None, h)
             z = self._next_z(wide_h, None if noise is None else noise[k - 1])
-            told = self._told(wide_h, z) if root.flight is None else root.told(k)
-            heard = self._heard(told)
-            q = [head.later(wide_h, h, z, told, heard, each[k]) for head in self._heads]
-            tally.value(self._read(q))
+            own = [head.later(wide_h, h, z, each[k]) for head in self._heads]
+            tally.value(self._read(own, self._shared_later(root, k, wide_h, z, each[k])))
             if k == len(each) - 1:
                 break  # nothing follows the last step
             tally.risk(torch.sigmoid(self._termination.last(wide_h, z, None)[..., 0]))
             x = self._mix.between(None, torch.cat([z, each[k]], -1), None)
         return tally.mean(len(each))
 
-    def _heard(self, told: Tensor | None) -> Tensor | float:
-        return 1.0 if told is None else self._model.heard(told)
+    def _shared_start(self, root: Root, action: Tensor) -> Tensor | float:
+        """What the heads of Q share, (..., width) at k = 0."""
+        if self._shared is None or root.passing is None:
+            return 0.0
+        told = root.told(0)
+        heard = 1.0 if told is None else self._model.heard(told)
+        return heard * self._shared.start(root.passing, action)
+
+    def _shared_later(
+        self, root: Root, k: int, wide_h: Tensor, z: Tensor, action: Tensor
+    ) -> Tensor | float:
+        """The same at k > 0."""
+        if self._shared is None:
+            return 0.0
+        told = self._told(wide_h, z) if root.flight is None else root.told(k)
+        assert told is not None
+        heard = self._model.heard(told)
+        told = told.expand(*action.shape[:-1], -1)
+        return heard * self._shared.later(None, torch.cat([told, action], -1))
 
     def _next_z(self, wide_h: Tensor, noise: Tensor | None) -> Tensor:
         out = self._prior.last(wide_h, None, None)
@@ -132,13 +126,12 @@ class PlanningNetwork:
         std = F.softplus(raw + 0.54) + self._model.config.min_std
         return mean + std * noise
 
-    def _told(self, wide_h: Tensor, z: Tensor) -> Tensor | None:
+    def _told(self, wide_h: Tensor, z: Tensor) -> Tensor:
         """`WorldModel.passing`."""
-        if self._passing is None:
-            return None
         out = self._passing.last(wide_h, z, None)
         coming = torch.sigmoid(out[..., 3:])
         return torch.cat([coming, coming * out[..., :3]], -1)
 
-    def _read(self, outputs: list[Tensor]) -> Tensor:
-        return q_of(self._model, self._config, torch.stack(outputs, -2))
+    def _read(self, own: list[Tensor], shared: Tensor | float) -> Tensor:
+        outputs = torch.stack([q + shared for q in own], -2)
+        return q_of(self._model, self._config, outputs)

@@ -18,7 +18,8 @@ class Root(NamedTuple):
     h: Tensor
     mix: Tensor  # sums of the first layer that leads to the GRU
     gates: Tensor  # sums of the GRU's gates
-    values: tuple[Tensor, ...]  # sums of the first layers of Q, two for a head that is told
+    values: tuple[Tensor, ...]  # sums of the first layers of Q's heads
+    passing: Tensor | None  # and of the part that they share
     flight: Tensor | None  # what is remembered of a flight
 
     def told(self, k: int) -> Tensor | None:
@@ -31,17 +32,16 @@ class Root(NamedTuple):
 def root_of(model: WorldModel, carry: Carry) -> Root:
     """From the robots' states (E, ...)."""
     carry = model.spread(carry)
-    told = None if model.passing_value_head is None else model.passing(carry)
-    values: list[Tensor] = []
     state = (carry.h, carry.z)
-    for head in model.q_heads:
-        reduce = head.state.reduce
-        values.append(_but_action(head.state.mlp, *(state if reduce is None else [reduce(*state)])))
-        if head.passing is not None and told is not None:
-            values.append(_but_action(head.passing, told))
+    values: list[Tensor] = []
+    for head in model.q_heads.states:
+        reduce = head.reduce
+        values.append(_but_action(head.mlp, *(state if reduce is None else [reduce(*state)])))
+    shared = model.q_heads.passing
+    passing = None if shared is None else _but_action(shared, model.passing(carry))
     mix, gates = model.mix.parts[0](carry.z), model.gru.project.parts[1](carry.h)
-    followed = carry.flight if model.passing_value_head is not None else None
-    return Root(carry.h, mix, gates, tuple(values), followed)
+    followed = None if shared is None else carry.flight
+    return Root(carry.h, mix, gates, tuple(values), passing, followed)
 
 
 def _but_action(mlp: SplitMlp, *state: Tensor) -> Tensor:

@@ -63,7 +63,7 @@ def test_every_option_trains_and_keeps_the_contract(name: str) -> None:
 def test_the_defaults_add_no_parameters_and_no_terms(batch: Batch) -> None:
     """So that older artefacts are complete, and a seed starts where it did."""
     names = {name.split(".")[0] for name in toy_model().state_dict()}
-    assert not names & {"more_value_heads", "more_passing_value_heads", "reward_head"}
+    assert not names & {"more_value_heads", "reward_head"}
     _, terms = world_model_loss(toy_model(), batch, torch.Generator().manual_seed(0))
     assert "loss/reward" not in terms
 
@@ -89,13 +89,10 @@ def test_q_is_the_mean_of_its_heads_and_the_lowest_is_below() -> None:
     model.return_std.fill_(3.0)
     carry, action = _asked(model)
     with torch.no_grad():
-        alone = torch.stack(
-            [
-                (head.state(carry.h, carry.z, action) + head.passing(model.passing(carry), action))
-                for head in model.q_heads
-                if head.passing is not None
-            ]
-        ).squeeze(-1)
+        states, shared = model.q_heads
+        assert shared is not None
+        both = shared(model.passing(carry), action)
+        alone = torch.stack([head(carry.h, carry.z, action) + both for head in states]).squeeze(-1)
         torch.testing.assert_close(model.value(carry, action), 3.0 * alone.mean(0) - 2.0)
         torch.testing.assert_close(model.lowest_value(carry, action), 3.0 * alone.amin(0) - 2.0)
     assert len(alone) == 3

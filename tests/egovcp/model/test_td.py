@@ -20,6 +20,7 @@ CHAIN = WorldModelConfig(
     hidden=12,
     latent=2,
     units=32,
+    value_units=32,
     channels=(4, 8, 8),
     value_state=0,
     value_of_passing=False,
@@ -123,8 +124,8 @@ def test_the_slow_heads_answer_as_the_model_did(change: dict[str, object]) -> No
     carry, slow = _states(model, batch), SlowHeads(model)
     with torch.no_grad():
         before = model.value(carry, batch.action)
-        for head in model.q_heads:
-            for parameter in head.state.parameters():
+        for head in model.q_heads.states:
+            for parameter in head.parameters():
                 parameter.add_(0.1)
         assert not torch.equal(model.value(carry, batch.action), before)
         torch.testing.assert_close(model.value_by(slow.heads, carry, batch.action), before)
@@ -136,7 +137,7 @@ def test_the_slow_heads_answer_as_the_model_did(change: dict[str, object]) -> No
 @pytest.mark.parametrize(("decay", "expected"), [(0.75, 1.0), (0.0, 4.0)])
 def test_the_slow_heads_follow_at_their_pace(decay: float, expected: float) -> None:
     model = _model(q_heads=2)
-    live = [p for head in model.q_heads for part in head if part for p in part.parameters()]
+    live = [p for part in model.q_heads.parts for p in part.parameters()]
     with torch.no_grad():
         torch._foreach_zero_(live)
         slow = SlowHeads(model)
