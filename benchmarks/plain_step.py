@@ -71,11 +71,12 @@ class PlainModel(nn.Module):
         self.decode_sight = copy.deepcopy(model.decode_sight)
         self.decode_passing = mlp(model.decode_passing)
         self.termination = mlp(model.termination_head)
-        assert model.value_head.reduce is not None
-        assert model.passing_value_head is not None
-        self.reduce = linear(model.value_head.reduce)
-        self.value_head = mlp(model.value_head.mlp)
-        self.passing_value = mlp(model.passing_value_head)
+        heads = model.q_heads
+        assert heads.passing is not None
+        reduced = [head.reduce for head in heads.states if head.reduce is not None]
+        self.reduce = nn.ModuleList(linear(reduce) for reduce in reduced)
+        self.value_heads = nn.ModuleList(mlp(head.mlp) for head in heads.states)
+        self.passing_value = mlp(heads.passing)
         for name, buffer in model.named_buffers():
             self.register_buffer(name, buffer.clone())
 
@@ -100,14 +101,17 @@ class PlainModel(nn.Module):
         return output.unflatten(-1, (len(self.config.motion_ahead), 4))
 
     def value(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
-        """Standardised."""
+        """Standardised, of each head, (..., heads)."""
         features = torch.cat([h, z], -1)
         out = self.decode_passing(features).detach()
         coming = torch.sigmoid(out[..., 3:])
         passing = torch.cat([coming, coming * out[..., :3]], -1)
-        q = self.value_head(torch.cat([self.reduce(features), action], -1))
-        q = q + self.passing_value(torch.cat([passing, action], -1))
-        return q.squeeze(-1)
+        own = [
+            head(torch.cat([reduce(features), action], -1))
+            for reduce, head in zip(self.reduce, self.value_heads, strict=True)
+        ]
+        shared: Tensor = self.passing_value(torch.cat([passing, action], -1))
+        return torch.cat(own, -1) + shared
 
 
 def widest(x: Tensor) -> Tensor:
@@ -251,11 +255,16 @@ def kl_terms(
     return [loss.kl_prior * kl(fixed_q, p), loss.kl_posterior * kl(q, fixed_p)]
 
 
+def value_error(q: Tensor, target: Tensor) -> Tensor:
+    """Of heads (..., heads) beside the target (...,), (...,)."""
+    return ((q - target[..., None]) ** 2).mean(-1)
+
+
 def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[Tensor]:
     loss = model.config.loss
     target = (batch.mc_return - model.return_mean) / model.return_std  # type: ignore[operator]
     usable = batch.valid & batch.mc_valid
-    value = mean_where((model.value(h, z, batch.action) - target) ** 2, usable)
+    value = mean_where(value_error(model.value(h, z, batch.action), target), usable)
     h = model.transition(h, z, batch.action)
     z = model.gaussian(model.prior(h))[0]
     fall = F.binary_cross_entropy_with_logits(
@@ -264,7 +273,8 @@ def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[T
         reduction="none",
     )
     q = model.value(h[:, :-1], z[:, :-1], batch.action[:, 1:])
-    imagined = mean_where((q - target[:, 1:]) ** 2, usable[:, 1:] & unbroken(batch, 1))
+    error = value_error(q, target[:, 1:])
+    imagined = mean_where(error, usable[:, 1:] & unbroken(batch, 1))
     return [
         loss.value * value,
         loss.termination * mean_where(fall, batch.valid),

@@ -45,7 +45,7 @@ def plain_plan(
         values, alive = [], torch.ones(m)
         for k in range(n):
             action = reflect(action + config.eta * deltas[:, k])
-            values.append(alive * (model.value(state, action) - model.return_floor))
+            values.append(alive * (model.lowest_value(state, action) - model.return_floor))
             if k > 0:
                 alive = alive * (model.termination(state) <= config.termination_threshold)
             state = model.imagine(state, action)
@@ -105,7 +105,8 @@ def main() -> None:
     args = p.parse_args()
     torch.manual_seed(0)
     model = WorldModel(WorldModelConfig()).eval().requires_grad_(False)
-    torch.nn.init.normal_(model.value_head.mlp.rest[-1].weight, std=0.1)
+    for head in model.q_heads.states:
+        torch.nn.init.normal_(head.mlp.rest[-1].weight, std=0.1)
     config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))
     h, z = torch.randn(1, model.config.hidden).tanh(), torch.randn(1, model.config.latent)
     carry = Carry(h, z, model.initial(1).flight)

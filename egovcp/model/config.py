@@ -143,10 +143,10 @@ class FlightConfig:
     """The variance of a crossing is this many times what independent sightings would give."""
     gate: float = 0.5
     """A sighting farther than this from the path of three or more is not its own, m."""
-    only_in_flight: bool = False
+    only_in_flight: bool = True
     """The part of Q that is told of a flight counts only while there is one. Otherwise it judges
-    an action by all that ever followed on actions like it. For several heads of Q and
-    ensemble=min: a single head of the other part alone is no better guide (docs/log.md)."""
+    an action by all that ever followed on actions like it, which is no worse a guide than a single
+    head of the other part (docs/log.md)."""
     painted: float = 0.5
     """A path at least so sure says where it is painted (`paint_flight`); else `motion` does."""
     forget: float = 0.5
@@ -182,8 +182,9 @@ class WorldModelConfig:
     value_loss: ValueLoss = "mse"
     """mse: Q is a number, fitted by its squared error; two_hot: a distribution over bins of
     symlog returns, fitted by cross entropy, whose mean is the number."""
-    q_heads: int = 1
-    """Heads of Q that differ in their start; Q is their mean unless the planner wants the least."""
+    q_heads: int = 5
+    """Heads of Q that differ in their start. A search finds what one of them is wrong about; where
+    the least of them is high, none says otherwise (`planner.ensemble`)."""
     value_units: int = 256
     """Width of a head of Q; half of it where it reads what is on its way."""
     flight: FlightConfig = field(default_factory=FlightConfig)
@@ -265,9 +266,12 @@ PRESETS = {
     "paper": WorldModelConfig(
         value_state=0,
         value_of_passing=False,
+        q_heads=1,
         paint_flight=False,
         flight=FlightConfig(enabled=False),
         loss=PAPER_LOSS,
     ),
-    "debug": WorldModelConfig(hidden=32, latent=8, units=32, value_units=32, channels=(4, 8, 8)),
+    "debug": WorldModelConfig(
+        hidden=32, latent=8, units=32, value_units=32, q_heads=2, channels=(4, 8, 8)
+    ),
 }

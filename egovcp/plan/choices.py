@@ -103,15 +103,5 @@ def step_of[L](
 def judge_of[L](
     model: object, value: Callable[[L, Tensor], Tensor], ensemble: Ensemble
 ) -> Callable[[L, Tensor], Tensor]:
-    """How an action is judged: ``value``, or the least of several.
-
-    Raises:
-        UsageError: the model has no other opinions.
-    """
-    if ensemble == "mean":
-        return value
-    if not isinstance(model, Doubts):
-        raise UsageError(
-            f"ensemble=min: {type(model).__name__} has no lowest_value; plan with ensemble=mean"
-        )
-    return model.lowest_value
+    """How an action is judged: ``value``, or the least of several if the model has them."""
+    return model.lowest_value if ensemble == "min" and isinstance(model, Doubts) else value

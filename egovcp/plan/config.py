@@ -44,8 +44,9 @@ class PlannerConfig:
     latent: Latent = "mean"
     """z of imagined states. mean: the prior's; sample: drawn from the prior, anew in each
     iteration, with the same noise for all candidates."""
-    ensemble: Ensemble = "mean"
-    """What several heads of Q are worth together (`q_heads`): their mean, or the least of them."""
+    ensemble: Ensemble = "min"
+    """What several heads of Q are worth together (`q_heads`): the least of them, or their mean. A
+    search goes where Q is too high; their least is so only where all of them are."""
     optimiser: OptimiserName = "cem"
     """How candidates are drawn: cem (fitted to the elites), icem (with coloured noise, elites kept
     and fewer samples each round), mppi (all weighted by their value), shooting (uniform)."""
@@ -79,11 +80,6 @@ class PlannerConfig:
             raise UsageError(
                 f"backend={self.backend} computes objective=value only; for objective="
                 f"{self.objective} choose auto or eager"
-            )
-        if self.objective == "reward" and self.ensemble != "mean":
-            raise UsageError(
-                f"ensemble={self.ensemble} says how heads of Q are read, and objective=reward asks "
-                "no Q; drop the one or the other"
             )
 
     @property

@@ -23,7 +23,7 @@ RULES: Final[dict[str, Flags]] = {
     "rule_shift": {"planner.termination_rule": "shift"},
     "rule_survival": {"planner.termination_rule": "survival"},
     "latent_sample": {"planner.latent": "sample"},
-    "ensemble_min": {"planner.ensemble": "min"},
+    "ensemble_mean": {"planner.ensemble": "mean"},
 }
 _REFERENCE: Final = "cem"
 
@@ -74,7 +74,7 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
         f"Searches: each weighs as many candidates as a plan of one robot affords in "
         f"{config.play.budget_ms:g} ms on the machine below, by a timing of all of them in turns. "
         "`cem_1` and `cem_6` are `cem` with that many rounds instead of 3. "
-        "Rules: the artefact's own search; `ensemble_min` differs only where Q has several heads."
+        "Rules: the artefact's own search; `ensemble_mean` differs only where Q has several heads."
     ]
     figures: dict[str, Any] = {}
     for task in config.tasks:

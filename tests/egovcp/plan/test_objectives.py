@@ -207,11 +207,6 @@ def test_a_model_that_foresees_no_rewards_is_refused(objective: Any) -> None:
         evaluate(PointWorld(), start, torch.zeros(1, 2, config.actions, 7), config)
 
 
-def test_a_sum_of_rewards_asks_no_heads_of_q() -> None:
-    with pytest.raises(UsageError, match="objective=reward asks no Q"):
-        PlannerConfig(objective="reward", ensemble="min")
-
-
 def test_draws_from_a_prior_that_was_only_trained_in_its_mean_are_refused() -> None:
     autoregressive = dataclasses.replace(DEBUG, dynamics="autoregressive")
     with pytest.raises(UsageError, match="plan with latent=mean"):
