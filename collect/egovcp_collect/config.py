@@ -14,7 +14,7 @@ from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT, TASKS
 
 ALL_TASKS: Final = "all"
 #: Options that an episode depends on; the others only say how the work is done.
-SHAPING: Final = ("task", "mix", "seed", "eta", "boundary", "env")
+SHAPING: Final = ("task", "mix", "seed", "eta", "step_ticks", "boundary", "env")
 
 
 _LEAST: Final = {
@@ -67,7 +67,11 @@ class CollectConfig:
     num_envs: int = 16
     """Robots that each process simulates side by side."""
     eta: float = ACTION_ETA
-    """Largest step of the random walk, action box units per planner tick (40 ms)."""
+    """Largest step of the random walk, action box units; what exceeds the rate limit of 0.32 per
+    planner tick (40 ms) is sent as a ramp."""
+    step_ticks: tuple[int, int] = (1, 1)
+    """Shortest and longest time from one step of the walk to the next, planner ticks; (1, 1) is
+    the paper's walk."""
     boundary: Literal["reflect", "clip"] = "reflect"
     """What keeps the walk inside the action box; clipping piles it up on the walls."""
     env: EnvConfig = field(default_factory=EnvConfig)
@@ -82,10 +86,17 @@ class CollectConfig:
             value = getattr(self, name)
             if value < least:
                 raise UsageError(f"--{name}={value}: expected at least {least}")
-        if not 0 < self.eta <= ACTION_RATE_LIMIT:
+        least, most = self.step_ticks
+        if not 1 <= least <= most:
             raise UsageError(
-                f"--eta={self.eta}: expected more than 0 and at most {ACTION_RATE_LIMIT}, the "
-                "rate limit that collection and deployment share"
+                f"--step_ticks={[least, most]}: expected 1 <= shortest <= longest, planner ticks"
+            )
+        reached = min(2.0, least * ACTION_RATE_LIMIT)
+        if not 0 < self.eta <= reached:
+            raise UsageError(
+                f"--eta={self.eta}: expected more than 0 and at most {reached:g}: within "
+                f"--step_ticks={[least, most]} no more is sent, at the rate limit of "
+                f"{ACTION_RATE_LIMIT} per tick that collection and deployment share"
             )
         if min(self._weights()) < 0 or sum(self._weights()) <= 0:
             raise UsageError(f"{self.mix}: expected weights of at least 0, and one above it")

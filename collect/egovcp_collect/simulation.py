@@ -50,7 +50,7 @@ class Simulation:
         self._watch = watch
         self._pictures = pictures
         self._waiting: deque[Scenario] = deque()
-        self._policy = RandomWalk(config.eta, config.boundary)
+        self._policy = RandomWalk(config.eta, config.boundary, config.step_ticks)
         self._env: VectorEnv | None = None
         self._observation: Observation
         self._record: Record

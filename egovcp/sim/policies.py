@@ -66,34 +66,54 @@ class RandomWalk:
     """The behaviour policy of the data: a_t = a_{t-1} + eta delta, delta ~ U(-1, 1)^7.
 
     (Paper section III-B.) ``reflect`` folds what leaves the box back inside, which keeps
-    the walk's distribution uniform; ``clip`` piles it up on the walls.
+    the walk's distribution uniform; ``clip`` piles it up on the walls. The next step comes
+    ``step_ticks`` (least, most) ticks after the last one, drawn anew each time. A step beyond the
+    environment's rate limit is sent as a ramp: an action then says where the hands will be for a
+    while, and its return what that was worth.
     """
 
     def __init__(
-        self, eta: float = ACTION_ETA, bounds: Literal["reflect", "clip"] = "reflect"
+        self,
+        eta: float = ACTION_ETA,
+        bounds: Literal["reflect", "clip"] = "reflect",
+        step_ticks: tuple[int, int] = (1, 1),
     ) -> None:
         self._eta = eta
         self._bounds = bounds
+        self._step_ticks = step_ticks
         self._action = np.zeros((0, ACTION_DIM))
+        self._wait = np.zeros(0, dtype=np.int64)  # ticks until the next step
         self._rngs: list[np.random.Generator] = []
 
     def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
         """Every row starts from neutral with its scenario's own randomness."""
         self._action = np.zeros((len(scenarios), ACTION_DIM))
+        self._wait = np.zeros(len(scenarios), dtype=np.int64)
         self._rngs = [scenario.rng("policy") for scenario in scenarios]
 
     def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
         """``rows`` start from neutral with their scenarios' own randomness."""
         for row, scenario in zip(rows, scenarios, strict=True):
             self._action[row] = 0.0
+            self._wait[row] = 0
             self._rngs[row] = scenario.rng("policy")
 
     def act(self, env: VectorEnv) -> Array:
         """(B, 7) the next step of each row's walk."""
-        delta = np.array([rng.uniform(-1.0, 1.0, ACTION_DIM) for rng in self._rngs])
+        delta = np.array([self._delta(row) for row in range(len(self._rngs))])
         fold = reflect if self._bounds == "reflect" else _clip
         self._action[:] = fold(self._action + self._eta * delta)
         return self._action.copy()
+
+    def _delta(self, row: int) -> Array:
+        """(7,) of one robot; zeros between two steps."""
+        if self._wait[row] > 0:
+            self._wait[row] -= 1
+            return np.zeros(ACTION_DIM)
+        rng, (least, most) = self._rngs[row], self._step_ticks
+        if most > 1:  # the paper's walk draws nothing else
+            self._wait[row] = rng.integers(least, most, endpoint=True) - 1
+        return rng.uniform(-1.0, 1.0, ACTION_DIM)
 
 
 def _clip(action: Array) -> Array:

@@ -88,6 +88,8 @@ def test_the_last_line_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (["--num_workers=-1"], "expected at least 0"),
         (["--seed=-1"], "expected at least 0"),
         (["--eta=0.5"], "rate limit"),
+        (["--eta=1", "--step_ticks=[3,9]"], "at most 0.96"),
+        (["--step_ticks=[9,4]"], "shortest <= longest"),
         (["--boundary=bounce"], "bounce"),
         (["--task=all", "--mix.ball=0", "--mix.wall=0", "--mix.arch=0"], "weights"),
         (["--episode=3"], "did you mean '--episodes'"),

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from huggingface_hub import DatasetCard, DatasetCardData
 
@@ -105,6 +105,7 @@ def _render(reader: DatasetReader, repo_id: str, found: Survey, pictures: Mappin
         **_origin(reader),
         eta=config.get("eta", spec.ACTION_ETA),
         boundary=_BOUNDARY.get(config.get("boundary", ""), "kept inside the box"),
+        step_ticks=_step_ticks(config),
         ranges=ranges,
         constants=constants,
         features=card_tables.feature_table(),
@@ -120,6 +121,12 @@ def _render(reader: DatasetReader, repo_id: str, found: Survey, pictures: Mappin
         cols=spec.DEPTH_COLS,
     )
     return f"{str(card).rstrip()}\n"
+
+
+def _step_ticks(config: Mapping[str, Any]) -> str:
+    """What the card says of a walk that does not step at every tick."""
+    least, most = config.get("step_ticks", (1, 1))
+    return "" if most == 1 else f", a step every {least} to {most} ticks, sent as a ramp"
 
 
 def _origin(reader: DatasetReader) -> dict[str, str]:

@@ -11,7 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
 import egovcp_collect.dataset
 from egovcp import spec
-from egovcp.data import DatasetConfig, DatasetReader, schema
+from egovcp.data import DatasetConfig, DatasetReader, Provenance, schema
 from egovcp.data.hashes import verify_hashes
 from egovcp.data.source import Source
 from egovcp.errors import UsageError
@@ -21,6 +21,7 @@ from egovcp_collect.dataset.card_tables import field_docs, settings_tables
 from egovcp_collect.dataset.cli import main
 from egovcp_collect.dataset.replace import replace_text
 
+from .conftest import write
 from .scenes import SETTINGS, three_balls, write_scenes
 
 HOUSE = Path(__file__).resolve().parents[3]
@@ -65,6 +66,14 @@ def test_how_it_was_collected_is_told(text: str) -> None:
     assert "| `env.ball.radius_range` | 0.09 | 0.12 | Radius of the ball, m. |" in text
     assert "`env.ball.block_reward` | 1 | Once" in text
     assert "env.wall." not in text  # no such task in it
+    assert "a step every" not in text
+
+
+def test_a_walk_that_steps_less_often_is_told(tmp_path: Path) -> None:
+    known = Provenance("stance-1", seed=5, command="", config={"eta": 1.0, "step_ticks": [5, 9]})
+    root = str(write(tmp_path / "data", [0], known))
+    text = card_text(DatasetReader.open(DatasetConfig(root=root)), "me/steps")
+    assert "a step every 5 to 9 ticks, sent as a ramp. It starts at the" in text
 
 
 def test_every_setting_of_a_task_is_in_one_of_the_tables_with_its_meaning() -> None:

@@ -60,9 +60,9 @@ def test_every_option_trains_and_keeps_the_contract(name: str) -> None:
         assert tensor.grad.isfinite().all(), parameter
 
 
-def test_the_defaults_add_no_parameters_and_no_terms(batch: Batch) -> None:
-    """So that older artefacts are complete, and a seed starts where it did."""
-    names = {name.split(".")[0] for name in toy_model().state_dict()}
+def test_what_is_not_asked_for_adds_no_parameters_and_no_terms(batch: Batch) -> None:
+    model = toy_model(_config(q_heads=1))
+    names = {name.split(".")[0] for name in model.state_dict()}
     assert not names & {"more_value_heads", "reward_head"}
     _, terms = world_model_loss(toy_model(), batch, torch.Generator().manual_seed(0))
     assert "loss/reward" not in terms
@@ -91,7 +91,8 @@ def test_q_is_the_mean_of_its_heads_and_the_lowest_is_below() -> None:
     with torch.no_grad():
         states, shared = model.q_heads
         assert shared is not None
-        both = shared(model.passing(carry), action)
+        told = model.passing(carry)
+        both = model.heard(told) * shared(told, action)
         alone = torch.stack([head(carry.h, carry.z, action) + both for head in states]).squeeze(-1)
         torch.testing.assert_close(model.value(carry, action), 3.0 * alone.mean(0) - 2.0)
         torch.testing.assert_close(model.lowest_value(carry, action), 3.0 * alone.amin(0) - 2.0)
@@ -100,7 +101,7 @@ def test_q_is_the_mean_of_its_heads_and_the_lowest_is_below() -> None:
 
 
 def test_one_head_has_no_second_opinion() -> None:
-    model = toy_model()
+    model = toy_model(_config(q_heads=1))
     carry, action = _asked(model)
     with torch.no_grad():
         assert torch.equal(model.value(carry, action), model.lowest_value(carry, action))

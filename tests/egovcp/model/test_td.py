@@ -23,6 +23,7 @@ CHAIN = WorldModelConfig(
     value_units=32,
     channels=(4, 8, 8),
     value_state=0,
+    q_heads=1,
     value_of_passing=False,
     loss=TD,
 )

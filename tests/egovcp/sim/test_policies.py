@@ -31,6 +31,17 @@ def test_reflection_fills_the_box_evenly_and_clipping_piles_up(env: VectorEnv) -
     assert np.mean(np.abs(piled) > 0.9) > 0.15
 
 
+def test_a_walk_steps_as_often_as_it_is_told(env: VectorEnv) -> None:
+    actions = walk(env, RandomWalk(eta=1.0, step_ticks=(3, 5)), 2000)
+    moved = np.diff(actions, axis=0) != 0.0  # (T - 1, B, 7)
+    steps = moved.all(-1)
+    np.testing.assert_array_equal(steps, moved.any(-1))  # all seven targets, or none
+    every = np.diff(np.flatnonzero(steps[:, 0]))
+    assert set(every) == {3, 4, 5}
+    assert np.abs(np.diff(actions, axis=0)).max() > ACTION_ETA
+    assert np.abs(actions).max() <= 1.0
+
+
 def test_a_walk_is_its_scenarios(env: VectorEnv) -> None:
     np.testing.assert_array_equal(
         walk(env, RandomWalk(), 5, first=0)[:, 2], walk(env, RandomWalk(), 5, first=2)[:, 0]
