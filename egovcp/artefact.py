@@ -34,9 +34,12 @@ from egovcp.plan import PlannerConfig, Policy, require_answers
 from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
 
 SCHEMA_VERSION = 2
-_NONE: Final[Mapping[str, Any]] = {}
-#: Options of models made before there were these, where the default is another.
-_BEFORE: Final[Mapping[str, Any]] = {"flight": {"enabled": False}}
+#: Options of models and planners made before there were these, where the default is another.
+_BEFORE: Final[Mapping[str, Any]] = {
+    "world_model": {"flight": {"enabled": False}, "q_heads": 1},
+    "planner": {"ensemble": "mean"},
+}
+_BEFORE_OF_FLIGHT: Final[Mapping[str, Any]] = {"only_in_flight": False}
 SEAL = "manifest_sha256"
 CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
 _PATTERNS = ("*.json", "*.safetensors")
@@ -195,7 +198,7 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
     _check_manifest(folder, manifest)
     config = _read_json(folder / CONFIG)
     try:
-        model = WorldModel(_decode(WorldModelConfig, config, "world_model", _BEFORE))
+        model = WorldModel(_decode(WorldModelConfig, config, "world_model"))
         planner = _decode(PlannerConfig, config, "planner")
         require_answers(model.config, planner)
         model.load_state_dict(load_file(folder / WEIGHTS))
@@ -213,17 +216,18 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
     return Artefact(folder, model.eval(), planner, manifest)
 
 
-def _decode[C](
-    config_class: type[C], config: dict[str, Any], key: str, absent: Mapping[str, Any] = _NONE
-) -> C:
+def _decode[C](config_class: type[C], config: dict[str, Any], key: str) -> C:
     """The dataclass under ``key``; raises KeyError, TypeError, UsageError or DraccusException.
 
-    Options that are ``absent`` have the values given there, others their defaults.
+    Options that are not there have the values of `_BEFORE`, or else their defaults.
     """
     values = config[key]
     if not isinstance(values, dict):
         raise TypeError(f"{key} is {type(values).__name__}, expected an object")
-    decoded: C = draccus.decode(config_class, {**absent, **values})
+    complete = {**_BEFORE[key], **values}
+    if isinstance(flight := complete.get("flight"), dict):
+        complete["flight"] = {**_BEFORE_OF_FLIGHT, **flight}
+    decoded: C = draccus.decode(config_class, complete)
     return decoded
 
 

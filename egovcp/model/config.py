@@ -185,8 +185,8 @@ class WorldModelConfig:
     q_heads: int = 5
     """Heads of Q that differ in their start. A search finds what one of them is wrong about; where
     the least of them is high, none says otherwise (`planner.ensemble`)."""
-    value_units: int = 256
-    """Width of a head of Q; half of it where it reads what is on its way."""
+    value_units: int = 0
+    """Width of a head of Q, half of it for the part that is told what is on its way; 0: `units`."""
     flight: FlightConfig = field(default_factory=FlightConfig)
     """Follows what is thrown at the robot; only where `value_of_passing`."""
     min_std: float = 0.1
@@ -271,7 +271,5 @@ PRESETS = {
         flight=FlightConfig(enabled=False),
         loss=PAPER_LOSS,
     ),
-    "debug": WorldModelConfig(
-        hidden=32, latent=8, units=32, value_units=32, q_heads=2, channels=(4, 8, 8)
-    ),
+    "debug": WorldModelConfig(hidden=32, latent=8, units=32, q_heads=2, channels=(4, 8, 8)),
 }

@@ -161,10 +161,11 @@ class WorldModel(nn.Module):
     def _new_value_head(self) -> ValueHead:
         c = self.config
         outputs = value.width(c.value_loss)
-        return ValueHead((c.hidden, c.latent), c.value_state, c.value_units, outputs)
+        return ValueHead((c.hidden, c.latent), c.value_state, c.value_units or c.units, outputs)
 
     def _new_passing_value_head(self) -> SplitMlp:
-        units, outputs = self.config.value_units // 2, value.width(self.config.value_loss)
+        c = self.config
+        units, outputs = (c.value_units or c.units) // 2, value.width(c.value_loss)
         return SplitMlp((4, spec.ACTION_DIM), units, outputs, hidden_layers=2)
 
     def _start_at_zero(self) -> None:

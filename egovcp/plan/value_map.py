@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from egovcp.plan.choices import Ensemble, judge_of
 from egovcp.plan.objective import Dynamics
 from egovcp.spec import ACTION_BOX
 
@@ -45,15 +46,18 @@ def value_map[L](
     action: Tensor,
     hand: Literal["left", "right"],
     grid: HandGrid,
+    ensemble: Ensemble = "min",
 ) -> Tensor:
-    """Q (E, n, m) of action (E, 7) with its ``hand`` at each (z, x) of ``grid``, return units."""
+    """Q (E, n, m) of action (E, 7) with its ``hand`` at each (z, x) of ``grid``, return units; of
+    several heads what a planner with ``ensemble`` makes of them."""
     axis_x, _, axis_z = HAND_AXES[hand]
     x = _normalised(grid.x, axis_x, action)
     z = _normalised(grid.z, axis_z, action)
     actions = action[:, None, None, :].repeat(1, len(z), len(x), 1)  # (E, n, m, 7)
     actions[..., axis_x] = x
     actions[..., axis_z] = z[:, None]
-    values = model.value(model.spread(carry), actions.flatten(1, 2))
+    judge = judge_of(model, model.value, ensemble)
+    values = judge(model.spread(carry), actions.flatten(1, 2))
     return values.reshape(len(action), len(z), len(x))
 
 

@@ -76,5 +76,7 @@ class CountingModel(WorldModel):
         last = carry.z[..., : spec.ACTION_DIM]
         return -(action - last - self.drift).square().sum(-1)
 
+    lowest_value = value
+
     def termination(self, carry: Carry) -> Tensor:
         return torch.zeros_like(carry.h[..., 0])

@@ -103,7 +103,7 @@ def test_the_final_fit_under_td_differs_from_that_to_returns(
         assert main(arguments(tmp_path / f"fit{steps}", value_fit__steps=steps, **TD)) == 0
     bare, fitted = _weights(tmp_path / "fit0"), _weights(tmp_path / "fit4")
     changed = {n.split(".")[0] for n, x in bare.items() if not torch.equal(x, fitted[n])}
-    assert changed == {"value_head", "passing_value_head"}
+    assert changed == {"value_head", "more_value_heads", "passing_value_head"}
 
 
 def test_the_artefact_says_what_it_is_and_plans(arguments: Arguments, tmp_path: Path) -> None:

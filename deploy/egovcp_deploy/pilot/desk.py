@@ -173,8 +173,9 @@ class Thinker:
             return reply
         film = self._imagining.imagine(reply.step.plan, self._imagine)
         maps: tuple[ValueMap, ...] = ()
-        if isinstance(self._policy, Policy):
-            maps = value_maps(self._policy.model, self._policy.carry, reply.step.action[0])
+        if isinstance(policy := self._policy, Policy):
+            action, ensemble = reply.step.action[0], policy.config.ensemble
+            maps = value_maps(policy.model, policy.carry, action, ensemble)
         decoded = Decoded(self._imagining.reconstruct()[0], film[0], maps)
         return replace(reply, decoded=decoded)
 

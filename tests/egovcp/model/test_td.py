@@ -20,7 +20,6 @@ CHAIN = WorldModelConfig(
     hidden=12,
     latent=2,
     units=32,
-    value_units=32,
     channels=(4, 8, 8),
     value_state=0,
     q_heads=1,
