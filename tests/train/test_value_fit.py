@@ -19,6 +19,7 @@ from egovcp.data import (
 from egovcp.model import PRESETS, Batch, Carry, WorldModel
 from egovcp.model.config import FlightConfig
 from egovcp.testing import CountingModel, toy_model
+from egovcp_train import batches
 from egovcp_train.batches import set_normalisation, to_tensors, whole_episodes
 from egovcp_train.value_fit import Rows, ValueFitConfig, _fit_heads, collect_rows, fit_value
 
@@ -199,3 +200,13 @@ def test_whole_episodes_are_whole_and_in_their_order(store: EpisodeStore) -> Non
     torch.testing.assert_close(mirrored.depth, plain.depth.flip(-1))
     everything = sum(int(b.valid.sum()) for b in whole_episodes(store, torch.device("cpu")))
     assert everything == store.num_frames
+
+
+def test_whole_episodes_are_padded_to_the_longest_beside_them(
+    store: EpisodeStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(batches, "EPISODES_AT_ONCE", 1)
+    found = [batch.valid for batch in whole_episodes(store, torch.device("cpu"))]
+    assert [valid.shape[1] for valid in found] == store.length.tolist()
+    assert len(set(store.length.tolist())) > 1
+    assert all(bool(valid.all()) for valid in found)

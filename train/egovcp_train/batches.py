@@ -31,18 +31,18 @@ def to_tensors(arrays: Mapping[str, NDArray[Any]], device: torch.device) -> Batc
 def whole_episodes(
     store: EpisodeStore, device: torch.device, mirror: bool = False, limit: int | None = None
 ) -> Iterator[Batch]:
-    """Whole episodes from their start, as a robot lives through them, padded to the longest.
+    """Whole episodes from their start, as a robot lives through them, padded to the longest of a
+    batch: episodes of one task are often several times as long as those of another.
 
     Args:
         mirror: and then their mirror images.
         limit: at most this many episodes, the first ones; None: all.
     """
     count = len(store.length) if limit is None else min(limit, len(store.length))
-    span = int(store.length[:count].max())
     for mirrored in (False, True) if mirror else (False,):
         for first in range(0, count, EPISODES_AT_ONCE):
             which = np.arange(first, min(first + EPISODES_AT_ONCE, count))
-            arrays = gather(store, store.start[which], which, span)
+            arrays = gather(store, store.start[which], which, int(store.length[which].max()))
             if mirrored:
                 mirror_rows(arrays, np.arange(len(which)))
             yield to_tensors(arrays, device)

@@ -69,6 +69,15 @@ class Material:
     return_scales: Mapping[str, ReturnScale]
     """Task -> the scale that its returns are on, under `returns.scale=per_task`; else empty."""
 
+    @property
+    def training_count(self) -> int:
+        """How many `training_episodes` there are, mirror images included."""
+        if isinstance(self.fitting, EpisodeIndex):
+            count = min(len(self.fitting), FIT_EPISODES)
+        else:
+            count = len(self.fitting.length)
+        return count * (2 if self.config.sampling.mirror else 1)
+
     def training_episodes(self, device: torch.device) -> Iterator[Batch]:
         """Whole training episodes, and their mirror images; a random part of a large dataset."""
         if isinstance(self.fitting, EpisodeIndex):

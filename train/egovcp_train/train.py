@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from egovcp.cli import run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.data.ahead import Ahead
 from egovcp.errors import ArtefactError, UsageError
-from egovcp.model import PRESETS, WorldModel
+from egovcp.model import PRESETS, Batch, WorldModel
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
 from egovcp_train.card import versions, write_card
@@ -198,11 +198,18 @@ class Run:
         if self.ranks.is_first and (fit or self.ranks.count == 1):
             shipped = copy.deepcopy(shipped)
             if fit:
-                episodes = self.material.training_episodes(self.device)
-                fit_value(shipped, episodes, self.config.value_fit, self.config.seed)
+                fit_value(shipped, self._states(), self.config.value_fit, self.config.seed)
             report = self.evaluate(shipped)
             record(report, self.output, shipped.config.depth_max_m)
         self.save(shipped)
+
+    def _states(self) -> Iterator[Batch]:
+        """Whole training episodes, with a bar: to filter them all takes minutes."""
+        total = self.material.training_count
+        with tqdm(total=total, unit="ep", desc="states for Q", mininterval=1.0) as bar:
+            for batch in self.material.training_episodes(self.device):
+                yield batch
+                bar.update(len(batch.valid))
 
     def evaluate(self, model: WorldModel) -> Report:
         """Measure a model on held-out episodes, and in simulation if that is asked for."""

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from tqdm import tqdm
 
 from egovcp.model import Batch, Carry, WorldModel, value
 from egovcp.model.losses import filter_sequence
@@ -176,7 +177,7 @@ def _descend(
     device = _device(head)
     optimizer = torch.optim.AdamW(head.parameters(), lr=config.lr, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=config.steps)
-    for _ in range(config.steps):
+    for _ in tqdm(range(config.steps), unit="step", desc="fit Q", mininterval=1.0, leave=False):
         pick = torch.randint(len(rows.target), (config.rows,), generator=generator)
         optimizer.zero_grad(set_to_none=True)
         beyond = None if known is None else known[pick].to(device)
