@@ -143,10 +143,10 @@ class FlightConfig:
     """The variance of a crossing is this many times what independent sightings would give."""
     gate: float = 0.5
     """A sighting farther than this from the path of three or more is not its own, m."""
-    only_in_flight: bool = True
+    only_in_flight: bool = False
     """The part of Q that is told of a flight counts only while there is one. Otherwise it judges
-    an action by all that ever followed on actions like it, which is no worse a guide than a single
-    head of the other part (docs/log.md)."""
+    an action by all that ever followed on actions like it: before a throw a better guide than the
+    other part, before a wall a worse one (docs/log.md)."""
     painted: float = 0.5
     """A path at least so sure says where it is painted (`paint_flight`); else `motion` does."""
     forget: float = 0.5
@@ -182,7 +182,7 @@ class WorldModelConfig:
     value_loss: ValueLoss = "mse"
     """mse: Q is a number, fitted by its squared error; two_hot: a distribution over bins of
     symlog returns, fitted by cross entropy, whose mean is the number."""
-    q_heads: int = 5
+    q_heads: int = 1
     """Heads of Q that differ in their start. A search finds what one of them is wrong about; where
     the least of them is high, none says otherwise (`planner.ensemble`)."""
     value_units: int = 0
@@ -266,7 +266,6 @@ PRESETS = {
     "paper": WorldModelConfig(
         value_state=0,
         value_of_passing=False,
-        q_heads=1,
         paint_flight=False,
         flight=FlightConfig(enabled=False),
         loss=PAPER_LOSS,

@@ -42,7 +42,7 @@ CHOICES: Final[dict[str, Flags]] = {
     },
     "raw_returns": {"returns.scale": "none"},
     "two_hot": {"policy.value_loss": "two_hot"},
-    "one_q_head": {"policy.q_heads": 1},
+    "five_q_heads": {"policy.q_heads": 5},
     "q_of_posterior_only": {"policy.loss.imagined_steps": 0},
     "reward_head": {"policy.loss.reward": 1},
     "arwm": {"policy.dynamics": "autoregressive"},
