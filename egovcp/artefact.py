@@ -34,12 +34,9 @@ from egovcp.plan import PlannerConfig, Policy, require_answers
 from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
 
 SCHEMA_VERSION = 2
-#: Options of models and planners made before there were these, where the default is another.
-_BEFORE: Final[Mapping[str, Any]] = {
-    "world_model": {"flight": {"enabled": False}, "q_heads": 1},
-    "planner": {"ensemble": "mean"},
-}
-_BEFORE_OF_FLIGHT: Final[Mapping[str, Any]] = {"only_in_flight": False}
+_NONE: Final[Mapping[str, Any]] = {}
+#: Options of models made before there were these, where the default is another.
+_BEFORE: Final[Mapping[str, Any]] = {"flight": {"enabled": False}}
 SEAL = "manifest_sha256"
 CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
 _PATTERNS = ("*.json", "*.safetensors")
@@ -198,7 +195,7 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
     _check_manifest(folder, manifest)
     config = _read_json(folder / CONFIG)
     try:
-        model = WorldModel(_decode(WorldModelConfig, config, "world_model"))
+        model = WorldModel(_decode(WorldModelConfig, config, "world_model", _BEFORE))
         planner = _decode(PlannerConfig, config, "planner")
         require_answers(model.config, planner)
         model.load_state_dict(load_file(folder / WEIGHTS))
@@ -216,18 +213,17 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
     return Artefact(folder, model.eval(), planner, manifest)
 
 
-def _decode[C](config_class: type[C], config: dict[str, Any], key: str) -> C:
+def _decode[C](
+    config_class: type[C], config: dict[str, Any], key: str, absent: Mapping[str, Any] = _NONE
+) -> C:
     """The dataclass under ``key``; raises KeyError, TypeError, UsageError or DraccusException.
 
-    Options that are not there have the values of `_BEFORE`, or else their defaults.
+    Options that are ``absent`` have the values given there, others their defaults.
     """
     values = config[key]
     if not isinstance(values, dict):
         raise TypeError(f"{key} is {type(values).__name__}, expected an object")
-    complete = {**_BEFORE[key], **values}
-    if isinstance(flight := complete.get("flight"), dict):
-        complete["flight"] = {**_BEFORE_OF_FLIGHT, **flight}
-    decoded: C = draccus.decode(config_class, complete)
+    decoded: C = draccus.decode(config_class, {**absent, **values})
     return decoded
 
 

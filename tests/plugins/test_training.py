@@ -134,7 +134,7 @@ def test_the_loss_falls_and_every_part_is_reported(
     batch = _windows(config, meta, ROWS)
     optimizer = config.get_optimizer_preset().build(policy.get_optim_params())
     losses = []
-    for _ in range(30):
+    for _ in range(60):
         loss, parts = policy.forward(batch)
         assert loss.item() == pytest.approx(sum(parts.values()), rel=1e-4)
         assert {"depth", "state", "value", "termination", "kl_prior"} <= parts.keys()
@@ -142,7 +142,8 @@ def test_the_loss_falls_and_every_part_is_reported(
         loss.backward()
         optimizer.step()
         losses.append(loss.item())
-    assert np.mean(losses[-5:]) < 0.9 * np.mean(losses[:5])
+    # Which half of the images is reconstructed is drawn at each step: a few losses say little.
+    assert np.mean(losses[-15:]) < 0.9 * np.mean(losses[:15])
 
 
 def test_what_is_saved_is_an_artefact(
