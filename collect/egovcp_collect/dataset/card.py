@@ -126,7 +126,7 @@ def _render(reader: DatasetReader, repo_id: str, found: Survey, pictures: Mappin
 def _step_ticks(config: Mapping[str, Any]) -> str:
     """What the card says of a walk that does not step at every tick."""
     least, most = config.get("step_ticks", (1, 1))
-    return "" if most == 1 else f", a step every {least} to {most} ticks, sent as a ramp"
+    return "" if most == 1 else f", a step every {least} to {most} ticks"
 
 
 def _origin(reader: DatasetReader) -> dict[str, str]:

@@ -73,7 +73,7 @@ def test_a_walk_that_steps_less_often_is_told(tmp_path: Path) -> None:
     known = Provenance("stance-1", seed=5, command="", config={"eta": 1.0, "step_ticks": [5, 9]})
     root = str(write(tmp_path / "data", [0], known))
     text = card_text(DatasetReader.open(DatasetConfig(root=root)), "me/steps")
-    assert "a step every 5 to 9 ticks, sent as a ramp. It starts at the" in text
+    assert "a step every 5 to 9 ticks. It starts at the" in text
 
 
 def test_every_setting_of_a_task_is_in_one_of_the_tables_with_its_meaning() -> None:
