@@ -16,9 +16,9 @@ class EpisodesConfig:
     """A number of episodes for each task."""
 
     ball: int = 1334
-    """Of the ball task, 150 ticks each."""
+    """Of the ball task, 150 ticks each where no flag says otherwise."""
     wall: int = 1334
-    """Of the wall task, 150 ticks each."""
+    """Of the wall task, likewise."""
     arch: int = 870
     """Of the arch task, 230 ticks each."""
 

@@ -66,14 +66,36 @@ def smoke() -> ExperimentConfig:
     )
 
 
+#: How data of few steps tell much: the hands stay for a while where the walk has put them, so that
+#: it shows what that is worth; episodes begin with the throw or the push and end soon after it.
+_TELLING: Final = (
+    "--eta=1",
+    "--step_ticks=[5,15]",
+    "--env.ball_episode.ticks=46",
+    "--env.ball_episode.event_ticks=[4,10]",
+    "--env.wall_episode.ticks=100",
+    "--env.wall_episode.event_ticks=[4,12]",
+)
+
+
 def small() -> ExperimentConfig:
-    """Two cores, hours: 200 000 random steps of each task, at most ten minutes of training for a
-    model, 100 paired episodes."""
+    """Two cores, hours: at most 500 000 random steps of each task, at most ten minutes of training
+    for a model, 100 paired episodes."""
     return ExperimentConfig(
         scale="small",
+        scenes=("--env.controller=stance",),
+        data=DataConfig(EpisodesConfig(ball=5400, wall=5000, arch=870), flags=_TELLING),
         train=TrainingConfig(
-            max_minutes=10.0, compared_steps=1000, flags=("--eval_freq=0", "--tensorboard=false")
+            max_minutes=10.0,
+            compared_steps=1000,
+            flags=(
+                "--returns.steps=20",
+                "--sampling.event_fraction=0.5",
+                "--eval_freq=0",
+                "--tensorboard=false",
+            ),
         ),
+        play=PlayConfig(flags=("--planner.samples=256", "--planner.elites=16")),
     )
 
 

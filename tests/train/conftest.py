@@ -70,6 +70,7 @@ def arguments(dataset_root: Path) -> Arguments:
             "tensorboard": "false",
             "threads": 1,
             "device": "cpu",
+            "mixed_precision": "no",
             **options,
         }
         named = [f"--{k.replace('__', '.')}={v}" for k, v in values.items() if v is not None]

@@ -17,6 +17,7 @@ from egovcp.checks import check_artefact
 from egovcp.cli import parse_config
 from egovcp.data import DatasetWriter, Episode, Provenance
 from egovcp.model import PRESETS, Batch
+from egovcp_train import device
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.config import TrainConfig
 from egovcp_train.device import choose_bf16
@@ -295,10 +296,26 @@ def test_what_the_launcher_says_of_precision_holds_where_no_flag_does(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", "fp16")
-    _refused(arguments(tmp_path / "run"), 2, capsys, "--mixed_precision=fp16; expected no or bf16")
+    flags = arguments(tmp_path / "run", mixed_precision="auto")
+    _refused(flags, 2, capsys, "--mixed_precision=fp16; expected no or bf16")
+    cpu = torch.device("cpu")
+    monkeypatch.setattr(device, "_computes_in_bf16", lambda where: False)
+    assert not choose_bf16("no", cpu)
     monkeypatch.setenv("ACCELERATE_MIXED_PRECISION", "bf16")
-    assert choose_bf16("auto")
-    assert not choose_bf16("no")
+    assert choose_bf16("auto", cpu)
+    assert not choose_bf16("no", cpu)
+
+
+@pytest.mark.parametrize("native", [True, False])
+def test_bfloat16_is_chosen_where_the_device_computes_in_it(
+    native: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = tmp_path / "cpuinfo"
+    info.write_text("processor: 0\nflags\t\t: fpu avx512f" + " avx512_bf16" * native + "\nbugs:\n")
+    monkeypatch.setattr(device, "Path", lambda name: info)
+    monkeypatch.delenv("ACCELERATE_MIXED_PRECISION", raising=False)
+    assert choose_bf16("auto", torch.device("cpu")) == native
+    assert not choose_bf16("no", torch.device("cpu"))
 
 
 def test_the_recording_of_open_loop_prediction_lies_in_the_run(

@@ -157,7 +157,8 @@ class TrainConfig:
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""
     mixed_precision: str = "auto"
-    """Precision of matrix products: no, bf16, or auto (as accelerate launch was told, else no)."""
+    """Precision of matrix products: no, bf16, or auto (as accelerate launch was told, else bf16 if
+    the device computes in it, as GPUs since Ampere and CPUs with AVX512-BF16 or AMX do)."""
     tensorboard: bool = True
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
     wandb: WandbConfig = field(default_factory=WandbConfig)

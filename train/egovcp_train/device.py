@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from contextlib import AbstractContextManager
+from pathlib import Path
 
 import torch
 
@@ -28,17 +29,33 @@ def choose_device(name: str) -> torch.device:
         raise UsageError(f"unknown --device {name!r}; expected cpu, cuda or auto") from error
 
 
-def choose_bf16(name: str) -> bool:
-    """Whether ``--mixed_precision`` asks for bfloat16; auto: as ``accelerate launch`` was told.
+def choose_bf16(name: str, device: torch.device) -> bool:
+    """Whether matrix products are in bfloat16, as ``--mixed_precision`` asks.
+
+    auto: as ``accelerate launch`` was told, else if the device computes in it: where bfloat16 is
+    emulated it is slower than float32.
 
     Raises:
         UsageError: it asks for something else.
     """
-    said = os.environ.get("ACCELERATE_MIXED_PRECISION", "no") if name == "auto" else name
+    said = name
+    if name == "auto":
+        own = "bf16" if _computes_in_bf16(device) else "no"
+        said = os.environ.get("ACCELERATE_MIXED_PRECISION", own)
     if said not in ("no", "bf16"):
         source = "accelerate launch " if name == "auto" else ""
         raise UsageError(f"{source}--mixed_precision={said}; expected no or bf16")
     return said == "bf16"
+
+
+def _computes_in_bf16(device: torch.device) -> bool:
+    if device.type == "cuda":
+        return bool(torch.cuda.is_bf16_supported(including_emulation=False))
+    info = Path("/proc/cpuinfo")
+    if device.type != "cpu" or not info.exists():
+        return False
+    flags = info.read_text().partition("\nflags")[2].partition("\n")[0].split()
+    return bool({"avx512_bf16", "amx_bf16"} & set(flags))
 
 
 def precision(device: torch.device, bf16: bool) -> AbstractContextManager[object]:

@@ -80,12 +80,12 @@ def train(config: TrainConfig) -> None:
     Raises:
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
-    bf16 = choose_bf16(config.mixed_precision)
+    device = choose_device(config.device)
+    bf16 = choose_bf16(config.mixed_precision, device)
     ranks = join(cpu=config.device == "cpu")
     output = _prepare_output(config, ranks)
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
-    device = choose_device(config.device)
     torch.manual_seed(config.seed)
     model = WorldModel(config.policy.world_model())
     material = prepare(config, model, ranks)
