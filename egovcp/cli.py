@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import errno
 import json
 import sys
@@ -25,6 +26,7 @@ from typing import Any, Literal, get_args, get_origin
 
 import draccus
 from draccus.argparsing import ArgumentParser
+from draccus.cfgparsing import load_config
 from draccus.utils import CONFIG_ARG, DecodingError, DraccusException
 
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError, suggest
@@ -144,9 +146,14 @@ def parse_config[C](
     kinds, types = parser.flag_kinds(), parser.flag_types()
     args = [_checked(arg, kinds, prog) for arg in _joined(argv)]
     try:
-        with _defaults_file(defaults(args) if defaults else {}) as path:
+        beneath = _merged(_own_defaults(config_class), defaults(args) if defaults else {})
+        flags, files = _config_files([_verbatim(arg, kinds) for arg in args])
+        for file in files:
+            with open(file, encoding="utf-8") as stream:
+                beneath = _merged(beneath, load_config(stream, file=file) or {})
+        with _defaults_file(beneath) as path:
             parser.config_path = path
-            config: C = parser.parse_args([_verbatim(arg, kinds) for arg in args])
+            config: C = parser.parse_args(flags)
     except (DraccusException, argparse.ArgumentError, ValueError, TypeError) as error:
         if own := _own_error(error):
             raise own from None
@@ -170,6 +177,59 @@ def _wrong_value(error: Exception, args: Sequence[str], types: Mapping[str, str]
     flag = f"--{'.'.join(error.key_path)}" if isinstance(error, DecodingError) else ""
     given = [arg for arg in args if arg.partition("=")[0] == flag]
     return f"{given[-1]}: expected {types[flag]}" if given and flag in types else ""
+
+
+def _own_defaults(config_class: type) -> dict[str, Any]:
+    """What a config has in its nested dataclasses that is not their own default, encoded.
+
+    Of a nested dataclass of which a flag or a file names one value, draccus takes all others from
+    that dataclass, and forgets what the config that holds it says.
+    """
+
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(config_class):
+        own = _default(field)
+        if dataclasses.is_dataclass(own):
+            found[field.name] = _differing(own)
+    return {name: values for name, values in found.items() if values}
+
+
+def _differing(config: Any) -> dict[str, Any]:
+    """The values of a config that are not its class's own defaults."""
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            if inner := _differing(value):
+                found[field.name] = inner
+        elif value != _default(field):
+            found[field.name] = draccus.encode(value)
+    return found
+
+
+def _default(field: dataclasses.Field[Any]) -> object:
+    """What stands where nothing is given; `MISSING` if something must be."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return field.default
+
+
+def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Both, groups within groups; ``above`` has the last word."""
+    merged = {**below}
+    for key, value in above.items():
+        old = merged.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            value = _merged(old, value)
+        merged[key] = value
+    return merged
+
+
+def _config_files(args: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The flags, and the files that ``--config_path`` names among them."""
+    own = f"--{CONFIG_ARG}="
+    files = [json.loads(a.removeprefix(own)) for a in args if a.startswith(own)]
+    return [a for a in args if not a.startswith(own)], files[-1:]
 
 
 @contextlib.contextmanager

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from egovcp.cli import parse_config
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.plan import PlannerConfig
 from egovcp.sim.config import eventful
+from egovcp.spec import TASKS
+from egovcp_deploy.evaluate import EvalConfig
 from egovcp_deploy.options import (
     PlannerOptions,
     check_choice,
@@ -73,4 +77,6 @@ def test_played_scenarios_are_never_collected_ones_and_search_sees_none_of_them(
 
 
 def test_played_episodes_all_have_an_event() -> None:
-    assert {eventful().episode(t).empty_probability for t in ("ball", "wall", "arch")} == {0.0}
+    assert {eventful().episode(t).empty_probability for t in TASKS} == {0.0}
+    given = parse_config(EvalConfig, ["--env.controller=stance"], "egovcp-eval").env
+    assert given == replace(eventful(), controller="stance")

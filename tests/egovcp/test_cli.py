@@ -145,6 +145,35 @@ def test_what_is_saved_parses_to_the_same(tmp_path: Path) -> None:
     assert changed.ball == Ball(radius=0.2, bounces=9)
 
 
+@dataclass(frozen=True)
+class Shop:
+    """A config that wants other values of what it holds."""
+
+    name: str
+    """Its name."""
+    ball: Ball = field(default_factory=lambda: Ball(radius=0.7, bounces=5))
+    """Its ball."""
+    lamp: Lamp = Lamp(stand=Stand((2.0, 3.0)), watts=40)
+    """Its lamp."""
+
+
+@pytest.mark.parametrize("flags", [["--ball.colour=blue"], ["--ball={colour: blue}"]])
+def test_one_value_of_a_group_leaves_the_others_as_the_command_has_them(flags: list[str]) -> None:
+    flags = ["--name=corner", *flags]
+    shop = parse_config(Shop, flags, PROG)
+    assert shop.ball == Ball(radius=0.7, bounces=5, colour="blue")
+    assert shop.lamp == Shop("corner").lamp
+    shop = parse_config(Shop, [*flags, "--ball.radius=0.1", "--lamp.watts=null"], PROG)
+    assert shop.ball == Ball(radius=0.1, bounces=5, colour="blue")
+    assert shop.lamp == Lamp(stand=Stand((2.0, 3.0)), watts=None)
+
+
+def test_one_value_of_a_group_in_a_file_leaves_the_others_likewise(tmp_path: Path) -> None:
+    (tmp_path / "shop.yaml").write_text("name: corner\nball: {colour: green}")
+    shop = parse_config(Shop, [f"--config_path={tmp_path}/shop.yaml", "--ball.bounces=1"], PROG)
+    assert shop.ball == Ball(radius=0.7, bounces=1, colour="green")
+
+
 # --- presets ----------------------------------------------------------------------------
 PRESETS = {"small": Ball(), "large": Ball(radius=0.5, bounces=7, colour="blue")}
 
