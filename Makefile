@@ -28,14 +28,16 @@ test: install
 	pytest -m "not slow and not gpu"
 
 # Laptop scale: the throw comes at once, so that each simulated second teaches something, and the
-# robot stands by the stance law, which is cheaper to simulate and keeps the camera still.
+# robot stands by the stance law, which is cheaper to simulate and keeps the camera still. Hands
+# that stay for a while where the walk puts them show what that is worth.
+WALK := --eta=1 --step_ticks="[5,15]"
 SCENES := --env.controller=stance --env.ball_episode.ticks=46 --env.ball_episode.event_ticks="[4,10]"
 POLICY := $(OUT)/policy/checkpoints/last/pretrained_model
 
 quickstart: install
 	@test ! -e $(OUT) || { echo "quickstart: error: $(OUT) exists; remove it or choose another: make quickstart OUT=..." >&2; exit 2; }
 	egovcp-collect --task=ball --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
-	  --episodes=5000 --seed=0 $(SCENES)
+	  --episodes=5000 --seed=0 $(WALK) $(SCENES)
 	egovcp-train --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
 	  --output_dir=$(OUT)/policy --returns.steps=16 --max_minutes=6.5 --seed=0
 	egovcp-eval --policy.path=$(POLICY) --task=ball --episodes=80 --planner.samples=256 --planner.elites=16 \

@@ -59,6 +59,9 @@ class TrainingConfig:
     place of the default model of that task (all: of the multi-task model) under every seed."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-train."""
+    task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Flags after those for the models of one task (all: of the multi-task model), '{arch:
+    [--returns.steps=50]}'."""
 
 
 @dataclass(frozen=True)
@@ -186,6 +189,9 @@ class ExperimentConfig:
         for task in self.tasks:
             if task not in TASKS:
                 raise UsageError(f"unknown task --tasks={task}{suggest(task, TASKS)}")
+        for task in self.train.task_flags:
+            if task not in (known := (*TASKS, "all")):
+                raise UsageError(f"unknown task {task} in --train.task_flags{suggest(task, known)}")
         if not self.tasks or not self.train.seeds:
             raise UsageError("--tasks and --train.seeds must name at least one each")
         if not self.data.parts or min(self.data.parts) <= 0:

@@ -93,7 +93,8 @@ class Grid:
         flags = {**data, "preset": config.preset, "steps": config.steps, "seed": seed}
         if config.max_minutes:
             flags["max_minutes"] = config.max_minutes
-        named = dict(flag.removeprefix("--").split("=", 1) for flag in config.flags)
+        extra = (*config.flags, *config.task_flags.get(task, ()))
+        named = dict(flag.removeprefix("--").split("=", 1) for flag in extra)
         cell = Cell(
             name or f"train-{task}-{model.name}-s{seed}", TRAIN, {**flags, **named, **model.flags}
         )

@@ -94,6 +94,8 @@ def small() -> ExperimentConfig:
                 "--eval_freq=0",
                 "--tensorboard=false",
             ),
+            # an arch is passed seconds after one has to crouch for it
+            task_flags={"arch": ("--returns.steps=50",)},
         ),
         play=PlayConfig(flags=("--planner.samples=256", "--planner.elites=16")),
     )

@@ -64,11 +64,24 @@ def test_a_model_of_all_tasks_reads_all_of_their_data() -> None:
     assert train.flags["datasets"] == [{"root": Output(name)} for name in names]
 
 
+def test_a_task_has_the_last_word_on_how_its_models_are_trained() -> None:
+    flags = {"arch": ("--returns.steps=50",), ALL: ("--returns.steps=30",)}
+    training = TrainingConfig(flags=("--returns.steps=20", "--threads=1"), task_flags=flags)
+    grid = Grid(ExperimentConfig(train=training))
+    for learned_from in ("ball", "arch", ALL):
+        grid.play("arch", 0, Variant("plain"), learned_from=learned_from)
+    trained = [cell.flags for cell in grid.cells if cell.tool is TRAIN]
+    assert [f["returns.steps"] for f in trained] == ["20", "50", "30"]
+    assert {f["threads"] for f in trained} == {"1"}
+
+
 def test_unknown_variants_and_tasks_are_named() -> None:
     with pytest.raises(UsageError, match="did you mean 'default'"):
         replace(ExperimentConfig(), only=("defualt",)).chosen({"default": 1})
     with pytest.raises(UsageError, match="did you mean 'ball'"):
         ExperimentConfig(output_dir="x", tasks=("bal",)).check()
+    with pytest.raises(UsageError, match=r"--train\.task_flags; did you mean 'wall'"):
+        ExperimentConfig("x", train=TrainingConfig(task_flags={"wal": ()})).check()
 
 
 def test_every_cell_has_flags_that_its_command_takes() -> None:
