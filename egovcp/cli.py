@@ -149,8 +149,7 @@ def parse_config[C](
         beneath = _merged(_own_defaults(config_class), defaults(args) if defaults else {})
         flags, files = _config_files([_verbatim(arg, kinds) for arg in args])
         for file in files:
-            with open(file, encoding="utf-8") as stream:
-                beneath = _merged(beneath, load_config(stream, file=file) or {})
+            beneath = _merged(beneath, _read_config(file))
         with _defaults_file(beneath) as path:
             parser.config_path = path
             config: C = parser.parse_args(flags)
@@ -230,6 +229,14 @@ def _config_files(args: Sequence[str]) -> tuple[list[str], list[str]]:
     own = f"--{CONFIG_ARG}="
     files = [json.loads(a.removeprefix(own)) for a in args if a.startswith(own)]
     return [a for a in args if not a.startswith(own)], files[-1:]
+
+
+def _read_config(file: str) -> dict[str, Any]:
+    with open(file, encoding="utf-8") as stream:
+        found = load_config(stream, file=file) or {}
+    if not isinstance(found, dict):
+        raise UsageError(f"{file} holds a {type(found).__name__}; expected options, name: value")
+    return found
 
 
 @contextlib.contextmanager

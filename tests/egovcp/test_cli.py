@@ -174,6 +174,13 @@ def test_one_value_of_a_group_in_a_file_leaves_the_others_likewise(tmp_path: Pat
     assert shop.ball == Ball(radius=0.7, bounces=1, colour="green")
 
 
+@pytest.mark.parametrize(("text", "kind"), [("- 1", "list"), ("x", "str")])
+def test_a_file_without_options_is_refused(text: str, kind: str, tmp_path: Path) -> None:
+    (tmp_path / "shop.yaml").write_text(text)
+    with pytest.raises(UsageError, match=rf"shop\.yaml holds a {kind}; expected options"):
+        _parse(f"--config_path={tmp_path}/shop.yaml")
+
+
 # --- presets ----------------------------------------------------------------------------
 PRESETS = {"small": Ball(), "large": Ball(radius=0.5, bounces=7, colour="blue")}
 
