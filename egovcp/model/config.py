@@ -143,10 +143,6 @@ class FlightConfig:
     """The variance of a crossing is this many times what independent sightings would give."""
     gate: float = 0.5
     """A sighting farther than this from the path of three or more is not its own, m."""
-    only_in_flight: bool = False
-    """The part of Q that is told of a flight counts only while there is one. Otherwise it judges
-    an action by all that ever followed on actions like it: before a throw a better guide than the
-    other part, before a wall a worse one (docs/log.md)."""
     painted: float = 0.5
     """A path at least so sure says where it is painted (`paint_flight`); else `motion` does."""
     forget: float = 0.5
@@ -226,11 +222,6 @@ class WorldModelConfig:
     def follows_flight(self) -> bool:
         """Whether there is a filter."""
         return self.flight.enabled and self.value_of_passing
-
-    @property
-    def told_only_in_flight(self) -> bool:
-        """Whether the part of Q that is told of a flight is silent without one."""
-        return self.follows_flight and self.flight.only_in_flight
 
 
 def require_longer(window: int, steps: int, flag: str) -> None:

@@ -330,8 +330,7 @@ class WorldModel(nn.Module):
         outputs = [head(carry.h, carry.z, action) for head in heads.states]
         if heads.passing is None:
             return outputs
-        told = self.passing(carry)
-        shared = self.heard(told) * heads.passing(told, action)
+        shared = heads.passing(self.passing(carry), action)
         return [q + shared for q in outputs]
 
     def reward(self, carry: Carry, action: Tensor) -> Tensor:
@@ -364,10 +363,6 @@ class WorldModel(nn.Module):
         out = out.detach()  # what is on its way is learned from labels, not from returns
         coming = torch.sigmoid(out[..., 3:])
         return torch.cat([coming, coming * out[..., :3]], -1)
-
-    def heard(self, told: Tensor) -> Tensor | float:
-        """How much the part of Q counts that is ``told`` (..., 4) of a flight, (..., 1) or 1."""
-        return (told[..., :1] > 0).to(told.dtype) if self.config.told_only_in_flight else 1.0
 
     def termination_logit(self, carry: Carry) -> Tensor:
         """Log-odds that the episode has failed at this state, (...,); equation 4."""

@@ -123,7 +123,6 @@ def test_an_artefact_without_the_younger_options_loads_as_what_it_was(folder: Pa
     def forget(config: Json) -> None:
         for name in ("value_loss", "q_heads", "value_units"):
             del config["world_model"][name]
-        del config["world_model"]["flight"]["only_in_flight"]
         for name in ("near", "near_threshold", "free_nats_per", "reward"):
             del config["world_model"]["loss"][name]
         for name in ("latent", "ensemble"):

@@ -1,6 +1,5 @@
 """The final fit of Q: which states it sees, what it changes, and that it helps."""
 
-import dataclasses
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,8 +15,7 @@ from egovcp.data import (
     SequenceStream,
     StreamConfig,
 )
-from egovcp.model import PRESETS, Batch, Carry, WorldModel
-from egovcp.model.config import FlightConfig
+from egovcp.model import Batch, Carry, WorldModel
 from egovcp.testing import CountingModel, toy_model
 from egovcp_train import batches
 from egovcp_train.batches import set_normalisation, to_tensors, whole_episodes
@@ -132,35 +130,6 @@ def test_what_an_action_earns_is_not_credited_to_the_state_that_goes_with_it() -
             Carry(h, z), bad
         )
     assert better.float().mean() > 0.95
-
-
-def test_what_is_told_of_flights_is_learned_from_flights_alone(store: EpisodeStore) -> None:
-    """Without any the part that is told of them answers zero; else rows without one teach it
-    nothing."""
-    config = dataclasses.replace(PRESETS["debug"], flight=FlightConfig(only_in_flight=True))
-    model = toy_model(config)
-    rows = _collect(model, store, ahead=0)
-    told, action = torch.zeros(64, 4), torch.rand(64, 7)
-    told[:, 0] = 1.0
-    passing = model.q_heads.passing
-    assert passing is not None
-
-    def learned(rows: Rows) -> Tensor:
-        torch.manual_seed(0)
-        fit = ValueFitConfig(steps=1, told_steps=30, told_rows=64, rows=16)
-        _fit_heads(model, rows, fit, torch.Generator().manual_seed(0))
-        with torch.no_grad():
-            return passing(told, action)  # type: ignore[no-any-return]
-
-    nothing = rows._replace(told=torch.zeros_like(rows.told))
-    assert not learned(nothing).any()
-    flies = nothing.told.clone()
-    flies[::2, 0] = 0.8
-    some = nothing._replace(told=flies)
-    expected = learned(some)
-    assert expected.any()
-    other = torch.where(flies[:, 0] > 0, rows.target, 100.0)
-    assert torch.equal(learned(some._replace(target=other)), expected)
 
 
 def test_a_seed_repeats_the_fit_and_no_steps_leave_the_model_alone(store: EpisodeStore) -> None:

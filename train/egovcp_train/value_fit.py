@@ -68,9 +68,9 @@ def fit_value(
     Under ``q_target=td`` the targets are what the Q that training has found says of the next
     rows: one more round of fitted Q evaluation.
 
-    First the part that sees only what is on its way, on the rows where it counts, then the part
-    that sees the whole state, to what the first leaves unexplained. Fitted together, the second,
-    which sees where the hands are going anyway, takes over what belongs to the action.
+    First the part that sees only what is on its way, then the part that sees the whole state, to
+    what the first leaves unexplained. Fitted together, the second, which sees where the hands are
+    going anyway, takes over what belongs to the action.
 
     Args:
         model: the finished world model.
@@ -107,7 +107,7 @@ def _fit_heads(
 def _fit_told(
     model: WorldModel, rows: Rows, config: ValueFitConfig, generator: torch.Generator
 ) -> Tensor | None:
-    """The part of Q that is told of a flight, on the rows where it counts.
+    """The part of Q that is told of a flight.
 
     Returns:
         What it says of all rows, (R, outputs); None without such a part.
@@ -124,18 +124,10 @@ def _fit_told(
         return value.error(told(x), x.target, kind).mean()
 
     thorough = replace(config, steps=config.told_steps, rows=config.told_rows, lr=config.told_lr)
-    heard = torch.ones(len(rows.target), 1) * model.heard(rows.told)
-    counts = heard[:, 0].nonzero()[:, 0]
-    if len(counts):
-        every = len(counts) == len(rows.target)  # h of all rows is not small: no copy of it
-        of_a_flight = rows if every else Rows(*(x[counts] for x in rows))
-        _descend(passing, told_error, of_a_flight, None, thorough, generator)
-    else:
-        passing.restart()
+    _descend(passing, told_error, rows, None, thorough, generator)
     with torch.no_grad():
         chunks = torch.split(torch.arange(len(rows.target)), 65536)
-        said = torch.cat([told(_pick(rows, some, _device(passing))).cpu() for some in chunks])
-        return said * heard
+        return torch.cat([told(_pick(rows, some, _device(passing))).cpu() for some in chunks])
 
 
 def _fit_state(

@@ -133,7 +133,7 @@ class _Packed:
             )
         self.network = n = library.Network()
         n.hidden, n.latent, n.actions, n.heads = c.hidden, c.latent, spec.ACTION_DIM, c.q_heads
-        n.only_in_flight, n.min_std = c.told_only_in_flight, c.min_std
+        n.min_std = c.min_std
         z, action = map(weight_of, model.mix.parts)
         norm = model.mix_act[0]
         assert isinstance(norm, nn.LayerNorm)

@@ -59,7 +59,6 @@ typedef struct {
 
 typedef struct {
     int32_t hidden, latent, actions, heads;
-    int32_t only_in_flight; /* `passing` counts only while something is on its way */
     Layer mix, gru, prior, termination, told;
     Wide prior_top;         /* [outputs] means, then raw deviations if they are wanted */
     const float *prior_bias; /* [MOST_FEW] */
@@ -423,8 +422,7 @@ static void block(const Network *net, const Root *root, int steps, const float *
             else if (net->told_top.outputs)
                 tell(net, &h_bytes, &z_bytes, &told);
         }
-        const int silent = net->only_in_flight && root->told && root->told[k * TOLD] <= 0.0f;
-        const int shared = net->passing.top.outputs && !silent;
+        const int shared = net->passing.top.outputs;
         float both[ROWS * MOST_FEW] = {0}; /* what the heads share, [ROWS][width] */
         if (shared) {
             Inputs in = {.action = action};

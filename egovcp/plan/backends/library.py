@@ -81,7 +81,6 @@ class Head(ctypes.Structure):
 class Network(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int32) for name in ("hidden", "latent", "actions", "heads")),
-        ("only_in_flight", ctypes.c_int32),
         *((name, Layer) for name in ("mix", "gru", "prior", "termination", "told")),
         ("prior_top", Wide),
         ("prior_bias", ctypes.c_void_p),

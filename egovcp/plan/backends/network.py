@@ -102,9 +102,7 @@ class PlanningNetwork:
         """What the heads of Q share, (..., width) at k = 0."""
         if self._shared is None or root.passing is None:
             return 0.0
-        told = root.told(0)
-        heard = 1.0 if told is None else self._model.heard(told)
-        return heard * self._shared.start(root.passing, action)
+        return self._shared.start(root.passing, action)
 
     def _shared_later(
         self, root: Root, k: int, wide_h: Tensor, z: Tensor, action: Tensor
@@ -114,9 +112,8 @@ class PlanningNetwork:
             return 0.0
         told = self._told(wide_h, z) if root.flight is None else root.told(k)
         assert told is not None
-        heard = self._model.heard(told)
         told = told.expand(*action.shape[:-1], -1)
-        return heard * self._shared.later(None, torch.cat([told, action], -1))
+        return self._shared.later(None, torch.cat([told, action], -1))
 
     def _next_z(self, wide_h: Tensor, noise: Tensor | None) -> Tensor:
         out = self._prior.last(wide_h, None, None)

@@ -7,7 +7,6 @@ import torch
 
 from egovcp.errors import UsageError
 from egovcp.model import LossConfig, WorldModel, WorldModelConfig
-from egovcp.model.config import FlightConfig
 from egovcp.model.nets import SplitMlp
 
 
@@ -48,15 +47,3 @@ def test_nothing_is_painted_where_nothing_teaches_the_place(config, message):
 def test_q_has_a_part_for_what_is_on_its_way_only_if_told(told):
     model = WorldModel(WorldModelConfig(value_of_passing=told))
     assert (model.passing_value_head is not None) == told
-
-
-def test_the_part_that_is_told_of_a_flight_is_silent_without_one():
-    torch.manual_seed(0)
-    config = WorldModelConfig(flight=FlightConfig(only_in_flight=True))
-    model = WorldModel(config).eval().requires_grad_(False)
-    carry, action = model.initial(1), torch.rand(1, 7)
-    without = model.value(carry, action)
-    torch.nn.init.normal_(model.passing_value_head.rest[-1].weight)
-    assert torch.equal(model.value(carry, action), without)
-    carry.flight[:, :4] = torch.tensor([0.9, 0.1, 0.4, 0.3])
-    assert not torch.equal(model.value(carry, action), without)

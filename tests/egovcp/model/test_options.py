@@ -91,8 +91,7 @@ def test_q_is_the_mean_of_its_heads_and_the_lowest_is_below() -> None:
     with torch.no_grad():
         states, shared = model.q_heads
         assert shared is not None
-        told = model.passing(carry)
-        both = model.heard(told) * shared(told, action)
+        both = shared(model.passing(carry), action)
         alone = torch.stack([head(carry.h, carry.z, action) + both for head in states]).squeeze(-1)
         torch.testing.assert_close(model.value(carry, action), 3.0 * alone.mean(0) - 2.0)
         torch.testing.assert_close(model.lowest_value(carry, action), 3.0 * alone.amin(0) - 2.0)

@@ -30,7 +30,6 @@ MODELS = [
     {"value_state": 0},
     {"value_of_passing": False},
     {"flight": FlightConfig(enabled=False)},
-    {"flight": FlightConfig(only_in_flight=True)},
     {"q_heads": 3},
     {"value_loss": "two_hot"},
     {"hidden": 48, "units": 64, "latent": 12},
