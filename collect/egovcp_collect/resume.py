@@ -9,7 +9,7 @@ import draccus
 
 from egovcp.data import Provenance
 from egovcp.errors import UsageError
-from egovcp_collect.config import CollectConfig
+from egovcp_collect.config import SHAPING, CollectConfig
 
 _SHOWN: Final = 5
 
@@ -38,7 +38,7 @@ def require_same(now: Provenance, before: Provenance) -> None:
 def _completed(settings: Mapping[str, Any]) -> dict[str, Any]:
     """With the defaults of options that are newer than the settings: what they were made with."""
     defaults: Mapping[str, Any] = draccus.encode(CollectConfig())
-    return _over({k: v for k, v in defaults.items() if k in settings}, settings)
+    return _over({k: v for k, v in defaults.items() if k in SHAPING}, settings)
 
 
 def _over(defaults: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
