@@ -147,10 +147,8 @@ def parse_config[C](
     args = [_checked(arg, kinds, prog) for arg in _joined(argv)]
     try:
         beneath = _merged(_own_defaults(config_class), defaults(args) if defaults else {})
-        flags, files = _config_files([_verbatim(arg, kinds) for arg in args])
-        for file in files:
-            beneath = _merged(beneath, _read_config(file))
-        with _defaults_file(beneath) as path:
+        flags, given = _without_config_file([_verbatim(arg, kinds) for arg in args])
+        with _defaults_file(_merged(beneath, given)) as path:
             parser.config_path = path
             config: C = parser.parse_args(flags)
     except (DraccusException, argparse.ArgumentError, ValueError, TypeError) as error:
@@ -185,12 +183,9 @@ def _own_defaults(config_class: type) -> dict[str, Any]:
     that dataclass, and forgets what the config that holds it says.
     """
 
-    found: dict[str, Any] = {}
-    for field in dataclasses.fields(config_class):
-        own = _default(field)
-        if dataclasses.is_dataclass(own):
-            found[field.name] = _differing(own)
-    return {name: values for name, values in found.items() if values}
+    defaults = {field.name: _default(field) for field in dataclasses.fields(config_class)}
+    nested = {k: _differing(v) for k, v in defaults.items() if dataclasses.is_dataclass(v)}
+    return {name: values for name, values in nested.items() if values}
 
 
 def _differing(config: Any) -> dict[str, Any]:
@@ -224,11 +219,12 @@ def _merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any
     return merged
 
 
-def _config_files(args: Sequence[str]) -> tuple[list[str], list[str]]:
-    """The flags, and the files that ``--config_path`` names among them."""
+def _without_config_file(args: Sequence[str]) -> tuple[list[str], dict[str, Any]]:
+    """The flags but for ``--config_path``, and what the file holds that it names last."""
     own = f"--{CONFIG_ARG}="
     files = [json.loads(a.removeprefix(own)) for a in args if a.startswith(own)]
-    return [a for a in args if not a.startswith(own)], files[-1:]
+    flags = [a for a in args if not a.startswith(own)]
+    return flags, _read_config(files[-1]) if files else {}
 
 
 def _read_config(file: str) -> dict[str, Any]:

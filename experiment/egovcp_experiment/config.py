@@ -189,8 +189,9 @@ class ExperimentConfig:
         for task in self.tasks:
             if task not in TASKS:
                 raise UsageError(f"unknown task --tasks={task}{suggest(task, TASKS)}")
+        known = (*TASKS, "all")
         for task in self.train.task_flags:
-            if task not in (known := (*TASKS, "all")):
+            if task not in known:
                 raise UsageError(f"unknown task {task} in --train.task_flags{suggest(task, known)}")
         if not self.tasks or not self.train.seeds:
             raise UsageError("--tasks and --train.seeds must name at least one each")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 from contextlib import AbstractContextManager
-from pathlib import Path
 
 import torch
 
@@ -51,11 +50,8 @@ def choose_bf16(name: str, device: torch.device) -> bool:
 def _computes_in_bf16(device: torch.device) -> bool:
     if device.type == "cuda":
         return bool(torch.cuda.is_bf16_supported(including_emulation=False))
-    info = Path("/proc/cpuinfo")
-    if device.type != "cpu" or not info.exists():
-        return False
-    flags = info.read_text().partition("\nflags")[2].partition("\n")[0].split()
-    return bool({"avx512_bf16", "amx_bf16"} & set(flags))
+    has = torch.cpu.get_capabilities() if device.type == "cpu" else {}
+    return bool(has.get("avx512_bf16") or has.get("amx_bf16"))
 
 
 def precision(device: torch.device, bf16: bool) -> AbstractContextManager[object]:

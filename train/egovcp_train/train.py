@@ -80,9 +80,9 @@ def train(config: TrainConfig) -> None:
     Raises:
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
+    ranks = join(cpu=config.device == "cpu")  # first: it says which GPU is this process' own
     device = choose_device(config.device)
     bf16 = choose_bf16(config.mixed_precision, device)
-    ranks = join(cpu=config.device == "cpu")
     output = _prepare_output(config, ranks)
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
