@@ -60,6 +60,8 @@ class WeightedDatasetConfig(SelectedDatasetConfig):
     weight: float | None = None
     """Share of the windows, relative to the other datasets; null, and then for all: in proportion
     to the frames."""
+    return_steps: int | None = None
+    """Horizon K of the returns of its rows, planner ticks; null: --returns.steps."""
 
 
 type Kind = Literal["switch", "text", "value"]

@@ -15,8 +15,9 @@ from egovcp.data.mix import Mix
 from egovcp.data.order import Shard
 from egovcp.data.provenance import Provenance
 from egovcp.data.reader import DatasetReader
+from egovcp.data.returns import MixedReturnConfig, ReturnConfig
 from egovcp.data.sample import sample_files
-from egovcp.data.store import EpisodeStore, ReturnConfig
+from egovcp.data.store import EpisodeStore
 from egovcp.data.stream import SequenceStream, StreamConfig
 from egovcp.data.survey import Survey, survey, survey_sample
 from egovcp.data.targets import is_terminal, mc_return, mc_valid
@@ -33,6 +34,7 @@ __all__ = [
     "EpisodeIndex",
     "EpisodeStore",
     "Mix",
+    "MixedReturnConfig",
     "Provenance",
     "ReturnConfig",
     "SequenceStream",

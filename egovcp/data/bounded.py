@@ -19,7 +19,8 @@ from egovcp.data.episode import Episode
 from egovcp.data.index import EpisodeIndex
 from egovcp.data.mix import Mix, group
 from egovcp.data.order import EpisodeOrder, Shard
-from egovcp.data.store import EpisodeStore, ReturnConfig
+from egovcp.data.returns import ReturnConfig
+from egovcp.data.store import EpisodeStore
 from egovcp.data.stream import PLAIN, StreamConfig, require_same
 from egovcp.data.survey import EventBound
 from egovcp.data.windows import Batch, draw_mirrored, finish, gather
@@ -187,6 +188,7 @@ class BoundedStream:
         read = self.index.read_again if self._checked[number] else self.index.read
         episode, store = read(number), self._slots
         self._checked[number] = True
+        store.dataset[slot] = self.index.dataset[number]
         store.fill(slot, episode, self._returns)
         store.length[slot] = len(episode)
         self._held[slot] = number

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,24 +14,8 @@ from egovcp.data import targets
 from egovcp.data.episode import Episode
 from egovcp.data.index import EpisodeIndex, fingerprint
 from egovcp.data.reader import DatasetReader
+from egovcp.data.returns import ReturnConfig
 from egovcp.data.split import HELDOUT_FRACTION
-
-ReturnScaling = Literal["dataset", "none", "per_task"]
-
-
-@dataclass(frozen=True)
-class ReturnConfig:
-    """The Monte Carlo target of Q."""
-
-    gamma: float = spec.GAMMA
-    """Discount per planner tick."""
-    steps: int = spec.RETURN_STEPS
-    """Horizon K, planner ticks."""
-    keep_truncated: bool = False
-    """Train on returns that the time limit cuts short, too (the paper's choice)."""
-    scale: ReturnScaling = "dataset"
-    """What Q is fitted to. dataset: returns in deviations from their mean over all tasks; none:
-    returns as they are; per_task: an ablation, in deviations from the mean of the own task."""
 
 
 @dataclass(frozen=True)
@@ -137,9 +121,10 @@ class EpisodeStore:
         self.prev_action[first] = 0.0
         self.prev_action[first + 1 : rows.stop] = episode.action[:-1]
         self.terminal_next[rows] = targets.is_terminal(episode.done, episode.truncated)
-        self.mc_return[rows] = targets.mc_return(episode.reward, config.gamma, config.steps)
+        steps = config.steps_of(int(self.dataset[number]))
+        self.mc_return[rows] = targets.mc_return(episode.reward, config.gamma, steps)
         self.mc_valid[rows] = targets.mc_valid(
-            len(episode), episode.time_limit, config.steps, config.keep_truncated
+            len(episode), episode.time_limit, steps, config.keep_truncated
         )
 
     @property

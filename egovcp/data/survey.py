@@ -14,7 +14,7 @@ from tqdm import tqdm
 from egovcp import spec
 from egovcp.data import targets
 from egovcp.data.index import EpisodeIndex
-from egovcp.data.store import ReturnConfig
+from egovcp.data.returns import ReturnConfig
 
 _EVENT_SHARE: Final = 0.1  # of the farthest reward, below which a row is no event
 
@@ -56,6 +56,8 @@ class Survey:
     """(74,)."""
     returns: NDArray[np.float32]
     """Monte Carlo returns of the rows that have a complete one."""
+    complete: NDArray[np.int64]
+    """(D,) how many of them each dataset has."""
     events: Mapping[str, EventBound]
     """Task -> which rewards are events."""
 
@@ -103,14 +105,14 @@ def survey(
         total += state.sum(0)
         squares += np.square(state).sum(0)
         rewards[episode.task].append(episode.reward)
-        valid = targets.mc_valid(
-            len(episode), episode.time_limit, config.steps, config.keep_truncated
-        )
-        found.append(targets.mc_return(episode.reward, config.gamma, config.steps)[valid])
+        steps = config.steps_of(int(index.dataset[number]))
+        valid = targets.mc_valid(len(episode), episode.time_limit, steps, config.keep_truncated)
+        found.append(targets.mc_return(episode.reward, config.gamma, steps)[valid])
     mean = total / index.num_frames
     variance = np.maximum(squares / index.num_frames - np.square(mean), 0.0)
     bounds = {
         task: EventBound.of(np.concatenate(parts), event_quantile)
         for task, parts in rewards.items()
     }
-    return Survey(mean, np.sqrt(variance), np.concatenate(found), bounds)
+    complete = np.bincount(index.dataset, weights=[len(returns) for returns in found])
+    return Survey(mean, np.sqrt(variance), np.concatenate(found), complete.astype(np.int64), bounds)

@@ -60,8 +60,11 @@ class TrainingConfig:
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-train."""
     task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """Flags after those for the models of one task (all: of the multi-task model), '{arch:
-    [--returns.steps=50]}'."""
+    """Flags after those for the models of one task (all: of the multi-task model), '{wall:
+    [--sampling.event_fraction=0.7]}'."""
+    return_steps: dict[str, int] = field(default_factory=dict)
+    """Task -> horizon of the returns of its data, ticks, in its own model and in the multi-task
+    one, '{arch: 50}'; where a task is not named, --returns.steps."""
 
 
 @dataclass(frozen=True)
@@ -193,6 +196,11 @@ class ExperimentConfig:
         for task in self.train.task_flags:
             if task not in known:
                 raise UsageError(f"unknown task {task} in --train.task_flags{suggest(task, known)}")
+        for task in self.train.return_steps:
+            if task not in TASKS:
+                raise UsageError(
+                    f"unknown task {task} in --train.return_steps{suggest(task, TASKS)}"
+                )
         if not self.tasks or not self.train.seeds:
             raise UsageError("--tasks and --train.seeds must name at least one each")
         if not self.data.parts or min(self.data.parts) <= 0:

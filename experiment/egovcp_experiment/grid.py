@@ -86,17 +86,22 @@ class Grid:
         """The training itself, whose figures are those on held-out episodes."""
         config = self.config.train
         tasks = self.config.tasks if task == ALL else (task,)
-        roots = [self.data(one) for one in tasks]
-        data: dict[str, Any] = {"dataset.root": roots[0]}
-        if len(roots) > 1:
-            data = {"datasets": [{"root": root} for root in roots]}
+        own = config.return_steps
+        data: dict[str, Any] = {"dataset.root": self.data(tasks[0])}
+        horizon = {"returns.steps": str(own[tasks[0]])} if tasks[0] in own else {}
+        if len(tasks) > 1:
+            horizons = ({"return_steps": own[one]} if one in own else {} for one in tasks)
+            each = zip(map(self.data, tasks), horizons, strict=True)
+            data, horizon = {"datasets": [{"root": root, **steps} for root, steps in each]}, {}
         flags = {**data, "preset": config.preset, "steps": config.steps, "seed": seed}
         if config.max_minutes:
             flags["max_minutes"] = config.max_minutes
         extra = (*config.flags, *config.task_flags.get(task, ()))
         named = dict(flag.removeprefix("--").split("=", 1) for flag in extra)
         cell = Cell(
-            name or f"train-{task}-{model.name}-s{seed}", TRAIN, {**flags, **named, **model.flags}
+            name or f"train-{task}-{model.name}-s{seed}",
+            TRAIN,
+            {**flags, **named, **horizon, **model.flags},
         )
         return self.add(cell)
 

@@ -75,6 +75,16 @@ def test_a_task_has_the_last_word_on_how_its_models_are_trained() -> None:
     assert {f["threads"] for f in trained} == {"1"}
 
 
+def test_the_horizon_of_a_task_goes_with_its_data() -> None:
+    training = TrainingConfig(flags=("--returns.steps=20",), return_steps={"arch": 50})
+    grid = Grid(ExperimentConfig(train=training))
+    for learned_from in ("ball", "arch", ALL):
+        grid.play("arch", 0, Variant("plain"), learned_from=learned_from)
+    ball, arch, mixed = [cell.flags for cell in grid.cells if cell.tool is TRAIN]
+    assert [f["returns.steps"] for f in (ball, arch, mixed)] == ["20", "50", "20"]
+    assert [d.get("return_steps") for d in mixed["datasets"]] == [None, None, 50]
+
+
 def test_unknown_variants_and_tasks_are_named() -> None:
     with pytest.raises(UsageError, match="did you mean 'default'"):
         replace(ExperimentConfig(), only=("defualt",)).chosen({"default": 1})
@@ -82,6 +92,8 @@ def test_unknown_variants_and_tasks_are_named() -> None:
         ExperimentConfig(output_dir="x", tasks=("bal",)).check()
     with pytest.raises(UsageError, match=r"--train\.task_flags; did you mean 'wall'"):
         ExperimentConfig("x", train=TrainingConfig(task_flags={"wal": ()})).check()
+    with pytest.raises(UsageError, match=r"--train\.return_steps; did you mean 'wall'"):
+        ExperimentConfig("x", train=TrainingConfig(return_steps={"wal": 20})).check()
 
 
 def test_every_cell_has_flags_that_its_command_takes() -> None:

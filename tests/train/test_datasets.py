@@ -51,6 +51,8 @@ def test_a_run_on_two_datasets_is_resumed_exactly(mixed: Arguments, tmp_path: Pa
         (("1", "-1"), [], "a weight of -1.0"),
         (("1", "1"), ["--sampling.tasks={bal: 2}"], "did you mean 'ball'"),
         (("1", "1"), ["--dataset.root=x"], "--dataset and --datasets"),
+        (("1", "1"), ["--returns.steps=0"], "--returns.steps=0"),
+        (("1, return_steps: 0", "1"), [], "return_steps=0"),
     ],
 )
 def test_a_mixture_that_makes_no_sense_is_refused_before_anything_is_written(
@@ -64,6 +66,27 @@ def test_a_mixture_that_makes_no_sense_is_refused_before_anything_is_written(
     assert main(mixed(tmp_path / "run", *flags, weights=weights)) == 2
     assert message in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("mode", ["ram", "stream"])
+def test_a_dataset_has_returns_over_its_own_horizon(
+    mixed: Arguments, tmp_path: Path, mode: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of 24 rows 20 have a return over 5 ticks; none one over 24, which is refused."""
+    flags = [f"--loading.mode={mode}", "--loading.shuffle.episodes=3", "--steps=1"]
+    same = mixed(tmp_path / "same", *flags, weights=("2", "1"))
+    own = mixed(tmp_path / "own", *flags, weights=("2, return_steps: 12", "1"))
+    assert main(same) == main(own) == 0
+    one, two = (
+        load_artefact(str(tmp_path / name / "checkpoints" / "last" / "pretrained_model"))
+        for name in ("same", "own")
+    )
+    assert two.world_model.return_std > 1.5 * one.world_model.return_std
+    given = two.manifest["train_config"]["datasets"]
+    assert [dataset["return_steps"] for dataset in given] == [12, None]
+    assert main(mixed(tmp_path / "none", *flags, weights=("2, return_steps: 25", "1"))) == 3
+    assert "return_steps: 20" in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
 
 
 # --- from the disk ----------------------------------------------------------------------------

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
 from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
-from egovcp.data import ReturnConfig, ShuffleConfig
+from egovcp.data import MixedReturnConfig, ReturnConfig, ShuffleConfig
 from egovcp.data.source import is_repo_id
 from egovcp.errors import UsageError
 from egovcp.hub import Patience
@@ -112,7 +112,8 @@ class TrainConfig:
     """Dataset to train on."""
     datasets: tuple[WeightedDatasetConfig, ...] = ()
     """Several datasets to train on instead, '[{root: data/ball, weight: 2}, {repo_id: me/wall,
-    weight: 1}]'; without weights every frame counts alike."""
+    weight: 1}]'; without weights every frame counts alike; one with return_steps has returns over
+    its own horizon."""
     preset: Literal["default", "paper", "debug"] = "default"
     """Starting point of all options; paper: equal weights, nothing added to the paper."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
@@ -163,6 +164,15 @@ class TrainConfig:
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
     wandb: WandbConfig = field(default_factory=WandbConfig)
     """Weights & Biases."""
+
+    @property
+    def targets(self) -> ReturnConfig:
+        """`returns`, where datasets have horizons of their own with these."""
+        own = [dataset.return_steps for dataset in self.datasets]
+        if own == [None] * len(own):
+            return self.returns
+        each = tuple(self.returns.steps if steps is None else steps for steps in own)
+        return MixedReturnConfig(**vars(self.returns), steps_each=each)
 
     def __post_init__(self) -> None:
         require_answers(self.policy, self.planner)

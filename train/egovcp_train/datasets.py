@@ -7,9 +7,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
-from typing import Literal
+from typing import Any, Literal
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.cli import DatasetConfig, SelectedDatasetConfig
@@ -29,7 +31,7 @@ from egovcp.data.ahead import Ahead
 from egovcp.data.memory import available_bytes
 from egovcp.data.order import Shard
 from egovcp.data.source import is_local
-from egovcp.errors import UsageError
+from egovcp.errors import DataError, UsageError
 from egovcp.model import Batch, WorldModel
 from egovcp_train.batches import (
     EPISODES_AT_ONCE,
@@ -112,6 +114,7 @@ def _prepare(config: TrainConfig, model: WorldModel, ranks: Ranks) -> Material:
     config.loading.shuffle.check()
     if config.loading.sample_files < 1:
         raise UsageError(f"--loading.sample_files={config.loading.sample_files}: at least 1")
+    config.targets.check()
     readers = open_readers(config)
     config = pinned(_decided(config, readers, ranks), readers)
     if config.loading.mode == "ram" and any(reader.is_remote for reader in readers):
@@ -207,13 +210,15 @@ def _in_memory(
     ranks: Ranks,
 ) -> Built:
     learning, heldout = (
-        EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
+        EpisodeStore.load(readers, split, config.targets) for split in ("train", "heldout")
     )
     scales: dict[str, ReturnScale] = {}
     if config.returns.scale == "per_task":
         scales = task_scales(learning)
         learning, heldout = (on_task_scales(store, scales) for store in (learning, heldout))
-    set_normalisation(model, learning, config.returns)
+    complete = np.bincount(np.repeat(learning.dataset, learning.length), weights=learning.mc_valid)
+    _require_returns(readers, learning.dataset, complete)
+    set_normalisation(model, learning, config.targets)
     heldout = label(heldout, config.passing)
     if needs_labels(config):
         learning = label(learning, config.passing)
@@ -242,15 +247,16 @@ def _on_disk(
         sample, unseen = sample_files(learning, unseen, config.loading.sample_files)
         for part in (sample, unseen):
             part.bring()
-    heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.returns)
+    heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.targets)
     heldout = label(heldout, config.passing)
     if learning.is_remote:
-        facts = survey_sample(learning, sample, config.returns, sampling.event_quantile)
+        facts = survey_sample(learning, sample, config.targets, sampling.event_quantile)
     else:
-        facts = survey(learning, config.returns, sampling.event_quantile)
+        facts = survey(learning, config.targets, sampling.event_quantile)
+    _require_returns(readers, sample.dataset, facts.complete)
     longest = int(learning.length.max())
     state = facts.state_mean, facts.state_std
-    fix_normalisation(model, *state, facts.returns, longest, config.returns)
+    fix_normalisation(model, *state, facts.returns, longest, config.targets)
     labelling = None
     if needs_labels(config):
         labelling = partial(label_episode, config=config.passing)
@@ -260,12 +266,31 @@ def _on_disk(
         mix,
         config.loading.shuffle,
         Shard(ranks.rank, ranks.count),
-        returns=config.returns,
+        returns=config.targets,
         events=facts.events,
         label=labelling,
         checked=not learning.is_remote,
     )
     return learning, Ahead(stream), heldout, sample, {}
+
+
+def _require_returns(
+    readers: Sequence[DatasetReader], dataset: NDArray[np.int64], complete: NDArray[Any]
+) -> None:
+    """Raise `DataError` for one of several datasets that would teach Q nothing.
+
+    Args:
+        readers: the datasets.
+        dataset: (E,) which of them each episode is of.
+        complete: (D,) rows of each that have a complete return.
+    """
+    without = [number for number in np.unique(dataset).tolist() if not complete[number]]
+    if without and complete.any():
+        raise DataError(
+            f"{readers[without[0]].root}: no row has a complete Monte Carlo return, though rows of "
+            "other datasets have: its episodes are not longer than that; give it a horizon of "
+            "its own, --datasets='[{root: ..., return_steps: 20}, ...]', or lower --returns.steps"
+        )
 
 
 def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -> Iterator[Batch]:
@@ -275,7 +300,7 @@ def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -
 
     def batches(first: int) -> Iterator[Batch]:
         part = index.select(chosen[first : first + EPISODES_AT_ONCE])
-        store = EpisodeStore.read(part, config.returns)
+        store = EpisodeStore.read(part, config.targets)
         if needs_labels(config):
             store = label(store, config.passing)
         yield from whole_episodes(store, device, config.sampling.mirror)

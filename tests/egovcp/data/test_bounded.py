@@ -19,6 +19,7 @@ from egovcp.data import (
     EpisodeIndex,
     EpisodeStore,
     Mix,
+    MixedReturnConfig,
     Provenance,
     ReturnConfig,
     SequenceStream,
@@ -269,3 +270,24 @@ def test_a_survey_says_what_the_arrays_say(six: EpisodeIndex, reader: DatasetRea
     np.testing.assert_allclose(facts.state_mean, store.state.mean(0, dtype=np.float64), atol=1e-9)
     np.testing.assert_allclose(facts.state_std, store.state.std(0, dtype=np.float64), rtol=1e-9)
     np.testing.assert_array_equal(facts.returns, store.mc_return[store.mc_valid])
+
+
+def test_each_dataset_has_the_returns_of_its_own_horizon(make_index: MakeIndex) -> None:
+    """From memory, in batches of a few episodes at a time, and in the survey."""
+    index, returns = make_index(6, 6), MixedReturnConfig(steps=9, steps_each=(2, 5))
+    store = EpisodeStore.read(index, returns)
+    for dataset, steps in enumerate(returns.steps_each):
+        alone = EpisodeStore.read(index.select(index.dataset == dataset), ReturnConfig(steps=steps))
+        rows = np.repeat(store.dataset, store.length) == dataset
+        np.testing.assert_array_equal(store.mc_return[rows], alone.mc_return)
+        np.testing.assert_array_equal(store.mc_valid[rows], alone.mc_valid)
+    facts = survey(index, returns)
+    np.testing.assert_array_equal(facts.returns, store.mc_return[store.mc_valid])
+    assert facts.complete.tolist() == [
+        int(store.mc_valid[np.repeat(store.dataset, store.length) == d].sum()) for d in (0, 1)
+    ]
+    stream = BoundedStream(index, _config(), shuffle=FEW, returns=returns)
+    for batch in islice(stream, 30):
+        rows, valid = store.start[batch["episode"]][:, None] + batch["t"], batch["valid"]
+        for name in ("mc_return", "mc_valid"):
+            np.testing.assert_array_equal(batch[name][valid], getattr(store, name)[rows][valid])

@@ -66,6 +66,20 @@ def test_the_figures_of_a_run_are_measured_again(
     assert content["all_tasks"] == trained["heldout"]
 
 
+def test_returns_of_a_mixture_with_several_horizons_must_be_named(
+    arguments: Arguments, dataset_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    data = f"--datasets=[{{root: {dataset_root}, return_steps: 12}}]"
+    assert train(arguments(tmp_path / "run", data, dataset__root=None, steps=1)) == 0
+    policy = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
+    argv = _argv(policy, dataset_root, tmp_path / "out", "--split=all", "--pictures=false")
+    assert main(argv) == 2
+    assert f"{dataset_root}: 12" in capsys.readouterr().err
+    assert main([*argv, "--return_steps=12"]) == 0
+    content = json.loads((tmp_path / "out" / "heldout.json").read_text("utf-8"))
+    assert content["tasks"]["ball"]["value"]["rows"] == 7 * 13 + 13
+
+
 def test_few_episodes_are_enough(policy: Path, dataset_root: Path, tmp_path: Path) -> None:
     argv = _argv(policy, dataset_root, tmp_path, "--split=all", "--episodes=2", "--pictures=false")
     assert main(argv) == 0
@@ -83,6 +97,7 @@ def test_few_episodes_are_enough(policy: Path, dataset_root: Path, tmp_path: Pat
         ("--policy.path=/nowhere", 4, "no policy artefact"),
         ("--dataset.root=/nowhere", 3, "/nowhere"),
         ("--device=tpu9", 2, "unknown --device"),
+        ("--return_steps=0", 2, "--returns.steps=0"),
     ],
 )
 def test_refusals(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from collections.abc import Sequence
@@ -13,7 +14,7 @@ import draccus
 import torch
 
 from egovcp.artefact import Artefact, load_artefact
-from egovcp.cli import SelectedDatasetConfig, run_command
+from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.errors import ArtefactError, UsageError
 from egovcp_train.device import choose_device
@@ -56,6 +57,9 @@ class HeldoutConfig:
     """Policy to measure."""
     dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
     """Dataset with the episodes."""
+    return_steps: int | None = None
+    """Horizon of the returns that Q is compared with, ticks; null: that of the training, if its
+    datasets had but one."""
     split: str = "heldout"
     """heldout, train or all; episodes are held out by a hash, the same ones in each training."""
     episodes: int = 64
@@ -84,7 +88,7 @@ def evaluate(config: HeldoutConfig) -> None:
     reader = DatasetReader.open(config.dataset)
     require_same_controller(artefact, reader)
     passing = trained_with(artefact, "passing", PassingConfig)
-    returns = trained_with(artefact, "returns", ReturnConfig)
+    returns = returns_of(artefact, config.return_steps)
     limit = config.episodes or None
     store = label(EpisodeStore.load([reader], config.split, returns, per_task=limit), passing)
     if returns.scale == "per_task":
@@ -122,15 +126,48 @@ def require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
         )
 
 
+def returns_of(artefact: Artefact, steps: int | None) -> ReturnConfig:
+    """The return that Q was trained on; of ``steps`` ticks, if that is given.
+
+    Raises:
+        UsageError: it is not given, and the datasets of the training differed in it.
+        ArtefactError: the manifest does not say what it was.
+    """
+    returns = trained_with(artefact, "returns", ReturnConfig)
+    if steps is not None:
+        returns = dataclasses.replace(returns, steps=steps)
+        returns.check()
+        return returns
+    datasets = _trained_on(artefact)
+    if any(dataset.return_steps is not None for dataset in datasets):
+        each = ", ".join(
+            f"{d.root or d.repo_id}: {d.return_steps or returns.steps}" for d in datasets
+        )
+        raise UsageError(
+            f"{artefact.path} was trained on returns over so many ticks ({each}); say which of "
+            "them this dataset wants: --return_steps=20"
+        )
+    return returns
+
+
 def trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
     """The options of the training under ``name``; the defaults where the manifest has none.
 
     Raises:
         ArtefactError: they cannot be read.
     """
+    return _decoded(artefact, name, kind, {})
+
+
+def _trained_on(artefact: Artefact) -> list[WeightedDatasetConfig]:
+    """The datasets of the training; none if it had one only."""
+    return _decoded(artefact, "datasets", list[WeightedDatasetConfig], [])
+
+
+def _decoded[C](artefact: Artefact, name: str, kind: type[C], default: Any) -> C:
     options: Any = artefact.manifest.get("train_config", {})
     try:
-        found: C = draccus.decode(kind, options.get(name, {}))
+        found: C = draccus.decode(kind, options.get(name, default))
     except (AttributeError, draccus.utils.DraccusException) as error:
         raise ArtefactError(
             f"{artefact.path}: its manifest's train_config.{name} cannot be read "

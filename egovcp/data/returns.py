@@ -1,0 +1,58 @@
+"""Which Monte Carlo return Q is fitted to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from egovcp import spec
+from egovcp.errors import UsageError
+
+ReturnScaling = Literal["dataset", "none", "per_task"]
+
+
+@dataclass(frozen=True)
+class ReturnConfig:
+    """The Monte Carlo target of Q."""
+
+    gamma: float = spec.GAMMA
+    """Discount per planner tick."""
+    steps: int = spec.RETURN_STEPS
+    """Horizon K, planner ticks."""
+    keep_truncated: bool = False
+    """Train on returns that the time limit cuts short, too (the paper's choice)."""
+    scale: ReturnScaling = "dataset"
+    """What Q is fitted to. dataset: returns in deviations from their mean over all tasks; none:
+    returns as they are; per_task: an ablation, in deviations from the mean of the own task."""
+
+    def check(self) -> None:
+        """Raise `UsageError` for values that make no sense."""
+        if self.steps < 1 or not 0 <= self.gamma <= 1:
+            raise UsageError(
+                f"--returns.steps={self.steps} --returns.gamma={self.gamma}: expected at least 1, "
+                "and from 0 to 1"
+            )
+
+    def steps_of(self, dataset: int) -> int:
+        """Horizon K of the rows of one of several datasets, by its number."""
+        del dataset  # all have the same
+        return self.steps
+
+
+@dataclass(frozen=True)
+class MixedReturnConfig(ReturnConfig):
+    """The same with a horizon for each dataset: what an action leads to is seen after a second at a
+    wall, after three at an arch."""
+
+    steps_each: tuple[int, ...] = ()
+    """Horizon K of each dataset, in their order."""
+
+    def check(self) -> None:
+        """Raise `UsageError` for values that make no sense."""
+        super().check()
+        if min(self.steps_each) < 1:
+            raise UsageError(f"return_steps={min(self.steps_each)} of a dataset: at least 1")
+
+    def steps_of(self, dataset: int) -> int:
+        """Horizon K of the rows of one of several datasets, by its number."""
+        return self.steps_each[dataset]
