@@ -80,7 +80,7 @@ class PlayConfig:
     budget_ms: float = 40.0
     """Time for a plan, where searches are compared on equal time, ms."""
     flags: tuple[str, ...] = ()
-    """Further flags of egovcp-eval."""
+    """Further flags of egovcp-eval; studies that play take those of the planner, too."""
 
 
 @dataclass(frozen=True)

@@ -97,7 +97,7 @@ class Grid:
         if config.max_minutes:
             flags["max_minutes"] = config.max_minutes
         extra = (*config.flags, *config.task_flags.get(task, ()))
-        named = dict(flag.removeprefix("--").split("=", 1) for flag in extra)
+        named = _named(extra)
         cell = Cell(
             name or f"train-{task}-{model.name}-s{seed}",
             TRAIN,
@@ -141,14 +141,24 @@ class Grid:
         """`BOUNDS` on the same scenarios as the planner."""
         return self.references(task, f"bounds-{task}", who=BOUNDS)
 
+    @property
+    def planner(self) -> Flags:
+        """Flags that change the artefact's planner, for studies that play."""
+        given = _named(self.config.play.flags)
+        return {name: value for name, value in given.items() if name.startswith("planner.")}
+
     def scenarios(self, task: str) -> Flags:
         """Flags of egovcp-eval that say what is played, by whoever it is."""
         config = self.config.play
-        named = (*self.config.scenes, *config.flags)
-        given = dict(flag.removeprefix("--").split("=", 1) for flag in named)
+        given = _named((*self.config.scenes, *config.flags))
         return {
             "task": task,
             "episodes": config.episodes,
             "seed": config.seed,
             **given,
         }
+
+
+def _named(flags: Sequence[str]) -> dict[str, str]:
+    """Name -> value of flags as they are written, ``--name=value``; of several the last."""
+    return dict(flag.removeprefix("--").split("=", 1) for flag in flags)

@@ -13,7 +13,7 @@ import pytest
 from egovcp.cli import parse_config
 from egovcp.errors import UsageError
 from egovcp_experiment.cell import Cell, Found, Given, Output, filled, in_order, written
-from egovcp_experiment.config import DataConfig, ExperimentConfig, TrainingConfig
+from egovcp_experiment.config import DataConfig, ExperimentConfig, PlayConfig, TrainingConfig
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.grid import ALL, Grid, Model, Variant
 from egovcp_experiment.scales import SCALES
@@ -83,6 +83,18 @@ def test_the_horizon_of_a_task_goes_with_its_data() -> None:
     ball, arch, mixed = [cell.flags for cell in grid.cells if cell.tool is TRAIN]
     assert [f["returns.steps"] for f in (ball, arch, mixed)] == ["20", "50", "20"]
     assert [d.get("return_steps") for d in mixed["datasets"]] == [None, None, 50]
+
+
+@pytest.mark.parametrize("name", ["interpret", "multitask", "variance"])
+def test_studies_plan_as_egovcp_eval_does(name: str) -> None:
+    config = replace(
+        ExperimentConfig(), play=PlayConfig(flags=("--planner.samples=256", "--num_workers=1"))
+    )
+    studies = [cell for cell in EXPERIMENTS[name].cells(config) if ".studies." in cell.tool.module]
+    assert studies
+    for cell in studies:
+        assert cell.flags["planner.samples"] == "256"
+        assert "num_workers" not in cell.flags
 
 
 def test_unknown_variants_and_tasks_are_named() -> None:

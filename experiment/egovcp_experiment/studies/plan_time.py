@@ -53,7 +53,7 @@ def measure(config: PlanTimeConfig) -> None:
     """Time the searches and write what each affords."""
     if config.budget_ms <= 0 or config.rounds < 1:
         raise UsageError("--budget_ms must be above 0, and --rounds at least 1")
-    artefact = config.policy.load()
+    artefact = config.load()
     policies = {
         (name, samples): _policy(artefact, name, samples)
         for name in SEARCHES

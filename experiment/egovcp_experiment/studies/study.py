@@ -5,33 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
-from egovcp.artefact import Artefact, load_artefact
+from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
 from egovcp.errors import UsageError
+from egovcp_deploy.options import PlannerOptions, PolicyOptions, load_policy
 from egovcp_experiment.tools import RESULT
 
-
-@dataclass(frozen=True)
-class PolicyConfig:
-    """Which policy artefact."""
-
-    path: str = ""
-    """Folder of the artefact, or its Hub id `user/name`."""
-    revision: str = ""
-    """Branch, tag or commit SHA on the Hub; empty: the latest."""
-
-    def load(self) -> Artefact:
-        """The artefact.
-
-        Raises:
-            UsageError: none is named.
-            ArtefactError: it is missing or damaged.
-        """
-        if not self.path:
-            raise UsageError("--policy.path is missing; name the artefact")
-        return load_artefact(self.path, self.revision)
+_AS_IT_IS: Final = PlannerOptions()
 
 
 @dataclass(frozen=True)
@@ -40,8 +22,19 @@ class StudyConfig:
 
     output_dir: str = ""
     """New folder for the result."""
-    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    policy: PolicyOptions = field(default_factory=PolicyOptions)
     """The policy to look at."""
+
+    def load(self, planner: PlannerOptions = _AS_IT_IS) -> Artefact:
+        """The policy, its planner changed.
+
+        Raises:
+            UsageError: none is named, or the changes make no sense.
+            ArtefactError: it is missing or damaged.
+        """
+        if not self.policy.path:
+            raise UsageError("--policy.path is missing; name the artefact")
+        return load_policy(self.policy, planner)
 
     def folder(self) -> Path:
         """Make the folder.

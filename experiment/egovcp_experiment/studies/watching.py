@@ -18,6 +18,7 @@ from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.env import Observation, StepResult, VectorEnv
 from egovcp.sim.scenario import Scenario
+from egovcp_deploy.options import PlannerOptions
 from egovcp_experiment.studies.study import StudyConfig
 
 STUDIED: Final = 4_000_000_000  # scenarios of no collection, evaluation or training
@@ -34,6 +35,8 @@ class WatchConfig(StudyConfig):
     """Scenarios."""
     seed: int = 0
     """Which scenarios."""
+    planner: PlannerOptions = field(default_factory=PlannerOptions)
+    """Changes to the artefact's planner."""
     env: EnvConfig = field(default_factory=eventful)
     """Scenes, sensors, delays and randomisation."""
 
@@ -46,7 +49,7 @@ class WatchConfig(StudyConfig):
         """
         if self.episodes < 1:
             raise UsageError(f"--episodes={self.episodes}: expected at least 1")
-        artefact = self.policy.load()
+        artefact = self.load(self.planner)
         artefact.require_controller(make_controller(self.env.controller).id)
         return artefact
 

@@ -56,6 +56,15 @@ def test_every_task_is_measured(task: str, key: str, flags: list[str], tmp_path:
     assert 0 < found[key]["mean"] < 1
 
 
+def test_its_planner_can_be_changed(
+    flags: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["--task=ball", *flags, "--planner.samples=3", "--planner.elites=2"]
+    assert main(argv) == 0
+    assert main([*argv, "--planner.samples=1", f"--output_dir={tmp_path / 'two'}"]) == 2
+    assert "elites (2) exceed samples (1)" in capsys.readouterr().err
+
+
 def test_an_artefact_of_another_controller_is_refused(
     flags: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
