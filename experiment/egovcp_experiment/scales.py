@@ -96,7 +96,8 @@ def small() -> ExperimentConfig:
             # an arch is passed seconds after one has to crouch for it
             return_steps={"arch": 50},
         ),
-        play=PlayConfig(flags=("--planner.samples=256", "--planner.elites=16")),
+        # the budget is about what 256 candidates take on one core
+        play=PlayConfig(budget_ms=8.0, flags=("--planner.samples=256", "--planner.elites=16")),
     )
 
 
