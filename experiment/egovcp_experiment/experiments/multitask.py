@@ -91,10 +91,15 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
 def _training(config: ExperimentConfig) -> str:
     limit = config.train.max_minutes
     words = f"{limit:g} minutes" if limit else f"{config.train.steps} gradient steps"
+    horizons = "".join(
+        f" Returns of {task} reach {steps} ticks, in its own model and in the mixed one."
+        for task, steps in config.train.return_steps.items()
+        if task in config.tasks
+    )
     return (
         f"Every model was trained for {words}: the one on mixed data sees each task "
         f"{len(config.tasks)} times less often than a single-task model does, and is told nothing "
-        "of which task it is."
+        f"of which task it is.{horizons}"
     )
 
 
