@@ -112,10 +112,7 @@ class WallConfig:
     impact_force: float = 300.0
     """Hand force that costs ``impact_cost`` in full, N."""
     pose_cost: float = 0.03
-    """Per tick while disturbed, times the mean squared action."""
-    idle_cost: float = 0.3
-    """Per tick while nothing disturbs, times the mean squared action. An episode stands for a life
-    in which pushes are far rarer: a guard that is held all along must not pay (docs/log.md)."""
+    """Per tick, times the mean squared action; makes a permanent guard expensive."""
     fall_cost: float = 1.0
     """Once, at a fall."""
 

@@ -94,7 +94,6 @@ class WallTask(Task):
         c = self.config
         hand_force = float(self.forces[_HANDS].max())
         upright = math.cos(self.robot.tilt) if self.disturbed else 0.0
-        pose_cost = c.pose_cost if self.disturbed else c.idle_cost
         leaning = bool(self.forces[_OTHERS].any())
         braced = hand_force > _BRACE_FORCE and not leaning and not self.away
         return {
@@ -102,7 +101,7 @@ class WallTask(Task):
             "upright": c.upright_reward * upright,
             "contact": -c.contact_cost * leaning,
             "impact": -c.impact_cost * min(1.0, hand_force / c.impact_force),
-            "pose": -pose_cost * float(np.mean(action**2)),
+            "pose": -c.pose_cost * float(np.mean(action**2)),
         }
 
     @property

@@ -139,19 +139,6 @@ def test_leaving_the_neutral_pose_costs(env: VectorEnv) -> None:
     assert task.rewards(np.ones(ACTION_DIM))["pose"] == pytest.approx(-task.config.pose_cost)
 
 
-def test_a_guard_is_dear_until_the_push_comes(config: EnvConfig) -> None:
-    env = VectorEnv(config, 1)
-    env.reset([Scenario("wall", 0, 0)])
-    task = env.lanes[0].task
-    assert task.event_tick is not None
-    guard, before = np.ones(ACTION_DIM), task.rewards(np.ones(ACTION_DIM))["pose"]
-    assert before == pytest.approx(-config.wall.idle_cost)
-    for _ in range(task.event_tick + 1):
-        env.step(np.zeros((1, ACTION_DIM)))
-    assert task.rewards(guard)["pose"] == pytest.approx(-config.wall.pose_cost)
-    assert config.wall.pose_cost < before * -0.5
-
-
 def test_a_push_gives_the_base_its_speed(config: EnvConfig) -> None:
     push = WallConfig(
         push_speed_range=(0.4, 0.4), push_bearing_range=(0.0, 0.0), away_probability=0.0
