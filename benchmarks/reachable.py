@@ -38,7 +38,8 @@ from egovcp.errors import DataError, UsageError
 from egovcp.model.losses import filter_sequence
 from egovcp_train.batches import whole_episodes
 from egovcp_train.heldout.calibration import calibration
-from egovcp_train.heldout.command import PolicyConfig, require_same_controller, trained_with
+from egovcp_train.heldout.command import PolicyConfig, require_same_controller
+from egovcp_train.heldout.trained import returns_of
 
 PROG = "reachable.py"
 VALIDATION = 0.16  # hashes below it are not learned from; held out are those below 0.05
@@ -158,7 +159,7 @@ def _cases(config: ReachableConfig, readers: Sequence[DatasetReader]) -> list[Ca
         artefact = load_artefact(path, config.policy.revision if number == 1 else "")
         for reader in readers:
             require_same_controller(artefact, reader)
-        returns = replace(trained_with(artefact, "returns", ReturnConfig), keep_truncated=False)
+        returns = replace(returns_of(artefact), keep_truncated=False)
         found.append(Case(f"policy{number}", returns, artefact))
     if not found:
         found = [Case(f"k{k}", ReturnConfig(config.gamma, k)) for k in config.horizons]

@@ -25,12 +25,12 @@ class ReturnConfig:
     """What Q is fitted to. dataset: returns in deviations from their mean over all tasks; none:
     returns as they are; per_task: an ablation, in deviations from the mean of the own task."""
 
-    def check(self) -> None:
-        """Raise `UsageError` for values that make no sense."""
+    def check(self, flag: str = "--returns") -> None:
+        """Raise `UsageError`, which names options of ``flag``, for values that make no sense."""
         if self.steps < 1 or not 0 <= self.gamma <= 1:
             raise UsageError(
-                f"--returns.steps={self.steps} --returns.gamma={self.gamma}: expected at least 1, "
-                "and from 0 to 1"
+                f"{flag}.steps={self.steps} {flag}.gamma={self.gamma}: expected at least 1, and "
+                "from 0 to 1"
             )
 
     def steps_of(self, dataset: int) -> int:
@@ -47,9 +47,9 @@ class MixedReturnConfig(ReturnConfig):
     steps_each: tuple[int, ...] = ()
     """Horizon K of each dataset, in their order."""
 
-    def check(self) -> None:
-        """Raise `UsageError` for values that make no sense."""
-        super().check()
+    def check(self, flag: str = "--returns") -> None:
+        """Raise `UsageError`, which names options of ``flag``, for values that make no sense."""
+        super().check(flag)
         if min(self.steps_each) < 1:
             raise UsageError(f"return_steps={min(self.steps_each)} of a dataset: at least 1")
 

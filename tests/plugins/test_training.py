@@ -3,6 +3,7 @@
 import dataclasses
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -210,8 +211,11 @@ def test_a_policy_without_dataset_neither_learns_nor_says_whom_it_drives(
         lonely.save_pretrained(tmp_path)
 
 
-@pytest.mark.parametrize("options", [{"sequence_length": 1}, {"drop_n_last_frames": -1}])
-def test_senseless_options_are_refused(options: dict[str, int]) -> None:
+@pytest.mark.parametrize(
+    "options",
+    [{"sequence_length": 1}, {"drop_n_last_frames": -1}, {"returns": ReturnConfig(steps=0)}],
+)
+def test_senseless_options_are_refused(options: dict[str, Any]) -> None:
     with pytest.raises(UsageError, match="--policy"):
         EgovcpConfig(device="cpu", **options)
 

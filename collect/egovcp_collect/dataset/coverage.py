@@ -44,6 +44,7 @@ def run(config: CoverageConfig) -> None:
         DataError: the dataset is damaged.
         EnvironmentFailure: pictures are asked for, and matplotlib is not installed.
     """
+    config.returns.check()
     if config.output_dir:
         require_matplotlib()
     reader = DatasetReader.open(config.dataset)

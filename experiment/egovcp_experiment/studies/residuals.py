@@ -34,6 +34,7 @@ from egovcp.spec import ACTION_DIM, ACTION_ETA, reflect
 from egovcp_experiment.studies.study import finish
 from egovcp_experiment.studies.watching import Moment, WatchConfig, Watcher, watch
 from egovcp_experiment.variance import Residuals, analysis
+from egovcp_train.heldout.trained import returns_of
 
 PROG: Final = "python -m egovcp_experiment.studies.residuals"
 STEPS: Final = 6  # the longest horizon of table I
@@ -145,10 +146,10 @@ def measure(config: ResidualsConfig) -> None:
 
 def _returns(artefact: Artefact) -> tuple[float, int]:
     """Discount and ticks of the return that Q was trained on."""
-    settings = artefact.manifest.get("train_config", {}).get("returns", {})
-    if not settings:
+    if not artefact.manifest.get("train_config", {}).get("returns"):
         raise UsageError(f"{artefact.path} does not say which return it was trained on")
-    return float(settings["gamma"]), int(settings["steps"])
+    returns = returns_of(artefact)
+    return returns.gamma, returns.steps
 
 
 def _branches(

@@ -75,6 +75,7 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
                 f"--policy.sequence_length={self.sequence_length} and --policy.drop_n_last_frames="
                 f"{self.drop_n_last_frames}; expected at least 2 and 0"
             )
+        self.returns.check("--policy.returns")
         if self.returns.scale == "per_task":
             raise UsageError(
                 "--policy.returns.scale=per_task is an ablation of egovcp-train; choose dataset or "

@@ -71,3 +71,8 @@ def test_a_missing_matplotlib_is_said_before_anything_is_read(
 
 def test_no_dataset_is_a_data_error(tmp_path: Path) -> None:
     assert main(["coverage", f"--dataset.root={tmp_path / 'none'}"]) == 3
+
+
+def test_returns_over_no_ticks_are_refused(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["coverage", f"--dataset.root={root}", "--returns.steps=0"]) == 2
+    assert "--returns.steps=0" in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """``egovcp-eval-model``: what it writes, what it refuses."""
 
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -69,15 +70,26 @@ def test_the_figures_of_a_run_are_measured_again(
 def test_returns_of_a_mixture_with_several_horizons_must_be_named(
     arguments: Arguments, dataset_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    data = f"--datasets=[{{root: {dataset_root}, return_steps: 12}}]"
-    assert train(arguments(tmp_path / "run", data, dataset__root=None, steps=1)) == 0
-    policy = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
-    argv = _argv(policy, dataset_root, tmp_path / "out", "--split=all", "--pictures=false")
-    assert main(argv) == 2
-    assert f"{dataset_root}: 12" in capsys.readouterr().err
-    assert main([*argv, "--return_steps=12"]) == 0
-    content = json.loads((tmp_path / "out" / "heldout.json").read_text("utf-8"))
-    assert content["tasks"]["ball"]["value"]["rows"] == 7 * 13 + 13
+    copy = shutil.copytree(dataset_root, tmp_path / "copy")
+
+    def rows(name: str, own: str, *flags: str) -> int:
+        """Rows that have a return, as egovcp-eval-model counts them; 0: it refuses."""
+        data = f"--datasets=[{{root: {dataset_root}, return_steps: 12}}, {{root: {copy}{own}}}]"
+        assert train(arguments(tmp_path / name, data, dataset__root=None, steps=1)) == 0
+        policy, output = (
+            tmp_path / name / "checkpoints/last/pretrained_model",
+            tmp_path / f"{name}2",
+        )
+        argv = _argv(policy, dataset_root, output, "--split=all", "--pictures=false", *flags)
+        if main(argv):
+            return 0
+        content = json.loads((output / "heldout.json").read_text("utf-8"))
+        return int(content["tasks"]["ball"]["value"]["rows"])
+
+    assert rows("unnamed", "") == 0
+    assert f"{dataset_root}: 12, {copy}: 5" in capsys.readouterr().err
+    assert rows("named", "", "--return_steps=12") == 7 * 13 + 13
+    assert rows("equal", ", return_steps: 12") == 7 * 13 + 13
 
 
 def test_few_episodes_are_enough(policy: Path, dataset_root: Path, tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 from collections.abc import Sequence
@@ -10,12 +9,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-import draccus
 import torch
 
 from egovcp.artefact import Artefact, load_artefact
-from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig, run_command
-from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
+from egovcp.cli import SelectedDatasetConfig, run_command
+from egovcp.data import DatasetReader, EpisodeStore
 from egovcp.errors import ArtefactError, UsageError
 from egovcp_train.device import choose_device
 from egovcp_train.heldout.episodes import recorded
@@ -23,6 +21,7 @@ from egovcp_train.heldout.pictures import draw
 from egovcp_train.heldout.recording import record
 from egovcp_train.heldout.report import Report, measure
 from egovcp_train.heldout.table import table
+from egovcp_train.heldout.trained import returns_of, trained_with
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.labels.passing import label
 from egovcp_train.output import require_writable
@@ -124,56 +123,6 @@ def require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
             f"{reader.controller_id!r}: the same actions lead elsewhere; choose a dataset of the "
             "policy's controller"
         )
-
-
-def returns_of(artefact: Artefact, steps: int | None) -> ReturnConfig:
-    """The return that Q was trained on; of ``steps`` ticks, if that is given.
-
-    Raises:
-        UsageError: it is not given, and the datasets of the training differed in it.
-        ArtefactError: the manifest does not say what it was.
-    """
-    returns = trained_with(artefact, "returns", ReturnConfig)
-    if steps is not None:
-        returns = dataclasses.replace(returns, steps=steps)
-        returns.check()
-        return returns
-    datasets = _trained_on(artefact)
-    if any(dataset.return_steps is not None for dataset in datasets):
-        each = ", ".join(
-            f"{d.root or d.repo_id}: {d.return_steps or returns.steps}" for d in datasets
-        )
-        raise UsageError(
-            f"{artefact.path} was trained on returns over so many ticks ({each}); say which of "
-            "them this dataset wants: --return_steps=20"
-        )
-    return returns
-
-
-def trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
-    """The options of the training under ``name``; the defaults where the manifest has none.
-
-    Raises:
-        ArtefactError: they cannot be read.
-    """
-    return _decoded(artefact, name, kind, {})
-
-
-def _trained_on(artefact: Artefact) -> list[WeightedDatasetConfig]:
-    """The datasets of the training; none if it had one only."""
-    return _decoded(artefact, "datasets", list[WeightedDatasetConfig], [])
-
-
-def _decoded[C](artefact: Artefact, name: str, kind: type[C], default: Any) -> C:
-    options: Any = artefact.manifest.get("train_config", {})
-    try:
-        found: C = draccus.decode(kind, options.get(name, default))
-    except (AttributeError, draccus.utils.DraccusException) as error:
-        raise ArtefactError(
-            f"{artefact.path}: its manifest's train_config.{name} cannot be read "
-            f"({' '.join(str(error).split())}); train again with this version"
-        ) from error
-    return found
 
 
 def _return_scales(artefact: Artefact) -> dict[str, ReturnScale]:
