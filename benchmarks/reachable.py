@@ -36,10 +36,11 @@ from egovcp.data.split import in_split
 from egovcp.data.targets import mc_return, mc_valid
 from egovcp.errors import DataError, UsageError
 from egovcp.model.losses import filter_sequence
+from egovcp.policy_options import PolicyOptions
+from egovcp.trained import returns_of
 from egovcp_train.batches import whole_episodes
 from egovcp_train.heldout.calibration import calibration
-from egovcp_train.heldout.command import PolicyConfig, require_same_controller
-from egovcp_train.heldout.trained import returns_of
+from egovcp_train.heldout.command import require_same_controller
 
 PROG = "reachable.py"
 VALIDATION = 0.16  # hashes below it are not learned from; held out are those below 0.05
@@ -56,7 +57,7 @@ class ReachableConfig:
     """Dataset with the episodes."""
     datasets: tuple[DatasetConfig, ...] = ()
     """Several datasets instead, '[{root: data/ball}, {root: data/wall}]'."""
-    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    policy: PolicyOptions = field(default_factory=PolicyOptions)
     """Policy whose Q is judged, too."""
     policies: tuple[str, ...] = ()
     """Further policies, '[RUN_A, RUN_B]'."""

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from egovcp.policy_options import PlannerOptions, PolicyOptions
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp_deploy.live.gamepad import GamepadOptions
 from egovcp_deploy.live.hardware import CameraOptions
-from egovcp_deploy.options import PLANNER, PlannerOptions, PolicyOptions
+from egovcp_deploy.options import PLANNER
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.recording import LogOptions
 from egovcp_deploy.robots.bridge import BridgeConfig

@@ -9,6 +9,7 @@ from typing import Final
 from egovcp.artefact import Artefact
 from egovcp.cli import run_command
 from egovcp.errors import EgovcpError, UsageError
+from egovcp.policy_options import load_policy
 from egovcp.sim.scenario import PLAYABLE
 from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
@@ -19,7 +20,6 @@ from egovcp_deploy.options import (
     check_choice,
     check_output_dir,
     check_positive,
-    load_policy,
 )
 from egovcp_deploy.robots.replay import open_recordings
 from egovcp_deploy.rollouts import make_robot, play_rollouts, replay

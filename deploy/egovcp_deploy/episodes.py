@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from egovcp.artefact import Artefact
 from egovcp.errors import EnvironmentFailure
+from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork, ReactivePolicy
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.controllers import PPO, Constants, Controller, Planned, reference
-from egovcp_deploy.options import PlannerOptions, PolicyOptions, load_policy
 from egovcp_deploy.safety import SafetyFilter
 from egovcp_deploy.scores import EpisodeScore
 

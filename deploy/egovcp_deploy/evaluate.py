@@ -16,6 +16,7 @@ from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
+from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, eventful
@@ -26,12 +27,9 @@ from egovcp_deploy.constant_search import Action, BestConstant, load_constants, 
 from egovcp_deploy.controllers import CONTROLLERS, PPO
 from egovcp_deploy.episodes import Group, Setup, Stage
 from egovcp_deploy.options import (
-    PlannerOptions,
-    PolicyOptions,
     check_choice,
     check_output_dir,
     check_positive,
-    load_policy,
     make_output_dir,
     versions,
 )

@@ -10,11 +10,11 @@ import pytest
 from egovcp.cli import parse_config
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.plan import PlannerConfig
+from egovcp.policy_options import PlannerOptions
 from egovcp.sim.config import eventful
 from egovcp.spec import TASKS
 from egovcp_deploy.evaluate import EvalConfig
 from egovcp_deploy.options import (
-    PlannerOptions,
     check_choice,
     check_output_dir,
     make_output_dir,

@@ -25,6 +25,7 @@ from safetensors.torch import load_file, save_file
 from egovcp.artefact import MANIFEST, WEIGHTS, Artefact, load_artefact
 from egovcp.cli import run_command
 from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.policy_options import PolicyOptions
 from egovcp_train.onnx_networks import (
     NETWORKS,
     OPSET,
@@ -45,16 +46,6 @@ _TRACED_ROWS: Final = 2
 
 
 @dataclass(frozen=True)
-class ArtefactConfig:
-    """Which policy artefact."""
-
-    path: str = ""
-    """Folder of the artefact, or its Hub id `user/name`."""
-    revision: str = ""
-    """Branch, tag or commit SHA on the Hub; empty: the latest."""
-
-
-@dataclass(frozen=True)
 class ExportConfig:
     """Write the networks that the planner calls as ONNX, and prove them with onnxruntime.
 
@@ -62,7 +53,7 @@ class ExportConfig:
     runtime can be proved as well.
     """
 
-    policy: ArtefactConfig = field(default_factory=ArtefactConfig)
+    policy: PolicyOptions = field(default_factory=PolicyOptions)
     """The artefact."""
     output_dir: str = ""
     """New folder for the networks."""

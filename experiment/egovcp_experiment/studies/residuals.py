@@ -31,10 +31,10 @@ from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import StepResult, VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM, ACTION_ETA, reflect
+from egovcp.trained import returns_of
 from egovcp_experiment.studies.study import finish
 from egovcp_experiment.studies.watching import Moment, WatchConfig, Watcher, watch
 from egovcp_experiment.variance import Residuals, analysis
-from egovcp_train.heldout.trained import returns_of
 
 PROG: Final = "python -m egovcp_experiment.studies.residuals"
 STEPS: Final = 6  # the longest horizon of table I

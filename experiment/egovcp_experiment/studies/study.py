@@ -10,7 +10,7 @@ from typing import Any, Final
 from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
 from egovcp.errors import UsageError
-from egovcp_deploy.options import PlannerOptions, PolicyOptions, load_policy
+from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp_experiment.tools import RESULT
 
 _AS_IT_IS: Final = PlannerOptions()

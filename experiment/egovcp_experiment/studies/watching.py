@@ -14,11 +14,11 @@ from tqdm import tqdm
 from egovcp.artefact import Artefact
 from egovcp.errors import UsageError
 from egovcp.plan import Policy, PolicyStep
+from egovcp.policy_options import PlannerOptions
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.env import Observation, StepResult, VectorEnv
 from egovcp.sim.scenario import Scenario
-from egovcp_deploy.options import PlannerOptions
 from egovcp_experiment.studies.study import StudyConfig
 
 STUDIED: Final = 4_000_000_000  # scenarios of no collection, evaluation or training

@@ -15,13 +15,14 @@ from egovcp.artefact import Artefact, load_artefact
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore
 from egovcp.errors import ArtefactError, UsageError
+from egovcp.policy_options import PolicyOptions
+from egovcp.trained import returns_of, trained_with
 from egovcp_train.device import choose_device
 from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
 from egovcp_train.heldout.recording import record
 from egovcp_train.heldout.report import Report, measure
 from egovcp_train.heldout.table import table
-from egovcp_train.heldout.trained import returns_of, trained_with
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.labels.passing import label
 from egovcp_train.output import require_writable
@@ -29,16 +30,6 @@ from egovcp_train.return_scale import ReturnScale, on_task_scales
 
 PROG: Final = "egovcp-eval-model"
 RESULT: Final = "heldout.json"
-
-
-@dataclass(frozen=True)
-class PolicyConfig:
-    """Which policy artefact."""
-
-    path: str = ""
-    """Folder of the artefact, or its Hub id `user/name`."""
-    revision: str = ""
-    """Branch, tag or commit SHA on the Hub; empty: the latest."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +43,7 @@ class HeldoutConfig:
 
     output_dir: str
     """Folder for heldout.json and the pictures; its other files are left alone."""
-    policy: PolicyConfig = field(default_factory=PolicyConfig)
+    policy: PolicyOptions = field(default_factory=PolicyOptions)
     """Policy to measure."""
     dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
     """Dataset with the episodes."""
