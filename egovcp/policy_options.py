@@ -20,10 +20,11 @@ class PolicyOptions:
     revision: str = ""
     """Branch, tag or commit SHA on the Hub; empty: the latest."""
 
-    def require(self, otherwise: str) -> None:
+    def require(self, otherwise: str = "") -> None:
         """Raise `UsageError`, which offers to do ``otherwise``, unless an artefact is named."""
         if not self.path:
-            raise UsageError(f"--policy.path is missing; name the artefact, or {otherwise}")
+            offer = f", or {otherwise}" if otherwise else ""
+            raise UsageError(f"--policy.path is missing; name the artefact{offer}")
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def test_a_mixture_that_makes_no_sense_is_refused_before_anything_is_written(
 def test_a_dataset_has_returns_over_its_own_horizon(
     mixed: Arguments, tmp_path: Path, mode: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Of 24 rows 20 have a return over 5 ticks; none one over 24, which is refused."""
+    """Of 24 rows 20 have a return over 5 ticks; none one over 25, which is refused."""
     flags = [f"--loading.mode={mode}", "--loading.shuffle.episodes=3", "--steps=1"]
     same = mixed(tmp_path / "same", *flags, weights=("2", "1"))
     own = mixed(tmp_path / "own", *flags, weights=("2, return_steps: 12", "1"))

@@ -32,8 +32,7 @@ class StudyConfig:
             UsageError: none is named, or the changes make no sense.
             ArtefactError: it is missing or damaged.
         """
-        if not self.policy.path:
-            raise UsageError("--policy.path is missing; name the artefact")
+        self.policy.require()
         return load_policy(self.policy, planner)
 
     def folder(self) -> Path:

@@ -76,10 +76,8 @@ def test_returns_of_a_mixture_with_several_horizons_must_be_named(
         """Rows that have a return, as egovcp-eval-model counts them; 0: it refuses."""
         data = f"--datasets=[{{root: {dataset_root}, return_steps: 12}}, {{root: {copy}{own}}}]"
         assert train(arguments(tmp_path / name, data, dataset__root=None, steps=1)) == 0
-        policy, output = (
-            tmp_path / name / "checkpoints/last/pretrained_model",
-            tmp_path / f"{name}2",
-        )
+        policy = tmp_path / name / "checkpoints" / "last" / "pretrained_model"
+        output = tmp_path / f"{name}-measured"
         argv = _argv(policy, dataset_root, output, "--split=all", "--pictures=false", *flags)
         if main(argv):
             return 0
