@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -44,12 +45,22 @@ class Puppeteer:
         """20 ms of the robot's life, after which the controller answers to its newest state."""
         for _ in range(4):
             seen = self.body.traffic.readings
-            stage.step()
-            assert stage.finished or eventually(lambda n=seen: self.body.traffic.readings > n)
+            self._insist(
+                stage.step, lambda n=seen: stage.finished or self.body.traffic.readings > n
+            )
         target = self.controller.step(self._state()[None])[0]
         c, heard = self.controller, self.fake.counts.commands
-        self.body.write(MotorCommand(target, c.stiffness, c.damping, MODE))
-        assert eventually(lambda: self._heard(heard))
+        command = MotorCommand(target, c.stiffness, c.damping, MODE)
+        self._insist(lambda: self.body.write(command), lambda: self._heard(heard))
+
+    def _insist(self, send: Callable[[], object], arrived: Callable[[], bool]) -> None:
+        """Send until it arrives: a reader that joins anew, as after a second of silence on a busy
+        machine, never sees what was published meanwhile."""
+        for _ in range(20):
+            send()
+            if eventually(arrived, patience=5.0):
+                return
+        raise AssertionError("twenty messages, and none arrived")
 
     def _heard(self, before: int) -> bool:
         self.fake._listen()

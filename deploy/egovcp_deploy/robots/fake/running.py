@@ -12,9 +12,9 @@ from egovcp_deploy.robots.fake.bridge import FakeBridge
 PATIENCE_S = 120.0
 
 
-def eventually(condition: Callable[[], bool]) -> bool:
-    """Whether it becomes true before patience ends."""
-    deadline = time.monotonic() + PATIENCE_S
+def eventually(condition: Callable[[], bool], patience: float = PATIENCE_S) -> bool:
+    """Whether it becomes true before patience, s, ends."""
+    deadline = time.monotonic() + patience
     while not condition():
         if time.monotonic() > deadline:
             return False
