@@ -51,7 +51,8 @@ class EpisodeIndex:
         chosen = list(compress(places, in_split(identities, split, heldout_fraction)))
         if not chosen:
             raise DataError(
-                f"none of the {len(places)} episodes falls into split {split!r}; collect more"
+                f"none of the {len(places)} episodes falls into split {split!r}: collect more, or "
+                "name other datasets beside them"
             )
         dataset, number = np.array(chosen, dtype=np.int64).T
         return cls(tuple(readers), dataset, number)
