@@ -44,6 +44,7 @@ def smoke() -> ExperimentConfig:
                 "--policy.loss.autoregressive_steps=4",
                 "--returns.steps=6",
                 "--value_fit.steps=4",
+                "--value_fit.passes=0",
                 "--value_fit.told_steps=4",
                 "--value_fit.rows=64",
                 "--planner.samples=32",

@@ -46,6 +46,7 @@ def artefact(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
         "sampling.length": 6,
         "returns.steps": RETURNS.steps,
         "value_fit.steps": 2,
+        "value_fit.passes": 0,
         "value_fit.told_steps": 2,
         "value_fit.rows": 16,
         "planner.samples": 16,

@@ -63,6 +63,7 @@ def arguments(dataset_root: Path) -> Arguments:
             "sampling__length": 6,
             "returns__steps": 5,
             "value_fit__steps": 4,
+            "value_fit__passes": 0,
             "value_fit__told_steps": 4,
             "value_fit__rows": 32,
             "planner__samples": 16,

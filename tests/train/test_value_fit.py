@@ -1,7 +1,9 @@
 """The final fit of Q: which states it sees, what it changes, and that it helps."""
 
+import math
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -15,9 +17,10 @@ from egovcp.data import (
     SequenceStream,
     StreamConfig,
 )
+from egovcp.errors import UsageError
 from egovcp.model import Batch, Carry, WorldModel
 from egovcp.testing import CountingModel, toy_model
-from egovcp_train import batches
+from egovcp_train import batches, value_fit
 from egovcp_train.batches import set_normalisation, to_tensors, whole_episodes
 from egovcp_train.value_fit import Rows, ValueFitConfig, _fit_heads, collect_rows, fit_value
 
@@ -99,7 +102,9 @@ def test_the_fit_improves_q_and_touches_nothing_else(store: EpisodeStore) -> Non
     before = {k: v.clone() for k, v in model.state_dict().items()}
     rows = _collect(model, store, ahead=3)
     start = _error(model, rows)
-    fit_value(model, _whole(store), ValueFitConfig(steps=60, told_steps=60, rows=64), seed=0)
+    fit_value(
+        model, _whole(store), ValueFitConfig(steps=60, passes=0.0, told_steps=60, rows=64), seed=0
+    )
     assert _error(model, rows) < 0.5 * start
     changed = {k for k, v in model.state_dict().items() if not torch.equal(v, before[k])}
     assert changed
@@ -138,7 +143,7 @@ def test_a_seed_repeats_the_fit_and_no_steps_leave_the_model_alone(store: Episod
         fit_value(
             model,
             _whole(store, mirror=True),
-            ValueFitConfig(steps, told_steps=steps, rows=16),
+            ValueFitConfig(steps, passes=0.0, told_steps=max(1, steps), rows=16),
             seed,
         )
         return model.state_dict()
@@ -149,6 +154,48 @@ def test_a_seed_repeats_the_fit_and_no_steps_leave_the_model_alone(store: Episod
     assert same(fitted(3, 0), fitted(3, 0))
     assert not same(fitted(3, 0), fitted(3, 1))
     assert same(fitted(0, 0), dict(toy_model().state_dict()))
+
+
+def test_many_rows_are_gone_over_as_often_as_few() -> None:
+    config = ValueFitConfig(steps=600, passes=2.0, rows=1024)
+    assert config.steps_over(300_000) == 600
+    assert config.steps_over(1_400_000) == 2735
+
+
+def test_the_fit_takes_the_steps_that_its_rows_ask_for(
+    store: EpisodeStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[int] = []
+
+    def counted(total: range, **options: object) -> range:
+        taken.append(len(total))
+        return total
+
+    monkeypatch.setattr(value_fit, "tqdm", counted)
+    model = toy_model()
+    count = len(_collect(model, store, ahead=3).target)
+    fit_value(model, _whole(store), ValueFitConfig(3, passes=2.0, told_steps=5, rows=16), seed=0)
+    heads = len(model.q_heads.states)
+    assert taken == [5] + heads * [math.ceil(2 * count / 16)]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"steps": -1},
+        {"rows": 0},
+        {"told_rows": 0},
+        {"told_steps": 0},
+        {"passes": -1.0},
+        {"passes": math.inf},
+        {"passes": math.nan},
+        {"imagined_steps": -1},
+        {"dropout": 1.0},
+    ],
+)
+def test_what_cannot_be_fitted_is_refused_at_once(wrong: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match=f"value_fit.*{next(iter(wrong))}"):
+        ValueFitConfig(**wrong)
 
 
 def test_a_batch_of_the_stream_becomes_the_models_tensors(store: EpisodeStore) -> None:

@@ -8,6 +8,7 @@ explains on held-out episodes doubled (0.04 to 0.08).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -17,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from tqdm import tqdm
 
+from egovcp.errors import UsageError
 from egovcp.model import Batch, Carry, WorldModel, value
 from egovcp.model.losses import filter_sequence
 from egovcp.model.nets import SplitMlp, ValueHead
@@ -28,7 +30,9 @@ class ValueFitConfig:
     """Fit of the value head on fixed states at the end of training."""
 
     steps: int = 600
-    """Gradient steps of the part of Q that reads the state, and of the reward; 0: no fit at all."""
+    """Least gradient steps of the part of Q that reads the state, and of the reward; 0: no fit."""
+    passes: float = 2.0
+    """How often all rows are gone over at least: of many, the least steps would see a part only."""
     imagined_steps: int = 3
     """States are imagined 0 to this many ticks ahead, as far as the planner looks."""
     rows: int = 1024
@@ -47,6 +51,23 @@ class ValueFitConfig:
     dropout: float = 0.5
     """Share of h and z hidden from the head at each step: a few thousand throws are soon known by
     heart."""
+
+    def __post_init__(self) -> None:
+        if min(self.rows, self.told_rows, self.told_steps) < 1 or self.steps < 0:
+            raise UsageError(
+                "value_fit.rows, .told_rows and .told_steps must be at least 1, .steps at least 0"
+            )
+        if not 0 <= self.passes < math.inf:
+            raise UsageError(f"value_fit.passes is {self.passes}; expected a number from 0 on")
+        if self.imagined_steps < 0 or not 0 <= self.dropout < 1:
+            raise UsageError(
+                f"value_fit.imagined_steps is {self.imagined_steps} and .dropout {self.dropout}; "
+                "expected at least 0, and from 0 to below 1"
+            )
+
+    def steps_over(self, rows: int) -> int:
+        """Gradient steps of the part that reads the state, where there are so many rows."""
+        return max(self.steps, math.ceil(self.passes * rows / self.rows))
 
 
 class Rows(NamedTuple):
@@ -93,6 +114,7 @@ def _fit_heads(
 ) -> None:
     """Each head of Q, and that of the reward if there is one."""
     known = _fit_told(model, rows, config, generator)
+    config = replace(config, steps=config.steps_over(len(rows.target)))
     for head in model.q_heads.states:
         _fit_state(model, head, rows, known, config, generator)
     if (reward := model.reward_head) is not None:
