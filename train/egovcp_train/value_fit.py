@@ -31,7 +31,7 @@ class ValueFitConfig:
 
     steps: int = 600
     """Least gradient steps of the part of Q that reads the state, and of the reward; 0: no fit."""
-    passes: float = 4.0
+    passes: float = 2.0
     """How often all rows are gone over at least: of many, the least steps would see a part only."""
     imagined_steps: int = 3
     """States are imagined 0 to this many ticks ahead, as far as the planner looks."""
