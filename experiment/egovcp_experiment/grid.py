@@ -2,7 +2,7 @@
 
 collect-TASK-COUNT
 train-TASK-MODEL-sSEED     from the data of a task, or under the task `all` from that of all
-play-TASK-VARIANT-sSEED    the planner with that model
+play-TASK-VARIANT-sSEED    the planner with that model; VARIANT is `default` where nothing differs
 references-TASK            hold, constant, random and oracle on the same scenarios
 bounds-TASK                the same without constant, whose search costs the most
 """
@@ -19,6 +19,9 @@ from egovcp_experiment.tools import ARTEFACT, COLLECT, PLAY, TRAIN
 
 #: The task of a model that learns all tasks, as egovcp-collect and egovcp-eval call them together.
 ALL: Final = "all"
+#: A model of a task's own data, trained and used as the configuration says: every experiment needs
+#: some, under whatever name it lists them.
+DEFAULT: Final = "default"
 #: Controllers of egovcp-eval that need no model.
 REFERENCES: Final = ("hold", "constant", "random", "oracle")
 #: Those of them that need no search either.
@@ -29,7 +32,7 @@ BOUNDS: Final = ("hold", "random", "oracle")
 class Model:
     """How a world model is trained."""
 
-    name: str = "default"
+    name: str = DEFAULT
     """Part of the names of cells."""
     flags: Flags = field(default_factory=dict)
     """What differs from the default, flags of egovcp-train."""
@@ -40,7 +43,7 @@ class Variant:
     """A model, and how it is used."""
 
     name: str
-    """Part of the names of cells."""
+    """Part of the names of cells, unless nothing differs from `DEFAULT`."""
     model: Model = field(default_factory=Model)
     """Its training."""
     play: Flags = field(default_factory=dict)
@@ -114,9 +117,11 @@ class Grid:
             variant: the model and its use.
             learned_from: the task, or `ALL`, that the model was trained on; empty: the one played.
         """
-        policy = self.model(learned_from or task, seed, variant.model)
+        teacher = learned_from or task
+        policy = self.model(teacher, seed, variant.model)
         flags = {**self.scenarios(task), "controllers": "planner", "policy.path": policy}
-        name = f"play-{task}-{variant.name}-s{seed}"
+        differs = variant.play or variant.model.flags or teacher != task
+        name = f"play-{task}-{variant.name if differs else DEFAULT}-s{seed}"
         return self.add(Cell(name, PLAY, {**flags, **variant.play}))
 
     def references(

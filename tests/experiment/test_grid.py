@@ -17,7 +17,7 @@ from egovcp_experiment.config import DataConfig, ExperimentConfig, PlayConfig, T
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.grid import ALL, Grid, Model, Variant
 from egovcp_experiment.scales import SCALES
-from egovcp_experiment.tools import COLLECT, PLAY, TRAIN
+from egovcp_experiment.tools import ARTEFACT, COLLECT, PLAY, TRAIN
 
 CONFIGS = {
     "egovcp_collect.collect": ("egovcp_collect.config", "CollectConfig"),
@@ -42,6 +42,17 @@ def test_variants_share_data_and_models() -> None:
     assert in_order(grid.cells) == tuple(grid.cells)
 
 
+def test_what_differs_in_nothing_is_played_once_for_all_experiments() -> None:
+    config = ExperimentConfig(tasks=("ball", "wall"))
+    found = {name: {c.name: c for c in e.cells(config)} for name, e in EXPERIMENTS.items()}
+    for name in ("generalise", "multitask", "planners", "ppo", "sample-efficiency"):
+        for task in ("ball", "wall"):
+            play = f"play-{task}-default-s0"
+            assert found[name][play].flags == found["ppo"][play].flags
+    mixed = found["multitask"]["play-ball-mixed-s0"].flags["policy.path"]
+    assert mixed == Output("train-all-default-s0", ARTEFACT)
+
+
 def test_what_is_there_already_is_not_made_again() -> None:
     data = DataConfig(roots={"ball": "data/ball"})
     grid = Grid(ExperimentConfig(data=data, train=TrainingConfig(policies={"wall": "a/wall"})))
@@ -49,8 +60,8 @@ def test_what_is_there_already_is_not_made_again() -> None:
     grid.play("wall", 0, Variant("plain"))
     assert names(grid.cells) == [
         "train-ball-default-s0",
-        "play-ball-plain-s0",
-        "play-wall-plain-s0",
+        "play-ball-default-s0",
+        "play-wall-default-s0",
     ]
     assert grid.cells[0].flags["dataset.root"] == Given("data/ball")
     assert grid.cells[2].flags["policy.path"] == Given("a/wall")
@@ -161,3 +172,11 @@ def test_parts_are_prefixes_of_one_dataset_as_large_as_the_largest() -> None:
     assert cells["collect-ball-2668"].flags["episodes"] == 2668
     parts = [c.flags["dataset.episodes"] for c in cells.values() if c.tool is TRAIN]
     assert parts == ["0:667", "0:2668"]
+
+
+def test_a_model_that_is_given_does_not_stand_for_one_of_all_episodes() -> None:
+    training = TrainingConfig(policies={"ball": "a/ball"})
+    config = ExperimentConfig(tasks=("ball", "wall"), data=DataConfig(parts=(1.0,)), train=training)
+    cells = EXPERIMENTS["sample-efficiency"].cells(config)
+    trained = [cell.name for cell in cells if cell.tool is TRAIN]
+    assert trained == ["train-ball-first_1334-s0", "train-wall-default-s0"]

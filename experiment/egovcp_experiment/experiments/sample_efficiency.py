@@ -42,14 +42,23 @@ def _grid(config: ExperimentConfig) -> Grid:
     return Grid(replace(config, data=data))
 
 
+def _model(config: ExperimentConfig, grid: Grid, task: str, part: float) -> Model:
+    """One that learns from a part. From all episodes it is the model that other experiments train,
+    unless they are given a model, or a dataset of whatever size."""
+    of_others = grid.config.data.episodes == config.data.episodes
+    given = task in config.train.policies or task in config.data.roots
+    if of_others and not given and _episodes(config, task, part) == _episodes(config, task, 1.0):
+        return Model()
+    flags = {"dataset.episodes": f"0:{_episodes(config, task, part)}"}
+    return Model(_name(config, task, part), flags)
+
+
 def _plays(config: ExperimentConfig, grid: Grid) -> dict[str, dict[float, list[str]]]:
     """Task -> part of the data -> names of its cells, one for each seed."""
     found: dict[str, dict[float, list[str]]] = {}
     for task in config.tasks:
         for part in config.data.parts:
-            name = _name(config, task, part)
-            flags = {"dataset.episodes": f"0:{_episodes(config, task, part)}"}
-            variant = Variant(name, Model(name, flags))
+            variant = Variant(_name(config, task, part), _model(config, grid, task, part))
             cells = [grid.play(task, seed, variant).name for seed in config.train.seeds]
             found.setdefault(task, {})[part] = cells
         grid.bounds(task)
