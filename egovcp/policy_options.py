@@ -42,6 +42,8 @@ class PlannerOptions:
     """Rounds of the search."""
     elites: int | None = None
     """Best candidates that the next round is fitted to."""
+    min_std: float | None = None
+    """Floor of the deviation that candidates are drawn with, in steps of the action process."""
     termination_rule: TerminationRule | None = None
     """What a failed plan's later values are: paper (0), shift (the data's worst return), survival
     (weighted with the probability of being alive)."""

@@ -70,6 +70,8 @@ class PlannerConfig:
             raise UsageError(f"elites ({self.elites}) exceed samples ({self.samples})")
         if not 0 < self.eta <= 2:
             raise UsageError(f"eta is {self.eta}; expected more than 0 and at most 2, the box")
+        if not self.min_std >= 0:
+            raise UsageError(f"min_std is {self.min_std}; expected at least 0")
         if self.temperature <= 0:
             raise UsageError(f"temperature is {self.temperature}; expected more than 0")
         if not 0 <= self.kept_elites <= 1:

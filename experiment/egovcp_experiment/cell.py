@@ -64,6 +64,8 @@ class Tool:
     """Name of the command in reports; empty: ``python -m MODULE``."""
     learns: bool = False
     """Whether it trains networks, which a GPU is for."""
+    alone: bool = False
+    """Whether it measures time, so that nothing may run beside it."""
 
 
 @dataclass(frozen=True)

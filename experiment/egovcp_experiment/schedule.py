@@ -96,16 +96,23 @@ class Schedule:
     def _start_some(self) -> bool:
         """Start what can be started; whether anything still waits for nothing but room."""
         for cell in self._waiting():
-            if len(self._running) >= self._jobs:
+            if not self._has_room(cell):
                 return True
             if not self._recall(cell):
                 self._start(cell)
         return bool(self._waiting())
 
+    def _has_room(self, cell: Cell) -> bool:
+        busy = [running.cell.tool for running in self._running]
+        if cell.tool.alone or any(tool.alone for tool in busy):
+            return not busy
+        return len(busy) < self._jobs
+
     def _waiting(self) -> list[Cell]:
-        """Cells that could begin now."""
+        """Cells that could begin now; those that must be alone come last, lest the room beside a
+        long cell stay empty for them."""
         busy = {running.cell.name for running in self._running}
-        return [
+        ready = [
             cell
             for cell in self._cells
             if cell.name not in self.records
@@ -113,6 +120,7 @@ class Schedule:
             and cell.name not in busy
             and all(name in self.records for name in cell.needs)
         ]
+        return sorted(ready, key=lambda cell: cell.tool.alone)
 
     def _start(self, cell: Cell) -> None:
         argv = self._store.prepare(cell, self.records)

@@ -128,13 +128,14 @@ PLAY: Final = Tool(
 )
 
 
-def study(name: str) -> Tool:
-    """A study of this package, ``egovcp_experiment.studies.NAME``."""
+def study(name: str, alone: bool = False) -> Tool:
+    """A study of this package, ``egovcp_experiment.studies.NAME``; alone: it measures time."""
     return Tool(
         module=f"egovcp_experiment.studies.{name}",
         output="output_dir",
         figures=lambda folder: dict(read_json(folder / RESULT)),
         digest=lambda folder: sha256(folder / RESULT),
+        alone=alone,
     )
 
 

@@ -62,8 +62,11 @@ def test_planner_options_change_only_what_they_name() -> None:
     assert (changed.samples, changed.horizon) == (128, 6)
     other = PlannerOptions(optimiser="icem", backend="float32").apply(own)
     assert (other.optimiser, other.backend, other.samples) == ("icem", "float32", 512)
+    assert PlannerOptions(min_std=0.05).apply(own) == replace(own, min_std=0.05)
     with pytest.raises(UsageError):
         PlannerOptions(samples=8).apply(own)  # fewer than the elites
+    with pytest.raises(UsageError, match="min_std is -1"):
+        PlannerOptions(min_std=-1).apply(own)
 
 
 def test_played_scenarios_are_never_collected_ones_and_search_sees_none_of_them() -> None:

@@ -96,7 +96,7 @@ def test_the_horizon_of_a_task_goes_with_its_data() -> None:
     assert [d.get("return_steps") for d in mixed["datasets"]] == [None, None, 50]
 
 
-@pytest.mark.parametrize("name", ["interpret", "multitask", "variance"])
+@pytest.mark.parametrize("name", ["interpret", "multitask", "planners", "variance"])
 def test_studies_plan_as_egovcp_eval_does(name: str) -> None:
     config = replace(
         ExperimentConfig(), play=PlayConfig(flags=("--planner.samples=256", "--num_workers=1"))
@@ -106,6 +106,13 @@ def test_studies_plan_as_egovcp_eval_does(name: str) -> None:
     for cell in studies:
         assert cell.flags["planner.samples"] == "256"
         assert "num_workers" not in cell.flags
+
+
+def test_searches_are_timed_alone() -> None:
+    cells = EXPERIMENTS["planners"].cells(ExperimentConfig())
+    assert {c.name for c in cells if c.tool.alone} == {
+        f"plan_time-{task}" for task in ("ball", "wall", "arch")
+    }
 
 
 def test_unknown_variants_and_tasks_are_named() -> None:

@@ -7,6 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -90,6 +91,24 @@ def test_independent_cells_run_side_by_side(cell: MakeCell, tmp_path: Path) -> N
     cells = [cell("a", wait=60), cell("b", wait=60)]
     with pytest.raises(KeyboardInterrupt):
         interrupted(cells, tmp_path / "out", jobs=2)
+
+
+def test_what_measures_time_runs_alone_and_after_what_can_share(
+    cell: MakeCell, tmp_path: Path
+) -> None:
+    shared = cell("t", wait=0.3)
+    timing = replace(shared, tool=replace(shared.tool, alone=True))
+    other = replace(timing, name="u")
+    after = cell("c", add=Found("u", ("total",)))
+    said: list[str] = []
+    cells = [timing, other, cell("a", wait=0.5), cell("b", wait=0.1), after]
+    run(cells, tmp_path / "out", jobs=3, say=said.append)
+    told = [line.partition(", ")[2] for line in said]
+    order = [f"{t.partition(':')[0]} {t.partition(': ')[2].split()[0]}" for t in told]
+    assert order[:2] == ["a begins;", "b begins;"]
+    assert sorted(order[2:4]) == ["a done", "b done"]
+    assert order[4:8] == ["t begins;", "t done", "u begins;", "u done"]
+    assert order[8:] == ["c begins;", "c done"]
 
 
 def test_an_interrupt_stops_cleanly_and_the_same_cells_go_on(

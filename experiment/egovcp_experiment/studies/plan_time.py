@@ -10,7 +10,7 @@ import statistics
 import sys
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
 import numpy as np
@@ -20,6 +20,7 @@ from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.plan import PlannerConfig, Policy
 from egovcp.plan.config import OptimiserName
+from egovcp.policy_options import PlannerOptions
 from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, STATE_DIM
 from egovcp_experiment.studies.study import StudyConfig, finish
 
@@ -36,13 +37,14 @@ SEARCHES: Final[Mapping[str, tuple[OptimiserName, int]]] = {
 _FEW: Final = 256
 _MANY: Final = 1024
 _STEP: Final = 32  # candidates are a multiple of it
-_ELITE_SHARE: Final = 16  # candidates per elite, as in the paper: 1024 and 64
 
 
 @dataclass(frozen=True)
 class PlanTimeConfig(StudyConfig):
     """Find the candidates that each search affords in equal time."""
 
+    planner: PlannerOptions = field(default_factory=PlannerOptions)
+    """Changes to the artefact's planner, whose share of elites all searches keep."""
     budget_ms: float = 40.0
     """Time for a plan of one robot, ms."""
     rounds: int = 9
@@ -53,7 +55,7 @@ def measure(config: PlanTimeConfig) -> None:
     """Time the searches and write what each affords."""
     if config.budget_ms <= 0 or config.rounds < 1:
         raise UsageError("--budget_ms must be above 0, and --rounds at least 1")
-    artefact = config.load()
+    artefact = config.load(config.planner)
     policies = {
         (name, samples): _policy(artefact, name, samples)
         for name in SEARCHES
@@ -61,7 +63,9 @@ def measure(config: PlanTimeConfig) -> None:
     }
     times = _in_turns(policies, config.rounds)
     searches = {
-        name: _afforded(name, times[name, _FEW], times[name, _MANY], config.budget_ms)
+        name: _afforded(
+            artefact.planner, name, times[name, _FEW], times[name, _MANY], config.budget_ms
+        )
         for name in SEARCHES
     }
     finish(config, {"budget_ms": config.budget_ms, "searches": searches})
@@ -75,10 +79,18 @@ def _policy(artefact: Artefact, search: str, samples: int) -> Policy:
 
 def _planner(planner: PlannerConfig, search: str, samples: int) -> PlannerConfig:
     optimiser, iterations = SEARCHES[search]
-    elites = max(1, samples // _ELITE_SHARE)
     return replace(
-        planner, optimiser=optimiser, iterations=iterations, samples=samples, elites=elites
+        planner,
+        optimiser=optimiser,
+        iterations=iterations,
+        samples=samples,
+        elites=_elites(planner, samples),
     )
+
+
+def _elites(planner: PlannerConfig, samples: int) -> int:
+    """As large a share of the candidates as the planner's own."""
+    return max(1, samples * planner.elites // planner.samples)
 
 
 def _in_turns[K](policies: Mapping[K, Policy], rounds: int) -> dict[K, float]:
@@ -95,7 +107,9 @@ def _in_turns[K](policies: Mapping[K, Policy], rounds: int) -> dict[K, float]:
     return {key: statistics.median(values) for key, values in times.items()}
 
 
-def _afforded(search: str, few_ms: float, many_ms: float, budget_ms: float) -> dict[str, Any]:
+def _afforded(
+    planner: PlannerConfig, search: str, few_ms: float, many_ms: float, budget_ms: float
+) -> dict[str, Any]:
     """The largest number of candidates whose plan is in time; at least one elite's worth."""
     optimiser, iterations = SEARCHES[search]
     slope = max((many_ms - few_ms) / (_MANY - _FEW), 1e-9)
@@ -105,7 +119,7 @@ def _afforded(search: str, few_ms: float, many_ms: float, budget_ms: float) -> d
         "optimiser": optimiser,
         "iterations": iterations,
         "samples": samples,
-        "elites": max(1, samples // _ELITE_SHARE),
+        "elites": _elites(planner, samples),
         "plan_ms": few_ms + slope * (samples - _FEW),
         "measured_ms": {str(_FEW): few_ms, str(_MANY): many_ms},
     }
