@@ -98,8 +98,9 @@ def small() -> ExperimentConfig:
             return_steps={"arch": 50},
         ),
         # A step of this walk may cross the whole box: elites are far apart, and the mean of many is
-        # none of them (docs/planner.md). The budget is about what 256 candidates take on one core.
-        play=PlayConfig(budget_ms=8.0, flags=("--planner.samples=256", "--planner.elites=4")),
+        # none of them (docs/planner.md). The budget is a little more than 256 candidates take on
+        # one core.
+        play=PlayConfig(budget_ms=12.0, flags=("--planner.samples=256", "--planner.elites=4")),
     )
 
 

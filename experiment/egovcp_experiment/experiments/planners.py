@@ -73,6 +73,7 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
     parts: list[Any] = [
         f"Searches: each weighs as many candidates as a plan of one robot affords in "
         f"{config.play.budget_ms:g} ms on the machine below, by a timing of all of them in turns. "
+        "Elites are as many as the planner has, and at most half of the candidates. "
         "`cem_1` and `cem_6` are `cem` with that many rounds instead of 3. "
         "Rules: the artefact's own search; `ensemble_mean` differs only where Q has several heads."
     ]

@@ -44,7 +44,7 @@ class PlanTimeConfig(StudyConfig):
     """Find the candidates that each search affords in equal time."""
 
     planner: PlannerOptions = field(default_factory=PlannerOptions)
-    """Changes to the artefact's planner, whose share of elites all searches keep."""
+    """Changes to the artefact's planner, whose number of elites all searches keep."""
     budget_ms: float = 40.0
     """Time for a plan of one robot, ms."""
     rounds: int = 9
@@ -89,8 +89,9 @@ def _planner(planner: PlannerConfig, search: str, samples: int) -> PlannerConfig
 
 
 def _elites(planner: PlannerConfig, samples: int) -> int:
-    """As large a share of the candidates as the planner's own."""
-    return max(1, samples * planner.elites // planner.samples)
+    """As many as the planner's own, for it is their number that decides what their mean is worth
+    (docs/planner.md), and at most half of the candidates."""
+    return min(planner.elites, samples // 2)
 
 
 def _in_turns[K](policies: Mapping[K, Policy], rounds: int) -> dict[K, float]:

@@ -23,16 +23,16 @@ def test_the_line_through_two_times(few: float, many: float, budget: float, samp
     planner = PlannerConfig(samples=256, elites=4)
     found = plan_time._afforded(planner, "cem", few, many, budget)
     assert found["samples"] == samples
-    assert found["elites"] == max(1, samples // 64)  # the planner's share
+    assert found["elites"] == 4  # the planner's number
     assert found["plan_ms"] == pytest.approx(2 + samples / 32)
 
 
 def test_every_search_is_timed_and_can_be_played(flags: list[str], tmp_path: Path) -> None:
     only = [f for f in flags if f.startswith(("--policy", "--output"))]
-    share = ["--planner.samples=256", "--planner.elites=4"]
-    assert plan_time.main([*only, *share, "--rounds=1", "--budget_ms=20"]) == 0
+    planner = ["--planner.samples=256", "--planner.elites=20"]
+    assert plan_time.main([*only, *planner, "--rounds=1", "--budget_ms=20"]) == 0
     found = read_json(tmp_path / "out" / "result.json")["searches"]
     assert set(found) == set(plan_time.SEARCHES)
     for row in found.values():
-        assert row["elites"] == max(1, row["samples"] // 64)
+        assert row["elites"] == min(20, row["samples"] // 2)
         PlannerConfig(**{k: row[k] for k in ("optimiser", "iterations", "samples", "elites")})
