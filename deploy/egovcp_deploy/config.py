@@ -61,7 +61,7 @@ class DeployConfig:
     """The policy artefact; not needed without the controller `planner`."""
     controller: str = PLANNER
     """Who drives: planner, or in simulation a reference that needs no artefact: hold (neutral
-    pose), random (the data's walk) or oracle (scripted, sees the truth)."""
+    pose), random (the paper's walk) or oracle (scripted, sees the truth)."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     """Changes to the artefact's planner."""
     robot: RobotOptions = field(default_factory=RobotOptions)

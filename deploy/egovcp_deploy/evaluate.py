@@ -87,7 +87,7 @@ class EvalConfig:
     """Which held-out scenarios."""
     controllers: str = ",".join(CONTROLLERS)
     """Who plays, separated by commas: planner, hold (neutral pose), constant (best fixed action),
-    random (the data's walk), oracle (scripted, sees the truth), ppo (learned without a model)."""
+    random (the paper's walk), oracle (scripted, sees the truth), ppo (learned without a model)."""
     constant: ConstantOptions = field(default_factory=ConstantOptions)
     """The reference `constant`."""
     ppo: PpoOptions = field(default_factory=PpoOptions)

@@ -1,4 +1,4 @@
-"""Reference policies that need no learning: hold, constant, the data's random walk.
+"""Reference policies that need no learning: hold, constant, random walks.
 
 A policy sees the environment, scripted oracles even its truth, and returns normalised
 actions (B, 7); the environment applies the same delays and rate limits to all of them.
@@ -65,11 +65,11 @@ class Hold(Constant):
 class RandomWalk:
     """The behaviour policy of the data: a_t = a_{t-1} + eta delta, delta ~ U(-1, 1)^7.
 
-    (Paper section III-B.) ``reflect`` folds what leaves the box back inside, which keeps
-    the walk's distribution uniform; ``clip`` piles it up on the walls. The next step comes
-    ``step_ticks`` (least, most) ticks after the last one, drawn anew each time. A step beyond the
-    environment's rate limit is sent as a ramp: an action then says where the hands will be for a
-    while, and its return what that was worth.
+    By default the paper's (section III-B). ``reflect`` folds what leaves the box back inside,
+    which keeps the walk's distribution uniform; ``clip`` piles it up on the walls. The next step
+    comes ``step_ticks`` (least, most) ticks after the last one, drawn anew each time. A step
+    beyond the environment's rate limit is sent as a ramp: an action then says where the hands will
+    be for a while, and its return what that was worth.
     """
 
     def __init__(
@@ -97,6 +97,27 @@ class RandomWalk:
             self._action[row] = 0.0
             self._wait[row] = 0
             self._rngs[row] = scenario.rng("policy")
+
+    def stand(self, action: Array, rngs: Sequence[np.random.Generator]) -> None:
+        """Every row stands at its ``action`` (B, 7), as if looked at by chance: somewhere in a
+        rest, a long one more likely than a short one. What follows is drawn from its own ``rngs``.
+        """
+        self._action = np.zeros((len(action), ACTION_DIM))
+        self._wait = np.zeros(len(action), dtype=np.int64)
+        self._rngs = list(rngs)
+        self.stand_rows(range(len(action)), action)
+
+    def stand_rows(self, rows: Sequence[int], action: Array) -> None:
+        """`stand`, for ``rows`` alone, with the randomness they have."""
+        for row, at in zip(rows, action, strict=True):
+            self._action[row] = at
+            self._wait[row] = self._rest(self._rngs[row])
+
+    def _rest(self, rng: np.random.Generator) -> int:
+        """What is left of a rest, ticks."""
+        least, most = self._step_ticks
+        rests = np.arange(least, most + 1)
+        return int(rng.integers(rng.choice(rests, p=rests / rests.sum())))
 
     def act(self, env: VectorEnv) -> Array:
         """(B, 7) the next step of each row's walk."""

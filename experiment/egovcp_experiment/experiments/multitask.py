@@ -132,9 +132,7 @@ def _levels_plot(levels: Mapping[str, Mapping[str, float]]) -> Plot:
         axes.set_ylabel("reward, 0 random, 1 oracle")
         axes.legend(fontsize=8)
 
-    return drawn(
-        "normalised", "Reward per step: 0 the data's walk, 1 the oracle", paint, (5.0, 3.0)
-    )
+    return drawn("normalised", "Reward per step: 0 a random walk, 1 the oracle", paint, (5.0, 3.0))
 
 
 def _maps(latents: Mapping[str, Any]) -> Plot:

@@ -19,6 +19,7 @@ from egovcp_experiment.studies.residuals import STEPS
 from egovcp_experiment.tools import study
 
 _HORIZONS: Final = tuple(range(1, STEPS + 1))
+_WALK: Final = ("--eta", "--step_ticks", "--boundary")  # flags of egovcp-collect
 _PLANS: Final = {"planner": "plans that the planner chose", "random": "random plans"}
 
 
@@ -31,7 +32,9 @@ def _residuals(config: ExperimentConfig, grid: Grid, task: str) -> str:
         "branches": config.play.branches,
         "seed": config.play.seed,
     }
-    return grid.add(Cell(f"residuals-{task}", study("residuals"), flags, config.scenes)).name
+    walk = tuple(flag for flag in config.data.flags if flag.partition("=")[0] in _WALK)
+    more = (*config.scenes, *walk)
+    return grid.add(Cell(f"residuals-{task}", study("residuals"), flags, more)).name
 
 
 def _plays(config: ExperimentConfig, grid: Grid, task: str) -> dict[int, list[str]]:

@@ -4,8 +4,9 @@
 
 Q^ is what the model says along a plan that it imagines. Q is what the data's random walk earns from
 there: the simulator is brought to the same state again, follows the plan up to a_k, and walks on at
-random, several times over. The mean of these returns has an error of its own, whose variance is
-known and taken off; errors of different k come from different walks and do not mix.
+random, several times over. Where the data's walk rests between its steps, a_k may be anywhere in a
+rest: how long that goes on is drawn, too. The mean of these returns has an error of its own, whose
+variance is known and taken off; errors of different k come from different walks and do not mix.
 
 Two kinds of plans: the planner's own, which were chosen for their Q^, and random ones.
 """
@@ -15,7 +16,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 import torch
@@ -29,8 +30,9 @@ from egovcp.model import Carry, WorldModel
 from egovcp.plan.process import walk
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import StepResult, VectorEnv
+from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import ACTION_DIM, ACTION_ETA, reflect
+from egovcp.spec import ACTION_DIM, ACTION_ETA
 from egovcp.trained import returns_of
 from egovcp_experiment.studies.study import finish
 from egovcp_experiment.studies.watching import Moment, WatchConfig, Watcher, watch
@@ -50,6 +52,16 @@ class ResidualsConfig(WatchConfig):
 
     branches: int = 12
     """Random walks that the worth of a step is the mean of."""
+    eta: float = ACTION_ETA
+    """egovcp-collect's, of the data that Q was trained on; so are the next two."""
+    step_ticks: tuple[int, int] = (1, 1)
+    """Shortest and longest time from one step of the walk to the next, planner ticks."""
+    boundary: Literal["reflect", "clip"] = "reflect"
+    """What keeps the walk inside the action box."""
+
+    def walk(self) -> RandomWalk:
+        """The data's."""
+        return RandomWalk(self.eta, self.boundary, self.step_ticks)
 
 
 @dataclass
@@ -69,8 +81,9 @@ class _Point:
 class _Points(Watcher):
     """Keeps one moment of every episode."""
 
-    def __init__(self, task: str, model: WorldModel, seed: int) -> None:
-        self._after, self._model = _AFTER[task], model
+    def __init__(self, task: str, artefact: Artefact, seed: int) -> None:
+        self._after, self._model = _AFTER[task], artefact.world_model
+        self._eta = artefact.planner.eta
         self._generator = torch.Generator().manual_seed(seed)
         self.points: list[_Point] = []
 
@@ -96,7 +109,7 @@ class _Points(Watcher):
         executed = torch.as_tensor(start, dtype=torch.float32)
         plans = {
             "planner": moment.step.plan[row].astype(np.float64),
-            "random": walk(executed, deltas, ACTION_ETA).double().numpy(),
+            "random": walk(executed, deltas, self._eta).double().numpy(),
         }
         carry = moment.policy.carry.row(row)
         values = {kind: _values(self._model, carry, plan) for kind, plan in plans.items()}
@@ -121,8 +134,14 @@ def measure(config: ResidualsConfig) -> None:
         raise UsageError(f"--task={config.task}: expected one of {', '.join(_AFTER)}")
     if config.branches < 2:
         raise UsageError(f"--branches={config.branches}: expected at least 2")
+    least, most = config.step_ticks
+    if not 1 <= least <= most or not 0 < config.eta <= 2:
+        raise UsageError(
+            f"--eta={config.eta} --step_ticks={[least, most]}: expected a step within the box, at "
+            "most 2, and 1 <= shortest <= longest; the data's card says how its walk stepped"
+        )
     artefact = config.artefact()
-    points = _Points(config.task, artefact.world_model, config.seed)
+    points = _Points(config.task, artefact, config.seed)
     longest = replace(artefact, planner=replace(artefact.planner, horizon=STEPS))
     watch(longest, config.env, config, points)
     returns = _returns(artefact)
@@ -130,7 +149,8 @@ def measure(config: ResidualsConfig) -> None:
     for number, point in enumerate(tqdm(points.points, unit="plan", desc="branch")):
         for kind, plan in point.plans.items():
             rng = np.random.default_rng([config.seed, number])
-            worth = _branches(config.env, point, plan, config.branches, rng, *returns)
+            rngs = rng.spawn(STEPS * config.branches)
+            worth = _branches(config.env, point, plan, config.walk(), rngs, *returns)
             found.setdefault(kind, []).append(Residuals(point.values[kind], *worth))
     finish(
         config,
@@ -156,24 +176,26 @@ def _branches(
     env_config: EnvConfig,
     point: _Point,
     plan: Array,
-    branches: int,
-    rng: np.random.Generator,
+    walk: RandomWalk,
+    rngs: Sequence[np.random.Generator],
     gamma: float,
     steps: int,
 ) -> tuple[Array, Array]:
     """(STEPS, branches) returns over ``steps`` ticks, and to the end of the episode, from each step
-    of the plan on."""
-    rows = STEPS * branches
+    of the plan on; each of (STEPS * branches) ``rngs`` makes one branch."""
+    rows = len(rngs)
     env = VectorEnv(env_config, rows, pictures=False)
     env.reset([point.scenario] * rows)
     for action in point.sent:
         env.step(np.tile(action, (rows, 1)))
-    own = np.repeat(np.arange(STEPS), branches)  # the step of the plan that a row is about
+    own = np.repeat(np.arange(STEPS), rows // STEPS)  # the step of the plan that a row is about
     short, whole = np.zeros(rows), np.zeros(rows)
+    walk.stand(np.zeros((rows, ACTION_DIM)), rngs)
     age = 0
     while not env.done.all():
-        delta = rng.uniform(-1.0, 1.0, (rows, ACTION_DIM))
-        action = reflect(env.sent_action + ACTION_ETA * delta)
+        over = np.flatnonzero(own == age - 1)
+        walk.stand_rows(over.tolist(), env.sent_action[over])
+        action = walk.act(env)
         planned = own >= age
         action[planned] = plan[min(age, STEPS - 1)]
         reward = env.step(action).reward
@@ -183,7 +205,7 @@ def _branches(
         short += np.where(since < steps, discount, 0.0) * reward
         age += 1
     env.close()
-    return short.reshape(STEPS, branches), whole.reshape(STEPS, branches)
+    return short.reshape(STEPS, -1), whole.reshape(STEPS, -1)
 
 
 CONFIG = ResidualsConfig

@@ -42,6 +42,19 @@ def test_a_walk_steps_as_often_as_it_is_told(env: VectorEnv) -> None:
     assert np.abs(actions).max() <= 1.0
 
 
+def test_who_is_looked_at_by_chance_is_likelier_in_a_long_rest(env: VectorEnv) -> None:
+    """Rests of 1 and 2 ticks, equally many: a tick is the only one of a rest, the first of two or
+    the last of two with the same probability, and a step follows at once in two cases of three."""
+    policy, rows = RandomWalk(step_ticks=(1, 2)), 3000
+    stood = np.full((rows, ACTION_DIM), 0.2)
+    policy.stand(stood, np.random.default_rng(0).spawn(rows))
+    waits = np.isclose(policy.act(env), stood).all(-1)
+    assert waits.mean() == pytest.approx(1 / 3, abs=0.03)
+    assert not np.isclose(policy.act(env), stood)[waits].all(-1).any()
+    policy.stand_rows([1], np.full((1, ACTION_DIM), -0.2))
+    np.testing.assert_allclose(policy.act(env)[1], -0.2, atol=ACTION_ETA)
+
+
 def test_a_walk_is_its_scenarios(env: VectorEnv) -> None:
     np.testing.assert_array_equal(
         walk(env, RandomWalk(), 5, first=0)[:, 2], walk(env, RandomWalk(), 5, first=2)[:, 0]
