@@ -97,9 +97,8 @@ def small() -> ExperimentConfig:
             # an arch is passed seconds after one has to crouch for it
             return_steps={"arch": 50},
         ),
-        # A step of this walk may cross the whole box: elites are far apart, and the mean of many is
-        # none of them (docs/planner.md). The budget is a little more than 256 candidates take on
-        # one core.
+        # Four elites earn more than 16 on all tasks (docs/planner.md). The budget is a little more
+        # than 256 candidates take on one core.
         play=PlayConfig(budget_ms=12.0, flags=("--planner.samples=256", "--planner.elites=4")),
     )
 
