@@ -8,7 +8,7 @@ from egovcp.artefact import Artefact, load_artefact
 from egovcp.errors import UsageError
 from egovcp.plan import PlannerConfig, require_answers
 from egovcp.plan.choices import Ensemble, Latent
-from egovcp.plan.config import BackendName, Objective, OptimiserName, TerminationRule
+from egovcp.plan.config import BackendName, Objective, OptimiserName, Process, TerminationRule
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,9 @@ class PlannerOptions:
     """Best candidates that the next round is fitted to."""
     min_std: float | None = None
     """Floor of the deviation that candidates are drawn with, in steps of the action process."""
+    process: Process | None = None
+    """What candidates are made of: walk (a step in every tick), or ramp (to a place to rest at, as
+    in data collected with longer --step_ticks)."""
     termination_rule: TerminationRule | None = None
     """What a failed plan's later values are: paper (0), shift (the data's worst return), survival
     (weighted with the probability of being alive)."""

@@ -10,6 +10,7 @@ from egovcp.errors import UsageError
 from egovcp.plan.choices import Ensemble, Latent
 
 Objective = Literal["value", "reward", "td"]
+Process = Literal["walk", "ramp"]
 TerminationRule = Literal["paper", "shift", "survival"]
 OptimiserName = Literal["cem", "icem", "mppi", "shooting"]
 BackendName = Literal["auto", "eager", "float32", "bfloat16", "int8", "compile"]
@@ -35,6 +36,10 @@ class PlannerConfig:
     """Floor of the sampling deviation, in units of delta."""
     eta: float = spec.ACTION_ETA
     """Step of the action process, box units per tick."""
+    process: Process = "walk"
+    """What candidates are made of. walk: a step of its own in every tick, as the paper's data;
+    ramp: the steps drawn add up to one place, to which it goes by eta a tick and where it rests, as
+    data collected with longer --step_ticks. Its first action is found with fewer candidates."""
     termination_threshold: float = 0.9
     """A candidate whose termination probability exceeds this loses its later values."""
     termination_rule: TerminationRule = "shift"

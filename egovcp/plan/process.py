@@ -1,4 +1,4 @@
-"""The action process of the data: a random walk in the box, folded back at its walls."""
+"""The action processes of the data: random walks in the box, folded back at its walls."""
 
 from __future__ import annotations
 
@@ -19,6 +19,18 @@ def walk(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
         action = reflect(action + eta * delta)
         actions.append(action)
     return torch.stack(actions, -2)
+
+
+def ramp(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
+    """Steps (..., N, 7) from ``start`` (..., 7) that go by ``eta`` a tick to where ``deltas`` would
+    lead in all, folded back into the box, and rest there: the process of data whose walk rests.
+
+    Steps of this kind are returned as they are.
+    """
+    target = reflect((start + eta * deltas.sum(-2)).clamp(-3.0, 3.0))
+    far = ((target - start) / eta)[..., None, :]
+    ticks = torch.arange(deltas.shape[-2], dtype=far.dtype, device=far.device)[:, None]
+    return (far.abs() - ticks).clamp(0.0, 1.0) * far.sign()
 
 
 def shift(deltas: Tensor) -> Tensor:

@@ -1,9 +1,9 @@
 """Value-guided sampling MPC (paper section III-D): draw plans, judge them, draw better ones.
 
 Candidates live in the action process of the data, a_k = a_{k-1} + eta * delta_k with
-delta in [-1, 1]^7 starting at the last executed action: anything else would ask Q about
-actions it never saw. A search is pure: no I/O, no global state, and no clock but the one that
-it is given.
+delta in [-1, 1]^7 starting at the last executed action (where the data rests between its steps, in
+ramps to a place to rest at): anything else would ask Q about actions it never saw. A search is
+pure: no I/O, no global state, and no clock but the one that it is given.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.plan.config import PlannerConfig
 from egovcp.plan.objective import Judge
-from egovcp.plan.process import walk
+from egovcp.plan.process import ramp, walk
 
 
 class Belief(NamedTuple):
@@ -108,6 +108,8 @@ def make_plan[C](
     start = executed[:, None]  # (E, 1, 7)
     for iteration in range(config.iterations):
         deltas = optimiser.propose(belief, iteration, generator)  # (E, M, N, 7)
+        if config.process == "ramp":
+            deltas = ramp(start, deltas, config.eta)
         values = worth(walk(start, deltas, config.eta), generator)
         values = values.masked_fill(~values.isfinite(), -torch.inf)
         belief = optimiser.learn(belief, deltas, values)

@@ -1,4 +1,4 @@
-"""Searches on equal time, and the rules after a failure, with one model and the same scenarios."""
+"""Searches on equal time, and other choices of a planner, with one model and the same scenarios."""
 
 from __future__ import annotations
 
@@ -22,6 +22,8 @@ RULES: Final[dict[str, Flags]] = {
     "rule_paper": {"planner.termination_rule": "paper"},
     "rule_shift": {"planner.termination_rule": "shift"},
     "rule_survival": {"planner.termination_rule": "survival"},
+    "process_walk": {"planner.process": "walk"},
+    "process_ramp": {"planner.process": "ramp"},
     "latent_sample": {"planner.latent": "sample"},
     "ensemble_mean": {"planner.ensemble": "mean"},
 }

@@ -13,7 +13,7 @@ from egovcp.model import Carry
 from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
 from egovcp.plan.config import TerminationRule
 from egovcp.plan.objective import Dynamics, evaluate
-from egovcp.plan.process import reflect, shift, walk
+from egovcp.plan.process import shift, walk
 from egovcp.testing import Point, PointWorld, ScriptedWorld, toy_model
 
 ETA = spec.ACTION_ETA
@@ -50,26 +50,6 @@ def _plan(
 
 def _random(rows: int, seed: int, scale: float = 1.0) -> Tensor:
     return scale * (2 * torch.rand(rows, spec.ACTION_DIM, generator=_generator(seed)) - 1)
-
-
-# --- the action process -----------------------------------------------------------------
-def test_the_walk_stays_in_the_box_and_steps_within_eta() -> None:
-    start, deltas = _random(500, 0), 2 * torch.rand(500, 6, 7, generator=_generator(1)) - 1
-    actions = walk(start, deltas, ETA)
-    assert actions.abs().max() <= 1
-    before = torch.cat([start[:, None], actions[:, :-1]], 1)
-    assert (actions - before).abs().max() <= ETA + 1e-6
-
-
-def test_the_walk_far_from_the_walls_is_a_sum() -> None:
-    deltas = torch.full((1, 3, 7), 0.5)
-    steps = torch.arange(1, 4)[None, :, None] * 0.5 * ETA
-    torch.testing.assert_close(walk(torch.zeros(1, 7), deltas, ETA), steps.expand(1, 3, 7))
-
-
-@pytest.mark.parametrize(("x", "inside"), [(1.2, 0.8), (-1.3, -0.7), (0.4, 0.4), (1.0, 1.0)])
-def test_reflection_folds_at_the_walls(x: float, inside: float) -> None:
-    assert reflect(torch.tensor(x)).item() == pytest.approx(inside)
 
 
 # --- the search ---------------------------------------------------------------------------
