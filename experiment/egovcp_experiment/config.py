@@ -81,6 +81,9 @@ class PlayConfig:
     """Time for a plan, where searches are compared on equal time, ms."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-eval; studies that play take those of the planner, too."""
+    task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Flags after those where the model of one task plays (all: the multi-task model), '{ball:
+    [--planner.process=ramp]}'."""
 
 
 @dataclass(frozen=True)
@@ -193,9 +196,11 @@ class ExperimentConfig:
             if task not in TASKS:
                 raise UsageError(f"unknown task --tasks={task}{suggest(task, TASKS)}")
         known = (*TASKS, "all")
-        for task in self.train.task_flags:
-            if task not in known:
-                raise UsageError(f"unknown task {task} in --train.task_flags{suggest(task, known)}")
+        for part, given in (("train", self.train.task_flags), ("play", self.play.task_flags)):
+            for task in given:
+                if task not in known:
+                    found = suggest(task, known)
+                    raise UsageError(f"unknown task {task} in --{part}.task_flags{found}")
         for task in self.train.return_steps:
             if task not in TASKS:
                 raise UsageError(

@@ -119,7 +119,8 @@ class Grid:
         """
         teacher = learned_from or task
         policy = self.model(teacher, seed, variant.model)
-        flags = {**self.scenarios(task), "controllers": "planner", "policy.path": policy}
+        own = _named(self.config.play.task_flags.get(teacher, ()))
+        flags = {**self.scenarios(task), **own, "controllers": "planner", "policy.path": policy}
         differs = variant.play or variant.model.flags or teacher != task
         name = f"play-{task}-{variant.name if differs else DEFAULT}-s{seed}"
         return self.add(Cell(name, PLAY, {**flags, **variant.play}))
@@ -146,10 +147,11 @@ class Grid:
         """`BOUNDS` on the same scenarios as the planner."""
         return self.references(task, f"bounds-{task}", who=BOUNDS)
 
-    @property
-    def planner(self) -> Flags:
-        """Flags that change the artefact's planner, for studies that play."""
-        given = _named(self.config.play.flags)
+    def planner(self, task: str) -> Flags:
+        """Flags that change the planner of the model of ``task``, or `ALL`, for studies that
+        play."""
+        config = self.config.play
+        given = _named((*config.flags, *config.task_flags.get(task, ())))
         return {name: value for name, value in given.items() if name.startswith("planner.")}
 
     def scenarios(self, task: str) -> Flags:

@@ -86,6 +86,22 @@ def test_a_task_has_the_last_word_on_how_its_models_are_trained() -> None:
     assert {f["threads"] for f in trained} == {"1"}
 
 
+def test_a_task_has_the_last_word_on_how_its_models_play() -> None:
+    flags = {"arch": ("--planner.elites=8",), ALL: ("--planner.elites=16",)}
+    play = PlayConfig(flags=("--planner.elites=4", "--planner.samples=64"), task_flags=flags)
+    grid = Grid(ExperimentConfig(play=play))
+    played = [
+        grid.play("arch", 0, Variant("plain"), learned_from=learned_from).flags
+        for learned_from in ("ball", "arch", ALL)
+    ]
+    assert [f["planner.elites"] for f in played] == ["4", "8", "16"]
+    assert {f["planner.samples"] for f in played} == {"64"}
+    assert [grid.planner(t)["planner.elites"] for t in ("ball", "arch", ALL)] == ["4", "8", "16"]
+    assert grid.references("arch").flags["planner.elites"] == "4"
+    varied = Variant("varied", play={"planner.elites": 2})
+    assert grid.play("arch", 0, varied).flags["planner.elites"] == 2
+
+
 def test_the_horizon_of_a_task_goes_with_its_data() -> None:
     training = TrainingConfig(flags=("--returns.steps=20",), return_steps={"arch": 50})
     grid = Grid(ExperimentConfig(train=training))
@@ -122,6 +138,8 @@ def test_unknown_variants_and_tasks_are_named() -> None:
         ExperimentConfig(output_dir="x", tasks=("bal",)).check()
     with pytest.raises(UsageError, match=r"--train\.task_flags; did you mean 'wall'"):
         ExperimentConfig("x", train=TrainingConfig(task_flags={"wal": ()})).check()
+    with pytest.raises(UsageError, match=r"--play\.task_flags; did you mean 'wall'"):
+        ExperimentConfig("x", play=PlayConfig(task_flags={"wal": ()})).check()
     with pytest.raises(UsageError, match=r"--train\.return_steps; did you mean 'wall'"):
         ExperimentConfig("x", train=TrainingConfig(return_steps={"wal": 20})).check()
 

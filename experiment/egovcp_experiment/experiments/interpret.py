@@ -33,7 +33,7 @@ def _studied(config: ExperimentConfig, grid: Grid) -> dict[tuple[str, str], str]
             if tasks and task not in tasks:
                 continue
             flags = {
-                **grid.planner,
+                **grid.planner(task),
                 "policy.path": grid.model(task, config.train.seeds[0]),
                 "task": task,
                 "episodes": config.play.episodes,

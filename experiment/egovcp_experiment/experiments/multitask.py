@@ -37,7 +37,7 @@ def _plays(config: ExperimentConfig, grid: Grid) -> dict[str, dict[str, list[str
 
 def _latents(config: ExperimentConfig, grid: Grid) -> str:
     flags = {
-        **grid.planner,
+        **grid.planner(ALL),
         "policy.path": grid.model(ALL, config.train.seeds[0]),
         "tasks": list(config.tasks),
         "episodes": min(config.play.episodes, _LATENT_EPISODES),

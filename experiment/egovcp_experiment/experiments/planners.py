@@ -46,7 +46,7 @@ def _names(config: ExperimentConfig) -> tuple[list[str], list[str]]:
 def _timing(grid: Grid, task: str) -> Cell:
     """The candidates depend on the networks' sizes alone: one model is timed for all seeds."""
     policy = grid.model(task, grid.config.train.seeds[0])
-    flags = {**grid.planner, "policy.path": policy, "budget_ms": grid.config.play.budget_ms}
+    flags = {**grid.planner(task), "policy.path": policy, "budget_ms": grid.config.play.budget_ms}
     return grid.add(Cell(f"plan_time-{task}", study("plan_time", alone=True), flags))
 
 

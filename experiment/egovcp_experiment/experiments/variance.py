@@ -25,7 +25,7 @@ _PLANS: Final = {"planner": "plans that the planner chose", "random": "random pl
 
 def _residuals(config: ExperimentConfig, grid: Grid, task: str) -> str:
     flags = {
-        **grid.planner,
+        **grid.planner(task),
         "policy.path": grid.model(task, config.train.seeds[0]),
         "task": task,
         "episodes": config.play.episodes,
