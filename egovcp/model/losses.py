@@ -7,7 +7,7 @@ because it is not conditioned on an action and the terminal observation is not s
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -21,6 +21,10 @@ from egovcp.model.flight import Sighting
 from egovcp.model.gaussian import Gaussian, kl_divergence
 from egovcp.model.shared import over_all_rows
 from egovcp.model.world_model import PASSING_UNIT, Carry, Look, WorldModel
+
+#: Pictures that are looked at together where no gradient is asked for: what the layers make of more
+#: no longer fits into a cache, nor into the memory that the allocator keeps.
+_AT_ONCE: Final = 512
 
 
 class Batch(NamedTuple):
@@ -65,7 +69,7 @@ def filter_sequence(
     size, length = batch.valid.shape
     near = nearness(batch.depth.flatten(0, 1), model.config.depth_max_m)
     state = model.standardise(batch.state)
-    embedding = model.embed_near(near, state.flatten(0, 1)).view(size, length, -1)
+    embedding = _embed(model, near, state.flatten(0, 1)).view(size, length, -1)
     carry = model.initial(size) if carry is None else carry
     hs: list[Tensor] = []
     zs: list[Tensor] = []
@@ -90,6 +94,13 @@ def filter_sequence(
     )
 
 
+def _embed(model: WorldModel, near: Tensor, state: Tensor) -> Tensor:
+    if torch.is_grad_enabled():
+        return model.embed_near(near, state)
+    pieces = zip(near.split(_AT_ONCE), state.split(_AT_ONCE), strict=True)
+    return torch.cat([model.embed_near(*piece) for piece in pieces])
+
+
 def _followed(
     model: WorldModel, batch: Batch, near: Tensor, embedding: Tensor, start: Carry
 ) -> Tensor | None:
@@ -106,9 +117,13 @@ def _follow(
     model: WorldModel, batch: Batch, near: Tensor, embedding: Tensor, memory: Tensor
 ) -> Tensor:
     size, length = batch.valid.shape
-    look = model.look(near, batch.state.flatten(0, 1), embedding.flatten(0, 1))
+    pictures = (near, batch.state.flatten(0, 1), embedding.flatten(0, 1))
+    looks = [
+        model.look(*piece) for piece in zip(*(x.split(_AT_ONCE) for x in pictures), strict=True)
+    ]
+    columns = zip(*((x for part in look for x in part) for look in looks), strict=True)
     point, weight, axes, position, rate = (
-        x.view(size, length, *x.shape[1:]) for part in look for x in part
+        torch.cat(column).unflatten(0, (size, length)) for column in columns
     )
     found = []
     for t in range(length):

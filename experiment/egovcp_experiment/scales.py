@@ -101,6 +101,7 @@ def small() -> ExperimentConfig:
         # arch's Q closely rises too soon (docs/planner.md). The budget is a little more than 256
         # candidates take on one core.
         play=PlayConfig(
+            branches=6,
             budget_ms=12.0,
             flags=("--planner.samples=256", "--planner.elites=4"),
             task_flags=dict.fromkeys(("ball", "wall"), ("--planner.process=ramp",)),

@@ -147,3 +147,14 @@ def test_the_report_tells_the_parts_of_a_sequence_apart() -> None:
     assert {"planner's arch", "planner's ball", "planner's wall"} <= set(table.head)
     wall = table.head.index("planner's wall")
     assert [row[wall] == "-" for row in table.rows] == [True, True, False]
+
+
+def test_multitask_says_which_models_are_played_otherwise() -> None:
+    found = str(report("multitask", 1.0).parts[0])
+    assert found.endswith(
+        "The model of ball alone is played with `--planner.process=ramp`. "
+        "The model of wall alone is played with `--planner.process=ramp`."
+    )
+    alike = replace(SCALES["small"](), tasks=("arch",))
+    plain = EXPERIMENTS["multitask"].report(alike, records("multitask", 1.0))
+    assert "played with" not in str(plain.parts[0])

@@ -99,7 +99,18 @@ def _training(config: ExperimentConfig) -> str:
     return (
         f"Every model was trained for {words}: the one on mixed data sees each task "
         f"{len(config.tasks)} times less often than a single-task model does, and is told nothing "
-        f"of which task it is.{horizons}"
+        f"of which task it is.{horizons}{_planners(config)}"
+    )
+
+
+def _planners(config: ExperimentConfig) -> str:
+    """In what the models' planners differ; empty if they do not."""
+    who = {**{task: f"of {task} alone" for task in config.tasks}, ALL: "on mixed data"}
+    own = config.play.task_flags
+    return "".join(
+        f" The model {words} is played with `{' '.join(own[model])}`."
+        for model, words in who.items()
+        if own.get(model)
     )
 
 

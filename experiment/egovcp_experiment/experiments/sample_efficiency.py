@@ -45,12 +45,12 @@ def _grid(config: ExperimentConfig) -> Grid:
 def _model(config: ExperimentConfig, grid: Grid, task: str, part: float) -> Model:
     """One that learns from a part. From all episodes it is the model that other experiments train,
     unless they are given a model, or a dataset of whatever size."""
+    episodes = _episodes(config, task, part)
     of_others = grid.config.data.episodes == config.data.episodes
     given = task in config.train.policies or task in config.data.roots
-    if of_others and not given and _episodes(config, task, part) == _episodes(config, task, 1.0):
+    if of_others and not given and episodes == _episodes(config, task, 1.0):
         return Model()
-    flags = {"dataset.episodes": f"0:{_episodes(config, task, part)}"}
-    return Model(_name(config, task, part), flags)
+    return Model(_name(config, task, part), {"dataset.episodes": f"0:{episodes}"})
 
 
 def _plays(config: ExperimentConfig, grid: Grid) -> dict[str, dict[float, list[str]]]:

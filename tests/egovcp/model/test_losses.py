@@ -69,6 +69,25 @@ def test_a_seed_repeats_the_loss_bit_for_bit(model: WorldModel, batch: Batch) ->
     assert _loss(model, batch, seed=1) != _loss(model, batch, seed=2)
 
 
+def test_without_gradients_pictures_are_looked_at_in_pieces(
+    model: WorldModel, batch: Batch, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert model.config.follows_flight
+    with torch.no_grad():
+        at_once = filter_sequence(model, batch, sample=False)
+        seen: list[int] = []
+        monkeypatch.setattr("egovcp.model.losses._AT_ONCE", 5)
+        monkeypatch.setattr(
+            model,
+            "embed_near",
+            lambda *x: seen.append(len(x[0])) or WorldModel.embed_near(model, *x),
+        )
+        in_pieces = filter_sequence(model, batch, sample=False)
+    assert seen == [5, 5, 5, 5, 1]
+    for one, other in zip(at_once.carry, in_pieces.carry, strict=True):
+        torch.testing.assert_close(one, other)
+
+
 @pytest.mark.parametrize("garbage", [False, True])
 def test_padding_changes_no_loss(batch: Batch, garbage: bool) -> None:
     model = _with_loss(EVERY_IMAGE)
