@@ -7,6 +7,7 @@ because it is not conditioned on an action and the terminal observation is not s
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 import torch
@@ -97,8 +98,11 @@ def filter_sequence(
 def _embed(model: WorldModel, near: Tensor, state: Tensor) -> Tensor:
     if torch.is_grad_enabled():
         return model.embed_near(near, state)
-    pieces = zip(near.split(_AT_ONCE), state.split(_AT_ONCE), strict=True)
-    return torch.cat([model.embed_near(*piece) for piece in pieces])
+    return torch.cat([model.embed_near(*piece) for piece in _pieces(near, state)])
+
+
+def _pieces(*rows: Tensor) -> Iterator[tuple[Tensor, ...]]:
+    return zip(*(torch.split(x, _AT_ONCE) for x in rows), strict=True)
 
 
 def _followed(
@@ -117,13 +121,11 @@ def _follow(
     model: WorldModel, batch: Batch, near: Tensor, embedding: Tensor, memory: Tensor
 ) -> Tensor:
     size, length = batch.valid.shape
-    pictures = (near, batch.state.flatten(0, 1), embedding.flatten(0, 1))
-    looks = [
-        model.look(*piece) for piece in zip(*(x.split(_AT_ONCE) for x in pictures), strict=True)
-    ]
-    columns = zip(*((x for part in look for x in part) for look in looks), strict=True)
+    pieces = _pieces(near, batch.state.flatten(0, 1), embedding.flatten(0, 1))
+    looks = [[x for part in model.look(*piece) for x in part] for piece in pieces]
     point, weight, axes, position, rate = (
-        torch.cat(column).unflatten(0, (size, length)) for column in columns
+        torch.cat(column).view(size, length, *column[0].shape[1:])
+        for column in zip(*looks, strict=True)
     )
     found = []
     for t in range(length):
