@@ -61,7 +61,7 @@ class TrainingConfig:
     """Further flags of egovcp-train."""
     task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Flags after those for the models of one task (all: of the multi-task model), '{wall:
-    [--sampling.event_fraction=0.7]}'."""
+    [--sampling.event_fraction=0.7]}'; a task that is not named keeps what the scale says of it."""
     return_steps: dict[str, int] = field(default_factory=dict)
     """Task -> horizon of the returns of its data, ticks, in its own model and in the multi-task
     one, '{arch: 50}'; where a task is not named, --returns.steps."""
@@ -83,7 +83,8 @@ class PlayConfig:
     """Further flags of egovcp-eval; studies that play take those of the planner, too."""
     task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Flags after those where the model of one task plays (all: the multi-task model), '{ball:
-    [--planner.process=ramp]}'."""
+    [--planner.process=ramp]}'; a task that is not named keeps what the scale says of it, '{ball:
+    []}' is without."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from egovcp_experiment.command import main
+from egovcp.cli import parse_config
+from egovcp_experiment.command import main, scale_of
+from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.experiments import EXPERIMENTS
 
 
@@ -43,6 +45,12 @@ def test_misuse_ends_with_2_before_anything_is_written(
     assert main(argv) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.glob("x/cells/*.json"))
+
+
+def test_a_flag_takes_from_one_task_what_the_scale_gives_it() -> None:
+    argv = ["--scale=small", "--play.task_flags={ball: []}"]
+    config = parse_config(ExperimentConfig, argv, "test", defaults=scale_of)
+    assert config.play.task_flags == {"ball": (), "wall": ("--planner.process=ramp",)}
 
 
 def test_an_experiment_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
