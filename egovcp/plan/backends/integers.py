@@ -52,7 +52,7 @@ class IntegerNetwork:
         self._outputs = value.width(model.config.value_loss)
         self._width = 1 if self._outputs == 1 else _whole(self._outputs)
         assert self._width <= MOST_FEW
-        self._packed = _Packed(model, drawn=config.latent == "sample")
+        self._packed = _Packed(model, config.latent == "sample", self._kernel.depth())
 
     def shared(self, root: Root) -> Shared:
         """Of one robot, from a root (1, 1, ...)."""
@@ -123,8 +123,9 @@ def _whole(count: int) -> int:
 class _Packed:
     """A network's description for the kernel, and the tensors that it points into."""
 
-    def __init__(self, model: WorldModel, drawn: bool) -> None:
+    def __init__(self, model: WorldModel, drawn: bool, depth: int) -> None:
         self._kept: list[object] = []
+        self._depth = depth
         c = model.config
         if max(2 * c.latent, c.value_state) > MOST_FEW:
             raise UsageError(
@@ -242,7 +243,9 @@ class _Packed:
     def _wide(self, weight: Tensor, state: bool) -> library.Wide:
         """Of a weight (N, K) for inputs of h or z (symmetric), or of a hidden layer."""
         zero, offset = (128, 0.0) if state else (0, LEAST_SILU)
-        weight = torch.nn.functional.pad(weight.detach().float(), (0, -weight.shape[1] % 4))
+        weight = torch.nn.functional.pad(
+            weight.detach().float(), (0, -weight.shape[1] % self._depth)
+        )
         outputs, inputs = weight.shape
         if inputs > WIDEST:
             raise UsageError(f"a layer of {inputs} inputs; {library.OTHERWISE}")

@@ -5,23 +5,29 @@
  *
  * A wide input row x (K numbers) is kept as x = scale * (u - zero) + offset with u in 0..255: zero and
  * offset belong to its kind, scale to the row. Weights are w = weight_scale[n] * i, i in -127..127,
- * in blocks [N/16][K/4][16][4] of which one vector register holds the last two axes. Few, exact
- * inputs (the action above all) stay in float32. The weights of a normalised layer are centred (their
- * mean over the outputs is zero), and so are its sums. No state, no allocation. */
+ * in blocks [N/16][K/4][16][4] of which one vector register holds the last two axes, and one tile of
+ * AMX the last three for 64 of the inputs. Few, exact inputs (the action above all) stay in float32.
+ * The weights of a normalised layer are centred (their mean over the outputs is zero), and so are its
+ * sums. No state, no allocation. */
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-#if defined(__AVX512VNNI__)
+#if defined(__AVX512VNNI__) || defined(__AMX_INT8__)
 #include <immintrin.h>
 #endif
 
-enum { ROWS = 8, LANES = 16, WIDEST = 1024, MOST_FEW = 128, TOLD = 4 };
+enum { LANES = 16, WIDEST = 1024, MOST_FEW = 128, TOLD = 4 };
+#if defined(__AMX_INT8__)
+enum { ROWS = 16, COLUMNS = 4, DEPTH = 64 }; /* a tile: rows, and inputs; and tiles that sum up */
+#else
+enum { ROWS = 8, COLUMNS = 3, DEPTH = 4 };
+#endif
 
 typedef float Floats __attribute__((vector_size(4 * LANES)));
 typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
 
 typedef struct {
-    int32_t inputs;       /* K, a multiple of 4; 0: there is no such input */
+    int32_t inputs;       /* K, a multiple of DEPTH; 0: there is no such input */
     const int8_t *weight; /* [N/16][K/4][16][4] */
     const float *scale;   /* [N] */
     const int32_t *start; /* [N] -zero * sum of the column's integers */
@@ -149,6 +155,56 @@ static inline Floats sigmoid(Floats x) {
 
 static inline float one_sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
 
+#if defined(__AMX_INT8__)
+/* Tiles are whole: 16 rows of 64 bytes. The thread that calls has them until it releases them. */
+static void take_tiles(void) {
+    struct {
+        uint8_t palette, start, reserved[14];
+        uint16_t bytes[16];
+        uint8_t rows[16];
+    } tiles __attribute__((aligned(64))) = {.palette = 1};
+    for (int i = 0; i < 8; i++) tiles.bytes[i] = 4 * LANES, tiles.rows[i] = ROWS;
+    _tile_loadconfig(&tiles);
+}
+
+static void release_tiles(void) { _tile_release(); }
+
+/* Dot products of a block of rows with `columns` (COLUMNS or 1) times 16 outputs from `n` on. */
+static inline __attribute__((always_inline)) void dots(const Wide *w, int n, int columns,
+                                                       const Bytes *in, Ints dot[][ROWS]) {
+    const int8_t *weight = w->weight + (int64_t)n * w->inputs;
+    const int column = LANES * w->inputs, tile = LANES * DEPTH, each = 4 * LANES;
+    _tile_loadd(0, w->start + n, 0); /* the same for all rows */
+    if (columns > 1) {
+        _tile_loadd(1, w->start + n + LANES, 0);
+        _tile_loadd(2, w->start + n + 2 * LANES, 0);
+        _tile_loadd(3, w->start + n + 3 * LANES, 0);
+    }
+    for (int k = 0; k < w->inputs; k += DEPTH, weight += tile) {
+        _tile_loadd(4, in->values[0] + k, WIDEST);
+        _tile_loadd(5, weight, each);
+        _tile_dpbusd(0, 4, 5);
+        if (columns > 1) {
+            _tile_loadd(6, weight + column, each);
+            _tile_dpbusd(1, 4, 6);
+            _tile_loadd(7, weight + 2 * column, each);
+            _tile_dpbusd(2, 4, 7);
+            _tile_loadd(5, weight + 3 * column, each);
+            _tile_dpbusd(3, 4, 5);
+        }
+    }
+    _tile_stored(0, dot[0], each);
+    if (columns > 1) {
+        _tile_stored(1, dot[1], each);
+        _tile_stored(2, dot[2], each);
+        _tile_stored(3, dot[3], each);
+    }
+}
+#else
+static void take_tiles(void) {}
+
+static void release_tiles(void) {}
+
 /* Dot products of a block of rows with `columns` times 16 outputs from `n` on. */
 static inline __attribute__((always_inline)) void dots(const Wide *w, int n, int columns,
                                                        const Bytes *in, Ints dot[][ROWS]) {
@@ -161,7 +217,7 @@ static inline __attribute__((always_inline)) void dots(const Wide *w, int n, int
     }
     for (int q = 0; q < quads; q++) {
 #if defined(__AVX512VNNI__)
-        __m512i b[3];
+        __m512i b[COLUMNS];
         for (int c = 0; c < columns; c++)
             b[c] = _mm512_loadu_si512(weight + ((int64_t)c * quads + q) * 4 * LANES);
         for (int r = 0; r < ROWS; r++) {
@@ -182,12 +238,13 @@ static inline __attribute__((always_inline)) void dots(const Wide *w, int n, int
 #endif
     }
 }
+#endif
 
 static inline __attribute__((always_inline)) void columns_of_product(const Wide *w, int n, int columns,
                                                                      const Bytes *in, const float *from,
                                                                      int from_stride, float *y,
                                                                      int stride) {
-    Ints dot[3][ROWS];
+    Ints dot[COLUMNS][ROWS];
     dots(w, n, columns, in, dot);
     for (int c = 0; c < columns; c++, n += LANES) {
         const Floats weight_scale = load(w->scale + n), shift = load(w->shift + n);
@@ -202,8 +259,8 @@ static inline __attribute__((always_inline)) void columns_of_product(const Wide 
 static void wide_product(const Wide *w, int outputs, const Bytes *in, const float *from, int from_stride,
                          float *y) {
     int n = 0;
-    for (; n + 3 * LANES <= outputs; n += 3 * LANES)
-        columns_of_product(w, n, 3, in, from, from_stride, y, outputs);
+    for (; n + COLUMNS * LANES <= outputs; n += COLUMNS * LANES)
+        columns_of_product(w, n, COLUMNS, in, from, from_stride, y, outputs);
     for (; n < outputs; n += LANES) columns_of_product(w, n, 1, in, from, from_stride, y, outputs);
 }
 
@@ -458,15 +515,19 @@ static void block(const Network *net, const Root *root, int steps, const float *
     }
 }
 
+/* How many inputs a wide product takes at once; weights are filled up to that with zeros. */
+int32_t depth(void) { return DEPTH; }
+
 /* Plans of one robot: actions [rows][steps][actions], noise [steps - 1][latent] or null -> q
  * [rows][steps][heads][width] and dead [rows][steps] (of steps 1 to steps - 2), both zero before.
  * Threads that share `next` share the blocks. */
 void judge(const Network *net, const Root *root, int rows, int steps, const float *actions,
            const float *noise, int width, float *q, float *dead, int32_t *next) {
     const int per_row = steps * net->actions, q_row = steps * net->heads * width;
+    take_tiles();
     for (;;) {
         const int row = __atomic_fetch_add(next, ROWS, __ATOMIC_RELAXED);
-        if (row >= rows) return;
+        if (row >= rows) break;
         if (row + ROWS <= rows) {
             block(net, root, steps, actions + (int64_t)row * per_row, noise, q + (int64_t)row * q_row, width,
                   dead + (int64_t)row * steps);
@@ -483,4 +544,5 @@ void judge(const Network *net, const Root *root, int rows, int steps, const floa
         memcpy(q + (int64_t)row * q_row, some_q, count * q_row * sizeof(float));
         memcpy(dead + (int64_t)row * steps, some_dead, count * steps * sizeof(float));
     }
+    release_tiles();
 }

@@ -29,6 +29,7 @@ FLAGS: Final = (
     "-shared",
     "-fPIC",
 )
+WITHOUT_TILES: Final = "-mno-amx-int8"
 OTHERWISE: Final = "plan with --planner.backend=float32"
 
 
@@ -118,8 +119,13 @@ class Threads:
 
 def processor_is_fast() -> bool:
     """Whether this processor multiplies 512-bit vectors of bytes (AVX-512 VNNI)."""
+    return processor_has("avx512_vnni")
+
+
+def processor_has(feature: str) -> bool:
+    """Whether Linux lists it among this processor's features."""
     info = Path("/proc/cpuinfo")
-    return info.exists() and "avx512_vnni" in info.read_text(encoding="utf-8", errors="replace")
+    return info.exists() and feature in info.read_text(encoding="utf-8", errors="replace")
 
 
 def compiler() -> str | None:
@@ -135,17 +141,29 @@ def library() -> ctypes.CDLL:
     Raises:
         EnvironmentFailure: there is no compiler, or it fails, or the cache cannot be written.
     """
-    path = _folder() / f"planner-{_identity()}.so"
+    flags = (*FLAGS, WITHOUT_TILES) if tiles_are_refused() else FLAGS
+    path = _folder() / f"planner-{_identity(flags)}.so"
     try:
         if not path.exists():
-            _compile(path)
+            _compile(path, flags)
         kernel = ctypes.CDLL(str(path))
     except OSError as error:
         raise EnvironmentFailure(f"cannot build or load {path}: {error}; {OTHERWISE}") from error
     p, i = ctypes.c_void_p, ctypes.c_int32
     kernel.judge.argtypes = [p, p, i, i, p, p, i, p, p, p]
     kernel.judge.restype = None
+    kernel.depth.argtypes = []
+    kernel.depth.restype = i
     return kernel
+
+
+def tiles_are_refused() -> bool:
+    """Whether the processor has AMX and Linux does not let this process use it."""
+    if not processor_has("amx_int8"):
+        return False
+    arch_prctl, ask_for, tile_data = 158, 0x1023, 18  # <asm/prctl.h>: ARCH_REQ_XCOMP_PERM
+    answer: int = ctypes.CDLL(None).syscall(arch_prctl, ask_for, tile_data)
+    return answer != 0
 
 
 def _folder() -> Path:
@@ -153,10 +171,10 @@ def _folder() -> Path:
     return Path(root) / "egovcp"
 
 
-def _identity() -> str:
+def _identity(flags: Sequence[str]) -> str:
     """Changes with the source, the flags and the processor that ``-march=native`` means."""
     digest = hashlib.sha256(SOURCE.read_bytes())
-    digest.update(repr((FLAGS, compiler(), platform.machine())).encode())
+    digest.update(repr((flags, compiler(), platform.machine())).encode())
     info = Path("/proc/cpuinfo")
     lines = info.read_text(errors="replace").splitlines() if info.exists() else []
     for line in lines:
@@ -167,7 +185,7 @@ def _identity() -> str:
     return digest.hexdigest()[:16]
 
 
-def _compile(path: Path) -> None:
+def _compile(path: Path, flags: Sequence[str]) -> None:
     """Into a temporary file beside ``path``, then in one step to its place."""
     command = compiler()
     if command is None:
@@ -178,7 +196,7 @@ def _compile(path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         made = Path(folder) / path.name
-        arguments = [command, *FLAGS, str(SOURCE), "-o", str(made), "-lm"]
+        arguments = [command, *flags, str(SOURCE), "-o", str(made), "-lm"]
         done = subprocess.run(arguments, capture_output=True, text=True, check=False)
         if done.returncode:
             reason = " ".join(done.stderr.split())[:300]

@@ -199,6 +199,26 @@ def test_the_kernel_says_the_same_where_there_are_no_wide_vectors(
     assert error[: int(0.97 * len(error))].max() < 0.02 * here.std()
 
 
+@needs_compiler
+@pytest.mark.skipif(not library.processor_has("amx_int8"), reason="no AMX")
+@pytest.mark.parametrize("change", MODELS)
+def test_where_tiles_are_refused_vectors_say_exactly_the_same(
+    change: dict[str, object], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert not library.tiles_are_refused()
+    model, config = _model(**change), PlannerConfig(backend="int8")
+    carry, actions = _carry(model), _actions()
+    tiles = _values(model, config, carry, actions)
+    monkeypatch.setattr(library, "tiles_are_refused", lambda: True)
+    library.library.cache_clear()
+    try:
+        vectors = _values(model, config, carry, actions)
+        assert library.library().depth() < 64
+    finally:
+        library.library.cache_clear()
+    assert torch.equal(tiles, vectors)
+
+
 def test_without_a_compiler_auto_takes_float32_and_int8_says_what_to_do(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
