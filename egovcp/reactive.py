@@ -91,7 +91,7 @@ class ReactiveNetwork:
     provenance: Mapping[str, Any]
     """Command, seed and steps of its training."""
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def __call__(self, pictures: Tensor, state: Tensor) -> Tensor:
         """Pictures (E, frames, 48, 64) and state (E, 74) -> actions (E, 7) in [-1, 1]."""
         x = pictures

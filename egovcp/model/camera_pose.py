@@ -20,7 +20,11 @@ from egovcp.robot.g1 import WAIST
 from egovcp.robot.kinematics import COS_ROTATION, LINK_OFFSET, REST_ROTATION, SIN_ROTATION
 
 STANDING: Final = 0.70  # m, about the height of the pelvis above the ankles in the neutral pose
-_LEGS: Final = (range(6), range(6, 12))
+_WAIST_AND_LEGS: Final = (
+    tuple(range(*WAIST.indices(len(spec.JOINT_NAMES)))),
+    tuple(range(6)),
+    tuple(range(6, 12)),
+)
 
 
 class CameraPose(NamedTuple):
@@ -43,12 +47,23 @@ class _Chain(NamedTuple):
 
 @cache
 def _chain(joints: tuple[tuple[int, ...], ...], device: torch.device) -> _Chain:
-    def of(table: NDArray[np.float64]) -> Tensor:
-        return torch.tensor(table[list(joints)], dtype=torch.float32, device=device)
+    """Shorter ones end in links that neither lead on nor turn: all are gone through at once."""
+    longest = max(map(len, joints))
 
-    index = torch.tensor(joints, device=device)
-    constants = (LINK_OFFSET, REST_ROTATION, SIN_ROTATION, COS_ROTATION)
-    return _Chain(index, *(of(np.asarray(table)) for table in constants))
+    def of(table: NDArray[np.float64], link: NDArray[np.float64]) -> Tensor:
+        filled = [[*table[list(chain)], *[link] * (longest - len(chain))] for chain in joints]
+        return torch.tensor(np.array(filled), dtype=torch.float32, device=device)
+
+    index = [(*chain, *[0] * (longest - len(chain))) for chain in joints]
+    still, none = np.eye(3), np.zeros((3, 3))
+    with torch.inference_mode(False):  # what is kept may be wanted in training, too
+        return _Chain(
+            torch.tensor(index, device=device),
+            of(LINK_OFFSET, np.zeros(3)),
+            of(np.asarray(REST_ROTATION), still),
+            of(np.asarray(SIN_ROTATION), none),
+            of(np.asarray(COS_ROTATION), none),
+        )
 
 
 def _end(chain: _Chain, joint_position: Tensor) -> tuple[Tensor, Tensor]:
@@ -66,10 +81,8 @@ def _end(chain: _Chain, joint_position: Tensor) -> tuple[Tensor, Tensor]:
 def camera_pose(state: Tensor, camera: CameraGeometry) -> CameraPose:
     """From raw proprioception (N, 74)."""
     joints = state[:, spec.STATE_SLICES["joint_position"]]
-    device = state.device
-    waist = tuple(range(*WAIST.indices(len(spec.JOINT_NAMES))))
-    torso, turn = (x[:, 0] for x in _end(_chain((waist,), device), joints))
-    feet, _ = _end(_chain(tuple(map(tuple, _LEGS)), device), joints)
+    ends, turns = _end(_chain(_WAIST_AND_LEGS, state.device), joints)
+    torso, feet, turn = ends[:, 0], ends[:, 1:], turns[:, 0]
     level = heading_rotation(state[:, spec.STATE_SLICES["projected_gravity"]])
     mount = torso + turn @ state.new_tensor(camera.position)
     tilt = state.new_tensor(_tilt(camera.pitch))

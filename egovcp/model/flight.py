@@ -14,6 +14,7 @@ one axis at a time. Nothing here is trained but the prior's statistics; nothing 
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Final, NamedTuple
 
 import torch
@@ -56,8 +57,7 @@ def sighting(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) ->
     """
     height, width = near.shape[-2:]
     focal = height / 2 / config.camera.half_height
-    row = (torch.arange(height, device=near.device)[:, None] - (height - 1) / 2) / focal
-    col = (torch.arange(width, device=near.device) - (width - 1) / 2) / focal
+    row, col = _slopes(height, focal, near.device)[:, None], _slopes(width, focal, near.device)
     x = (1 - sight[:, 2]).clamp(0.05, 1.0) * max_m + config.radius
     left = -sight[:, 0] * (width - 1) / 2 / focal * x
     up = -sight[:, 1] * (height - 1) / 2 / focal * x
@@ -76,6 +76,13 @@ def sighting(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) ->
     likely = torch.sigmoid(sight[:, 3])
     weight = torch.where(likely > 0.5, likely, 0.0) / deviation.square()
     return Sighting(point, weight)
+
+
+@cache
+def _slopes(pixels: int, focal: float, device: torch.device) -> Tensor:
+    """(pixels,) by how much each one's ray leads sideways per metre ahead."""
+    with torch.inference_mode(False):  # what is kept may be wanted elsewhere
+        return (torch.arange(pixels, device=device) - (pixels - 1) / 2) / focal
 
 
 def follow(

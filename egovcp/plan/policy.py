@@ -52,6 +52,7 @@ class Policy:
         self._judge: Judge[Carry] | None = None
         self.reset()
 
+    @torch.inference_mode()
     def reset(self, rows: NDArray[np.intp] | None = None) -> None:
         """Forget the past of ``rows`` (None: of all, and restart the random stream)."""
         if rows is None:
@@ -67,7 +68,7 @@ class Policy:
         self._sent[index] = 0.0
         self._warm[index] = 0.0
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
         """Take depth (E, 48, 64) mm and state (E, 74) into the recurrence, without planning."""
         self._carry = self.model.observe(
@@ -79,7 +80,7 @@ class Policy:
         )
         self._first = torch.zeros_like(self._first)
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def act(
         self,
         depth: NDArray[np.uint16],
@@ -142,12 +143,12 @@ class Policy:
         """The filtered state, for probes and logs."""
         return self._carry
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def reconstruct(self) -> Array:
         """Depth (E, 48, 64) in metres decoded from the filtered state; 0 = nothing there."""
         return _numpy(self.model.decode(self._carry)[0])
 
-    @torch.no_grad()
+    @torch.inference_mode()
     def imagine(self, plan: NDArray[np.floating], horizon: int) -> Array:
         """Depth (E, horizon, 48, 64), metres, imagined under ``plan`` (E, N, 7).
 

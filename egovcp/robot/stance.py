@@ -20,10 +20,9 @@ from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS
 from egovcp.robot.kinematics import (
     JOINT_LOWER,
     JOINT_UPPER,
-    LINK_NAMES,
     Array,
+    foot_positions,
     heading_rotation,
-    link_transforms,
     rotate,
     torso_rotation,
 )
@@ -33,7 +32,6 @@ from egovcp.robot.stance_table import stance_table
 from egovcp.spec import STATE_DIM, STATE_SLICES
 
 _SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the sole
-_FEET: Final = tuple(LINK_NAMES.index(f"{side}_ankle_roll_link") for side in ("left", "right"))
 _TARGET_SLACK: Final = 0.6  # rad that a target may pass a joint limit by, to make torque there
 TARGET_LOW: Final = JOINT_LOWER - _TARGET_SLACK
 TARGET_HIGH: Final = JOINT_UPPER + _TARGET_SLACK
@@ -120,6 +118,6 @@ class StanceController:
 
 def pelvis_height(joint_position: Array, gravity: Array) -> Array:
     """(B,) pelvis above the lower foot's sole, m."""
-    position, _ = link_transforms(joint_position)
-    feet = rotate(heading_rotation(gravity)[:, None], position[:, _FEET])
+    ankles = foot_positions(np.asarray(joint_position, dtype=np.float64))
+    feet = rotate(heading_rotation(gravity)[:, None], ankles)
     return np.asarray(_SOLE_HEIGHT - np.min(feet[..., 2], axis=1))
