@@ -1,8 +1,10 @@
 """Gradient steps per second, against a plain eager implementation and on data that is ready.
 
-* ``step``: `egovcp_train.loop.Learner.update`, forward to averaged weights, on one batch in memory;
+* ``step``: `egovcp_train.loop.Learner.update`, forward to averaged weights, on one batch in memory,
+  in the precision that ``egovcp-train`` takes here by itself (``bf16`` says which);
+* ``float32``: the same in float32;
 * ``plain``: the same mathematics in plain eager fp32 (`plain_step.py`): the same weights, batch
-  and random draws, and, before anything is measured, the same loss;
+  and random draws, and, before anything is measured, the same loss as ``float32``;
 * ``data``: a step with its batch drawn from the stream and made into tensors, as in training.
 
 The cases take turns; ratios are medians of the ratios of one turn. Processor time counts, so that
@@ -14,6 +16,7 @@ rates, which are by the clock, want a quiet machine.
 
 from __future__ import annotations
 
+import copy
 import statistics
 import tempfile
 import time
@@ -30,6 +33,7 @@ from egovcp.data import EpisodeIndex, EpisodeStore, SequenceStream, StreamConfig
 from egovcp.model import Batch, WorldModel, WorldModelConfig
 from egovcp_train.batches import set_normalisation, to_tensors
 from egovcp_train.config import OptimizerConfig, SamplingConfig
+from egovcp_train.device import choose_bf16
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.labels.passing import label
 from egovcp_train.loop import Learner
@@ -38,6 +42,7 @@ TOLERANCE = 1e-4  # of the loss, relative: sums of some million fp32 numbers in 
 LENGTH = SamplingConfig().length
 EPISODES = 100  # of each task
 CPU = torch.device("cpu")
+BF16 = choose_bf16("auto", CPU)
 
 type Turn = dict[str, tuple[float, float]]
 
@@ -53,15 +58,17 @@ class Case:
         self.stream = SequenceStream(store, StreamConfig(batch_size=batch, length=LENGTH))
         self.batch = self._next()
         self.plain = PlainLearner(model, config, seed=0)
-        self.ours = Learner(model, config, seed=0)
+        self.ours = Learner(copy.deepcopy(model), config, seed=0, bf16=BF16)
+        self.float32 = Learner(model, config, seed=0)
         self._compare()
 
     def _next(self) -> Batch:
         return to_tensors(next(self.stream), CPU)
 
     def _compare(self) -> None:
-        """The first step warms both up, and has to find the same loss."""
-        ours = float(self.ours.update(self.batch, 0.0)["loss/total"])
+        """The first step warms all up, and has to find the same loss."""
+        self.ours.update(self.batch, 0.0)
+        ours = float(self.float32.update(self.batch, 0.0)["loss/total"])
         plain = self.plain.update(self.batch)
         self.difference = abs(ours - plain) / abs(plain)
         if self.difference > TOLERANCE:
@@ -79,6 +86,7 @@ class Case:
         fetched: list[Batch] = []
         cases: dict[str, Callable[[], object]] = {
             "plain": lambda: self.plain.update(self.batch),
+            "float32": lambda: self.float32.update(self.batch, 0.0),
             "step": lambda: self.ours.update(self.batch, 0.0),
             "data": on_data,
         }
@@ -103,8 +111,10 @@ def figures(turns: list[Turn], name: str, frames: int) -> dict[str, object]:
     clock = statistics.median(turn["data"][1] for turn in turns)
     return {
         f"{name}_cpu_ms": 1e3 * cpu["step"],
+        f"{name}_float32_cpu_ms": 1e3 * cpu["float32"],
         f"{name}_plain_cpu_ms": 1e3 * cpu["plain"],
         f"{name}_ratio": ratio("plain", "step"),
+        f"{name}_float32_ratio": ratio("plain", "float32"),
         f"{name}_data_ratio": ratio("data", "step"),
         f"{name}_wait_share": ratio("wait", "data"),
         f"{name}_steps_per_s": 1.0 / clock,
@@ -118,7 +128,7 @@ def measure(root: Path, batches: list[int], threads: list[int], rounds: int) -> 
     """All figures; keys say the batch and the number of threads."""
     index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
     store = label(EpisodeStore.read(index), PassingConfig())
-    out: dict[str, object] = {"window": LENGTH}
+    out: dict[str, object] = {"window": LENGTH, "bf16": BF16}
     for size in batches:
         for count in threads:
             torch.set_num_threads(count)
