@@ -12,12 +12,15 @@
 #include <math.h>
 #include <stdint.h>
 #include <string.h>
-#if defined(__AVX512VNNI__) || defined(__AMX_INT8__)
+#if defined(__AMX_INT8__) && !defined(WITHOUT_TILES)
+#define TILES 1
+#endif
+#if defined(__AVX512VNNI__) || defined(TILES)
 #include <immintrin.h>
 #endif
 
 enum { LANES = 16, WIDEST = 1024, MOST_FEW = 128, TOLD = 4 };
-#if defined(__AMX_INT8__)
+#if defined(TILES)
 enum { ROWS = 16, COLUMNS = 4, DEPTH = 64 }; /* a tile: rows, and inputs; and tiles that sum up */
 #else
 enum { ROWS = 8, COLUMNS = 3, DEPTH = 4 };
@@ -155,7 +158,7 @@ static inline Floats sigmoid(Floats x) {
 
 static inline float one_sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
 
-#if defined(__AMX_INT8__)
+#if defined(TILES)
 /* Tiles are whole: 16 rows of 64 bytes. The thread that calls has them until it releases them. */
 static void take_tiles(void) {
     struct {

@@ -29,7 +29,7 @@ FLAGS: Final = (
     "-shared",
     "-fPIC",
 )
-WITHOUT_TILES: Final = "-mno-amx-int8"
+WITHOUT_TILES: Final = "-DWITHOUT_TILES"
 OTHERWISE: Final = "plan with --planner.backend=float32"
 
 
