@@ -151,7 +151,9 @@ def _plot(task: str, plans: Mapping[str, Mapping[str, Any]], played: Mapping[int
             at = [h["n"] for h in row["horizons"]]
             low, high = ([h[name] for h in row["horizons"]] for name in ("v_lb", "v_ub"))
             left.fill_between(at, low, high, color=f"C{k}", alpha=0.12, linewidth=0)
-            left.plot(at, [h["variance"] for h in row["horizons"]], "o-", color=f"C{k}", label=kind)
+            found = [h["variance"] for h in row["horizons"]]
+            left.plot(at, found, "o-", color=f"C{k}", label=kind)
+            left.plot(at, [found[0] / n for n in at], ":", color=f"C{k}")
         left.set(xlabel="N", ylabel="variance of J_N's error")
         left.legend(fontsize=8)
         right.plot(list(played), [o.reward_per_step for o in played.values()], "o-", color="C2")
@@ -166,7 +168,10 @@ def _plot(task: str, plans: Mapping[str, Mapping[str, Any]], played: Mapping[int
         )
         right.set(xlabel="N", ylabel="reward per step, closed loop")
 
-    caption = f"{task}: measured variance between its bounds (shaded), and reward against N"
+    caption = (
+        f"{task}: measured variance between its bounds (shaded) and beside that of independent "
+        "errors (dotted), and reward against N"
+    )
     return drawn(f"bounds-{task}", caption, paint)
 
 
