@@ -140,7 +140,7 @@ class Policy:
 
     @property
     def carry(self) -> Carry:
-        """The filtered state, for probes and logs."""
+        """The filtered state, for probes and logs; of inference mode: no gradient passes it."""
         return self._carry
 
     @torch.inference_mode()

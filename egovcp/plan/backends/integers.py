@@ -52,7 +52,7 @@ class IntegerNetwork:
         self._outputs = value.width(model.config.value_loss)
         self._width = 1 if self._outputs == 1 else _whole(self._outputs)
         assert self._width <= MOST_FEW
-        self._packed = _Packed(model, config.latent == "sample", self._kernel.depth())
+        self._packed = _Packed(model, drawn=config.latent == "sample", depth=self._kernel.depth())
 
     def shared(self, root: Root) -> Shared:
         """Of one robot, from a root (1, 1, ...)."""
