@@ -1,10 +1,12 @@
 """Gradient steps per second, against a plain eager implementation and on data that is ready.
 
 * ``step``: `egovcp_train.loop.Learner.update`, forward to averaged weights, on one batch in memory,
-  in the precision that ``egovcp-train`` takes here by itself (``bf16`` says which);
+  in the precision that ``egovcp-train`` takes here by itself (``bf16`` says which), and in a
+  process that keeps freed memory, as it does;
 * ``float32``: the same in float32;
-* ``plain``: the same mathematics in plain eager fp32 (`plain_step.py`): the same weights, batch
-  and random draws, and, before anything is measured, the same loss as ``float32``;
+* ``plain``: the same mathematics in plain eager fp32 (`plain_step.py`), in a process as Python
+  starts it: the same weights, batch and random draws, and, before anything is measured, the same
+  loss as ``float32``;
 * ``data``: a step with its batch drawn from the stream and made into tensors, as in training.
 
 The cases take turns; ratios are medians of the ratios of one turn. Processor time counts, so that
@@ -17,11 +19,15 @@ rates, which are by the clock, want a quiet machine.
 from __future__ import annotations
 
 import copy
+import multiprocessing
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import torch
 from plain_step import PlainLearner
@@ -31,6 +37,7 @@ from writer import writer as write
 
 from egovcp.data import EpisodeIndex, EpisodeStore, SequenceStream, StreamConfig, open_dataset
 from egovcp.model import Batch, WorldModel, WorldModelConfig
+from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import set_normalisation, to_tensors
 from egovcp_train.config import OptimizerConfig, SamplingConfig
 from egovcp_train.device import choose_bf16
@@ -44,54 +51,103 @@ EPISODES = 100  # of each task
 CPU = torch.device("cpu")
 BF16 = choose_bf16("auto", CPU)
 
-type Turn = dict[str, tuple[float, float]]
+type Side = Literal["ours", "plain"]
+type Times = dict[str, tuple[float, float]]
 
 
-class Case:
-    """One batch size: both learners, and the stream."""
+class Learners:
+    """What one process measures: our steps and the stream, or the plain step."""
 
-    def __init__(self, store: EpisodeStore, batch: int) -> None:
+    def __init__(self, side: Side, root: Path, size: int, threads: int) -> None:
+        if side == "ours":
+            keep_freed_memory()
+        torch.set_num_threads(threads)
         torch.manual_seed(0)
-        model = WorldModel(WorldModelConfig())
-        set_normalisation(model, store)
-        config = OptimizerConfig(warmup_steps=0)
-        self.stream = SequenceStream(store, StreamConfig(batch_size=batch, length=LENGTH))
-        self.batch = self._next()
-        self.plain = PlainLearner(model, config, seed=0)
-        self.ours = Learner(copy.deepcopy(model), config, seed=0, bf16=BF16)
-        self.float32 = Learner(model, config, seed=0)
-        self._compare()
+        index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
+        store = label(EpisodeStore.read(index), PassingConfig())
+        self._model = WorldModel(WorldModelConfig())
+        set_normalisation(self._model, store)
+        self._config = OptimizerConfig(warmup_steps=0)
+        self._stream = SequenceStream(store, StreamConfig(batch_size=size, length=LENGTH))
+        self._batch = self._next()
 
     def _next(self) -> Batch:
-        return to_tensors(next(self.stream), CPU)
+        return to_tensors(next(self._stream), CPU)
 
-    def _compare(self) -> None:
-        """The first step warms all up, and has to find the same loss."""
-        self.ours.update(self.batch, 0.0)
-        ours = float(self.float32.update(self.batch, 0.0)["loss/total"])
-        plain = self.plain.update(self.batch)
-        self.difference = abs(ours - plain) / abs(plain)
-        if self.difference > TOLERANCE:
-            raise SystemExit(f"not the same mathematics: loss {ours}, plain {plain}")
+    @cached_property
+    def _plain(self) -> PlainLearner:
+        return PlainLearner(self._model, self._config, seed=0)
 
-    def turn(self) -> Turn:
+    @cached_property
+    def _float32(self) -> Learner:
+        return Learner(copy.deepcopy(self._model), self._config, seed=0)
+
+    @cached_property
+    def _ours(self) -> Learner:
+        return Learner(copy.deepcopy(self._model), self._config, seed=0, bf16=BF16)
+
+    def first(self, side: Side) -> float:
+        """The first step warms all up; its loss, in float32."""
+        if side == "plain":
+            return self._plain.update(self._batch)
+        self._ours.update(self._batch, 0.0)
+        return float(self._float32.update(self._batch, 0.0)["loss/total"])
+
+    def turn(self, side: Side) -> Times:
         """Seconds of the processor and of the clock of each case, and of getting a batch."""
+        if side == "plain":
+            return {"plain": timed(lambda: self._plain.update(self._batch))}
+        fetched: list[Batch] = []
         wait = (0.0, 0.0)
 
         def on_data() -> None:
             nonlocal wait
             wait = timed(lambda: fetched.append(self._next()))
-            self.ours.update(fetched.pop(), 0.0)
+            self._ours.update(fetched.pop(), 0.0)
 
-        fetched: list[Batch] = []
         cases: dict[str, Callable[[], object]] = {
-            "plain": lambda: self.plain.update(self.batch),
-            "float32": lambda: self.float32.update(self.batch, 0.0),
-            "step": lambda: self.ours.update(self.batch, 0.0),
+            "float32": lambda: self._float32.update(self._batch, 0.0),
+            "step": lambda: self._ours.update(self._batch, 0.0),
             "data": on_data,
         }
-        found = {name: timed(case) for name, case in cases.items()}
-        return found | {"wait": wait}
+        return {name: timed(case) for name, case in cases.items()} | {"wait": wait}
+
+
+_learners: list[Learners] = []  # of a process of `Case`
+
+
+def _begin(side: Side, root: Path, size: int, threads: int) -> None:
+    _learners.append(Learners(side, root, size, threads))
+
+
+def _first(side: Side) -> float:
+    return _learners[0].first(side)
+
+
+def _turn(side: Side) -> Times:
+    return _learners[0].turn(side)
+
+
+def case(root: Path, size: int, threads: int, rounds: int) -> tuple[list[Times], float]:
+    """Turns of both sides, each in its own process, one at a time; how far their losses differ."""
+    spawn = multiprocessing.get_context("spawn")
+    sides: Mapping[Side, ProcessPoolExecutor] = {
+        side: ProcessPoolExecutor(1, spawn, _begin, (side, root, size, threads))
+        for side in ("plain", "ours")
+    }
+    try:
+        plain, ours = (pool.submit(_first, side).result() for side, pool in sides.items())
+        difference = abs(ours - plain) / abs(plain)
+        if difference > TOLERANCE:
+            raise SystemExit(f"not the same mathematics: loss {ours}, plain {plain}")
+        turns = []
+        for _ in range(rounds):
+            parts = [pool.submit(_turn, side).result() for side, pool in sides.items()]
+            turns.append(parts[0] | parts[1])
+        return turns, difference
+    finally:
+        for pool in sides.values():
+            pool.shutdown()
 
 
 def timed(case: Callable[[], object]) -> tuple[float, float]:
@@ -101,7 +157,7 @@ def timed(case: Callable[[], object]) -> tuple[float, float]:
     return time.process_time() - cpu, time.perf_counter() - clock
 
 
-def figures(turns: list[Turn], name: str, frames: int) -> dict[str, object]:
+def figures(turns: list[Times], name: str, frames: int) -> dict[str, object]:
     """What the turns of one case come to; keys begin with ``name``."""
 
     def ratio(a: str, b: str) -> float:
@@ -126,17 +182,13 @@ def figures(turns: list[Turn], name: str, frames: int) -> dict[str, object]:
 
 def measure(root: Path, batches: list[int], threads: list[int], rounds: int) -> dict[str, object]:
     """All figures; keys say the batch and the number of threads."""
-    index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
-    store = label(EpisodeStore.read(index), PassingConfig())
     out: dict[str, object] = {"window": LENGTH, "bf16": BF16}
     for size in batches:
         for count in threads:
-            torch.set_num_threads(count)
-            case = Case(store, size)
-            turns = [case.turn() for _ in range(rounds)]
+            turns, difference = case(root, size, count, rounds)
             name = f"step_{size}_threads_{count}"
             out |= figures(turns, name, size * LENGTH)
-            out[f"{name}_loss_difference"] = case.difference
+            out[f"{name}_loss_difference"] = difference
     return out
 
 

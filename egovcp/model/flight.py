@@ -42,7 +42,7 @@ _BEHIND: Final = -0.08  # s, the time left at which it has passed
 class Sighting(NamedTuple):
     """What N pictures show."""
 
-    point: Tensor  # (N, 3) m, camera frame (forward, left, up), the middle of the thing
+    point: Tensor  # (N, 3) m, camera frame (forward, left, up), the middle of the thing; else 0
     weight: Tensor  # (N,) 1 / m^2; 0: nothing is seen
 
 
@@ -55,6 +55,18 @@ def sighting(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) ->
         max_m: depth at which nearness is 0, m.
         config: of the filter.
     """
+    point, weight = sight.new_zeros(len(sight), 3), sight.new_zeros(len(sight))
+    likely = torch.sigmoid(sight[:, 3])
+    rows = (likely > 0.5).nonzero()[:, 0]  # most pictures show nothing that flies
+    point[rows], deviation = _measured(near[rows], sight[rows], max_m, config)
+    weight[rows] = likely[rows] / deviation.square()
+    return Sighting(point, weight)
+
+
+def _measured(
+    near: Tensor, sight: Tensor, max_m: float, config: FlightConfig
+) -> tuple[Tensor, Tensor]:
+    """The middle (N, 3) of the thing in each picture, and its deviation (N,), m."""
     height, width = near.shape[-2:]
     focal = height / 2 / config.camera.half_height
     row, col = _slopes(height, focal, near.device)[:, None], _slopes(width, focal, near.device)
@@ -73,9 +85,7 @@ def sighting(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) ->
     found = (count >= _MIN_PIXELS) & (cut == 0)
     point = torch.where(found[:, None], torch.stack(mean, -1), guess)
     deviation = config.deviation * point[:, 0].clamp_min(1.0) * torch.where(found, 1.0, 2.5)
-    likely = torch.sigmoid(sight[:, 3])
-    weight = torch.where(likely > 0.5, likely, 0.0) / deviation.square()
-    return Sighting(point, weight)
+    return point, deviation
 
 
 @cache
