@@ -4,21 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from egovcp.artefact import save_artefact
-from egovcp.plan import PlannerConfig, PolicyStep
+from egovcp.plan import PolicyStep
 from egovcp.rate import LockstepClock
 from egovcp.robot.stance import StanceController
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot, Servos
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
-from egovcp.testing import toy_model
 from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.pilot import Pilot
@@ -38,16 +35,6 @@ PATIENT = [
     "--robot.limits.state_hold_s=5",
     "--robot.limits.state_damp_s=10",
 ]
-
-
-@pytest.fixture(scope="session")
-def artefact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A policy artefact with random weights whose steps are short: whatever it draws, the robot
-    stands, and what is tested is the runner."""
-    path = tmp_path_factory.mktemp("policy") / "policy"
-    planner = PlannerConfig(samples=16, elites=4, iterations=1, eta=0.02)
-    save_artefact(path, toy_model(), planner, {"controller_id": StanceController().id})
-    return path
 
 
 @dataclass
