@@ -1,0 +1,211 @@
+"""Anything but an artefact as it was written is refused by name, and nothing in it is executed."""
+
+import pickle
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from egovcp.artefact import CONFIG, MANIFEST, WEIGHTS, load_artefact
+from egovcp.errors import ArtefactError
+from egovcp.processors import PROCESSORS
+
+from .conftest import FILES, PLANNER, Json, edit, sign
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
+def test_a_missing_file_is_named(folder: Path, name: str) -> None:
+    (folder / name).unlink()
+    with pytest.raises(ArtefactError, match=name):
+        load_artefact(str(folder))
+
+
+@pytest.mark.parametrize("name", sorted(FILES - {MANIFEST}))
+@pytest.mark.parametrize("where", [0, -1])
+def test_a_changed_byte_is_noticed(folder: Path, name: str, where: int) -> None:
+    content = bytearray((folder / name).read_bytes())
+    content[where] ^= 1
+    (folder / name).write_bytes(content)
+    with pytest.raises(ArtefactError, match=f"{name}.*SHA-256"):
+        load_artefact(str(folder))
+
+
+@pytest.mark.parametrize("word", ["stance-1", "sha256", "schema_version", "files"])
+def test_no_word_of_the_manifest_changes_unnoticed(folder: Path, word: str) -> None:
+    text = (folder / MANIFEST).read_text()
+    assert word in text
+    (folder / MANIFEST).write_text(text.replace(word, word.upper(), 1))
+    with pytest.raises(ArtefactError, match=MANIFEST):
+        load_artefact(str(folder))
+
+
+def test_an_older_artefact_without_files_for_lerobot_still_loads(folder: Path) -> None:
+    for name in PROCESSORS:
+        (folder / name).unlink()
+    edit(folder / MANIFEST, lambda m: [m["files"].pop(name) for name in PROCESSORS])
+    assert load_artefact(str(folder)).planner == PLANNER
+
+
+@pytest.mark.parametrize("name", sorted(FILES))
+def test_a_truncated_file_is_noticed(folder: Path, name: str) -> None:
+    content = (folder / name).read_bytes()
+    (folder / name).write_bytes(content[: len(content) // 2])
+    with pytest.raises(ArtefactError, match=name):
+        load_artefact(str(folder))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m: m.update(schema_version=1), "schema version 1"),
+        (lambda m: m.pop("schema_version"), "schema version None"),
+        (lambda m: m["features"].update(planner_hz=50), "another feature spec.*planner_hz"),
+        (lambda m: m["features"]["action_box"].update(low=[0] * 7), "feature spec.*action_box"),
+        (lambda m: m["features"]["state_names"].pop(), "feature spec.*state_names"),
+        (lambda m: m["features"].update(smell=1), "another feature spec"),
+        (lambda m: m.update(features=[1]), "another feature spec"),
+        (lambda m: m.pop("features"), "another feature spec"),
+        (lambda m: m.pop("controller_id"), "no controller_id"),
+        (lambda m: m.update(controller_id=7), "no controller_id"),
+        (lambda m: m.pop("files"), "SHA-256"),
+        (lambda m: m.update(files=["a"]), "SHA-256"),
+        (lambda m: m["files"].pop(WEIGHTS), f"{WEIGHTS}.*SHA-256"),
+    ],
+)
+def test_a_manifest_of_something_else_is_refused(
+    folder: Path, change: Callable[[Json], object], message: str
+) -> None:
+    edit(folder / MANIFEST, change)
+    with pytest.raises(ArtefactError, match=message):
+        load_artefact(str(folder))
+
+
+@pytest.mark.parametrize("content", ["[]", "3", "null", "not json", '{"a": ', "\xff\xfe"])
+def test_a_manifest_that_is_none_is_refused(folder: Path, content: str) -> None:
+    (folder / MANIFEST).write_text(content, encoding="latin-1")
+    with pytest.raises(ArtefactError, match=MANIFEST):
+        load_artefact(str(folder))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c.pop("world_model"),
+        lambda c: c.pop("planner"),
+        lambda c: c["world_model"].update(hidden=48),
+        lambda c: c["world_model"].update(hidden="wide"),
+        lambda c: c["world_model"].update(channels=[4, 8]),
+        lambda c: c["world_model"].update(surprise=1),
+        lambda c: c.update(world_model=[1, 2]),
+        lambda c: c["planner"].update(samples=0),
+        lambda c: c["planner"].update(termination_rule="never"),
+        lambda c: c.update(planner=None),
+    ],
+)
+def test_a_configuration_that_cannot_be_is_refused(
+    folder: Path, change: Callable[[Json], object]
+) -> None:
+    """Even where somebody has signed it again."""
+    edit(folder / CONFIG, change)
+    sign(folder)
+    with pytest.raises(ArtefactError, match="copy"):
+        load_artefact(str(folder))
+
+
+class _Bomb:
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[str]]:
+        return (pytest.fail, ("a pickle was executed",))
+
+
+def test_a_pickle_is_never_executed(folder: Path) -> None:
+    (folder / WEIGHTS).write_bytes(pickle.dumps(_Bomb()))
+    sign(folder)
+    with pytest.raises(ArtefactError, match="weights"):
+        load_artefact(str(folder))
+    torch.save(_Bomb(), folder / WEIGHTS)
+    sign(folder)
+    with pytest.raises(ArtefactError, match="weights"):
+        load_artefact(str(folder))
+
+
+def test_loading_never_unpickles(original: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        pytest.fail("unpickling")
+
+    for target in ("pickle.load", "pickle.loads", "pickle.Unpickler", "torch.load"):
+        monkeypatch.setattr(target, refuse)
+    load_artefact(str(original))
+
+
+def _mutate(rng: np.random.Generator, content: bytes) -> bytes:
+    """A few bytes changed, cut out, doubled or put in, anywhere."""
+    data = bytearray(content)
+    for _ in range(rng.integers(1, 4)):
+        at, length = int(rng.integers(len(data) or 1)), int(rng.integers(1, 9))
+        match int(rng.integers(5)):
+            case 0:
+                data[at : at + 1] = bytes([int(rng.integers(256))])
+            case 1:
+                del data[at : at + length]
+            case 2:
+                data[at:at] = data[at : at + length]
+            case 3:
+                data[at:at] = rng.bytes(length)
+            case 4:
+                del data[at:]
+    return bytes(data)
+
+
+def _near_the_head(rng: np.random.Generator, content: bytes) -> bytes:
+    """The same where a file of weights says what follows."""
+    return _mutate(rng, content[:600]) + content[600:]
+
+
+def _loaded(folder: Path) -> dict[str, torch.Tensor] | None:
+    try:
+        return load_artefact(str(folder)).world_model.state_dict()
+    except ArtefactError:
+        return None
+
+
+def test_of_1000_mutated_artefacts_none_loads_as_another_or_runs_code(
+    original: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        pytest.fail("code of the artefact")
+
+    for target in ("pickle.load", "pickle.loads", "pickle.Unpickler", "torch.load"):
+        monkeypatch.setattr(target, refuse)
+    folder, rng = Path(shutil.copytree(original, tmp_path / "copy")), np.random.default_rng(0)
+    contents = {name: (original / name).read_bytes() for name in sorted(FILES)}
+    truth, loads = load_artefact(str(original)).world_model.state_dict(), 0
+    for number in range(1000):
+        name = sorted(FILES)[number % len(FILES)]
+        mutate = _near_the_head if number % 2 else _mutate
+        mutated = mutate(rng, contents[name])
+        (folder / name).write_bytes(mutated)
+        weights = _loaded(folder)
+        assert weights is None or mutated == contents[name] or name == MANIFEST
+        if weights is not None:
+            loads += 1
+            assert all(torch.equal(weights[key], value) for key, value in truth.items())
+        if name in (CONFIG, WEIGHTS):
+            sign(folder)  # by whoever changed it: what is loaded may differ, what happens may not
+            _loaded(folder)
+            (folder / MANIFEST).write_bytes(contents[MANIFEST])
+        (folder / name).write_bytes(contents[name])
+    assert loads < 20
+
+
+def test_it_holds_only_json_and_safetensors(original: Path) -> None:
+    assert {path.name for path in original.iterdir()} == FILES
+
+
+def test_another_controller_is_refused(original: Path) -> None:
+    loaded = load_artefact(str(original))
+    loaded.require_controller("stance-1")
+    with pytest.raises(ArtefactError, match=r"policy.*'stance-1'.*'walker-2'"):
+        loaded.require_controller("walker-2")

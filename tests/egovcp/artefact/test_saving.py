@@ -1,0 +1,155 @@
+"""What is written is what is loaded, and an old artefact is replaced whole or not at all."""
+
+import dataclasses
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from egovcp import artefact as module
+from egovcp import spec
+from egovcp.artefact import CONFIG, load_artefact, save_artefact
+from egovcp.errors import ArtefactError
+from egovcp.model import PRESETS, WorldModel
+from egovcp.plan import PlannerConfig, Policy
+from egovcp.testing import toy_model
+
+from .conftest import FILES, PLANNER, PROVENANCE, Json, edit, sign
+
+
+def test_the_loaded_policy_acts_as_the_saved_one(original: Path) -> None:
+    saved = toy_model()
+    loaded = load_artefact(str(original))
+    saved.load_state_dict(loaded.world_model.state_dict())
+    rng = np.random.default_rng(0)
+    depth = rng.integers(0, 5000, (2, spec.DEPTH_ROWS, spec.DEPTH_COLS)).astype(np.uint16)
+    state = rng.normal(size=(2, spec.STATE_DIM)).astype(np.float32)
+    mine = Policy(saved, PLANNER, num_envs=2, seed=4)
+    theirs = loaded.make_policy(num_envs=2, seed=4)
+    for _ in range(3):
+        a, b = (policy.act(depth, state) for policy in (mine, theirs))
+        for x, y in zip(a, b, strict=True):
+            np.testing.assert_array_equal(x, y)
+        mine.advance(a.action)
+        theirs.advance(b.action)
+        np.testing.assert_array_equal(mine.reconstruct(), theirs.reconstruct())
+
+
+def test_weights_statistics_and_settings_survive(tmp_path: Path) -> None:
+    model = toy_model()
+    model.state_std.uniform_(0.5, 2)
+    model.return_floor.fill_(-7.0)
+    save_artefact(tmp_path / "policy", model, PLANNER, PROVENANCE)
+    loaded = load_artefact(str(tmp_path / "policy"))
+    kept = loaded.world_model.state_dict()
+    assert kept.keys() == model.state_dict().keys()
+    for name, value in model.state_dict().items():
+        assert torch.equal(kept[name], value), name
+    assert loaded.world_model.config == model.config
+    assert loaded.planner == PLANNER
+    assert loaded.manifest["datasets"] == PROVENANCE["datasets"]
+    assert not loaded.world_model.training
+
+
+def test_saving_what_was_loaded_is_the_identity(original: Path, tmp_path: Path) -> None:
+    loaded = load_artefact(str(original))
+    save_artefact(tmp_path / "again", loaded.world_model, loaded.planner, PROVENANCE)
+    for name in FILES:
+        assert (tmp_path / "again" / name).read_bytes() == (original / name).read_bytes()
+
+
+def test_another_planner_can_be_asked_for(original: Path) -> None:
+    other = PlannerConfig(samples=8, elites=2, horizon=2)
+    assert load_artefact(str(original)).make_policy(planner=other).config == other
+
+
+def test_an_artefact_without_the_younger_options_loads_as_what_it_was(folder: Path) -> None:
+    """They are absent in files of an earlier version; their defaults change nothing."""
+    shutil.rmtree(folder)
+    model = WorldModel(dataclasses.replace(PRESETS["debug"], q_heads=1))
+    save_artefact(folder, model, PlannerConfig(), {"controller_id": "s-1"})
+    expected = load_artefact(str(folder))
+
+    def forget(config: Json) -> None:
+        for name in ("value_loss", "q_heads", "value_units"):
+            del config["world_model"][name]
+        for name in ("near", "near_threshold", "free_nats_per", "reward"):
+            del config["world_model"]["loss"][name]
+        for name in ("latent", "ensemble"):
+            del config["planner"][name]
+
+    edit(folder / CONFIG, forget)
+    sign(folder)
+    found = load_artefact(str(folder))
+    assert (found.world_model.config, found.planner) == (
+        expected.world_model.config,
+        expected.planner,
+    )
+
+
+def test_a_model_from_before_flights_were_followed_does_not_follow_them(folder: Path) -> None:
+    assert load_artefact(str(folder)).world_model.config.follows_flight
+    edit(folder / CONFIG, lambda config: config["world_model"].pop("flight"))
+    sign(folder)
+    assert not load_artefact(str(folder)).world_model.config.follows_flight
+
+
+def test_options_that_the_weights_contradict_are_refused(folder: Path) -> None:
+    edit(folder / CONFIG, lambda config: config["world_model"].update(q_heads=3))
+    sign(folder)
+    with pytest.raises(
+        ArtefactError, match=r"weights and configuration disagree.*more_value_heads"
+    ):
+        load_artefact(str(folder))
+
+
+def test_an_older_artefact_is_replaced_and_nothing_is_left_over(folder: Path) -> None:
+    (folder / "stale").touch()
+    save_artefact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
+    assert {path.name for path in folder.iterdir()} == FILES
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+    loaded = load_artefact(str(folder)).world_model.state_dict()
+    expected = toy_model(seed=1).state_dict()
+    assert all(torch.equal(loaded[name], expected[name]) for name in expected)
+
+
+@pytest.mark.parametrize("step", ["save_file", "_write_json", "_sha256"])
+def test_a_failure_while_writing_leaves_the_old_artefact(
+    folder: Path, step: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = {path.name: path.read_bytes() for path in folder.iterdir()}
+
+    def fail(*_: object, **__: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(module, step, fail)
+        with pytest.raises(OSError, match="No space left"):
+            save_artefact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
+    assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    save_artefact(folder, toy_model(seed=1), PLANNER, PROVENANCE)  # leftovers do no harm
+    load_artefact(str(folder))
+
+
+def test_a_failing_rename_leaves_an_artefact(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """At the last moment, too: never neither the old one nor the new one."""
+    rename = Path.rename
+
+    def fail(self: Path, target: Path) -> Path:
+        if target == folder and self.name.endswith(".partial"):
+            raise OSError(5, "Input/output error")
+        return rename(self, target)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "rename", fail)
+        with pytest.raises(OSError, match="Input/output"):
+            save_artefact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
+    load_artefact(str(folder))
+
+
+def test_provenance_without_a_controller_is_refused_before_writing(tmp_path: Path) -> None:
+    with pytest.raises(ArtefactError, match="controller_id"):
+        save_artefact(tmp_path / "policy", toy_model(), PLANNER, {"datasets": []})
+    assert not list(tmp_path.iterdir())
