@@ -109,7 +109,7 @@ class Grid:
         return self.add(cell)
 
     def play(self, task: str, seed: int, variant: Variant, learned_from: str = "") -> Cell:
-        """The planner in closed loop.
+        """The planner in closed loop. A variant that asks for what is done anyway is the default.
 
         Args:
             task: what is played.
@@ -121,9 +121,10 @@ class Grid:
         policy = self.model(teacher, seed, variant.model)
         own = _named(self.config.play.task_flags.get(teacher, ()))
         flags = {**self.scenarios(task), **own, "controllers": "planner", "policy.path": policy}
-        differs = variant.play or variant.model.flags or teacher != task
+        changes = {name: value for name, value in variant.play.items() if flags.get(name) != value}
+        differs = changes or variant.model.flags or teacher != task
         name = f"play-{task}-{variant.name if differs else DEFAULT}-s{seed}"
-        return self.add(Cell(name, PLAY, {**flags, **variant.play}))
+        return self.add(Cell(name, PLAY, {**flags, **changes}))
 
     def references(
         self,

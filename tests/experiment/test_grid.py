@@ -53,6 +53,15 @@ def test_what_differs_in_nothing_is_played_once_for_all_experiments() -> None:
     assert mixed == Output("train-all-default-s0", ARTEFACT)
 
 
+def test_a_variant_that_asks_for_what_is_done_anyway_is_the_default() -> None:
+    play = PlayConfig(task_flags={"ball": ("--planner.process=ramp",)})
+    grid = Grid(ExperimentConfig(play=play))
+    ramp, walk = (Variant(f"process_{p}", play={"planner.process": p}) for p in ("ramp", "walk"))
+    assert grid.play("ball", 0, ramp) == grid.play("ball", 0, Variant("default"))
+    assert grid.play("ball", 0, walk).name == "play-ball-process_walk-s0"
+    assert grid.play("wall", 0, ramp).name == "play-wall-process_ramp-s0"
+
+
 def test_what_is_there_already_is_not_made_again() -> None:
     data = DataConfig(roots={"ball": "data/ball"})
     grid = Grid(ExperimentConfig(data=data, train=TrainingConfig(policies={"wall": "a/wall"})))
