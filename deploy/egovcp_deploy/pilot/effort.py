@@ -16,6 +16,7 @@ POOR_TO_HALVE: Final = 3  # late or short plans; two good ones make up for one
 _MADE_UP: Final = 0.5
 GOOD_TO_DOUBLE: Final = 50  # good plans in a row, 2 s
 FEWEST_SAMPLES: Final = 64
+FEWEST_ELITES: Final = 4  # the mean of two follows Q's errors too closely (docs/planner.md)
 
 
 class Effort:
@@ -47,6 +48,7 @@ class Effort:
         fewest = min(FEWEST_SAMPLES, self._full.samples)
         samples = min(max(samples, fewest), self._full.samples)
         changed = samples != self.config.samples
-        elites = max(1, self._full.elites * samples // self._full.samples)
+        elites = self._full.elites * samples // self._full.samples
+        elites = min(max(elites, FEWEST_ELITES), self._full.elites)
         self.config = replace(self._full, samples=samples, elites=elites)
         return changed

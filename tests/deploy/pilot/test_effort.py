@@ -56,3 +56,11 @@ def test_a_planner_that_is_small_already_is_left_alone() -> None:
     effort = Effort(PlannerConfig(samples=16, elites=4))
     assert not any(effort.record(late=True, iterations=1) for _ in range(20))
     assert effort.config.samples == 16
+
+
+@pytest.mark.parametrize("elites", [1, 2, 4, 6])
+def test_few_elites_are_not_halved(elites: int) -> None:
+    effort = Effort(PlannerConfig(samples=256, elites=elites))
+    for _ in range(POOR_TO_HALVE):
+        effort.record(late=True, iterations=1)
+    assert (effort.config.samples, effort.config.elites) == (128, min(elites, 4))
