@@ -35,6 +35,7 @@ _SUMS, _PLACES, _MOMENTS = slice(20, 23), slice(23, 26), slice(26, 29)
 SIZE: Final = 29
 _DT: Final = spec.PLANNER_DT
 _MIN_PIXELS: Final = 2
+_MANY: Final = 32  # pictures among which it pays to pick; graphs are traced with fewer
 _LEAST_SPEED: Final = 1.0  # m/s towards the robot
 _BEHIND: Final = -0.08  # s, the time left at which it has passed
 
@@ -55,9 +56,14 @@ def sighting(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) ->
         max_m: depth at which nearness is 0, m.
         config: of the filter.
     """
-    point, weight = sight.new_zeros(len(sight), 3), sight.new_zeros(len(sight))
     likely = torch.sigmoid(sight[:, 3])
-    rows = (likely > 0.5).nonzero()[:, 0]  # most pictures show nothing that flies
+    seen = likely > 0.5
+    if len(sight) < _MANY:
+        point, deviation = _measured(near, sight, max_m, config)
+        weight = torch.where(seen, likely, 0.0) / deviation.square()
+        return Sighting(torch.where(seen[:, None], point, 0.0), weight)
+    point, weight = sight.new_zeros(len(sight), 3), sight.new_zeros(len(sight))
+    rows = seen.nonzero()[:, 0]  # most pictures show nothing that flies
     point[rows], deviation = _measured(near[rows], sight[rows], max_m, config)
     weight[rows] = likely[rows] / deviation.square()
     return Sighting(point, weight)

@@ -198,6 +198,20 @@ def test_the_pixels_say_where_it_is_better_than_the_encoder(off: tuple[float, fl
     assert unsure.weight == 0
 
 
+def test_of_many_pictures_those_that_show_nothing_are_passed_over() -> None:
+    generator = torch.Generator().manual_seed(0)
+    near = torch.rand((80, spec.DEPTH_ROWS, spec.DEPTH_COLS), generator=generator)
+    sight = torch.randn((80, 4), generator=generator)
+    many = flight.sighting(near, sight, spec.DEPTH_MAX_M, CONFIG)
+    few = [
+        flight.sighting(near[k : k + 8], sight[k : k + 8], spec.DEPTH_MAX_M, CONFIG)
+        for k in range(0, 80, 8)
+    ]
+    assert 20 < (many.weight > 0).sum() < 60
+    for whole, parts in zip(many, zip(*few, strict=True), strict=True):
+        assert torch.equal(whole, torch.cat(parts))
+
+
 def test_the_camera_is_where_kinematics_says() -> None:
     rng = np.random.default_rng(1)
     state = torch.cat([_standing(rng, 0.2) for _ in range(5)])
