@@ -44,6 +44,9 @@ class PlannerOptions:
     """Best candidates that the next round is fitted to."""
     min_std: float | None = None
     """Floor of the deviation that candidates are drawn with, in steps of the action process."""
+    hands_cost: float | None = None
+    """What hands away from the neutral pose cost a plan: so much return times their mean squared
+    action (docs/planner.md)."""
     process: Process | None = None
     """What candidates are made of: walk (a step in every tick), or ramp (to a place to rest at, as
     in data collected with longer --step_ticks)."""

@@ -116,6 +116,7 @@ ACTION_NAMES: Final = (
     "height",
 )
 ACTION_DIM: Final = 7
+ACTION_HANDS: Final = slice(0, 6)
 ACTION_ETA: Final = 0.32  # random-walk step of the paper (section III-B), box units per tick
 ACTION_RATE_LIMIT: Final = 0.32  # box units per planner tick; same in collection and deployment
 

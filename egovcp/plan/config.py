@@ -36,6 +36,9 @@ class PlannerConfig:
     """Floor of the sampling deviation, in units of delta."""
     eta: float = spec.ACTION_ETA
     """Step of the action process, box units per tick."""
+    hands_cost: float = 0.0
+    """What hands away from the neutral pose cost a candidate, in units of return: times their mean
+    squared action. Q knows the price of a pose, but not as exactly as it would have to."""
     process: Process = "walk"
     """What candidates are made of. walk: a step of its own in every tick, as the paper's data;
     ramp: the steps drawn add up to one place, to which it goes by eta a tick and where it rests, as
@@ -75,6 +78,8 @@ class PlannerConfig:
             raise UsageError(f"elites ({self.elites}) exceed samples ({self.samples})")
         if not 0 < self.eta <= 2:
             raise UsageError(f"eta is {self.eta}; expected more than 0 and at most 2, the box")
+        if not 0 <= self.hands_cost < float("inf"):
+            raise UsageError(f"hands_cost is {self.hands_cost}; expected at least 0")
         if not self.min_std >= 0:
             raise UsageError(f"min_std is {self.min_std}; expected at least 0")
         if self.temperature <= 0:

@@ -28,7 +28,7 @@ class Belief(NamedTuple):
     std: Tensor  # (E, N, 7)
     elites: Tensor  # (E, elites, N, 7) deltas, best first; of the last round
     values: Tensor  # (E, elites); -inf where J was not a number
-    value: Tensor  # (E,) J of the answer, as far as it is known
+    value: Tensor  # (E,) J of the answer, less its hands' cost, as far as it is known
 
 
 class Optimiser(Protocol):
@@ -110,7 +110,11 @@ def make_plan[C](
         deltas = optimiser.propose(belief, iteration, generator)  # (E, M, N, 7)
         if config.process == "ramp":
             deltas = ramp(start, deltas, config.eta)
-        values = worth(walk(start, deltas, config.eta), generator)
+        actions = walk(start, deltas, config.eta)
+        values = worth(actions, generator)
+        if config.hands_cost > 0:
+            hands = actions[..., spec.ACTION_HANDS]
+            values = values - config.hands_cost * hands.square().mean((-2, -1))
         values = values.masked_fill(~values.isfinite(), -torch.inf)
         belief = optimiser.learn(belief, deltas, values)
         if not pace.goes_on():

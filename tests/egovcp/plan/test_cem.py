@@ -66,6 +66,24 @@ def test_the_best_reachable_plan_is_found(seed: int) -> None:
     assert (plan.actions - ideal).abs().mean() < 0.08
 
 
+def test_hands_that_cost_something_stay_nearer_to_neutral_and_the_height_goes_its_way() -> None:
+    """In a world whose Q is -|a - goal|^2, J - c |hands|^2 / 6 is best at goal / (1 + c / 6)."""
+    executed, goal = torch.full((1, 7), 0.4), torch.full((1, 7), 0.4)
+    config = PlannerConfig(samples=512, elites=16, iterations=8, min_std=0.02)
+    free = _plan(executed, goal, config).actions[0, -1]
+    torch.testing.assert_close(free, goal[0], atol=0.05, rtol=0)
+    price = dataclasses.replace(config, hands_cost=60.0)
+    held = _plan(executed, goal, price).actions[0, -1]
+    assert held[spec.ACTION_HANDS].abs().max() < 0.15
+    torch.testing.assert_close(held[6], goal[0, 6], atol=0.15, rtol=0)
+
+
+@pytest.mark.parametrize("cost", [-0.1, math.inf, math.nan])
+def test_a_price_of_hands_is_a_number_from_zero_up(cost: float) -> None:
+    with pytest.raises(UsageError, match="hands_cost"):
+        PlannerConfig(hands_cost=cost)
+
+
 def test_a_goal_within_reach_is_met_at_once() -> None:
     executed = _random(4, 2, scale=0.5)
     goal = executed + 0.1
