@@ -48,9 +48,7 @@ class Plan(NamedTuple):
 
     actions: Tensor  # (E, N, 7) in [-1, 1]; the first is to be executed
     deltas: Tensor  # (E, N, 7) its steps; shifted, the warm start of the next plan
-    value: (
-        Tensor  # (E,) J, or the mean of the last elites' (cem); -inf: no candidate had a finite J
-    )
+    value: Tensor  # (E,) J less the hands' cost (cem: mean of the last elites); -inf: none finite
     candidates: Tensor  # (E, elites, N, 7) elites of the last round, best first
     candidate_values: Tensor  # (E, elites); -inf where J was not a number
     iterations: int
