@@ -39,7 +39,7 @@ class BalanceConfig:
 
     height_frequency: float = 8.0
     """rad/s: the height follows its command like a critically damped spring."""
-    height_speed: float = 0.45
+    height_speed: float = 0.25
     """m/s."""
     correction_limit: float = 0.8
     """Bound of each balance correction, as a share of effort limit / stiffness."""

@@ -11,6 +11,7 @@ from egovcp.cli import parse_config
 from egovcp_experiment.command import main, scale_of
 from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.experiments import EXPERIMENTS
+from egovcp_experiment.scales import SCALES
 
 
 def test_help_lists_every_experiment(capsys: pytest.CaptureFixture[str]) -> None:
@@ -50,7 +51,8 @@ def test_misuse_ends_with_2_before_anything_is_written(
 def test_a_flag_takes_from_one_task_what_the_scale_gives_it() -> None:
     argv = ["--scale=small", "--play.task_flags={ball: []}"]
     config = parse_config(ExperimentConfig, argv, "test", defaults=scale_of)
-    assert config.play.task_flags == {"ball": (), "wall": ("--planner.process=ramp",)}
+    assert config.play.task_flags == {**SCALES["small"]().play.task_flags, "ball": ()}
+    assert config.play.task_flags["wall"] == ("--planner.process=ramp",)
 
 
 def test_an_experiment_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
