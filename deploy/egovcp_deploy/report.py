@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
-from egovcp_deploy.scores import EpisodeScore, success_gain, summarise
+from egovcp_deploy.scores import EpisodeScore, success_gain, success_rate, summarise
 
 type Played = Mapping[str, Mapping[str, Sequence[EpisodeScore]]]
 
@@ -27,16 +27,12 @@ def gains(scores: Played) -> dict[str, dict[str, Any]]:
         others = [name for name in row if name != "planner"] if "planner" in row else []
         out[task] = {
             name: {
-                "gain": _rate(row["planner"]) - _rate(row[name]),
+                "gain": success_rate(row["planner"]) - success_rate(row[name]),
                 "ci95": list(success_gain(row["planner"], row[name])),
             }
             for name in others
         }
     return out
-
-
-def _rate(scores: Sequence[EpisodeScore]) -> float:
-    return sum(score.success for score in scores) / len(scores)
 
 
 def table(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
@@ -45,8 +41,19 @@ def table(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
     for task, row in figures.items():
         for name, played in row.items():
             lines += [_line(task, name, played), *_parts(played.get("parts", {}))]
-    widths = [max(len(line[i]) for line in lines) for i in range(len(_HEAD))]
-    return "\n".join(_aligned(line, widths) for line in lines)
+    return aligned(lines, words=2)
+
+
+def aligned(lines: Sequence[Sequence[str]], words: int) -> str:
+    """Columns of equal width: the first ``words`` to the left, numbers to the right."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if i < words else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )
 
 
 def _parts(parts: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, ...]]:
@@ -71,12 +78,3 @@ def _line(task: str, name: str, figures: Mapping[str, Any]) -> tuple[str, ...]:
         f"{figures['plan_ms_p50']:.2f}",
         f"{figures['plan_ms_p99']:.2f}",
     )
-
-
-def _aligned(line: Sequence[str], widths: Sequence[int]) -> str:
-    """Words to the left, numbers to the right."""
-    cells = [
-        cell.ljust(width) if i < 2 else cell.rjust(width)
-        for i, (cell, width) in enumerate(zip(line, widths, strict=True))
-    ]
-    return "  ".join(cells).rstrip()

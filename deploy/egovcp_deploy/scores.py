@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from egovcp.intervals import Interval, bootstrap, wilson
 
@@ -29,6 +30,11 @@ class EpisodeScore:
     """Success of each part of a sequence of tasks; of a single task, nothing."""
 
 
+def success_rate(scores: Sequence[EpisodeScore]) -> float:
+    """Share of the episodes that succeeded."""
+    return sum(score.success for score in scores) / len(scores)
+
+
 def reward_per_step(scores: Sequence[EpisodeScore]) -> float:
     """Sum of all rewards over the number of all steps."""
     return sum(score.reward for score in scores) / sum(score.steps for score in scores)
@@ -36,9 +42,28 @@ def reward_per_step(scores: Sequence[EpisodeScore]) -> float:
 
 def reward_interval(scores: Sequence[EpisodeScore]) -> Interval:
     """Bootstrap interval of `reward_per_step` over episodes."""
-    rewards = np.array([score.reward for score in scores])
-    steps = np.array([score.steps for score in scores])
-    return bootstrap(lambda i: rewards[i].sum(axis=1) / steps[i].sum(axis=1), len(scores))
+    return bootstrap(_reward_per_step(scores), len(scores))
+
+
+def reward_gain(scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]) -> Interval:
+    """Bootstrap interval of the difference in `reward_per_step` on the *same* scenarios."""
+    theirs = {score.episode: score for score in others}
+    ours, paired = _reward_per_step(scores), _reward_per_step([theirs[s.episode] for s in scores])
+    return bootstrap(lambda i: ours(i) - paired(i), len(scores))
+
+
+def _reward_per_step(
+    scores: Sequence[EpisodeScore],
+) -> Callable[[NDArray[np.int64]], NDArray[np.float64]]:
+    """Picks (R, E) of the episodes -> (R,) `reward_per_step` of each row."""
+    rewards = np.array([score.reward for score in scores], np.float64)
+    steps = np.array([score.steps for score in scores], np.float64)
+
+    def of(picks: NDArray[np.int64]) -> NDArray[np.float64]:
+        rates: NDArray[np.float64] = rewards[picks].sum(axis=1) / steps[picks].sum(axis=1)
+        return rates
+
+    return of
 
 
 def success_gain(scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]) -> Interval:
