@@ -16,7 +16,7 @@ from egovcp.log.sink import Sink
 from egovcp.log.tick import Candidates, Tick
 from egovcp.plan import PolicyStep
 from egovcp.rate import FixedRate
-from egovcp.spec import ACTION_BOX
+from egovcp.spec import ACTION_BOX, ACTION_HANDS
 from egovcp_deploy.pilot.desk import Desk, Reply
 from egovcp_deploy.pilot.pilot import REJECTED, Pilot
 from egovcp_deploy.pilot.states import Limits, Request, State
@@ -196,5 +196,5 @@ def thoughts(reply: Reply | None) -> dict[str, Any]:
 def _candidates(step: PolicyStep) -> Candidates:
     """The best candidates of the plan as hand paths, m, heading frame."""
     actions = step.candidates[0, :LOGGED_CANDIDATES]  # (n, N, 7)
-    hands = ACTION_BOX.to_metric(actions)[..., :6].reshape(*actions.shape[:2], 2, 3)
+    hands = ACTION_BOX.to_metric(actions)[..., ACTION_HANDS].reshape(*actions.shape[:2], 2, 3)
     return Candidates(hands, step.candidate_values[0, :LOGGED_CANDIDATES])

@@ -20,7 +20,7 @@ from egovcp.log.messages import to_millimetres
 from egovcp.log.pose import WRISTS, RobotPose
 from egovcp.log.tick import SceneObject, Tick
 from egovcp.robot.kinematics import LINK_NAMES, PARENT, quaternion
-from egovcp.spec import ACTION_BOX, STATE_SLICES
+from egovcp.spec import ACTION_BOX, ACTION_HANDS, STATE_SLICES
 
 Array = NDArray[np.floating]
 
@@ -143,7 +143,7 @@ def _plans(frames: Sequence[Frame]) -> Iterator[Columns]:
 
 def _best(frame: Frame) -> Array:
     """(2, N, 3) path of each hand along the chosen plan, world frame."""
-    hands = ACTION_BOX.to_metric(np.asarray(frame.tick.plan))[:, :6].reshape(-1, 2, 3)
+    hands = ACTION_BOX.to_metric(np.asarray(frame.tick.plan))[:, ACTION_HANDS].reshape(-1, 2, 3)
     return frame.pose.from_heading(hands).swapaxes(0, 1)
 
 

@@ -17,6 +17,9 @@ Range = tuple[float, float]
 #: (``stance``) and that do (``walk``).
 STANDING_PUSHES: Range = (0.40, 0.60)
 STEPPING_PUSHES: Range = (0.80, 1.20)
+#: s after a push in which bracing is rewarded, likewise.
+STANDING_DISTURBED = 6.0
+STEPPING_DISTURBED = 2.0
 
 
 def _check_ranges(where: str, part: object) -> None:
@@ -98,9 +101,10 @@ class WallConfig:
     """Change of base velocity by a push away from the wall, m/s; the stance survives it."""
     push_time: float = 0.02
     """Time over which a push acts, s."""
-    disturbed_time: float = 6.0
-    """Time after a push in which bracing is rewarded, s; by default the rest of the episode, since
-    a controller that does not step leans on the wall for so long."""
+    disturbed_time: float | None = None
+    """Time after a push in which bracing is rewarded, s. None: 2 s for a controller that steps,
+    which stands by itself again then; 6 s, the rest of the episode, for one that does not: it leans
+    on the wall and falls against it when its hands let go."""
     brace_reward: float = 0.03
     """Per tick upright with a hand and nothing else on the wall while disturbed."""
     upright_reward: float = 0.02
@@ -301,11 +305,15 @@ class EnvConfig:
                 f"{self.controller!r}, which {cause}; expected {motion} or auto, or another "
                 "--env.controller"
             )
-        pushes = self.wall.push_speed_range or (STEPPING_PUSHES if walks else STANDING_PUSHES)
+        wall = self.wall
+        pushes = wall.push_speed_range or (STEPPING_PUSHES if walks else STANDING_PUSHES)
+        disturbed = STEPPING_DISTURBED if walks else STANDING_DISTURBED
+        if wall.disturbed_time is not None:
+            disturbed = wall.disturbed_time
         return replace(
             self,
             arch=replace(self.arch, motion=motion),
-            wall=replace(self.wall, push_speed_range=pushes),
+            wall=replace(wall, push_speed_range=pushes, disturbed_time=disturbed),
         )
 
     def episode(self, task: str) -> EpisodeConfig:

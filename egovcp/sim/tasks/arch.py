@@ -18,7 +18,7 @@ from egovcp.sim.robot import SimulatedRobot, Touch
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import ARCH, ARCH_GEOMS, HEAD, PARTS
 from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
-from egovcp.spec import PHYSICS_DT
+from egovcp.spec import ACTION_HANDS, PHYSICS_DT
 
 _OTHERS: Final = [part for part in range(len(PARTS)) if part != HEAD]
 _POST_HALF_WIDTH: Final = 0.06  # m
@@ -161,7 +161,7 @@ class ArchTask(Task):
             "head": -c.head_cost * bool(self.forces[HEAD] > 0.0),
             "contact": -c.contact_cost * bool(self.forces[_OTHERS].any()),
             "crouch": -c.crouch_cost * crouch * needless,
-            "pose": -c.pose_cost * float(np.mean(action[:6] ** 2)),
+            "pose": -c.pose_cost * float(np.mean(action[ACTION_HANDS] ** 2)),
         }
 
     @property

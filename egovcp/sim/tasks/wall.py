@@ -36,8 +36,10 @@ class WallTask(Task):
         push = scenario.rng("push")
         self.away = bool(push.random() < c.away_probability)
         self._bearing = float(push.uniform(*c.push_bearing_range)) + math.pi * self.away
-        towards = c.push_speed_range
+        towards, disturbed = c.push_speed_range, c.disturbed_time
         assert towards is not None, "decided by `EnvConfig.for_controller`"
+        assert disturbed is not None, "likewise"
+        self._disturbed_time = disturbed
         speed = c.away_speed_range if self.away else towards
         self.push_speed = float(push.uniform(*speed))
         self._touched_otherwise = False
@@ -87,7 +89,7 @@ class WallTask(Task):
     @property
     def disturbed(self) -> bool:
         """Whether a push is being felt or has just been."""
-        return 0.0 <= self.since_event <= self.config.disturbed_time
+        return 0.0 <= self.since_event <= self._disturbed_time
 
     def rewards(self, action: Array) -> dict[str, float]:
         """``brace`` and ``upright`` while disturbed; contact, impact and pose in every tick."""

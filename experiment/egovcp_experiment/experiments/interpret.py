@@ -212,7 +212,8 @@ def _behaviour(task: str, found: Mapping[str, Any]) -> _Section:
         lines.append(
             f"wall: {percent(untouched['share'])} of undisturbed scenes without contact (bar 95 %)"
             f"; hands back after {percent(back['share'])} of {back['episodes']} recoveries, of "
-            f"{found['pushed']} pushes towards the wall"
+            f"{found['pushed']} pushes towards the wall; a brace is rewarded for "
+            f"{found['braced_for_s']:g} s"
         )
     if task == "arch" and found["pelvis_far"]["mean"] is not None:
         lines.append(

@@ -20,7 +20,7 @@ from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.intervals import bootstrap, wilson
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import StepResult
+from egovcp.sim.env import StepResult, decided
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import PLANNER_HZ, TASKS
 from egovcp_experiment.studies.study import finish
@@ -131,6 +131,7 @@ def _wall(config: BehaviourConfig, eventful: list[Track], empty: list[Track]) ->
     pushed = [track for track in eventful if not track.away]
     return {
         "undisturbed_without_contact": _share(untouched),
+        "braced_for_s": decided(config.env).wall.disturbed_time,
         "hands_back": _share(back),
         "pushed": len(pushed),
         "recovered": len(back),

@@ -32,6 +32,23 @@ def test_pushes_are_those_of_the_controller_unless_given():
     assert given.for_controller(walks=True).wall.push_speed_range == (0.1, 0.2)
 
 
+def test_a_brace_is_rewarded_for_as_long_as_the_controller_needs_it():
+    assert EnvConfig().for_controller(walks=True).wall.disturbed_time == 2.0
+    assert EnvConfig().for_controller(walks=False).wall.disturbed_time == 6.0
+    given = EnvConfig(wall=WallConfig(disturbed_time=1.0))
+    assert given.for_controller(walks=False).wall.disturbed_time == 1.0
+
+
+def test_hands_let_go_of_a_wall_only_under_who_steps():
+    """Two seconds after a push the oracle takes its hands off: who does not step falls forward."""
+    held = EpisodeConfig(ticks=140, event_ticks=(3, 6), empty_probability=0.0)
+    for controller, stands in (("walk", 8), ("stance", 0)):
+        wall = WallConfig(away_probability=0.0, disturbed_time=2.0)
+        config = EnvConfig(controller=controller, wall=wall, wall_episode=held)
+        succeeded, _ = _play(config, "wall", Oracle(), rows=8)
+        assert sum(succeeded) == stands
+
+
 def test_a_robot_that_walks_is_not_put_before_an_arch_on_a_rail():
     with pytest.raises(UsageError, match=r"arch\.motion=rail.*walks.*--env\.controller"):
         VectorEnv(EnvConfig(arch=ArchConfig(motion="rail")), 1)
