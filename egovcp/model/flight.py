@@ -56,23 +56,19 @@ def sighting(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) ->
         max_m: depth at which nearness is 0, m.
         config: of the filter.
     """
-    likely = torch.sigmoid(sight[:, 3])
-    seen = likely > 0.5
+    seen = torch.sigmoid(sight[:, 3]) > 0.5
     if len(sight) < _MANY:
-        point, deviation = _measured(near, sight, max_m, config)
-        weight = torch.where(seen, likely, 0.0) / deviation.square()
-        return Sighting(torch.where(seen[:, None], point, 0.0), weight)
+        found = _measured(near, sight, max_m, config)
+        point = torch.where(seen[:, None], found.point, 0.0)
+        return Sighting(point, torch.where(seen, found.weight, 0.0))
     point, weight = sight.new_zeros(len(sight), 3), sight.new_zeros(len(sight))
     rows = seen.nonzero()[:, 0]  # most pictures show nothing that flies
-    point[rows], deviation = _measured(near[rows], sight[rows], max_m, config)
-    weight[rows] = likely[rows] / deviation.square()
+    point[rows], weight[rows] = _measured(near[rows], sight[rows], max_m, config)
     return Sighting(point, weight)
 
 
-def _measured(
-    near: Tensor, sight: Tensor, max_m: float, config: FlightConfig
-) -> tuple[Tensor, Tensor]:
-    """The middle (N, 3) of the thing in each picture, and its deviation (N,), m."""
+def _measured(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) -> Sighting:
+    """The thing that each picture is held to show."""
     height, width = near.shape[-2:]
     focal = height / 2 / config.camera.half_height
     row, col = _slopes(height, focal, near.device)[:, None], _slopes(width, focal, near.device)
@@ -91,7 +87,7 @@ def _measured(
     found = (count >= _MIN_PIXELS) & (cut == 0)
     point = torch.where(found[:, None], torch.stack(mean, -1), guess)
     deviation = config.deviation * point[:, 0].clamp_min(1.0) * torch.where(found, 1.0, 2.5)
-    return point, deviation
+    return Sighting(point, torch.sigmoid(sight[:, 3]) / deviation.square())
 
 
 @cache
