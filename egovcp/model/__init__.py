@@ -1,9 +1,10 @@
 """The world model: networks, recurrence and losses. Imports neither data nor a simulator."""
 
+from egovcp.model.carry import Carry
 from egovcp.model.config import PRESETS, LossConfig, WorldModelConfig
 from egovcp.model.losses import Batch
 from egovcp.model.objective import world_model_loss
-from egovcp.model.world_model import Carry, WorldModel
+from egovcp.model.world_model import WorldModel
 
 __all__ = [
     "PRESETS",

@@ -22,8 +22,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from egovcp.model.carry import Carry
 from egovcp.model.losses import Batch, Rollout, masked_mean, motion_error, motion_target, unbroken
-from egovcp.model.world_model import Carry, WorldModel
+from egovcp.model.world_model import WorldModel
 
 
 class Imagined(NamedTuple):

@@ -16,12 +16,13 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.model.camera_pose import CameraPose
+from egovcp.model.carry import Carry
 from egovcp.model.config import LossConfig
 from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, within
 from egovcp.model.flight import Sighting
 from egovcp.model.gaussian import Gaussian, kl_divergence
 from egovcp.model.shared import over_all_rows
-from egovcp.model.world_model import PASSING_UNIT, Carry, Look, WorldModel
+from egovcp.model.world_model import PASSING_UNIT, Look, WorldModel
 
 #: Pictures that are looked at together where no gradient is asked for: what the layers make of more
 #: no longer fits into a cache, nor into the memory that the allocator keeps.

@@ -6,10 +6,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from egovcp.model.carry import Carry
 from egovcp.model.config import LossConfig
 from egovcp.model.losses import Batch, Rollout, masked_mean, unbroken
 from egovcp.model.td import td_target
-from egovcp.model.world_model import Carry, QHeads, WorldModel
+from egovcp.model.world_model import QHeads, WorldModel
 
 
 def value_target(

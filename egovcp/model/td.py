@@ -15,9 +15,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from egovcp.model.carry import Carry
 from egovcp.model.losses import Batch, unbroken
 from egovcp.model.nets import ValueHead
-from egovcp.model.world_model import Carry, QHeads, WorldModel
+from egovcp.model.world_model import QHeads, WorldModel
 
 
 class SlowHeads(nn.Module):

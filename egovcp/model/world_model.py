@@ -16,7 +16,7 @@ on the robot and replay; `imagine` advances it without an observation.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -26,6 +26,7 @@ from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import flight, value
 from egovcp.model.camera_pose import CameraPose, camera_pose
+from egovcp.model.carry import Carry
 from egovcp.model.config import WorldModelConfig
 from egovcp.model.depth import nearness, network_image, paint_ball, to_metres
 from egovcp.model.gaussian import Gaussian
@@ -40,37 +41,6 @@ from egovcp.model.nets import (
 
 #: The head's units of y, z (m) and of the time left (s): about their spread.
 PASSING_UNIT = (0.25, 0.25, 0.25)
-
-
-class Carry(NamedTuple):
-    """The model's memory: h (..., hidden) and z (..., latent); and what it remembers of a flight.
-
-    Without the latter Q is told of it what h and z say.
-    """
-
-    h: Tensor
-    z: Tensor
-    flight: Tensor | None = None  # (..., `egovcp.model.flight.SIZE`), or its first four numbers
-
-    def map(self, change: Callable[[Tensor], Tensor]) -> Carry:
-        """Every part changed in the same way."""
-        flight = None if self.flight is None else change(self.flight)
-        return Carry(change(self.h), change(self.z), flight)
-
-    def row(self, index: int) -> Carry:
-        """That of one robot, (1, ...)."""
-        return self.map(lambda x: x[index : index + 1])
-
-    @staticmethod
-    def join(carries: Sequence[Carry], how: Callable[[list[Tensor]], Tensor]) -> Carry:
-        """Equal parts of several joined in the same way."""
-        flights = [c.flight for c in carries if c.flight is not None]
-        joined = how(flights) if flights else None
-        return Carry(how([c.h for c in carries]), how([c.z for c in carries]), joined)
-
-    @property
-    def features(self) -> Tensor:
-        return torch.cat([self.h, self.z], -1)
 
 
 class PosteriorHead(nn.Module):
