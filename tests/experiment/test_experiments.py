@@ -153,8 +153,10 @@ def test_multitask_says_which_models_are_played_otherwise() -> None:
     found = str(report("multitask", 1.0).parts[0])
     assert found.endswith(
         "The model of ball alone is played with `--planner.process=ramp`. "
-        "The model of wall alone is played with `--planner.process=ramp`."
+        "The model of wall alone is played with `--planner.process=ramp`. "
+        "The model of arch alone is played with `--planner.hands_cost=1`."
     )
-    alike = replace(SCALES["small"](), tasks=("arch",))
+    small = SCALES["small"]()
+    alike = replace(small, play=replace(small.play, task_flags={}))
     plain = EXPERIMENTS["multitask"].report(alike, records("multitask", 1.0))
     assert "played with" not in str(plain.parts[0])
