@@ -47,6 +47,8 @@ class PlannerOptions:
     hands_cost: float | None = None
     """What hands away from the neutral pose cost a plan: so much return times their mean squared
     action (docs/planner.md)."""
+    step_cost: float | None = None
+    """What moving costs a plan: so much return times its mean squared step."""
     process: Process | None = None
     """What candidates are made of: walk (a step in every tick), or ramp (to a place to rest at, as
     in data collected with longer --step_ticks)."""

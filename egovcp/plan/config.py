@@ -39,6 +39,9 @@ class PlannerConfig:
     hands_cost: float = 0.0
     """What hands away from the neutral pose cost a candidate, in units of return: times their mean
     squared action. Q knows the price of a pose, but not as exactly as it would have to."""
+    step_cost: float = 0.0
+    """What moving costs a candidate, in units of return: times its mean squared step, of which 1 is
+    the largest. Where Q has nothing to say, whoever pays for steps stays where it is."""
     process: Process = "walk"
     """What candidates are made of. walk: a step of its own in every tick, as the paper's data;
     ramp: the steps drawn add up to one place, to which it goes by eta a tick and where it rests, as
@@ -78,8 +81,9 @@ class PlannerConfig:
             raise UsageError(f"elites ({self.elites}) exceed samples ({self.samples})")
         if not 0 < self.eta <= 2:
             raise UsageError(f"eta is {self.eta}; expected more than 0 and at most 2, the box")
-        if not 0 <= self.hands_cost < float("inf"):
-            raise UsageError(f"hands_cost is {self.hands_cost}; expected at least 0")
+        for name in ("hands_cost", "step_cost"):
+            if not 0 <= getattr(self, name) < float("inf"):
+                raise UsageError(f"{name} is {getattr(self, name)}; expected at least 0")
         if not self.min_std >= 0:
             raise UsageError(f"min_std is {self.min_std}; expected at least 0")
         if self.temperature <= 0:

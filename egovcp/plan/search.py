@@ -28,7 +28,7 @@ class Belief(NamedTuple):
     std: Tensor  # (E, N, 7)
     elites: Tensor  # (E, elites, N, 7) deltas, best first; of the last round
     values: Tensor  # (E, elites); -inf where J was not a number
-    value: Tensor  # (E,) J of the answer, less its hands' cost, as far as it is known
+    value: Tensor  # (E,) J of the answer, less what its effort costs, as far as it is known
 
 
 class Optimiser(Protocol):
@@ -48,7 +48,7 @@ class Plan(NamedTuple):
 
     actions: Tensor  # (E, N, 7) in [-1, 1]; the first is to be executed
     deltas: Tensor  # (E, N, 7) its steps; shifted, the warm start of the next plan
-    value: Tensor  # (E,) J less the hands' cost (cem: mean of the last elites); -inf: none finite
+    value: Tensor  # (E,) J less effort (cem: mean of the last elites); -inf: none finite
     candidates: Tensor  # (E, elites, N, 7) elites of the last round, best first
     candidate_values: Tensor  # (E, elites); -inf where J was not a number
     iterations: int
@@ -110,9 +110,7 @@ def make_plan[C](
             deltas = ramp(start, deltas, config.eta)
         actions = walk(start, deltas, config.eta)
         values = worth(actions, generator)
-        if config.hands_cost > 0:
-            hands = actions[..., spec.ACTION_HANDS]
-            values = values - config.hands_cost * hands.square().mean((-2, -1))
+        values = values - _effort(actions, deltas, config)
         values = values.masked_fill(~values.isfinite(), -torch.inf)
         belief = optimiser.learn(belief, deltas, values)
         if not pace.goes_on():
@@ -120,6 +118,16 @@ def make_plan[C](
     best = walk(start.expand(-1, belief.elites.shape[1], -1), belief.elites, config.eta)
     chosen = walk(executed, belief.mean, config.eta)
     return Plan(chosen, belief.mean, belief.value, best, belief.values, iteration + 1)
+
+
+def _effort(actions: Tensor, deltas: Tensor, config: PlannerConfig) -> Tensor | float:
+    """What plans (E, M, N, 7) cost besides what Q says of them: (E, M), or 0 for all."""
+    cost: Tensor | float = 0.0
+    if config.hands_cost > 0:
+        cost = config.hands_cost * actions[..., spec.ACTION_HANDS].square().mean((-2, -1))
+    if config.step_cost > 0:
+        cost = cost + config.step_cost * deltas.square().mean((-2, -1))
+    return cost
 
 
 def _start(executed: Tensor, config: PlannerConfig, warm: Tensor | None) -> Belief:

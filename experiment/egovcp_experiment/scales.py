@@ -97,15 +97,21 @@ def small() -> ExperimentConfig:
             # an arch is passed seconds after one has to crouch for it
             return_steps={"arch": 50},
         ),
-        # Four elites earn more than 16, and on ball and wall ramps more than walks; who follows an
-        # arch's Q closely rises too soon, and needs hands that cost more (docs/planner.md). All
-        # this was chosen on the scenarios of seeds 0 and 1, so others are reported. The budget is
-        # a little more than 256 candidates take on one core.
+        # Four elites earn more than 16, with hands and steps that cost something, and on ball and
+        # wall ramps more than walks; who follows an arch's Q closely rises too soon, and needs
+        # hands that cost more (docs/planner.md). All this was chosen on the scenarios of seeds 0
+        # and 1, so others are reported. The budget is a little more than 256 candidates take on one
+        # core.
         play=PlayConfig(
             seed=2,
             branches=6,
             budget_ms=12.0,
-            flags=("--planner.samples=256", "--planner.elites=4", "--planner.hands_cost=0.2"),
+            flags=(
+                "--planner.samples=256",
+                "--planner.elites=4",
+                "--planner.hands_cost=0.1",
+                "--planner.step_cost=0.2",
+            ),
             task_flags={
                 **dict.fromkeys(("ball", "wall"), ("--planner.process=ramp",)),
                 "arch": ("--planner.hands_cost=1",),

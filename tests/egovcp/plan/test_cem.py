@@ -11,7 +11,7 @@ from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import Carry
 from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
-from egovcp.plan.config import TerminationRule
+from egovcp.plan.config import Process, TerminationRule
 from egovcp.plan.objective import Dynamics, evaluate
 from egovcp.plan.process import shift, walk
 from egovcp.testing import Point, PointWorld, toy_model
@@ -78,10 +78,46 @@ def test_hands_that_cost_something_stay_nearer_to_neutral_and_the_height_goes_it
     torch.testing.assert_close(held[6], goal[0, 6], atol=0.15, rtol=0)
 
 
+class Indifferent(PointWorld):
+    """Every action is worth the same."""
+
+    def value(self, carry: Point, action: Tensor) -> Tensor:
+        return torch.zeros(action.shape[:-1])
+
+
+@pytest.mark.parametrize("process", ["walk", "ramp"])
+def test_who_pays_for_steps_stays_where_nothing_is_to_be_gained(process: Process) -> None:
+    """Planned ten times over, each plan from where the one before it has led."""
+    config = PlannerConfig(samples=256, elites=4, iterations=3, process=process)
+
+    def wandered(config: PlannerConfig) -> Tensor:
+        at, warm = torch.zeros(8, 7), None
+        for seed in range(10):
+            plan = _plan(at, at, config, warm, Indifferent(), seed)
+            at, warm = plan.actions[:, 0], shift(plan.deltas)
+        return at.square().mean().sqrt()
+
+    free, held = wandered(config), wandered(dataclasses.replace(config, step_cost=0.1))
+    assert held < free / 2
+
+
+def test_who_pays_for_steps_still_goes_where_it_is_worth_the_way() -> None:
+    """Q is -|a - goal|^2, so that one step a < eta into the first action loses 7 (goal - a)^2 of J
+    and costs c (a / eta)^2 / 4, best at goal / (1 + c / (28 eta^2)): for the c below, half-way."""
+    executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.3)
+    config = PlannerConfig(samples=512, elites=16, iterations=8, min_std=0.02, process="ramp")
+    free = _plan(executed, goal, config).actions[0, 0]
+    torch.testing.assert_close(free, goal[0], atol=0.06, rtol=0)
+    price = dataclasses.replace(config, step_cost=28 * ETA**2)
+    held = _plan(executed, goal, price).actions[0, 0]
+    torch.testing.assert_close(held, goal[0] / 2, atol=0.06, rtol=0)
+
+
+@pytest.mark.parametrize("name", ["hands_cost", "step_cost"])
 @pytest.mark.parametrize("cost", [-0.1, math.inf, math.nan])
-def test_a_price_of_hands_is_a_number_from_zero_up(cost: float) -> None:
-    with pytest.raises(UsageError, match="hands_cost"):
-        PlannerConfig(hands_cost=cost)
+def test_a_price_is_a_number_from_zero_up(name: str, cost: float) -> None:
+    with pytest.raises(UsageError, match=f"{name} is {cost}"):
+        PlannerConfig(**{name: cost})
 
 
 def test_a_goal_within_reach_is_met_at_once() -> None:
