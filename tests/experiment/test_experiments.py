@@ -153,7 +153,8 @@ def test_multitask_says_which_models_are_played_otherwise() -> None:
     found = str(report("multitask", 1.0).parts[0])
     assert found.endswith(
         "The model of ball alone is played with `--planner.process=ramp`. "
-        "The model of wall alone is played with `--planner.process=ramp`. "
+        "The model of wall alone is played with "
+        "`--planner.process=ramp --planner.hands_cost=0.3`. "
         "The model of arch alone is played with `--planner.hands_cost=1`."
     )
     small = SCALES["small"]()

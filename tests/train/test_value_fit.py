@@ -137,13 +137,36 @@ def test_what_an_action_earns_is_not_credited_to_the_state_that_goes_with_it() -
     assert better.float().mean() > 0.95
 
 
+@pytest.mark.parametrize("steps", [0, 100])
+def test_the_part_told_of_flights_may_stay_silent(steps: int) -> None:
+    """Then the other part learns all of Q; else only what the first leaves unexplained."""
+    model = toy_model()
+    rng = torch.Generator().manual_seed(0)
+    count, config = 2048, model.config
+    h = torch.randn(count, config.hidden, generator=rng)
+    z = torch.randn(count, config.latent, generator=rng)
+    action = torch.rand((count, 7), generator=rng) * 2 - 1
+    told = torch.zeros(count, 4)
+    target = h[:, 0] = action[:, 0]
+    rows = Rows(h, z, told, action, target, torch.zeros(count))
+    _fit_heads(model, rows, ValueFitConfig(steps=100, told_steps=steps, rows=512, lr=3e-3), rng)
+    passing = model.q_heads.passing
+    assert passing is not None
+    with torch.no_grad():
+        said = passing(told, action)
+        q = model.value_head(h, z, action)[:, 0]
+    assert bool((said == 0).all()) == (steps == 0)
+    learned = said[:, 0] if steps else q
+    assert (learned - target).square().mean() < 0.2 * target.var()
+
+
 def test_a_seed_repeats_the_fit_and_no_steps_leave_the_model_alone(store: EpisodeStore) -> None:
     def fitted(steps: int, seed: int) -> dict[str, Tensor]:
         model = toy_model()
         fit_value(
             model,
             _whole(store, mirror=True),
-            ValueFitConfig(steps, passes=0.0, told_steps=max(1, steps), rows=16),
+            ValueFitConfig(steps, passes=0.0, told_steps=steps, rows=16),
             seed,
         )
         return model.state_dict()
@@ -162,8 +185,9 @@ def test_many_rows_are_gone_over_as_often_as_few() -> None:
     assert config.steps_over(1_400_000) == 2735
 
 
+@pytest.mark.parametrize("told", [[], [5]])
 def test_the_fit_takes_the_steps_that_its_rows_ask_for(
-    store: EpisodeStore, monkeypatch: pytest.MonkeyPatch
+    store: EpisodeStore, told: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     taken: list[int] = []
 
@@ -174,9 +198,10 @@ def test_the_fit_takes_the_steps_that_its_rows_ask_for(
     monkeypatch.setattr(value_fit, "tqdm", counted)
     model = toy_model()
     count = len(_collect(model, store, ahead=3).target)
-    fit_value(model, _whole(store), ValueFitConfig(3, passes=2.0, told_steps=5, rows=16), seed=0)
+    config = ValueFitConfig(3, passes=2.0, told_steps=sum(told), rows=16)
+    fit_value(model, _whole(store), config, seed=0)
     heads = len(model.q_heads.states)
-    assert taken == [5] + heads * [math.ceil(2 * count / 16)]
+    assert taken == told + heads * [math.ceil(2 * count / 16)]
 
 
 @pytest.mark.parametrize(
@@ -185,7 +210,7 @@ def test_the_fit_takes_the_steps_that_its_rows_ask_for(
         {"steps": -1},
         {"rows": 0},
         {"told_rows": 0},
-        {"told_steps": 0},
+        {"told_steps": -1},
         {"passes": -1.0},
         {"passes": math.inf},
         {"passes": math.nan},

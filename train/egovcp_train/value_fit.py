@@ -31,8 +31,9 @@ class ValueFitConfig:
 
     steps: int = 600
     """Least gradient steps of the part of Q that reads the state, and of the reward; 0: no fit."""
-    passes: float = 2.0
-    """How often all rows are gone over at least: of many, the least steps would see a part only."""
+    passes: float = 8.0
+    """How often all rows are gone over at least: of many, the least steps would see a part only,
+    and after two passes another seed is another policy."""
     imagined_steps: int = 3
     """States are imagined 0 to this many ticks ahead, as far as the planner looks."""
     rows: int = 1024
@@ -41,7 +42,9 @@ class ValueFitConfig:
     """Peak learning rate; one cycle."""
     told_steps: int = 2500
     """Gradient steps of the part of Q that reads what is told of a flight: few numbers, from which
-    there is more to be learned than from the state, which is soon known by heart (docs/log.md)."""
+    there is more to be learned than from the state, which is soon known by heart (docs/log.md).
+    0: the part stays silent. Where nothing flies it judges an action by what followed on actions
+    like it in all states; on the wall the other part is better off without."""
     told_rows: int = 2048
     """States per step of that part."""
     told_lr: float = 2e-3
@@ -53,9 +56,10 @@ class ValueFitConfig:
     heart."""
 
     def __post_init__(self) -> None:
-        if min(self.rows, self.told_rows, self.told_steps) < 1 or self.steps < 0:
+        if min(self.rows, self.told_rows) < 1 or min(self.steps, self.told_steps) < 0:
             raise UsageError(
-                "value_fit.rows, .told_rows and .told_steps must be at least 1, .steps at least 0"
+                "value_fit.rows and .told_rows must be at least 1, .steps and .told_steps at least "
+                "0"
             )
         if not 0 <= self.passes < math.inf:
             raise UsageError(f"value_fit.passes is {self.passes}; expected a number from 0 on")
@@ -132,10 +136,13 @@ def _fit_told(
     """The part of Q that is told of a flight.
 
     Returns:
-        What it says of all rows, (R, outputs); None without such a part.
+        What it says of all rows, (R, outputs); None if it says nothing.
     """
     kind, passing = model.config.value_loss, model.q_heads.passing
     if passing is None:
+        return None
+    if config.told_steps == 0:
+        passing.restart()
         return None
 
     def told(x: Rows) -> Tensor:
