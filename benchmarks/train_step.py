@@ -13,7 +13,7 @@ The cases take turns; ratios are medians of the ratios of one turn. Processor ti
 other programs on the machine do not; with several threads that is the time of all of them, and the
 rates, which are by the clock, want a quiet machine.
 
-    python benchmarks/train_step.py --root data/ball
+    python benchmarks/train_step.py --root data/ball --return_steps 20
 """
 
 from __future__ import annotations
@@ -35,7 +35,14 @@ from report import parser, publish
 from writer import make_episode
 from writer import writer as write
 
-from egovcp.data import EpisodeIndex, EpisodeStore, SequenceStream, StreamConfig, open_dataset
+from egovcp.data import (
+    EpisodeIndex,
+    EpisodeStore,
+    ReturnConfig,
+    SequenceStream,
+    StreamConfig,
+    open_dataset,
+)
 from egovcp.model import Batch, WorldModel, WorldModelConfig
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import set_normalisation, to_tensors
@@ -58,13 +65,15 @@ type Times = dict[str, tuple[float, float]]
 class Learners:
     """What one process measures: our steps and the stream, or the plain step."""
 
-    def __init__(self, side: Side, root: Path, size: int, threads: int) -> None:
+    def __init__(
+        self, side: Side, root: Path, returns: ReturnConfig, size: int, threads: int
+    ) -> None:
         if side == "ours":
             keep_freed_memory()
         torch.set_num_threads(threads)
         torch.manual_seed(0)
         index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
-        store = label(EpisodeStore.read(index), PassingConfig())
+        store = label(EpisodeStore.read(index, returns), PassingConfig())
         self._model = WorldModel(WorldModelConfig())
         set_normalisation(self._model, store)
         self._config = OptimizerConfig(warmup_steps=0)
@@ -116,8 +125,8 @@ class Learners:
 _learners: list[Learners] = []  # of a process of `Case`
 
 
-def _begin(side: Side, root: Path, size: int, threads: int) -> None:
-    _learners.append(Learners(side, root, size, threads))
+def _begin(side: Side, root: Path, returns: ReturnConfig, size: int, threads: int) -> None:
+    _learners.append(Learners(side, root, returns, size, threads))
 
 
 def _first(side: Side) -> float:
@@ -128,11 +137,13 @@ def _turn(side: Side) -> Times:
     return _learners[0].turn(side)
 
 
-def case(root: Path, size: int, threads: int, rounds: int) -> tuple[list[Times], float]:
+def case(
+    root: Path, returns: ReturnConfig, size: int, threads: int, rounds: int
+) -> tuple[list[Times], float]:
     """Turns of both sides, each in its own process, one at a time; how far their losses differ."""
     spawn = multiprocessing.get_context("spawn")
     sides: Mapping[Side, ProcessPoolExecutor] = {
-        side: ProcessPoolExecutor(1, spawn, _begin, (side, root, size, threads))
+        side: ProcessPoolExecutor(1, spawn, _begin, (side, root, returns, size, threads))
         for side in ("plain", "ours")
     }
     try:
@@ -180,12 +191,14 @@ def figures(turns: list[Times], name: str, frames: int) -> dict[str, object]:
     }
 
 
-def measure(root: Path, batches: list[int], threads: list[int], rounds: int) -> dict[str, object]:
+def measure(
+    root: Path, returns: ReturnConfig, batches: list[int], threads: list[int], rounds: int
+) -> dict[str, object]:
     """All figures; keys say the batch and the number of threads."""
     out: dict[str, object] = {"window": LENGTH, "bf16": BF16}
     for size in batches:
         for count in threads:
-            turns, difference = case(root, size, count, rounds)
+            turns, difference = case(root, returns, size, count, rounds)
             name = f"step_{size}_threads_{count}"
             out |= figures(turns, name, size * LENGTH)
             out[f"{name}_loss_difference"] = difference
@@ -198,12 +211,16 @@ def main() -> None:
     options.add_argument("--root", type=Path, help="dataset to train on; none: one is made")
     options.add_argument("--batches", type=int, nargs="+", default=[16, 32], help="windows")
     options.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="CPU threads")
+    options.add_argument(
+        "--return_steps", type=int, default=ReturnConfig().steps, help="horizon of returns, ticks"
+    )
     args = options.parse_args()
+    returns = ReturnConfig(steps=args.return_steps)
     with tempfile.TemporaryDirectory() as folder:
         root = args.root or Path(folder) / "dataset"
         if args.root is None:
             write(root, [make_episode(i, 150) for i in range(100)])
-        publish(measure(root, args.batches, args.threads, args.rounds), args.json)
+        publish(measure(root, returns, args.batches, args.threads, args.rounds), args.json)
 
 
 if __name__ == "__main__":
