@@ -104,67 +104,129 @@ def follow(
     first: Tensor,
     config: FlightConfig,
 ) -> Tensor:
-    """One tick: the memory (N, `SIZE`) after a picture.
+    """One tick: the memory (N, `SIZE`) after a picture; N rows of what `follow_all` takes."""
+    poses = CameraPose(*(x[:, None] for x in pose))
+    pictures = Sighting(*(x[:, None] for x in seen))
+    return follow_all(memory, poses, pictures, first[:, None], config)[:, 0]
+
+
+def follow_all(
+    memory: Tensor,
+    pose: CameraPose,
+    seen: Sighting,
+    first: Tensor,
+    config: FlightConfig,
+) -> Tensor:
+    """The memories (N, T, `SIZE`) after each of T pictures.
+
+    Only the sums go from tick to tick; what does not depend on them is computed for all ticks at
+    once, since N is small and what an operation costs is mostly its call.
 
     Args:
-        memory: of the tick before.
-        pose: of the camera now; the picture is `FlightConfig.picture_age` older.
-        seen: what the picture shows.
-        first: (N,) bool, an episode begins: nothing is remembered.
+        memory: (N, `SIZE`) of the tick before.
+        pose: (N, T, ...) of the camera; the picture is `FlightConfig.picture_age` older.
+        seen: (N, T, ...) what the pictures show.
+        first: (N, T) bool, an episode begins: nothing is remembered.
         config: of the filter.
     """
-    prior = memory.new_tensor(config.prior)  # (3, 5)
-    memory = memory.masked_fill(first[:, None], 0.0)
-    yaw = torch.where(first, 0.0, memory[:, _YAW] + pose.yaw_rate * _DT)
-    turn = _about_vertical(yaw)
-    axes = (turn @ pose.axes).flatten(1)
+    yaw = _turned_by(memory[:, _YAW], pose.yaw_rate, first)
+    turn = _about_vertical(yaw.flatten()).view(*yaw.shape, 3, 3)
+    axes = (turn @ pose.axes).flatten(-2)
     position = (turn @ pose.position[..., None])[..., 0]
-    before = [
-        torch.where(first[:, None], now, memory[:, part])
-        for now, part in ((axes, _AXES), (position, _POSITION))
-    ]
-    age = config.picture_age / _DT
-    then_axes = (axes + age * (before[0] - axes)).view(-1, 3, 3)
-    then_position = position + age * (before[1] - position)
-    place = (then_axes @ seen.point[..., None])[..., 0] + then_position
+    then_axes = _at_picture(axes, memory[:, _AXES], first, config)
+    then_position = _at_picture(position, memory[:, _POSITION], first, config)
+    turned = (then_axes.view(*yaw.shape, 3, 3) @ seen.point[..., None])[..., 0]
+    place = turned + then_position
 
-    lost, left = memory[:, _LOST] + _DT, memory[:, 3] - _DT
-    over = (memory[:, _SEEN] > 0) & ((left < 1.5 * _BEHIND) | (lost > config.forget))
-    memory = memory.masked_fill(over[:, None], 0.0)
-    flies = memory[:, _SEEN] > 0
-    since = torch.where(flies, memory[:, _SINCE] + _DT, 0.0)
-    weight = seen.weight * _agrees(memory, since, place, prior, config)
-    sums, places, moments = _added(memory, weight, since, place)
-    path = _solve(sums, places, moments, prior)
-    age_now = since + config.picture_age
-    crossing = _crossing(*path, age_now, yaw, config.plane)
-    told = _believed(crossing, _variance(sums, prior, age_now + crossing[:, 2]), config)
-
-    count = memory[:, _SEEN] + (weight > 0)
-    on = (count > 0) & (told[:, 3] > _BEHIND)
-    told = torch.where(on[:, None], told, 0.0)
-    since_last = torch.where(weight > 0, 0.0, torch.where(over, 0.0, lost))
-    parts = [told, *(x[:, None] for x in (count, since, since_last, yaw))]
-    return torch.cat([*parts, axes, position, sums, places, moments], -1)
+    tracks, on = _tracks(memory, place, seen.weight, first, yaw, config)
+    told = _told(tracks.flatten(0, 1), yaw.flatten(), config).view(*yaw.shape, 4)
+    told = torch.where(on[..., None], told, 0.0)
+    marks, sums = tracks[..., 1:4], tracks[..., 4:]
+    return torch.cat([told, marks, yaw[..., None], axes, position, sums], -1)
 
 
-def _agrees(
-    memory: Tensor, since: Tensor, place: Tensor, prior: Tensor, config: FlightConfig
-) -> Tensor:
-    """(N,) 1 where a sighting lies near the path so far, or there is none yet."""
+def _turned_by(yaw: Tensor, rate: Tensor, first: Tensor) -> Tensor:
+    """Heading (N, T), rad, since the episode began or the memory, from what it was (N,)."""
+    found = []
+    for step, new in zip((rate * _DT).unbind(1), first.unbind(1), strict=True):
+        yaw = (yaw + step).masked_fill(new, 0.0)
+        found.append(yaw)
+    return torch.stack(found, 1)
+
+
+def _at_picture(x: Tensor, before: Tensor, first: Tensor, config: FlightConfig) -> Tensor:
+    """What (N, T, k) was when the pictures were taken, from it and from the (N, k) of the tick
+    before the first."""
+    before = torch.cat([before[:, None], x[:, :-1]], 1)
+    before = torch.where(first[..., None], x, before)
+    return x + config.picture_age / _DT * (before - x)
+
+
+def _tracks(
+    memory: Tensor,
+    place: Tensor,
+    weight: Tensor,
+    first: Tensor,
+    yaw: Tensor,
+    config: FlightConfig,
+) -> tuple[Tensor, Tensor]:
+    """What goes from tick to tick, of places (N, T, 3) that are seen with a weight (N, T).
+
+    Returns:
+        (N, T, 13) time left, sightings, time since the first and since the last of them, and the
+        sums of the fit; and (N, T) bool, whether anything is on its way.
+    """
+    prior = memory.new_tensor(config.prior)  # (3, 5)
+    tick = memory.new_tensor([-_DT, 0.0, _DT, _DT, *[0.0] * 9])
+    fall = memory.new_tensor([0.0, 0.0, 0.5 * GRAVITY])
+    heading = torch.stack([yaw.cos(), yaw.sin()], -1)
+    track = torch.cat([memory[:, 3:4], memory[:, _SEEN : _LOST + 1], memory[:, _SUMS.start :]], -1)
     p, v = _solve(memory[:, _SUMS], memory[:, _PLACES], memory[:, _MOMENTS], prior)
-    expected = _fallen(p + v * since[:, None], since, -1.0)
-    near = (place - expected).norm(dim=-1) < config.gate
-    agrees: Tensor = near | (memory[:, _SEEN] < 3)
-    return agrees.to(place.dtype)
+    found, coming = [], []
+    for new, now, gain, ahead in zip(
+        *(x.unbind(1) for x in (first, place, weight, heading)), strict=True
+    ):
+        track = track.masked_fill(new[:, None], 0.0) + tick
+        left, count, since, lost = track[:, :4].unbind(-1)
+        over = (count > 0) & ((left < 1.5 * _BEHIND) | (lost > config.forget))
+        track = track.masked_fill(over[:, None], 0.0)
+        _, count, since, lost = track[:, :4].unbind(-1)
+        since = since * (count > 0)
+        # Where there is no path yet, or no longer, the path of before says nothing.
+        straight = torch.addcmul(now, fall, (since * since)[:, None])
+        off = straight - torch.addcmul(p, v, since[:, None])
+        own = gain * ((off.norm(dim=-1) < config.gate) | (count < 3))
+        powers = torch.stack([own, own * since, own * since * since], -1)
+        more = [powers, powers[:, :1] * straight, powers[:, 1:2] * straight]
+        sums = track[:, 4:] + torch.cat(more, -1)
+        p, v = _solve(sums[:, :3], sums[:, 3:6], sums[:, 6:], prior)
+        seen = own > 0
+        count = count + seen
+        left = _time_left(p, v, since + config.picture_age, ahead, config.plane)
+        on = (count > 0) & (left > _BEHIND)
+        marks = torch.stack([left * on, count, since, lost.masked_fill(seen, 0.0)], -1)
+        track = torch.cat([marks, sums], -1)
+        found.append(track)
+        coming.append(on)
+    return torch.stack(found, 1), torch.stack(coming, 1)
 
 
-def _added(
-    memory: Tensor, weight: Tensor, since: Tensor, place: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
-    straight = _fallen(place, since, 1.0) * weight[:, None]
-    sums = memory[:, _SUMS] + torch.stack([weight, weight * since, weight * since * since], -1)
-    return sums, memory[:, _PLACES] + straight, memory[:, _MOMENTS] + straight * since[:, None]
+def _time_left(p: Tensor, v: Tensor, t: Tensor, heading: Tensor, plane: float) -> Tensor:
+    """(N,) s until a path that is at time ``t`` crosses the plane before (N, 2) the heading."""
+    x = (torch.addcmul(p, v, t[:, None])[:, :2] * heading).sum(-1)
+    speed = (v[:, :2] * heading).sum(-1)
+    return ((plane - x) / speed.clamp_max(-_LEAST_SPEED)).clamp(-1.0, 1.5)
+
+
+def _told(track: Tensor, yaw: Tensor, config: FlightConfig) -> Tensor:
+    """`TOLD` (N, 4) of (N, 13) `_tracks`."""
+    prior = track.new_tensor(config.prior)
+    left, since, sums = track[:, 0], track[:, 2], track[:, 4:7]
+    p, v = _solve(sums, track[:, 7:10], track[:, 10:], prior)
+    t = since + config.picture_age
+    place = _crossing(p, v, t, left, yaw)
+    sure, place = _believed(place, _variance(sums, prior, t + left), config)
+    return torch.cat([sure, place, left[:, None]], -1)
 
 
 def _fallen(place: Tensor, t: Tensor, sign: float) -> Tensor:
@@ -176,22 +238,20 @@ def _fallen(place: Tensor, t: Tensor, sign: float) -> Tensor:
 def _solve(sums: Tensor, places: Tensor, moments: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
     """Place and velocity (N, 3) at the first sighting."""
     place, speed, a, b, c = prior.unbind(-1)  # (3,) each
-    m00, m01, m11 = (s[:, None] + x for s, x in zip(sums.unbind(-1), (a, b, c), strict=True))
-    r0, r1 = places + a * place + b * speed, moments + b * place + c * speed
+    m00, m01, m11 = (sums[..., None] + prior[:, 2:].T).unbind(-2)
+    r0, r1 = places + (a * place + b * speed), moments + (b * place + c * speed)
     det = m00 * m11 - m01 * m01
     return (m11 * r0 - m01 * r1) / det, (m00 * r1 - m01 * r0) / det
 
 
-def _crossing(p: Tensor, v: Tensor, t: Tensor, yaw: Tensor, plane: float) -> Tensor:
-    """(N, 3): y and z (m) and time left (s) of the path at time ``t``."""
+def _crossing(p: Tensor, v: Tensor, t: Tensor, left: Tensor, yaw: Tensor) -> Tensor:
+    """(N, 2): y and z (m) of the path (N,) s after time ``t``."""
     back = _about_vertical(-yaw)
     now = (back @ _fallen(p + v * t[:, None], t, -1.0)[..., None])[..., 0]
     speed = (back @ v[..., None])[..., 0]
-    left = (plane - now[:, 0]) / speed[:, 0].clamp_max(-_LEAST_SPEED)
-    left = left.clamp(-1.0, 1.5)
     y = now[:, 1] + speed[:, 1] * left
     z = now[:, 2] + (speed[:, 2] - GRAVITY * t) * left - 0.5 * GRAVITY * left * left
-    return torch.stack([y, z, left], -1)
+    return torch.stack([y, z], -1)
 
 
 def _variance(sums: Tensor, prior: Tensor, t: Tensor) -> Tensor:
@@ -204,12 +264,11 @@ def _variance(sums: Tensor, prior: Tensor, t: Tensor) -> Tensor:
     return variance
 
 
-def _believed(crossing: Tensor, variance: Tensor, config: FlightConfig) -> Tensor:
-    """(N, 4) what is told: the crossing, drawn towards the mean of all throws."""
+def _believed(crossing: Tensor, variance: Tensor, config: FlightConfig) -> tuple[Tensor, Tensor]:
+    """How sure a crossing (N, 2) is, (N, 1), and where, drawn towards the mean of all throws."""
     mean, deviation = crossing.new_tensor(config.aim).unbind(-1)
     sure = 1.0 / (1.0 + config.doubt * variance / deviation.square())
-    place = mean + sure * (crossing[:, :2] - mean).clamp(-1.0, 1.0)
-    return torch.cat([sure[:, :1], place, crossing[:, 2:]], -1)
+    return sure[:, :1], mean + sure * (crossing - mean).clamp(-1.0, 1.0)
 
 
 def _about_vertical(angle: Tensor) -> Tensor:

@@ -128,15 +128,8 @@ def _follow(
         torch.cat(column).view(size, length, *column[0].shape[1:])
         for column in zip(*looks, strict=True)
     )
-    found = []
-    for t in range(length):
-        seen, pose = (
-            Sighting(point[:, t], weight[:, t]),
-            CameraPose(axes[:, t], position[:, t], rate[:, t]),
-        )
-        memory = model.follow(memory, Look(seen, pose), batch.is_first[:, t])
-        found.append(memory)
-    return torch.stack(found, 1)
+    look = Look(Sighting(point, weight), CameraPose(axes, position, rate))
+    return model.follow_all(memory, look, batch.is_first)
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:

@@ -222,6 +222,11 @@ class WorldModel(nn.Module):
         """What is remembered of a flight (N, ...) after N pictures."""
         return flight.follow(memory, seen.pose, seen.sighting, is_first, self.config.flight)
 
+    @torch.no_grad()
+    def follow_all(self, memory: Tensor, seen: Look, is_first: Tensor) -> Tensor:
+        """The same after each of T ticks, (N, T, ...): memory (N, ...) before, all else (N, T)."""
+        return flight.follow_all(memory, seen.pose, seen.sighting, is_first, self.config.flight)
+
     def advance(self, carry: Carry, action: Tensor, is_first: Tensor) -> Tensor:
         """h_t of equation 1, restarting from zeros where ``is_first`` (B,).
 

@@ -155,6 +155,29 @@ def test_an_episode_begins_with_nothing_even_after_what_is_no_number() -> None:
     assert torch.equal(fresh, healed)
 
 
+def test_following_tick_by_tick_equals_following_all_at_once() -> None:
+    rng = np.random.default_rng(1)
+    torch.manual_seed(1)
+    size, ticks = 4, 25
+    states = torch.cat([_standing(rng, 0.05) for _ in range(size * ticks)])
+    pose = camera_pose(states, CONFIG.camera)._replace(yaw_rate=0.5 * torch.randn(size * ticks))
+    pose = CameraPose(*(x.view(size, ticks, *x.shape[1:]) for x in pose))
+    t = DT * torch.arange(ticks) % 1.0
+    path = torch.stack([3.0 - 3.6 * t, 0.3 - 0.2 * t, 0.1 + 3.4 * t - 4.9 * t * t], -1)
+    seen = flight.Sighting(
+        path + 0.1 * torch.randn(size, ticks, 3), 1e3 * (torch.rand(size, ticks) < 0.6)
+    )
+    first = torch.rand(size, ticks) < 0.1
+    begun = 3.0 * first[:, :1] * torch.ones(size, flight.SIZE)  # of an episode before
+    together = flight.follow_all(begun, pose, seen, first, CONFIG)
+    memory = begun
+    for k in range(ticks):
+        now = (CameraPose(*(x[:, k] for x in pose)), flight.Sighting(*(x[:, k] for x in seen)))
+        memory = flight.follow(memory, *now, first[:, k], CONFIG)
+        torch.testing.assert_close(together[:, k], memory)
+    assert 0.1 < (together[..., 0] > 0).float().mean() < 0.9
+
+
 def test_later_is_what_nothing_seen_meanwhile_tells() -> None:
     memory = _follow(Throw(), 8)
     torch.testing.assert_close(
