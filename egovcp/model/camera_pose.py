@@ -93,6 +93,21 @@ def camera_pose(state: Tensor, camera: CameraGeometry) -> CameraPose:
     return CameraPose(level @ turn @ tilt, position, rate)
 
 
+def earlier(state: Tensor, age: Tensor) -> Tensor:
+    """Raw proprioception (N, 74) of (N,) s ago, by its own velocities: what the camera's pose is
+    made of, gravity and joint positions."""
+    then, s = state.clone(), age[:, None]
+    joints, velocity, gravity, turn = (
+        spec.STATE_SLICES[name]
+        for name in ("joint_position", "joint_velocity", "projected_gravity", "angular_velocity")
+    )
+    then[:, joints] = state[:, joints] - s * state[:, velocity]
+    # Of a direction that stays put, in axes that turn: dg/dt = -w x g.
+    spun = torch.linalg.cross(state[:, turn], state[:, gravity])
+    then[:, gravity] = state[:, gravity] + s * spun
+    return then
+
+
 def _tilt(pitch: float) -> list[list[float]]:
     c, s = float(np.cos(pitch)), float(np.sin(pitch))
     return [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]

@@ -14,6 +14,8 @@ FreeNatsPer = Literal["step", "dimension"]
 Dynamics = Literal["joint", "autoregressive"]
 QTarget = Literal["mc", "td"]
 AxisPrior = tuple[float, float, float, float, float]
+Ages = tuple[float, float, float, float]
+AGES = 4  #: of pictures, that are thought possible
 
 
 @dataclass(frozen=True)
@@ -121,8 +123,14 @@ class FlightConfig:
     """Of the recordings."""
     plane: float = 0.32
     """The plane, before the pelvis, whose crossing is told, m."""
-    picture_age: float = 0.05
-    """How much older than the state beside it a picture is on average, s."""
+    picture_ages: Ages = (0.02, 0.04, 0.06, 0.08)
+    """How much older than the state beside it a picture may be, s, at most two ticks; the floor
+    says how likely each is (`egovcp.model.picture_age`)."""
+    age_deviation: float = 0.03
+    """By how much the floor may seem to rise and sink in the pictures that count, m: with a tenth
+    of it the stillest floor alone is believed, with ten times as much all ages alike."""
+    age_memory: float = 0.95
+    """What one picture says of their age counts for so much less with each tick."""
     radius: float = 0.10
     """What is added to the depth of a surface to reach the middle of the thing, m."""
     search: float = 0.25
@@ -139,11 +147,11 @@ class FlightConfig:
     default task."""
     aim: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.24), (0.45, 0.18))
     """Mean and deviation of y and z where throws cross the plane, m."""
-    doubt: float = 4.0
+    doubt: float = 2.0
     """The variance of a crossing is this many times what independent sightings would give."""
     gate: float = 0.5
     """A sighting farther than this from the path of three or more is not its own, m."""
-    painted: float = 0.5
+    painted: float = 0.25
     """A path at least so sure says where it is painted (`paint_flight`); else `motion` does."""
     forget: float = 0.5
     """A path whose thing has not been seen for so long is forgotten, s."""

@@ -20,6 +20,7 @@ from egovcp.model.carry import Carry
 from egovcp.model.config import LossConfig
 from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, within
 from egovcp.model.flight import Sighting
+from egovcp.model.floor import Floor
 from egovcp.model.gaussian import Gaussian, kl_divergence
 from egovcp.model.shared import over_all_rows
 from egovcp.model.world_model import PASSING_UNIT, Look, WorldModel
@@ -124,11 +125,11 @@ def _follow(
     size, length = batch.valid.shape
     pieces = _pieces(near, batch.state.flatten(0, 1), embedding.flatten(0, 1))
     looks = [[x for part in model.look(*piece) for x in part] for piece in pieces]
-    point, weight, axes, position, rate = (
+    point, weight, axes, position, rate, ground, shown = (
         torch.cat(column).view(size, length, *column[0].shape[1:])
         for column in zip(*looks, strict=True)
     )
-    look = Look(Sighting(point, weight), CameraPose(axes, position, rate))
+    look = Look(Sighting(point, weight), CameraPose(axes, position, rate), Floor(ground, shown))
     return model.follow_all(memory, look, batch.is_first)
 
 

@@ -29,6 +29,7 @@ from egovcp.model.camera_pose import CameraPose, camera_pose
 from egovcp.model.carry import Carry
 from egovcp.model.config import WorldModelConfig
 from egovcp.model.depth import nearness, network_image, paint_ball, to_metres
+from egovcp.model.floor import Floor, floor
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.nets import (
     DepthDecoder,
@@ -61,6 +62,7 @@ class Look(NamedTuple):
 
     sighting: flight.Sighting
     pose: CameraPose
+    floor: Floor
 
 
 def _later(carry: Carry) -> Tensor | None:
@@ -215,17 +217,22 @@ class WorldModel(nn.Module):
         and the embedding (N, units) of both."""
         c = self.config
         seen = flight.sighting(near, self.sight(embedding), c.depth_max_m, c.flight)
-        return Look(seen, camera_pose(state, c.flight.camera))
+        pose = camera_pose(state, c.flight.camera)
+        return Look(seen, pose, floor(near, pose, c.depth_max_m, c.flight.camera))
 
     @torch.no_grad()
     def follow(self, memory: Tensor, seen: Look, is_first: Tensor) -> Tensor:
         """What is remembered of a flight (N, ...) after N pictures."""
-        return flight.follow(memory, seen.pose, seen.sighting, is_first, self.config.flight)
+        return flight.follow(
+            memory, seen.pose, seen.sighting, seen.floor, is_first, self.config.flight
+        )
 
     @torch.no_grad()
     def follow_all(self, memory: Tensor, seen: Look, is_first: Tensor) -> Tensor:
         """The same after each of T ticks, (N, T, ...): memory (N, ...) before, all else (N, T)."""
-        return flight.follow_all(memory, seen.pose, seen.sighting, is_first, self.config.flight)
+        return flight.follow_all(
+            memory, seen.pose, seen.sighting, seen.floor, is_first, self.config.flight
+        )
 
     def advance(self, carry: Carry, action: Tensor, is_first: Tensor) -> Tensor:
         """h_t of equation 1, restarting from zeros where ``is_first`` (B,).
@@ -377,8 +384,7 @@ class WorldModel(nn.Module):
             return place
         c = self.config
         state = self.decode_state(carry.h, carry.z).float() * self.state_std + self.state_mean
-        pose = camera_pose(state, c.flight.camera)
-        followed = flight.in_picture(carry.flight, pose, c.depth_max_m, c.flight)
+        followed = flight.in_picture(carry.flight, state, c.depth_max_m, c.flight)
         return torch.where(followed[:, 3:] > 0, followed, place)
 
     def decode(self, carry: Carry) -> tuple[Tensor, Tensor]:

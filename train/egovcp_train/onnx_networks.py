@@ -29,6 +29,7 @@ from torch import Tensor, nn
 from egovcp import spec
 from egovcp.model import Carry, WorldModel, flight
 from egovcp.model.camera_pose import camera_pose
+from egovcp.model.floor import Floor
 from egovcp.plan.choices import Ensemble, judge_of
 
 OPSET: Final = 17
@@ -193,12 +194,13 @@ def _golden_memory(model: WorldModel, batch: int, seed: int) -> Tensor:
     generator = torch.Generator().manual_seed(seed + 1)
     memory = torch.zeros(batch, flight.SIZE)
     pose = camera_pose(model.state_mean.expand(batch, -1), model.config.flight.camera)
+    floor = Floor(torch.zeros(batch, 2, 3), torch.zeros(batch, 2))  # none is seen
     for tick in range(4):
         place = torch.tensor([3.0 - 0.16 * tick, 0.0, 0.5])
         point = place + 0.3 * torch.randn(batch, 3, generator=generator)
         seen = flight.Sighting(point, torch.full((batch,), 1e3))
         first = torch.full((batch,), tick == 0)
-        memory = flight.follow(memory, pose, seen, first, model.config.flight)
+        memory = flight.follow(memory, pose, seen, floor, first, model.config.flight)
     return memory
 
 
