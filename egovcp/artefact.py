@@ -209,7 +209,10 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
         draccus.utils.DraccusException,
     ) as error:
         reason = " ".join(str(error).split())[:300]
-        raise ArtefactError(f"{folder}: weights and configuration disagree: {reason}") from error
+        raise ArtefactError(
+            f"{folder}: weights and configuration disagree: {reason}; a policy of another version "
+            "of egovcp has to be trained again with this one"
+        ) from error
     return Artefact(folder, model.eval(), planner, manifest)
 
 

@@ -41,9 +41,9 @@ height of the pelvis; time left (s). What is unsure lies near the mean of all th
 _SEEN, _SINCE, _LOST, _YAW, _RATE = range(4, 9)  # sightings; s since first and last; rad, rad/s
 _POSE, _BEFORE = slice(9, 21), slice(21, 33)  # axes and position of the camera, last two ticks
 _EVIDENCE = slice(33, 33 + picture_age.SIZE)  # of how old the pictures are
-_SUMS = slice(_EVIDENCE.stop, _EVIDENCE.stop + 3 + 2 * 3 * AGES)
+SUMS = slice(_EVIDENCE.stop, _EVIDENCE.stop + 3 + 2 * 3 * AGES)
 """Of the weights, and for each age of the places and their moments."""
-SIZE: Final = _SUMS.stop
+SIZE: Final = SUMS.stop
 _DT: Final = spec.PLANNER_DT
 _MIN_PIXELS: Final = 2
 _MANY: Final = 32  # pictures among which it pays to pick; graphs are traced with fewer
@@ -194,15 +194,15 @@ def _tracks(
     is likeliest, the mean over ages with their shares (N, T, A), is the solution of mean sums.
 
     Returns:
-        (N, T, 4 + `_SUMS`) time left, sightings, time since the first and since the last of them,
+        (N, T, 4 + `SUMS`) time left, sightings, time since the first and since the last of them,
         and the sums of the fits; and (N, T) bool, whether anything is on its way.
     """
     prior = memory.new_tensor(config.prior)  # (3, 5)
-    tick = memory.new_tensor([-_DT, 0.0, _DT, _DT, *[0.0] * (SIZE - _SUMS.start)])
+    tick = memory.new_tensor([-_DT, 0.0, _DT, _DT, *[0.0] * (SIZE - SUMS.start)])
     fall = memory.new_tensor([0.0, 0.0, 0.5 * GRAVITY])
     heading = torch.stack([yaw.cos(), yaw.sin()], -1)
     old = (ages * memory.new_tensor(config.picture_ages)).sum(-1)
-    track = torch.cat([memory[:, 3:4], memory[:, _SEEN : _LOST + 1], memory[:, _SUMS]], -1)
+    track = torch.cat([memory[:, 3:4], memory[:, _SEEN : _LOST + 1], memory[:, SUMS]], -1)
     found, coming = [], []
     for new, now, gain, share, age, ahead in zip(
         *(x.unbind(1) for x in (first, place, weight, ages, old, heading)), strict=True
@@ -235,14 +235,14 @@ def _tracks(
 
 
 def _path(sums: Tensor, share: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Place and velocity (N, 3) at the first sighting, of sums (N, `_SUMS`) and shares (N, A)."""
+    """Place and velocity (N, 3) at the first sighting, of sums (N, `SUMS`) and shares (N, A)."""
     fits = sums[:, 3:].reshape(-1, 2, share.shape[-1], 3)
     places, moments = (share[:, None, :, None] * fits).sum(2).unbind(1)
     return solve(sums[:, :3], places, moments, prior)
 
 
 def _told(track: Tensor, share: Tensor, yaw: Tensor, config: FlightConfig) -> Tensor:
-    """`TOLD` (N, 4) of (N, 4 + `_SUMS`) `_tracks`."""
+    """`TOLD` (N, 4) of (N, 4 + `SUMS`) `_tracks`."""
     prior = track.new_tensor(config.prior)
     left, since, sums = track[:, 0], track[:, 2], track[:, 4:]
     p, v = _path(sums, share, prior)
@@ -278,7 +278,7 @@ def in_picture(memory: Tensor, state: Tensor, max_m: float, config: FlightConfig
     age = (share * share.new_tensor(config.picture_ages)).sum(-1)
     pose = camera_pose(earlier(state, age), config.camera)
     since, turn = memory[:, _SINCE], about_vertical(memory[:, _YAW] - age * pose.yaw_rate)
-    p, v = _path(memory[:, _SUMS], share, memory.new_tensor(config.prior))
+    p, v = _path(memory[:, SUMS], share, memory.new_tensor(config.prior))
     place = fallen(p + v * since[:, None], since, -1.0)
     from_camera = place - (turn @ pose.position[..., None])[..., 0]
     x, left, up = ((turn @ pose.axes).mT @ from_camera[..., None])[..., 0].unbind(-1)

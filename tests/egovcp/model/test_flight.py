@@ -6,18 +6,21 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from egovcp import spec
 from egovcp.data.mirror import mirror_state
 from egovcp.model import flight
-from egovcp.model.camera_pose import CameraPose, camera_pose
+from egovcp.model.camera_pose import CameraPose, camera_pose, earlier
 from egovcp.model.config import FlightConfig
+from egovcp.model.floor import LEVEL, Floor
 from egovcp.robot.kinematics import LINK_NAMES, heading_rotation, link_transforms
 
 CONFIG = FlightConfig()
 DT = spec.PLANNER_DT
 GRAVITY = torch.tensor([0.0, 0.0, -9.81])
+NO_FLOOR = Floor(torch.zeros(1, 2, 3), torch.zeros(1, 2))
 
 
 class Throw(NamedTuple):
@@ -57,35 +60,55 @@ def _turned(pose: CameraPose, angle: float) -> CameraPose:
     return CameraPose(turn @ pose.axes, pose.position @ turn.T, pose.yaw_rate)
 
 
-def _follow(throw: Throw, ticks: int, sway: float = 0.0, yaw_rate: float = 0.0) -> Tensor:
-    """The memory (1, ...) after so many pictures of a throw that begins at the first one."""
-    rng = np.random.default_rng(0)
-    states = [_standing(rng, 0.0), *(_standing(rng, sway) for _ in range(ticks))]
-    poses = [
-        camera_pose(s, CONFIG.camera)._replace(yaw_rate=torch.tensor([yaw_rate])) for s in states
-    ]
-    ground = [_turned(pose, yaw_rate * DT * (k - 1)) for k, pose in enumerate(poses)]
+class World(NamedTuple):
+    """What a robot lives through: its states, and a camera whose pictures are late."""
+
+    sway: float = 0.0  # rad
+    yaw_rate: float = 0.0  # rad/s
+    age: float = 0.06  # s, of a picture
+    watched: int = 0  # ticks before the throw, in which the floor is seen
+
+    def states(self, ticks: int) -> list[Tensor]:
+        rng = np.random.default_rng(0)
+        quiet = [_standing(rng, 0.0)] if self.watched == 0 else []
+        return [*quiet, *(_standing(rng, self.sway) for _ in range(self.watched + ticks))]
+
+
+def _follow(throw: Throw, ticks: int, world: World = World()) -> Tensor:  # noqa: B008
+    """The memory (1, ...) after so many pictures of a throw."""
+    states = world.states(ticks)
+    rate = torch.tensor([world.yaw_rate])
+    poses = [camera_pose(s, CONFIG.camera)._replace(yaw_rate=rate) for s in states]
+    ground = [_turned(pose, world.yaw_rate * DT * k) for k, pose in enumerate(poses)]
     memory = torch.zeros(1, flight.SIZE)
-    age = CONFIG.picture_age / DT
-    for k in range(1, ticks + 1):
-        before = ground[k - 1] if k > 1 else ground[k]
-        axes = ground[k].axes + age * (before.axes - ground[k].axes)
-        position = ground[k].position + age * (before.position - ground[k].position)
-        place = throw.at((k - 1) * DT) - position
-        point = torch.linalg.solve(axes, place[..., None])[..., 0]
-        seen = flight.Sighting(point, torch.tensor([1e3]))
-        memory = flight.follow(memory, poses[k], seen, torch.tensor([k == 1]), CONFIG)
+    thrown = len(states) - ticks
+    for k, pose in enumerate(poses):
+        axes, position = _earlier(ground, k, world.age / DT)
+        at = throw.at((k - thrown) * DT) - position
+        point = torch.linalg.solve(axes, at[..., None])[..., 0]
+        seen = flight.Sighting(point, torch.full((1,), 1e3 * (k >= thrown)))
+        below = torch.tensor([[2.5, 0.6, LEVEL], [2.5, -0.6, LEVEL]]) - position
+        floor = Floor((below @ axes.mT.inverse()), torch.full((1, 2), float(world.watched > 0)))
+        memory = flight.follow(memory, pose, seen, floor, torch.tensor([k == 0]), CONFIG)
     return memory
+
+
+def _earlier(ground: list[CameraPose], k: int, ticks: float) -> tuple[Tensor, Tensor]:
+    """Axes and position of the camera so long before tick k."""
+    before = max(k - int(ticks), 0)
+    part = ticks - int(ticks)
+    a, b = ground[before], ground[max(before - 1, 0)]
+    return torch.lerp(a.axes, b.axes, part), torch.lerp(a.position, b.position, part)
 
 
 @pytest.mark.parametrize("sway", [0.0, 0.05])
 @pytest.mark.parametrize("yaw_rate", [0.0, 0.4])
 def test_the_crossing_is_found_whatever_the_robot_does(sway: float, yaw_rate: float) -> None:
-    throw, ticks = Throw(), 12
-    told = _follow(throw, ticks, sway, yaw_rate)[0, flight.TOLD]
-    angle = yaw_rate * DT * (ticks - 1)  # the plane turns with the robot
+    throw, ticks, world = Throw(), 12, World(sway, yaw_rate, watched=10)
+    told = _follow(throw, ticks, world)[0, flight.TOLD]
+    angle = yaw_rate * DT * (world.watched + ticks - 1)  # the plane turns with the robot
     c, s = math.cos(angle), math.sin(angle)
-    now = (ticks - 1) * DT + CONFIG.picture_age
+    now = (ticks - 1) * DT + world.age
     t = torch.linspace(0, 1.5, 15001)
     path = torch.stack([throw.at(float(x)) for x in t])
     k = int((c * path[:, 0] + s * path[:, 1] - CONFIG.plane).abs().argmin())
@@ -94,6 +117,18 @@ def test_the_crossing_is_found_whatever_the_robot_does(sway: float, yaw_rate: fl
     assert abs(float(told[1]) - y) < 0.05
     assert abs(float(told[2]) - float(path[k, 2])) < 0.05
     assert abs(float(told[3]) - (float(t[k]) - now)) < 0.02
+
+
+def test_who_has_watched_the_floor_knows_how_old_pictures_are_and_where_a_ball_goes() -> None:
+    still = _follow(Throw(), 8)[0, 1:3]
+
+    def swayed(age: float, watched: int) -> float:
+        told = _follow(Throw(), 8, World(0.03, age=age, watched=watched))
+        return float((told[0, 1:3] - still).norm())
+
+    blind, watching = ([swayed(age, n) for age in CONFIG.picture_ages] for n in (0, 20))
+    assert max(watching) < 0.002
+    assert min(blind) > 0.004
 
 
 def test_more_pictures_make_it_surer() -> None:
@@ -120,7 +155,7 @@ def _nothing(memory: Tensor, ticks: int) -> Tensor:
     pose = camera_pose(_standing(np.random.default_rng(0), 0.0), CONFIG.camera)
     unseen = flight.Sighting(torch.ones(1, 3), torch.zeros(1))
     for _ in range(ticks):
-        memory = flight.follow(memory, pose, unseen, torch.tensor([False]), CONFIG)
+        memory = flight.follow(memory, pose, unseen, NO_FLOOR, torch.tensor([False]), CONFIG)
     return memory
 
 
@@ -135,14 +170,14 @@ def test_a_path_is_remembered_while_its_thing_is_out_of_sight_and_forgotten_afte
     torch.testing.assert_close(unseen[0, :3], memory[0, :3], atol=0.05, rtol=0)
     gone = _nothing(memory, 30)
     assert not gone[:, flight.TOLD].any()
-    assert not gone[:, 20:].any()
+    assert not gone[:, flight.SUMS].any()
 
 
 def test_a_flicker_beside_the_path_is_none_of_it() -> None:
     memory = _follow(Throw(), 8)
     pose = camera_pose(_standing(np.random.default_rng(0), 0.0), CONFIG.camera)
     flicker = flight.Sighting(torch.tensor([[2.0, -1.5, 0.0]]), torch.tensor([1e3]))
-    after = flight.follow(memory, pose, flicker, torch.tensor([False]), CONFIG)
+    after = flight.follow(memory, pose, flicker, NO_FLOOR, torch.tensor([False]), CONFIG)
     torch.testing.assert_close(after, _nothing(memory, 1))
 
 
@@ -151,7 +186,7 @@ def test_an_episode_begins_with_nothing_even_after_what_is_no_number() -> None:
     seen = flight.Sighting(torch.tensor([[3.0, 0.0, 0.0]]), torch.tensor([1e3]))
     first = torch.tensor([True])
     memories = (torch.zeros(1, flight.SIZE), torch.full((1, flight.SIZE), torch.nan))
-    fresh, healed = (flight.follow(m, pose, seen, first, CONFIG) for m in memories)
+    fresh, healed = (flight.follow(m, pose, seen, NO_FLOOR, first, CONFIG) for m in memories)
     assert torch.equal(fresh, healed)
 
 
@@ -168,11 +203,19 @@ def test_following_tick_by_tick_equals_following_all_at_once() -> None:
         path + 0.1 * torch.randn(size, ticks, 3), 1e3 * (torch.rand(size, ticks) < 0.6)
     )
     first = torch.rand(size, ticks) < 0.1
+    height = LEVEL + 0.01 * torch.randn(size, ticks, 2, 1)
+    floor = Floor(
+        torch.cat([2.0 + torch.rand(size, ticks, 2, 2), height], -1), torch.ones(size, ticks, 2)
+    )
     begun = 3.0 * first[:, :1] * torch.ones(size, flight.SIZE)  # of an episode before
-    together = flight.follow_all(begun, pose, seen, first, CONFIG)
+    together = flight.follow_all(begun, pose, seen, floor, first, CONFIG)
     memory = begun
     for k in range(ticks):
-        now = (CameraPose(*(x[:, k] for x in pose)), flight.Sighting(*(x[:, k] for x in seen)))
+        now = (
+            CameraPose(*(x[:, k] for x in pose)),
+            flight.Sighting(*(x[:, k] for x in seen)),
+            Floor(*(x[:, k] for x in floor)),
+        )
         memory = flight.follow(memory, *now, first[:, k], CONFIG)
         torch.testing.assert_close(together[:, k], memory)
     assert 0.1 < (together[..., 0] > 0).float().mean() < 0.9
@@ -276,14 +319,32 @@ def test_the_camera_of_the_mirrored_robot_is_mirrored() -> None:
 def test_it_is_painted_where_the_camera_will_see_it(ahead: int) -> None:
     throw, ticks = Throw(), 8
     memory = flight.later(_follow(throw, ticks), ahead)
-    pose = camera_pose(_standing(np.random.default_rng(0), 0.0), CONFIG.camera)
+    state = _standing(np.random.default_rng(0), 0.0)
+    pose = camera_pose(state, CONFIG.camera)
     place = throw.at((ticks - 1 + ahead) * DT) - pose.position[0]
     x, left, up = (pose.axes[0].T @ place).tolist()
-    seen = flight.in_picture(memory, pose, spec.DEPTH_MAX_M, CONFIG)[0]
+    seen = flight.in_picture(memory, state, spec.DEPTH_MAX_M, CONFIG)[0]
     half = CONFIG.camera.half_height
     assert abs(float(seen[0]) * half * 4 / 3 * x + left) < 0.03
     assert abs(float(seen[1]) * half * x + up) < 0.03
     assert abs((1 - float(seen[2])) * spec.DEPTH_MAX_M - (x - CONFIG.radius)) < 0.03
     assert seen[3] > 0
-    unsure = flight.in_picture(_follow(throw, 1), pose, spec.DEPTH_MAX_M, CONFIG)
+    unsure = flight.in_picture(_follow(throw, 1), state, spec.DEPTH_MAX_M, CONFIG)
     assert unsure[0, 3] < 0
+
+
+def test_a_state_is_wound_back_by_its_own_velocities() -> None:
+    """A body that turns about a fixed axis while its joints move evenly."""
+    axis, rate, age = np.array([0.4, -0.7, 0.2]), 0.8, 0.06
+
+    def state(t: float) -> Tensor:
+        out = np.zeros((1, spec.STATE_DIM), np.float32)
+        spin = Rotation.from_rotvec(axis * rate * t)
+        out[0, spec.STATE_SLICES["projected_gravity"]] = spin.inv().apply([0.1, 0.2, -0.97])
+        out[0, spec.STATE_SLICES["angular_velocity"]] = axis * rate
+        out[0, spec.STATE_SLICES["joint_position"]] = 0.1 + 0.5 * t
+        out[0, spec.STATE_SLICES["joint_velocity"]] = 0.5
+        return torch.from_numpy(out)
+
+    back = earlier(state(1.0), torch.tensor([age]))
+    torch.testing.assert_close(back, state(1.0 - age), atol=2e-3, rtol=0)
