@@ -1,4 +1,4 @@
-"""The planning network packed for `kernel.c`: wide products in 8-bit integers, all else in float32.
+"""The planning network packed for `kernel/kernel.c`: wide products in 8-bit integers.
 
 Weights have a scale per output, inputs a scale per row: what a row gives does not depend on the
 rows beside it.
@@ -19,13 +19,12 @@ from egovcp.model.nets import SplitLinear, SplitMlp, ValueHead
 from egovcp.plan.backends import library
 from egovcp.plan.backends.layers import first_outputs, gru_layer, linears_of, norms_of, weight_of
 from egovcp.plan.backends.root import Root
+from egovcp.plan.backends.tables import LEAST_SILU, ONE, UNIT, silu_table, tanh_table
 from egovcp.plan.config import PlannerConfig
 
 LANES: Final = 16
 WIDEST: Final = 1024
 MOST_FEW: Final = 128
-LEAST_SILU: Final = -0.27846456
-"""The least value of SiLU: bytes of hidden layers count from there."""
 LEVELS: Final = 127
 
 
@@ -47,16 +46,17 @@ class IntegerNetwork:
     """
 
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
-        self._kernel = library.library()
+        kernel = library.library()
         self._heads = len(model.q_heads.states)
         self._outputs = value.width(model.config.value_loss)
         self._width = 1 if self._outputs == 1 else _whole(self._outputs)
         assert self._width <= MOST_FEW
-        self._packed = _Packed(model, drawn=config.latent == "sample", depth=self._kernel.depth())
+        self._packed = _Packed(model, drawn=config.latent == "sample", depth=kernel.depth())
+        self._threads = library.Threads(kernel, torch.get_num_threads())
 
     def shared(self, root: Root) -> Shared:
         """Of one robot, from a root (1, 1, ...)."""
-        h, mix, gates = root.h.flatten().contiguous(), _centred(root.mix), _centred(root.gates)
+        h, mix, gates = _words(root.h), _centred(root.mix), _centred(root.gates)
         values = [_centred(x) for x in root.values]
         pointers = (ctypes.c_void_p * len(values))(*(x.data_ptr() for x in values))
         passing = None if root.passing is None else _centred(root.passing)
@@ -71,7 +71,7 @@ class IntegerNetwork:
         return Shared(description, (h, mix, gates, values, pointers, passing), root, {})
 
     def outputs(
-        self, shared: Shared, actions: Tensor, noise: Tensor | None, threads: library.Threads
+        self, shared: Shared, actions: Tensor, noise: Tensor | None
     ) -> tuple[Tensor, Tensor]:
         """Along plans (M, N, 7), by as many threads as there are.
 
@@ -82,26 +82,27 @@ class IntegerNetwork:
         plans, steps, _ = actions.shape
         q = torch.zeros(plans, steps, self._heads, self._width)
         dead = torch.zeros(plans, steps)
-        following = ctypes.c_int32(0)
         if steps not in shared.told:  # the same for every iteration of a search
             shared.told[steps] = _told(shared.root, steps)
         told = shared.told[steps]
         shared.description.told = None if told is None else told.data_ptr()
-        kept = (actions.contiguous(), None if noise is None else noise.contiguous())
-        arguments = (
-            self._packed.address,
-            ctypes.byref(shared.description),
-            plans,
-            steps,
-            kept[0].data_ptr(),
-            None if kept[1] is None else kept[1].data_ptr(),
-            self._width,
-            q.data_ptr(),
-            dead.data_ptr(),
-            ctypes.byref(following),
+        actions, noise = actions.contiguous(), None if noise is None else noise.contiguous()
+        self._threads.judge(
+            network=ctypes.addressof(self._packed.network),
+            root=ctypes.addressof(shared.description),
+            rows=plans,
+            steps=steps,
+            width=self._width,
+            actions=actions.data_ptr(),
+            noise=None if noise is None else noise.data_ptr(),
+            q=q.data_ptr(),
+            dead=dead.data_ptr(),
         )
-        threads.each(self._kernel.judge, arguments)
         return q[..., : self._outputs], dead
+
+    def soon(self) -> None:
+        """There is going to be something to compute."""
+        self._threads.call()
 
 
 def _told(root: Root, steps: int) -> Tensor | None:
@@ -113,6 +114,12 @@ def _told(root: Root, steps: int) -> Tensor | None:
 def _centred(sums: Tensor) -> Tensor:
     """(1, 1, n) -> (n,), less the mean, which LayerNorm would take away."""
     return (sums - sums.mean()).flatten().contiguous()
+
+
+def _words(h: Tensor) -> Tensor:
+    """(1, 1, n) in [-1, 1] -> (n + 16,) in 16-bit fixed point, filled up with zeros."""
+    words = (ONE * h).round().clamp(1 - ONE, ONE - 1).nan_to_num().to(torch.int16)
+    return torch.nn.functional.pad(words.flatten(), (0, LANES))
 
 
 def _whole(count: int) -> int:
@@ -135,23 +142,23 @@ class _Packed:
         self.network = n = library.Network()
         n.hidden, n.latent, n.actions, n.heads = c.hidden, c.latent, spec.ACTION_DIM, c.q_heads
         n.min_std = c.min_std
+        n.silu, n.tanh = (self._keep(t, torch.int16) for t in (silu_table(), tanh_table()))
         z, action = map(weight_of, model.mix.parts)
         norm = model.mix_act[0]
         assert isinstance(norm, nn.LayerNorm)
-        n.mix = self._layer(norm, beside=z, action=action)
+        n.mix = self._layer(norm, beside=z, few=[action])
         n.gru = self._gru(model)
         n.prior, top = self._one_hidden(model.prior)
         self._prior_top(first_outputs(top, None if drawn else c.latent))
         n.termination, top = self._one_hidden(model.termination_head)
-        n.termination_top = self._linear(top.weight, top.bias)
+        n.termination_top = self._top(top)
         if (shared := model.q_heads.passing) is not None:
             n.passing = self._mlp(shared, wide=False)
             n.told, top = self._one_hidden(model.decode_passing)
-            n.told_top = self._linear(top.weight, top.bias)
+            n.told_top = self._top(top)
         heads = (library.Head * c.q_heads)(*map(self._head, model.q_heads.states))
         n.head = ctypes.cast(heads, ctypes.c_void_p)
         self._kept.append(heads)
-        self.address = ctypes.byref(n)
 
     def _keep(self, tensor: Tensor, dtype: torch.dtype = torch.float32) -> int:
         """The address of a copy."""
@@ -167,9 +174,14 @@ class _Packed:
         return packed
 
     def _reduced(self, reduce: SplitLinear) -> list[library.Linear]:
-        """Two layers whose outputs add up."""
-        weights = map(weight_of, reduce.parts)
-        return [self._linear(w, w.new_zeros(len(w)), filled=True) for w in weights]
+        """Two layers whose outputs add up: of h, which comes in words, and of z."""
+        h, z = map(weight_of, reduce.parts)
+        bias = h.new_zeros(len(h))
+        return [self._linear(w, bias, filled=True) for w in (h / ONE, z)]
+
+    def _top(self, top: nn.Linear) -> library.Linear:
+        """Of a hidden layer, which comes in words."""
+        return self._linear(top.weight / UNIT, top.bias)
 
     def _mlp(self, mlp: SplitMlp, wide: bool) -> library.Mlp:
         """Two hidden layers, the first one of h and z if ``wide``, else of a few numbers."""
@@ -178,11 +190,11 @@ class _Packed:
         between, top = linears_of(mlp)
         packed = library.Mlp()
         if wide:
-            packed.first = self._layer(first, wide=state[0], beside=state[1], action=action)
+            packed.first = self._layer(first, wide=state[0], beside=state[1], few=[action])
         else:
-            packed.first = self._layer(first, few=state[0], action=action)
+            packed.first = self._layer(first, few=[action, state[0]])
         packed.second = self._layer(second, wide=between.weight, wide_is_state=False)
-        packed.top = self._linear(top.weight, top.bias)
+        packed.top = self._top(top)
         return packed
 
     def _one_hidden(self, mlp: SplitMlp) -> tuple[library.Layer, nn.Linear]:
@@ -200,7 +212,9 @@ class _Packed:
 
     def _gru(self, model: WorldModel) -> library.Layer:
         gru = gru_layer(model.gru)
-        layer = self._normalised(gru.gamma, gru.beta, gru.epsilon)
+        half = ONE / 4 / 2  # tanh takes words of up to 4; gates are tanh of half their sums
+        unit = torch.tensor([half, UNIT, half]).repeat_interleave(model.config.hidden)
+        layer = self._normalised(unit * gru.gamma, unit * gru.beta, gru.epsilon)
         layer.wide = self._wide(_centred_columns(gru.wide_x), state=False)
         layer.beside = self._wide(_centred_columns(gru.wide_h), state=True)
         return layer
@@ -210,19 +224,16 @@ class _Packed:
         norm: nn.LayerNorm,
         wide: Tensor | None = None,
         beside: Tensor | None = None,
-        few: Tensor | None = None,
-        action: Tensor | None = None,
+        few: list[Tensor] | None = None,
         wide_is_state: bool = True,
     ) -> library.Layer:
-        layer = self._normalised(norm.weight, norm.bias, norm.eps)
+        layer = self._normalised(UNIT * norm.weight, UNIT * norm.bias, norm.eps)
         if wide is not None:
             layer.wide = self._wide(_centred_columns(wide), wide_is_state)
         if beside is not None:
             layer.beside = self._wide(_centred_columns(beside), state=True)
         if few is not None:
-            layer.few = self._narrow(few)
-        if action is not None:
-            layer.action = self._narrow(action)
+            layer.few = self._narrow(torch.cat(few, 1))
         return layer
 
     def _normalised(self, gamma: Tensor, beta: Tensor, epsilon: float) -> library.Layer:
@@ -234,7 +245,8 @@ class _Packed:
             )
         layer = library.Layer()
         layer.outputs, layer.epsilon = outputs, epsilon
-        layer.gamma, layer.beta = self._keep(gamma), self._keep(beta)
+        pad = torch.nn.functional.pad
+        layer.gamma, layer.beta = (self._keep(pad(x, (0, LANES))) for x in (gamma, beta))
         return layer
 
     def _narrow(self, weight: Tensor) -> library.Narrow:

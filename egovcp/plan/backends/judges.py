@@ -9,7 +9,6 @@ from torch import Tensor
 
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.backends.integers import IntegerNetwork, Shared
-from egovcp.plan.backends.library import Threads
 from egovcp.plan.backends.network import PlanningNetwork
 from egovcp.plan.backends.reading import noise_of, q_of
 from egovcp.plan.backends.root import Root, root_of
@@ -68,11 +67,11 @@ class IntegerJudge:
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
         self._model, self._config = model, config
         self._network = IntegerNetwork(model, config)
-        self._threads = Threads(torch.get_num_threads())
 
     @torch.no_grad()
     def at(self, carry: Carry) -> Worth:
         """See `Judge`."""
+        self._network.soon()
         # One by one: what a robot's plans are worth does not depend on the robots beside it.
         states = (carry.row(e) for e in range(len(carry.h)))
         robots = [self._network.shared(root_of(self._model, state)) for state in states]
@@ -89,7 +88,7 @@ class IntegerJudge:
 
     def _one(self, robot: Shared, actions: Tensor, noise: Tensor | None) -> Tensor:
         """J (M,) of plans (M, N, 7) of a robot."""
-        outputs, dead = self._network.outputs(robot, actions, noise, self._threads)
+        outputs, dead = self._network.outputs(robot, actions, noise)
         q, risk = q_of(self._model, self._config, outputs), torch.sigmoid(dead)
         tally, horizon = Tally(self._config, self._model.return_floor), actions.shape[-2]
         for k in range(horizon):

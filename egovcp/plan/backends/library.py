@@ -9,15 +9,16 @@ import platform
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Final
 
 from egovcp.errors import EnvironmentFailure
 
-SOURCE: Final = Path(__file__).with_name("kernel.c")
+SOURCE: Final = Path(__file__).parent / "kernel" / "kernel.c"
 FLAGS: Final = (
     "-O3",
     "-march=native",
@@ -26,6 +27,7 @@ FLAGS: Final = (
     "-ffp-contract=fast",
     "-fno-math-errno",
     "-fno-trapping-math",
+    "-fwrapv",
     "-shared",
     "-fPIC",
 )
@@ -55,7 +57,6 @@ class Layer(ctypes.Structure):
         ("wide", Wide),
         ("beside", Wide),
         ("few", Narrow),
-        ("action", Narrow),
         ("gamma", ctypes.c_void_p),
         ("beta", ctypes.c_void_p),
         ("epsilon", ctypes.c_float),
@@ -90,6 +91,8 @@ class Network(ctypes.Structure):
         ("min_std", ctypes.c_float),
         ("head", ctypes.c_void_p),
         ("passing", Mlp),
+        ("silu", ctypes.c_void_p),
+        ("tanh", ctypes.c_void_p),
     )
 
 
@@ -99,22 +102,52 @@ class Root(ctypes.Structure):
     )
 
 
+class Crew(ctypes.Structure):
+    _fields_ = tuple((name, ctypes.c_int32) for name in ("next", "turn", "inside", "present"))
+
+
+class Job(ctypes.Structure):
+    _fields_ = (
+        ("network", ctypes.c_void_p),
+        ("root", ctypes.c_void_p),
+        *((name, ctypes.c_int32) for name in ("rows", "steps", "width")),
+        *((name, ctypes.c_void_p) for name in ("actions", "noise", "q", "dead")),
+        ("crew", Crew),
+    )
+
+
 class Threads:
-    """Runs a function of the kernel on several threads at once, this one among them."""
+    """Judges the plans of a job on several threads at once, the caller's among them.
 
-    def __init__(self, count: int) -> None:
-        self._others = ThreadPoolExecutor(count - 1, "planner") if count > 1 else None
-        self._count = count
+    The others are asked to come at the start of a plan, and leave when nothing has come for a
+    millisecond. One job is judged at a time.
+    """
 
-    def each(self, function: Callable[..., None], arguments: Sequence[object]) -> None:
-        """Call it with the same arguments on each thread; returns when all have ended."""
-        if self._others is None:
-            function(*arguments)
-            return
-        running = [self._others.submit(function, *arguments) for _ in range(self._count - 1)]
-        function(*arguments)
-        for other in running:
-            other.result()
+    def __init__(self, kernel: ctypes.CDLL, count: int) -> None:
+        self._kernel = kernel
+        self._others = count - 1
+        self._pool = ThreadPoolExecutor(count - 1, "planner") if count > 1 else None
+        self._job = Job()
+        self._address = ctypes.byref(self._job)
+        self._lock = Lock()
+
+    def call(self) -> None:
+        """Ask them to come: there is going to be a job soon."""
+        if self._pool is not None:
+            for _ in range(self._kernel.lacking(self._address, self._others)):
+                self._pool.submit(self._kernel.help, self._address)
+
+    def judge(self, **job: int | None) -> None:
+        """Returns when all have ended.
+
+        Args:
+            job: numbers and addresses, as `Job` has them.
+        """
+        with self._lock:
+            for name, value in job.items():
+                setattr(self._job, name, value)
+            self.call()
+            self._kernel.judge(self._address)
 
 
 def processor_is_fast() -> bool:
@@ -150,8 +183,11 @@ def library() -> ctypes.CDLL:
     except OSError as error:
         raise EnvironmentFailure(f"cannot build or load {path}: {error}; {OTHERWISE}") from error
     p, i = ctypes.c_void_p, ctypes.c_int32
-    kernel.judge.argtypes = [p, p, i, i, p, p, i, p, p, p]
-    kernel.judge.restype = None
+    for function in (kernel.judge, kernel.help):
+        function.argtypes = [p]
+        function.restype = None
+    kernel.lacking.argtypes = [p, i]
+    kernel.lacking.restype = i
     kernel.depth.argtypes = []
     kernel.depth.restype = i
     return kernel
@@ -173,7 +209,9 @@ def _folder() -> Path:
 
 def _identity(flags: Sequence[str]) -> str:
     """Changes with the source, the flags and the processor that ``-march=native`` means."""
-    digest = hashlib.sha256(SOURCE.read_bytes())
+    digest = hashlib.sha256()
+    for path in sorted(SOURCE.parent.glob("*.[ch]")):
+        digest.update(path.read_bytes())
     digest.update(repr((flags, compiler(), platform.machine())).encode())
     info = Path("/proc/cpuinfo")
     lines = info.read_text(errors="replace").splitlines() if info.exists() else []

@@ -1,0 +1,218 @@
+/* Imagination and value of candidate plans, in 8-bit integers: the planning network of `network.py`.
+ *
+ * A block of ROWS candidates goes through all steps of the horizon before the next one starts, so that
+ * what they carry stays in the fastest cache; threads take blocks from a common counter.
+ *
+ * A wide input row x (K numbers) is kept as x = scale * (u - zero) + offset with u in 0..255: zero and
+ * offset belong to its kind, scale to the row. Weights are w = weight_scale[n] * i, i in -127..127,
+ * in blocks [N/16][K/4][16][4] of which one vector register holds the last two axes, and one tile of
+ * AMX the last three for 64 of the inputs. Few, exact inputs (the action above all) stay in float32;
+ * what a layer activates, and h, is in 16-bit fixed point (`words.h`).
+ * The weights of a normalised layer are centred (their mean over the outputs is zero), and so are its
+ * sums. No state, no allocation. */
+#include "crew.h"
+#include "layers.h"
+
+static inline float one_sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
+
+/* Rows z [ROWS][FEW_STRIDE] as bytes, counted from 128. */
+static void bytes_of_z(const Few *z, int latent, Bytes *bytes) {
+    for (int r = 0; r < ROWS; r++) {
+        const float *x = z->values[r];
+        float most = 1e-6f;
+        for (int i = 0; i < latent; i++) most = fabsf(x[i]) > most ? fabsf(x[i]) : most;
+        const float scale = most / 127.0f, rate = 1.0f / scale;
+        for (int i = 0; i < latent; i += 2 * WORDS)
+            store_bytes(bytes->values[r] + i,
+                        all(128) + words_of(load(x + i) * rate, load(x + i + LANES) * rate),
+                        all(128) + words_of(load(x + i + WORDS) * rate, load(x + i + WORDS + LANES) * rate));
+        bytes->scale[r] = scale;
+    }
+}
+
+/* z of the prior, with noise [latent] or (null) its mean; also as bytes. */
+static void next_z(const Network *net, const Bytes *h, const float *noise, Few *z, Bytes *bytes) {
+    float out[ROWS * MOST_FEW];
+    const int latent = net->latent, outputs = net->prior_outputs;
+    Fixed x;
+    Bytes between;
+    hidden(net, &net->prior, (Inputs){.wide = h}, &x, &between);
+    wide_product(&net->prior_top, outputs, &between, net->prior_bias, 0, out);
+    for (int r = 0; r < ROWS; r++) {
+        const float *mean = out + r * outputs;
+        for (int i = 0; i < latent; i++) z->values[r][i] = mean[i];
+        for (int i = 0; noise && i < latent; i++) {
+            const float raw = mean[latent + i] + 0.54f;
+            const float std = log1pf(expf(-fabsf(raw))) + (raw > 0.0f ? raw : 0.0f) + net->min_std;
+            z->values[r][i] += std * noise[i];
+        }
+    }
+    bytes_of_z(z, latent, bytes);
+}
+
+/* What is on its way, to `told` of each row: its probability, and that times where and when. */
+static void tell(const Network *net, const Bytes *h, const Bytes *z, float *told, int stride) {
+    Fixed x;
+    Few out = {{{0}}};
+    hidden(net, &net->told, (Inputs){.wide = h, .beside = z}, &x, 0);
+    linear_of_words(&net->told_top, &x, out.values[0], FEW_STRIDE);
+    for (int r = 0; r < ROWS; r++) {
+        const float coming = one_sigmoid(out.values[r][3]);
+        told[r * stride] = coming;
+        for (int i = 0; i < 3; i++) told[r * stride + 1 + i] = coming * out.values[r][i];
+    }
+}
+
+/* q [ROWS][stride] += the outputs of a network of two hidden layers. */
+static void mlp(const Network *net, const Mlp *m, Inputs in, float *q, int stride) {
+    Fixed x;
+    Bytes bytes;
+    hidden(net, &m->first, in, &x, &bytes);
+    hidden(net, &m->second, (Inputs){.wide = &bytes}, &x, 0);
+    linear_of_words(&m->top, &x, q, stride);
+}
+
+/* What a block carries from step to step. */
+typedef struct {
+    Fixed h;
+    Few z;
+    Bytes h_bytes, z_bytes, x;
+} Carry;
+
+/* both [ROWS][width] += what the heads share, at step k; `few` has the action. */
+static void shared_part(const Network *net, const Root *root, const Carry *at, int k, Few *few, float *both,
+                        int width) {
+    const int actions = net->actions;
+    Inputs in = {.few = few, .few_inputs = actions, .from = root->passing};
+    if (k > 0) {
+        in = (Inputs){.few = few, .few_inputs = actions + TOLD};
+        for (int r = 0; root->told && r < ROWS; r++)
+            memcpy(few->values[r] + actions, root->told + k * TOLD, TOLD * sizeof(float));
+        if (!root->told) tell(net, &at->h_bytes, &at->z_bytes, few->values[0] + actions, FEW_STRIDE);
+    }
+    mlp(net, &net->passing, in, both, width);
+}
+
+/* q [ROWS][stride] += a head's own part, at step k; `few` has the action. */
+static void own_part(const Network *net, const Head *head, const float *from, const Carry *at, int k,
+                     Few *few, float *q, int stride) {
+    Inputs in = {.few = few, .few_inputs = net->actions, .from = k > 0 ? 0 : from};
+    const int reduced = head->reduce_h.outputs;
+    if (k > 0 && reduced) {
+        float *to = few->values[0] + net->actions;
+        for (int r = 0; r < ROWS; r++) memset(to + r * FEW_STRIDE, 0, reduced * sizeof(float));
+        linear_of_words(&head->reduce_h, &at->h, to, FEW_STRIDE);
+        linear(&head->reduce_z, at->z.values[0], FEW_STRIDE, to, FEW_STRIDE);
+        in.few_inputs = head->state.first.few.inputs;
+    } else if (k > 0) {
+        in.wide = &at->h_bytes, in.beside = &at->z_bytes;
+    }
+    mlp(net, &head->state, in, q, stride);
+}
+
+/* Everything of a block: actions [ROWS][steps][actions] -> q [ROWS][steps][heads][width], zero before,
+ * and the log-odds of a failure, dead [ROWS][steps]. */
+static void block(const Network *net, const Root *root, int steps, const float *actions, const float *noise,
+                  float *q, int width, float *dead) {
+    Carry at;
+    Fixed x;
+    Few few;
+    const int q_stride = steps * net->heads * width;
+    for (int k = 0; k < steps; k++) {
+        for (int r = 0; r < ROWS; r++)
+            memcpy(few.values[r], actions + (r * steps + k) * net->actions, net->actions * sizeof(float));
+        if (k == 1)
+            recur(net, (Inputs){.wide = &at.x, .from = root->gates}, root->h, 0, &at.h, &at.h_bytes);
+        else if (k > 1)
+            recur(net, (Inputs){.wide = &at.x, .beside = &at.h_bytes}, at.h.values[0], WIDEST, &at.h,
+                  &at.h_bytes);
+        if (k > 0) next_z(net, &at.h_bytes, noise ? noise + (k - 1) * net->latent : 0, &at.z, &at.z_bytes);
+        const int shared = net->passing.top.outputs;
+        float both[ROWS * MOST_FEW] = {0}; /* [ROWS][width] */
+        if (shared) shared_part(net, root, &at, k, &few, both, width);
+        for (int i = 0; i < net->heads; i++) {
+            float *to = q + (k * net->heads + i) * width;
+            own_part(net, net->head + i, root->values[i], &at, k, &few, to, q_stride);
+            for (int r = 0; shared && r < ROWS; r++)
+                for (int j = 0; j < width; j++) to[r * q_stride + j] += both[r * width + j];
+        }
+        if (k == steps - 1) break; /* nothing follows the last step */
+        if (k > 0) {
+            hidden(net, &net->termination, (Inputs){.wide = &at.h_bytes, .beside = &at.z_bytes}, &x, 0);
+            linear_of_words(&net->termination_top, &x, dead + k, steps);
+        }
+        const Inputs in = {.few = &few,
+                           .few_inputs = net->actions,
+                           .beside = k > 0 ? &at.z_bytes : 0,
+                           .from = k > 0 ? 0 : root->mix};
+        hidden(net, &net->mix, in, &x, &at.x);
+    }
+}
+
+/* How many inputs a wide product takes at once; weights are filled up to that with zeros. */
+int32_t depth(void) { return DEPTH; }
+
+/* Plans of one robot. */
+typedef struct {
+    const Network *net;
+    const Root *root;
+    int32_t rows, steps, width;
+    const float *actions; /* [rows][steps][actions] */
+    const float *noise;   /* [steps - 1][latent] or null */
+    float *q;             /* [rows][steps][heads][width], zero before */
+    float *dead;          /* [rows][steps] log-odds of a failure at steps 1 to steps - 2; zero before */
+    Crew crew;
+} Job;
+
+/* The block that starts at `row`, of which there are fewer rows than a block has. */
+static void part_of_block(const Job *job, int row) {
+    const int steps = job->steps, per_row = steps * job->net->actions;
+    const int q_row = steps * job->net->heads * job->width, count = job->rows - row;
+    float some[ROWS * per_row], q[ROWS * q_row], dead[ROWS * steps];
+    memset(q, 0, sizeof q);
+    memset(dead, 0, sizeof dead);
+    for (int r = 0; r < ROWS; r++) /* rows beyond the last repeat the first */
+        memcpy(some + r * per_row, job->actions + (int64_t)(row + (r < count ? r : 0)) * per_row,
+               per_row * sizeof(float));
+    block(job->net, job->root, steps, some, job->noise, q, job->width, dead);
+    memcpy(job->q + (int64_t)row * q_row, q, count * q_row * sizeof(float));
+    memcpy(job->dead + (int64_t)row * steps, dead, count * steps * sizeof(float));
+}
+
+static void blocks(Job *job) {
+    const int steps = job->steps, q_row = steps * job->net->heads * job->width;
+    take_tiles();
+    for (;;) {
+        const int row = __atomic_fetch_add(&job->crew.next, ROWS, __ATOMIC_RELAXED);
+        if (row >= job->rows) break;
+        if (row + ROWS > job->rows)
+            part_of_block(job, row);
+        else
+            block(job->net, job->root, steps, job->actions + (int64_t)row * steps * job->net->actions,
+                  job->noise, job->q + (int64_t)row * q_row, job->width, job->dead + (int64_t)row * steps);
+    }
+    release_tiles();
+}
+
+/* All plans of a job are judged when this returns. */
+void judge(Job *job) {
+    open_job(&job->crew);
+    blocks(job);
+    close_job(&job->crew);
+}
+
+/* Takes part in jobs until none has come for a while. */
+void help(Job *job) {
+    for (int32_t turn = 0; (turn = wait_for_job(&job->crew, turn));) {
+        blocks(job);
+        change(&job->crew.inside, -1);
+    }
+    change(&job->crew.present, -1);
+}
+
+/* How many helpers have to be asked to come, so that there are `wanted`. */
+int32_t lacking(Job *job, int32_t wanted) {
+    const int32_t count = wanted - look(&job->crew.present);
+    change(&job->crew.present, count);
+    return count;
+}

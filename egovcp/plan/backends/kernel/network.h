@@ -1,0 +1,82 @@
+/* What Python says of a network (`library.py` has the same structures), and what a block carries. */
+#pragma once
+#include "words.h"
+
+enum { WIDEST = 1024, MOST_FEW = 128, TOLD = 4, FEW_STRIDE = MOST_FEW + LANES };
+#if defined(TILES)
+enum { ROWS = 16, COLUMNS = 4, DEPTH = 64 }; /* a tile: rows, and inputs; and tiles that sum up */
+#else
+enum { ROWS = 8, COLUMNS = 2, DEPTH = 4 };
+#endif
+
+typedef struct {
+    int32_t inputs;       /* K, a multiple of DEPTH; 0: there is no such input */
+    const int8_t *weight; /* [N/16][K/4][16][4] */
+    const float *scale;   /* [N] */
+    const int32_t *start; /* [N] -zero * sum of the column's integers */
+    const float *shift;   /* [N] offset * sum of the column's weights */
+} Wide;
+
+typedef struct {
+    int32_t inputs;      /* K; 0: there is no such input */
+    const float *weight; /* [K][N] */
+} Narrow;
+
+typedef struct {
+    int32_t outputs;           /* N, a multiple of 16 */
+    Wide wide, beside;         /* h and z; or a hidden layer, and h */
+    Narrow few;                /* the action first */
+    const float *gamma, *beta; /* [N + 16] of the normalisation, in words */
+    float epsilon;
+} Layer;
+
+typedef struct {
+    int32_t inputs, outputs; /* outputs: 1 or a multiple of 16; 0: there is no such layer */
+    const float *weight;     /* [inputs][outputs] */
+    const float *bias;       /* [outputs] */
+} Linear;
+
+typedef struct {
+    Layer first, second;
+    Linear top;
+} Mlp;
+
+typedef struct {
+    Linear reduce_h, reduce_z; /* to what `state` reads in place of h and z, if there are any */
+    Mlp state;
+} Head;
+
+typedef struct {
+    int32_t hidden, latent, actions, heads;
+    Layer mix, gru, prior, termination, told;
+    Wide prior_top;         /* [outputs] means, then raw deviations if they are wanted */
+    const float *prior_bias; /* [MOST_FEW] */
+    int32_t prior_outputs;  /* a multiple of 16 */
+    Linear termination_top, told_top;
+    float min_std;
+    const Head *head; /* [heads] */
+    Mlp passing;      /* reads what is on its way, is added to each head; none if its top has no outputs */
+    const int16_t *silu, *tanh; /* [2][NODES] each, see `Lines` */
+} Network;
+
+typedef struct {
+    const int16_t *h;    /* [hidden + 16] words */
+    const float *mix;    /* sums of the first layers that do not depend on the candidate */
+    const float *gates;
+    const float *const *values; /* of the heads */
+    const float *passing;       /* of what they share */
+    const float *told;          /* [steps][TOLD] what is on its way, if it is followed; else null */
+} Root;
+
+typedef struct {
+    uint8_t values[ROWS][WIDEST];
+    float scale[ROWS];
+} Bytes;
+
+typedef struct {
+    int16_t values[ROWS][WIDEST];
+} Fixed;
+
+typedef struct {
+    float values[ROWS][FEW_STRIDE];
+} Few;

@@ -1,0 +1,198 @@
+/* Vectors of 16 floats and of 32 fixed-point numbers, with and without AVX-512. */
+#pragma once
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+#if defined(__AMX_INT8__) && !defined(WITHOUT_TILES)
+#define TILES 1
+#endif
+#if defined(__AVX512VNNI__) && defined(__AVX512BW__)
+#define WIDE_VECTORS 1
+#endif
+#if defined(WIDE_VECTORS) || defined(TILES)
+#include <immintrin.h>
+#endif
+#define INLINE static inline __attribute__((always_inline))
+
+enum { LANES = 16, WORDS = 32 };
+
+typedef float Floats __attribute__((vector_size(4 * LANES)));
+typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
+typedef int16_t Words __attribute__((vector_size(2 * WORDS)));
+typedef int16_t HalfWords __attribute__((vector_size(2 * LANES)));
+
+INLINE Floats load(const float *x) {
+    Floats v;
+    memcpy(&v, x, sizeof v);
+    return v;
+}
+
+INLINE void store(float *x, Floats v) { memcpy(x, &v, sizeof v); }
+
+INLINE Words load_words(const int16_t *x) {
+    Words v;
+    memcpy(&v, x, sizeof v);
+    return v;
+}
+
+INLINE void store_words(int16_t *x, Words v) { memcpy(x, &v, sizeof v); }
+
+/* 16 words as floats. */
+INLINE Floats floats_of(const int16_t *x) {
+    HalfWords v;
+    memcpy(&v, x, sizeof v);
+    return __builtin_convertvector(v, Floats);
+}
+
+INLINE float total(Floats v) {
+#if defined(WIDE_VECTORS)
+    return _mm512_reduce_add_ps((__m512)v);
+#else
+    float sum = 0.0f;
+    for (int i = 0; i < LANES; i++) sum += v[i];
+    return sum;
+#endif
+}
+
+/* Rounded to whole numbers, to the nearest word where there is none. */
+INLINE Words words_of(Floats a, Floats b) {
+#if defined(WIDE_VECTORS)
+    const __m512i each =
+        _mm512_packs_epi32(_mm512_cvtps_epi32((__m512)a), _mm512_cvtps_epi32((__m512)b));
+    return (Words)_mm512_permutexvar_epi64(_mm512_setr_epi64(0, 2, 4, 6, 1, 3, 5, 7), each);
+#else
+    Words v;
+    for (int i = 0; i < WORDS; i++) {
+        const float x = i < LANES ? a[i] : b[i - LANES];
+        v[i] = !(x > -32768.0f) ? -32768 : x > 32767.0f ? 32767 : (int16_t)lrintf(x);
+    }
+    return v;
+#endif
+}
+
+/* The first `count` lanes, the others zero. */
+INLINE Words first(Words v, int count) {
+#if defined(WIDE_VECTORS)
+    return (Words)_mm512_maskz_mov_epi16((1u << count) - 1u, (__m512i)v);
+#else
+    for (int i = count; i < WORDS; i++) v[i] = 0;
+    return v;
+#endif
+}
+
+INLINE Words larger(Words a, Words b) {
+#if defined(WIDE_VECTORS)
+    return (Words)_mm512_max_epi16((__m512i)a, (__m512i)b);
+#else
+    const Words this = a > b;
+    return (a & this) | (b & ~this);
+#endif
+}
+
+/* Of -32768: itself, which is 32768 to whom words have no sign. */
+INLINE Words absolute(Words a) {
+#if defined(WIDE_VECTORS)
+    return (Words)_mm512_abs_epi16((__m512i)a);
+#else
+    const Words negative = a < 0;
+    return (a ^ negative) - negative;
+#endif
+}
+
+/* a + b, at most the largest word and at least the least. */
+INLINE Words sum(Words a, Words b) {
+#if defined(WIDE_VECTORS)
+    return (Words)_mm512_adds_epi16((__m512i)a, (__m512i)b);
+#else
+    for (int i = 0; i < WORDS; i++) {
+        const int v = a[i] + b[i];
+        a[i] = v < -32768 ? -32768 : v > 32767 ? 32767 : v;
+    }
+    return a;
+#endif
+}
+
+/* The same of words without a sign. */
+INLINE Words sum_of_unsigned(Words a, Words b) {
+#if defined(WIDE_VECTORS)
+    return (Words)_mm512_adds_epu16((__m512i)a, (__m512i)b);
+#else
+    for (int i = 0; i < WORDS; i++) {
+        const int v = (uint16_t)a[i] + (uint16_t)b[i];
+        a[i] = (int16_t)(uint16_t)(v > 65535 ? 65535 : v);
+    }
+    return a;
+#endif
+}
+
+/* a b / 2^15, rounded. */
+INLINE Words product(Words a, Words b) {
+#if defined(WIDE_VECTORS)
+    return (Words)_mm512_mulhrs_epi16((__m512i)a, (__m512i)b);
+#else
+    for (int i = 0; i < WORDS; i++) a[i] = (int16_t)((a[i] * b[i] + (1 << 14)) >> 15);
+    return a;
+#endif
+}
+
+/* a b / 2^16 of words without a sign, rounded down. */
+INLINE Words product_of_unsigned(Words a, Words b) {
+#if defined(WIDE_VECTORS)
+    return (Words)_mm512_mulhi_epu16((__m512i)a, (__m512i)b);
+#else
+    for (int i = 0; i < WORDS; i++)
+        a[i] = (int16_t)(uint16_t)(((uint32_t)(uint16_t)a[i] * (uint16_t)b[i]) >> 16);
+    return a;
+#endif
+}
+
+INLINE Words halved(Words a, int times) {
+#if defined(WIDE_VECTORS)
+    return (Words)_mm512_srai_epi16((__m512i)a, times);
+#else
+    return a >> times;
+#endif
+}
+
+/* Shifted as words without a sign. */
+INLINE Words left(Words a, int bits) {
+    typedef uint16_t Unsigned __attribute__((vector_size(2 * WORDS)));
+    return (Words)((Unsigned)a << bits);
+}
+
+INLINE Words right(Words a, int bits) {
+    typedef uint16_t Unsigned __attribute__((vector_size(2 * WORDS)));
+    return (Words)((Unsigned)a >> bits);
+}
+
+INLINE Words all(int x) { return (Words){0} + (int16_t)x; }
+
+/* The largest, if none is below zero. */
+INLINE int highest(Words v) {
+#if defined(WIDE_VECTORS)
+    const __m256i half = _mm256_max_epi16(_mm512_castsi512_si256((__m512i)v),
+                                          _mm512_extracti64x4_epi64((__m512i)v, 1));
+    const __m128i eight =
+        _mm_max_epi16(_mm256_castsi256_si128(half), _mm256_extracti128_si256(half, 1));
+    const __m128i lacking = _mm_minpos_epu16(_mm_sub_epi16(_mm_set1_epi16(0x7fff), eight));
+    return 0x7fff - (_mm_cvtsi128_si32(lacking) & 0xffff);
+#else
+    int most = 0;
+    for (int i = 0; i < WORDS; i++) most = v[i] > most ? v[i] : most;
+    return most;
+#endif
+}
+
+/* 64 words as bytes without a sign, to the nearest byte where there is none. */
+INLINE void store_bytes(uint8_t *u, Words a, Words b) {
+#if defined(WIDE_VECTORS)
+    const __m512i each = _mm512_packus_epi16((__m512i)a, (__m512i)b);
+    _mm512_storeu_si512(u,
+                        _mm512_permutexvar_epi64(_mm512_setr_epi64(0, 2, 4, 6, 1, 3, 5, 7), each));
+#else
+    for (int i = 0; i < 2 * WORDS; i++) {
+        const int x = i < WORDS ? a[i] : b[i - WORDS];
+        u[i] = x < 0 ? 0 : x > 255 ? 255 : (uint8_t)x;
+    }
+#endif
+}
