@@ -252,8 +252,8 @@ def _told(track: Tensor, share: Tensor, yaw: Tensor, config: FlightConfig) -> Te
     return torch.cat([sure, place, left[:, None]], -1)
 
 
-def later(memory: Tensor, ticks: int = 1) -> Tensor:
-    """The memory (..., n) that many ticks later, if nothing is seen meanwhile."""
+def later(memory: Tensor, ticks: int | Tensor = 1) -> Tensor:
+    """The memory (..., n) that many ticks (or (..., 1)) later, if nothing is seen meanwhile."""
     left = memory[..., 3:4] - ticks * _DT
     told = torch.cat([memory[..., :3], left], -1)
     told = torch.where((memory[..., :1] > 0) & (left > _BEHIND), told, 0.0)

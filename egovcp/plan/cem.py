@@ -25,12 +25,18 @@ class CrossEntropy:
     def learn(self, belief: Belief, deltas: Tensor, values: Tensor) -> Belief:
         """See `Optimiser`."""
         elites, top = best_of(deltas, values, self.config.elites)
-        mean, std = refit(elites, top.isfinite(), belief)
-        return Belief(mean, std.clamp_min(self.config.min_std), elites, top, mean_value(top))
+        usable = top.isfinite()
+        mean, std = refit(elites, usable, belief)
+        value = mean_value(top, usable)
+        return Belief(mean, std.clamp_min(self.config.min_std), elites, top, value)
 
 
 def refit(elites: Tensor, usable: Tensor, belief: Belief) -> tuple[Tensor, Tensor]:
     """Mean and deviation (E, N, 7) of the usable elites (E, elites, N, 7); without any, the old."""
+    if everything(usable):
+        mean = elites.sum(1) / elites.shape[1]
+        squares = (elites - mean[:, None]).square_()
+        return mean, (squares.sum(1) / elites.shape[1]).sqrt_()
     weight = usable[:, :, None, None].to(elites.dtype)
     count = weight.sum(1)
     fitted = (elites * weight).sum(1) / count.clamp_min(1.0)
@@ -40,8 +46,15 @@ def refit(elites: Tensor, usable: Tensor, belief: Belief) -> tuple[Tensor, Tenso
     return mean, torch.where(count > 0, spread, belief.std)
 
 
-def mean_value(top: Tensor) -> Tensor:
-    """Mean (E,) of the finite of (E, elites); -inf without any."""
-    usable = top.isfinite()
+def mean_value(top: Tensor, usable: Tensor) -> Tensor:
+    """Mean (E,) of the usable ones of (E, elites); -inf without any."""
+    if everything(usable):
+        return top.sum(1) / top.shape[1]
     value = top.masked_fill(~usable, 0.0).sum(1) / usable.sum(1).clamp_min(1)
     return value.masked_fill(~usable.any(1), -torch.inf)
+
+
+def everything(usable: Tensor) -> bool:
+    """Whether all are, for which less has to be computed to the same bits; asked on processors
+    only, for the answer of another device would have to be waited for."""
+    return usable.device.type == "cpu" and bool(usable.all())

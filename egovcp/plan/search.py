@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -40,6 +40,15 @@ class Optimiser(Protocol):
 
     def learn(self, belief: Belief, deltas: Tensor, values: Tensor) -> Belief:
         """After the ``values`` (E, M) of these candidates; -inf where J was not a number."""
+        ...
+
+
+@runtime_checkable
+class Walker(Protocol):
+    """A judge that can do more than judge."""
+
+    def walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
+        """`process.walk`, to the same bits and sooner: (E, M, N, 7) from (E, 1, 7)."""
         ...
 
 
@@ -103,31 +112,31 @@ def make_plan[C](
     pace = Pace(remaining)
     belief = _start(executed, config, warm)
     worth = judge.at(carry)
+    follow = judge.walk if isinstance(judge, Walker) else walk
     start = executed[:, None]  # (E, 1, 7)
     for iteration in range(config.iterations):
         deltas = optimiser.propose(belief, iteration, generator)  # (E, M, N, 7)
         if config.process == "ramp":
             deltas = ramp(start, deltas, config.eta)
-        actions = walk(start, deltas, config.eta)
-        values = worth(actions, generator)
-        values = values - _effort(actions, deltas, config)
-        values = values.masked_fill(~values.isfinite(), -torch.inf)
+        actions = follow(start, deltas, config.eta)
+        values = _less_effort(worth(actions, generator), actions, deltas, config)
+        values = values.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
         belief = optimiser.learn(belief, deltas, values)
         if not pace.goes_on():
             break
-    best = walk(start.expand(-1, belief.elites.shape[1], -1), belief.elites, config.eta)
-    chosen = walk(executed, belief.mean, config.eta)
+    best = follow(start, belief.elites, config.eta)
+    chosen = follow(start, belief.mean[:, None], config.eta)[:, 0]
     return Plan(chosen, belief.mean, belief.value, best, belief.values, iteration + 1)
 
 
-def _effort(actions: Tensor, deltas: Tensor, config: PlannerConfig) -> Tensor | float:
-    """What plans (E, M, N, 7) cost besides what Q says of them: (E, M), or 0 for all."""
+def _less_effort(values: Tensor, actions: Tensor, deltas: Tensor, config: PlannerConfig) -> Tensor:
+    """J (E, M) less what plans (E, M, N, 7) cost besides what Q says of them."""
     cost: Tensor | float = 0.0
     if config.hands_cost > 0:
         cost = config.hands_cost * actions[..., spec.ACTION_HANDS].square().mean((-2, -1))
     if config.step_cost > 0:
         cost = cost + config.step_cost * deltas.square().mean((-2, -1))
-    return cost
+    return values - cost if isinstance(cost, Tensor) else values
 
 
 def _start(executed: Tensor, config: PlannerConfig, warm: Tensor | None) -> Belief:
@@ -160,4 +169,6 @@ def white(mean: Tensor, samples: int, generator: torch.Generator) -> Tensor:
 def best_of(deltas: Tensor, values: Tensor, count: int) -> tuple[Tensor, Tensor]:
     """The ``count`` best of (E, M, N, 7) by their values (E, M), best first."""
     top, index = values.topk(count, dim=1)
-    return deltas.take_along_dim(index[:, :, None, None], 1), top
+    rows = deltas.flatten(2)
+    best = rows.gather(1, index[:, :, None].expand(-1, -1, rows.shape[2]))
+    return best.view(*index.shape, *deltas.shape[2:]), top

@@ -34,7 +34,7 @@ class Shared(NamedTuple):
     description: library.Root
     tensors: tuple[object, ...]
     root: Root
-    told: dict[int, Tensor | None]  # by number of steps, see `_told`
+    told: dict[int, Tensor | None]  # (N, 4) by number of steps N
 
 
 class IntegerNetwork:
@@ -46,7 +46,7 @@ class IntegerNetwork:
     """
 
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
-        kernel = library.library()
+        self._kernel = kernel = library.library()
         self._heads = len(model.q_heads.states)
         self._outputs = value.width(model.config.value_loss)
         self._width = 1 if self._outputs == 1 else _whole(self._outputs)
@@ -83,7 +83,8 @@ class IntegerNetwork:
         q = torch.zeros(plans, steps, self._heads, self._width)
         dead = torch.zeros(plans, steps)
         if steps not in shared.told:  # the same for every iteration of a search
-            shared.told[steps] = _told(shared.root, steps)
+            told = shared.root.told_along(steps)
+            shared.told[steps] = None if told is None else told[0].contiguous()
         told = shared.told[steps]
         shared.description.told = None if told is None else told.data_ptr()
         actions, noise = actions.contiguous(), None if noise is None else noise.contiguous()
@@ -100,15 +101,17 @@ class IntegerNetwork:
         )
         return q[..., : self._outputs], dead
 
+    def walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
+        """`process.walk`, bit for bit: actions (E, M, N, 7) from (E, 1, 7) by (E, M, N, 7)."""
+        start, deltas = start.contiguous(), deltas.contiguous()
+        actions = torch.empty_like(deltas)
+        addresses = (start.data_ptr(), deltas.data_ptr(), actions.data_ptr())
+        self._kernel.walk(*deltas.shape, eta, *addresses)
+        return actions
+
     def soon(self) -> None:
         """There is going to be something to compute."""
         self._threads.call()
-
-
-def _told(root: Root, steps: int) -> Tensor | None:
-    """(N, 4) what is on its way at each step, if it is followed."""
-    each = [told for k in range(steps) if (told := root.told(k)) is not None]
-    return torch.cat(each).view(steps, -1).contiguous() if each else None
 
 
 def _centred(sums: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from egovcp.plan.backends.network import PlanningNetwork
 from egovcp.plan.backends.reading import noise_of, q_of
 from egovcp.plan.backends.root import Root, root_of
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.objective import Tally, Worth
+from egovcp.plan.objective import Worth, mean_value
 
 
 class FloatJudge:
@@ -75,14 +75,14 @@ class IntegerJudge:
         # One by one: what a robot's plans are worth does not depend on the robots beside it.
         states = (carry.row(e) for e in range(len(carry.h)))
         robots = [self._network.shared(root_of(self._model, state)) for state in states]
-        sound = carry.h.isfinite().all(1) & carry.z.isfinite().all(1)
+        nothing = 0.0 * (carry.h.sum(1) + carry.z.sum(1))[:, None]  # or not a number
 
         @torch.no_grad()
         def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:
             noise = noise_of(self._model, self._config, actions.shape[-2], generator)
             values = [self._one(*one, noise) for one in zip(robots, actions, strict=True)]
-            finite = actions.sum((2, 3)).isfinite() & sound[:, None]
-            return torch.stack(values).where(finite, torch.nan)  # bytes know no NaN
+            # bytes know no NaN
+            return torch.stack(values).add_(nothing).add_(actions.sum((2, 3)), alpha=0.0)
 
         return worth
 
@@ -90,9 +90,8 @@ class IntegerJudge:
         """J (M,) of plans (M, N, 7) of a robot."""
         outputs, dead = self._network.outputs(robot, actions, noise)
         q, risk = q_of(self._model, self._config, outputs), torch.sigmoid(dead)
-        tally, horizon = Tally(self._config, self._model.return_floor), actions.shape[-2]
-        for k in range(horizon):
-            tally.value(q[:, k])
-            if 0 < k < horizon - 1:
-                tally.risk(risk[:, k])
-        return tally.mean(horizon)
+        return mean_value(q, risk, self._config, self._model.return_floor)
+
+    def walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
+        """See `Walker`."""
+        return self._network.walk(start, deltas, eta)

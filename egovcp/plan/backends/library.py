@@ -24,7 +24,7 @@ FLAGS: Final = (
     "-march=native",
     "-mprefer-vector-width=512",
     "-std=gnu11",
-    "-ffp-contract=fast",
+    "-ffp-contract=off",
     "-fno-math-errno",
     "-fno-trapping-math",
     "-fwrapv",
@@ -186,6 +186,8 @@ def library() -> ctypes.CDLL:
     for function in (kernel.judge, kernel.help):
         function.argtypes = [p]
         function.restype = None
+    kernel.walk.argtypes = [i, i, i, i, ctypes.c_float, p, p, p]
+    kernel.walk.restype = None
     kernel.lacking.argtypes = [p, i]
     kernel.lacking.restype = i
     kernel.depth.argtypes = []

@@ -12,6 +12,7 @@
  * sums. No state, no allocation. */
 #include "crew.h"
 #include "layers.h"
+#include "walk.h"
 
 static inline float one_sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
 

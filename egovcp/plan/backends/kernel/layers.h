@@ -32,7 +32,7 @@ static inline void rates(const Layer *l, const float *y, float *rate) {
     for (int i = 0; i < l->outputs; i += LANES)
         for (int r = 0; r < ROWS; r++) {
             const Floats v = load(y + r * l->outputs + i);
-            squares[r] += v * v;
+            squares[r] = fused(v, v, squares[r]);
         }
     for (int r = 0; r < ROWS; r++) rate[r] = total(squares[r]);
     for (int r = 0; r < ROWS; r++) rate[r] = 1.0f / sqrtf(rate[r] / (float)l->outputs + l->epsilon);
@@ -41,8 +41,8 @@ static inline void rates(const Layer *l, const float *y, float *rate) {
 /* 32 sums of a row, normalised, as words. */
 INLINE Words normal(const Layer *l, const float *y, int at, float rate) {
     const float *gamma = l->gamma + at, *beta = l->beta + at;
-    return words_of(load(y) * rate * load(gamma) + load(beta),
-                    load(y + LANES) * rate * load(gamma + LANES) + load(beta + LANES));
+    return words_of(fused(load(y) * rate, load(gamma), load(beta)),
+                    fused(load(y + LANES) * rate, load(gamma + LANES), load(beta + LANES)));
 }
 
 /* Linear, LayerNorm, SiLU: x [ROWS][N] in words, and as bytes if they are wanted. */
@@ -100,7 +100,7 @@ static void linear(const Linear *l, const float *x, int x_stride, float *out, in
         for (int r = 0; r < ROWS; r++) acc[r] = load(out + r * out_stride + j) + load(l->bias + j);
         for (int n = 0; n < l->inputs; n++) {
             const Floats weight = load(l->weight + (int64_t)n * l->outputs + j);
-            for (int r = 0; r < ROWS; r++) acc[r] += x[r * x_stride + n] * weight;
+            for (int r = 0; r < ROWS; r++) acc[r] = fused(all_floats(x[r * x_stride + n]), weight, acc[r]);
         }
         for (int r = 0; r < ROWS; r++) store(out + r * out_stride + j, acc[r]);
     }
@@ -112,7 +112,8 @@ static void linear_of_words(const Linear *l, const Fixed *x, float *out, int out
     if (l->outputs == 1) {
         for (int r = 0; r < ROWS; r++) {
             Floats sum = {0};
-            for (int n = 0; n < l->inputs; n += LANES) sum += floats_of(x->values[r] + n) * load(l->weight + n);
+            for (int n = 0; n < l->inputs; n += LANES)
+                sum = fused(floats_of(x->values[r] + n), load(l->weight + n), sum);
             out[r * out_stride] += total(sum) + l->bias[0];
         }
         return;

@@ -93,7 +93,8 @@ INLINE void columns_of_product(const Wide *w, int n, int columns, const Bytes *i
         const Floats weight_scale = load(w->scale + n), shift = load(w->shift + n);
         for (int r = 0; r < ROWS; r++) {
             const Floats product = __builtin_convertvector(dot[c][r], Floats) * weight_scale;
-            store(y + r * stride + n, load(from + r * from_stride + n) + shift + in->scale[r] * product);
+            const Floats start = load(from + r * from_stride + n) + shift;
+            store(y + r * stride + n, fused(all_floats(in->scale[r]), product, start));
         }
     }
 }
@@ -115,7 +116,8 @@ INLINE void columns_of_narrow(const Narrow *w, int inputs, int outputs, int n, i
     for (int k = 0; k < inputs; k++) {
         const float *weight = w->weight + (int64_t)k * outputs + n;
         for (int r = 0; r < ROWS; r++)
-            for (int c = 0; c < columns; c++) acc[c][r] += x->values[r][k] * load(weight + c * LANES);
+            for (int c = 0; c < columns; c++)
+                acc[c][r] = fused(all_floats(x->values[r][k]), load(weight + c * LANES), acc[c][r]);
     }
     for (int c = 0; c < columns; c++)
         for (int r = 0; r < ROWS; r++) store(y + r * outputs + n + c * LANES, acc[c][r]);

@@ -44,6 +44,17 @@ INLINE Floats floats_of(const int16_t *x) {
     return __builtin_convertvector(v, Floats);
 }
 
+/* a b + c, rounded once where the processor can. */
+INLINE Floats fused(Floats a, Floats b, Floats c) {
+#if defined(WIDE_VECTORS)
+    return (Floats)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
+#else
+    return a * b + c;
+#endif
+}
+
+INLINE Floats all_floats(float x) { return (Floats){0} + x; }
+
 INLINE float total(Floats v) {
 #if defined(WIDE_VECTORS)
     return _mm512_reduce_add_ps((__m512)v);
