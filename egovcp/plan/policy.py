@@ -99,7 +99,7 @@ class Policy:
         self.observe(depth, state)
         plan = make_plan(
             self.prepare(),
-            optimiser_of(self.config),
+            optimiser_of(self.config, self._device),
             self._carry,
             self._sent,
             self.config,

@@ -45,7 +45,7 @@ class Optimiser(Protocol):
 
 @runtime_checkable
 class Walker(Protocol):
-    """A judge that can do more than judge."""
+    """An optimiser that also makes actions of its draws."""
 
     def walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
         """`process.walk`, to the same bits and sooner: (E, M, N, 7) from (E, 1, 7)."""
@@ -112,7 +112,7 @@ def make_plan[C](
     pace = Pace(remaining)
     belief = _start(executed, config, warm)
     worth = judge.at(carry)
-    follow = judge.walk if isinstance(judge, Walker) else walk
+    follow = optimiser.walk if isinstance(optimiser, Walker) else walk
     start = executed[:, None]  # (E, 1, 7)
     for iteration in range(config.iterations):
         deltas = optimiser.propose(belief, iteration, generator)  # (E, M, N, 7)

@@ -26,6 +26,8 @@ LANES: Final = 16
 WIDEST: Final = 1024
 MOST_FEW: Final = 128
 LEVELS: Final = 127
+RULES: Final = ("paper", "shift", "survival")
+"""As the kernel counts them."""
 
 
 class Shared(NamedTuple):
@@ -46,12 +48,12 @@ class IntegerNetwork:
     """
 
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
-        self._kernel = kernel = library.library()
+        kernel = library.library()
         self._heads = len(model.q_heads.states)
         self._outputs = value.width(model.config.value_loss)
         self._width = 1 if self._outputs == 1 else _whole(self._outputs)
         assert self._width <= MOST_FEW
-        self._packed = _Packed(model, drawn=config.latent == "sample", depth=kernel.depth())
+        self._packed = _Packed(model, config, kernel.depth())
         self._threads = library.Threads(kernel, torch.get_num_threads())
 
     def shared(self, root: Root) -> Shared:
@@ -67,21 +69,40 @@ class IntegerNetwork:
             ctypes.cast(pointers, ctypes.c_void_p),
             None if passing is None else passing.data_ptr(),
             None,
+            0.0 * float(root.h.sum() + root.mix.sum()),
         )
         return Shared(description, (h, mix, gates, values, pointers, passing), root, {})
+
+    def worth(self, shared: Shared, actions: Tensor, noise: Tensor | None) -> Tensor | None:
+        """J (M,) of plans (M, N, 7), by as many threads as there are.
+
+        None where a head has several outputs: ask for `outputs`, and read them.
+        """
+        if self._outputs > 1:
+            return None
+        values = torch.empty(len(actions))
+        self._judge(shared, actions, noise, q=None, dead=None, worth=values.data_ptr())
+        return values
 
     def outputs(
         self, shared: Shared, actions: Tensor, noise: Tensor | None
     ) -> tuple[Tensor, Tensor]:
-        """Along plans (M, N, 7), by as many threads as there are.
+        """Along plans (M, N, 7).
 
         Returns:
             Outputs of the heads of Q (M, N, heads, width), and log-odds of a failure (M, N), those
             of the steps 1 to N - 2 only.
         """
         plans, steps, _ = actions.shape
-        q = torch.zeros(plans, steps, self._heads, self._width)
-        dead = torch.zeros(plans, steps)
+        q = torch.empty(plans, steps, self._heads, self._width)
+        dead = torch.empty(plans, steps)
+        self._judge(shared, actions, noise, q=q.data_ptr(), dead=dead.data_ptr(), worth=None)
+        return q[..., : self._outputs], dead
+
+    def _judge(
+        self, shared: Shared, actions: Tensor, noise: Tensor | None, **results: int | None
+    ) -> None:
+        plans, steps, _ = actions.shape
         if steps not in shared.told:  # the same for every iteration of a search
             told = shared.root.told_along(steps)
             shared.told[steps] = None if told is None else told[0].contiguous()
@@ -96,18 +117,8 @@ class IntegerNetwork:
             width=self._width,
             actions=actions.data_ptr(),
             noise=None if noise is None else noise.data_ptr(),
-            q=q.data_ptr(),
-            dead=dead.data_ptr(),
+            **results,
         )
-        return q[..., : self._outputs], dead
-
-    def walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
-        """`process.walk`, bit for bit: actions (E, M, N, 7) from (E, 1, 7) by (E, M, N, 7)."""
-        start, deltas = start.contiguous(), deltas.contiguous()
-        actions = torch.empty_like(deltas)
-        addresses = (start.data_ptr(), deltas.data_ptr(), actions.data_ptr())
-        self._kernel.walk(*deltas.shape, eta, *addresses)
-        return actions
 
     def soon(self) -> None:
         """There is going to be something to compute."""
@@ -133,7 +144,7 @@ def _whole(count: int) -> int:
 class _Packed:
     """A network's description for the kernel, and the tensors that it points into."""
 
-    def __init__(self, model: WorldModel, drawn: bool, depth: int) -> None:
+    def __init__(self, model: WorldModel, config: PlannerConfig, depth: int) -> None:
         self._kept: list[object] = []
         self._depth = depth
         c = model.config
@@ -152,13 +163,19 @@ class _Packed:
         n.mix = self._layer(norm, beside=z, few=[action])
         n.gru = self._gru(model)
         n.prior, top = self._one_hidden(model.prior)
-        self._prior_top(first_outputs(top, None if drawn else c.latent))
+        self._prior_top(first_outputs(top, None if config.latent == "sample" else c.latent))
         n.termination, top = self._one_hidden(model.termination_head)
         n.termination_top = self._top(top)
         if (shared := model.q_heads.passing) is not None:
             n.passing = self._mlp(shared, wide=False)
             n.told, top = self._one_hidden(model.decode_passing)
             n.told_top = self._top(top)
+        n.reading = library.Reading(
+            RULES.index(config.termination_rule),
+            config.ensemble == "min",
+            *map(float, (model.return_mean, model.return_std, model.return_floor)),
+            config.termination_threshold,
+        )
         heads = (library.Head * c.q_heads)(*map(self._head, model.q_heads.states))
         n.head = ctypes.cast(heads, ctypes.c_void_p)
         self._kept.append(heads)

@@ -75,23 +75,22 @@ class IntegerJudge:
         # One by one: what a robot's plans are worth does not depend on the robots beside it.
         states = (carry.row(e) for e in range(len(carry.h)))
         robots = [self._network.shared(root_of(self._model, state)) for state in states]
-        nothing = 0.0 * (carry.h.sum(1) + carry.z.sum(1))[:, None]  # or not a number
 
         @torch.no_grad()
         def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:
             noise = noise_of(self._model, self._config, actions.shape[-2], generator)
-            values = [self._one(*one, noise) for one in zip(robots, actions, strict=True)]
-            # bytes know no NaN
-            return torch.stack(values).add_(nothing).add_(actions.sum((2, 3)), alpha=0.0)
+            each = zip(robots, actions, strict=True)
+            return torch.stack([self._one(robot, plans, noise) for robot, plans in each])
 
         return worth
 
     def _one(self, robot: Shared, actions: Tensor, noise: Tensor | None) -> Tensor:
         """J (M,) of plans (M, N, 7) of a robot."""
+        worth = self._network.worth(robot, actions, noise)
+        if worth is not None:
+            return worth
         outputs, dead = self._network.outputs(robot, actions, noise)
         q, risk = q_of(self._model, self._config, outputs), torch.sigmoid(dead)
-        return mean_value(q, risk, self._config, self._model.return_floor)
-
-    def walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
-        """See `Walker`."""
-        return self._network.walk(start, deltas, eta)
+        value = mean_value(q, risk, self._config, self._model.return_floor)
+        nothing = robot.description.nothing  # bytes know no NaN
+        return value.add_(actions.sum((1, 2)), alpha=0.0).add_(nothing)

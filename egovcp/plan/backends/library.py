@@ -80,6 +80,13 @@ class Head(ctypes.Structure):
     _fields_ = (("reduce_h", Linear), ("reduce_z", Linear), ("state", Mlp))
 
 
+class Reading(ctypes.Structure):
+    _fields_ = (
+        *((name, ctypes.c_int32) for name in ("rule", "lowest")),
+        *((name, ctypes.c_float) for name in ("mean", "std", "floor", "threshold")),
+    )
+
+
 class Network(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int32) for name in ("hidden", "latent", "actions", "heads")),
@@ -93,12 +100,14 @@ class Network(ctypes.Structure):
         ("passing", Mlp),
         ("silu", ctypes.c_void_p),
         ("tanh", ctypes.c_void_p),
+        ("reading", Reading),
     )
 
 
 class Root(ctypes.Structure):
-    _fields_ = tuple(
-        (name, ctypes.c_void_p) for name in ("h", "mix", "gates", "values", "passing", "told")
+    _fields_ = (
+        *((name, ctypes.c_void_p) for name in ("h", "mix", "gates", "values", "passing", "told")),
+        ("nothing", ctypes.c_float),
     )
 
 
@@ -111,7 +120,7 @@ class Job(ctypes.Structure):
         ("network", ctypes.c_void_p),
         ("root", ctypes.c_void_p),
         *((name, ctypes.c_int32) for name in ("rows", "steps", "width")),
-        *((name, ctypes.c_void_p) for name in ("actions", "noise", "q", "dead")),
+        *((name, ctypes.c_void_p) for name in ("actions", "noise", "q", "dead", "worth")),
         ("crew", Crew),
     )
 
@@ -186,8 +195,12 @@ def library() -> ctypes.CDLL:
     for function in (kernel.judge, kernel.help):
         function.argtypes = [p]
         function.restype = None
-    kernel.walk.argtypes = [i, i, i, i, ctypes.c_float, p, p, p]
-    kernel.walk.restype = None
+    f = ctypes.c_float
+    kernel.draw.argtypes = [i, i, i, p, p, p, p]
+    kernel.walk.argtypes = [i, i, i, i, f, p, p, p]
+    kernel.learn.argtypes = [i, i, i, i, f, p, p, p, p, p, p, p]
+    for function in (kernel.draw, kernel.walk, kernel.learn):
+        function.restype = None
     kernel.lacking.argtypes = [p, i]
     kernel.lacking.restype = i
     kernel.depth.argtypes = []

@@ -12,7 +12,7 @@
  * sums. No state, no allocation. */
 #include "crew.h"
 #include "layers.h"
-#include "walk.h"
+#include "search.h"
 
 static inline float one_sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
 
@@ -153,45 +153,74 @@ static void block(const Network *net, const Root *root, int steps, const float *
 /* How many inputs a wide product takes at once; weights are filled up to that with zeros. */
 int32_t depth(void) { return DEPTH; }
 
-/* Plans of one robot. */
+/* Plans of one robot. Asked for are either what the heads say, or what plans are worth. */
 typedef struct {
     const Network *net;
     const Root *root;
     int32_t rows, steps, width;
     const float *actions; /* [rows][steps][actions] */
     const float *noise;   /* [steps - 1][latent] or null */
-    float *q;             /* [rows][steps][heads][width], zero before */
-    float *dead;          /* [rows][steps] log-odds of a failure at steps 1 to steps - 2; zero before */
+    float *q;             /* [rows][steps][heads][width] */
+    float *dead;          /* [rows][steps] log-odds of a failure at steps 1 to steps - 2 */
+    float *worth;         /* [rows] J, of heads of one output; null: q and dead are asked for */
     Crew crew;
 } Job;
 
-/* The block that starts at `row`, of which there are fewer rows than a block has. */
-static void part_of_block(const Job *job, int row) {
+/* Q in units of return, from the outputs of the heads. */
+static float value_of(const Network *net, const float *q) {
+    float value = q[0];
+    for (int i = 1; i < net->heads; i++) {
+        if (!net->reading.lowest) value += q[i];
+        else if (q[i] < value) value = q[i];
+    }
+    if (!net->reading.lowest) value /= (float)net->heads;
+    return net->reading.mean + value * net->reading.std;
+}
+
+/* J of a plan, as `Tally` sums it: q [steps][heads], dead [steps], actions [steps][actions]. */
+static float worth_of(const Job *job, const float *q, const float *dead, const float *actions) {
+    const Network *net = job->net;
+    const Reading *as = &net->reading;
+    const float base = as->rule == PAPER ? 0.0f : as->floor;
+    float total = 0.0f, share = 1.0f, nothing = job->root->nothing;
+    for (int k = 0; k < job->steps; k++, q += net->heads) {
+        total += share * (value_of(net, q) - base);
+        if (k == 0) continue; /* the first state was seen alive */
+        const float risk = one_sigmoid(dead[k]);
+        share *= as->rule == SURVIVAL ? 1.0f - risk : risk <= as->threshold;
+    }
+    for (int i = 0; i < job->steps * net->actions; i++) nothing += 0.0f * actions[i];
+    return total / (float)job->steps + base + nothing;
+}
+
+/* A block of candidates from `row` on; rows beyond the last repeat the first. */
+static void judge_block(const Job *job, int row) {
     const int steps = job->steps, per_row = steps * job->net->actions;
-    const int q_row = steps * job->net->heads * job->width, count = job->rows - row;
+    const int q_row = steps * job->net->heads * job->width;
+    const int count = row + ROWS <= job->rows ? ROWS : job->rows - row;
+    const float *actions = job->actions + (int64_t)row * per_row;
     float some[ROWS * per_row], q[ROWS * q_row], dead[ROWS * steps];
     memset(q, 0, sizeof q);
     memset(dead, 0, sizeof dead);
-    for (int r = 0; r < ROWS; r++) /* rows beyond the last repeat the first */
-        memcpy(some + r * per_row, job->actions + (int64_t)(row + (r < count ? r : 0)) * per_row,
-               per_row * sizeof(float));
-    block(job->net, job->root, steps, some, job->noise, q, job->width, dead);
+    if (count < ROWS) {
+        for (int r = 0; r < ROWS; r++)
+            memcpy(some + r * per_row, actions + (r < count ? r : 0) * per_row, per_row * sizeof(float));
+        actions = some;
+    }
+    block(job->net, job->root, steps, actions, job->noise, q, job->width, dead);
+    if (job->worth) {
+        for (int r = 0; r < count; r++)
+            job->worth[row + r] = worth_of(job, q + r * q_row, dead + r * steps, actions + r * per_row);
+        return;
+    }
     memcpy(job->q + (int64_t)row * q_row, q, count * q_row * sizeof(float));
     memcpy(job->dead + (int64_t)row * steps, dead, count * steps * sizeof(float));
 }
 
 static void blocks(Job *job) {
-    const int steps = job->steps, q_row = steps * job->net->heads * job->width;
     take_tiles();
-    for (;;) {
-        const int row = __atomic_fetch_add(&job->crew.next, ROWS, __ATOMIC_RELAXED);
-        if (row >= job->rows) break;
-        if (row + ROWS > job->rows)
-            part_of_block(job, row);
-        else
-            block(job->net, job->root, steps, job->actions + (int64_t)row * steps * job->net->actions,
-                  job->noise, job->q + (int64_t)row * q_row, job->width, job->dead + (int64_t)row * steps);
-    }
+    for (int row; (row = __atomic_fetch_add(&job->crew.next, ROWS, __ATOMIC_RELAXED)) < job->rows;)
+        judge_block(job, row);
     release_tiles();
 }
 

@@ -39,8 +39,7 @@ static inline void rates(const Layer *l, const float *y, float *rate) {
 }
 
 /* 32 sums of a row, normalised, as words. */
-INLINE Words normal(const Layer *l, const float *y, int at, float rate) {
-    const float *gamma = l->gamma + at, *beta = l->beta + at;
+INLINE Words normal(const float *y, Floats rate, const float *gamma, const float *beta) {
     return words_of(fused(load(y) * rate, load(gamma), load(beta)),
                     fused(load(y + LANES) * rate, load(gamma + LANES), load(beta + LANES)));
 }
@@ -49,13 +48,15 @@ INLINE Words normal(const Layer *l, const float *y, int at, float rate) {
 static void hidden(const Network *net, const Layer *l, Inputs in, Fixed *x, Bytes *bytes) {
     float y[(ROWS + 1) * WIDEST] __attribute__((aligned(64))), rate[ROWS];
     const Lines lines = lines_of(net->silu);
+    const float *gamma = l->gamma, *beta = l->beta;
     const int n = l->outputs;
     sums(l, in, y);
     rates(l, y, rate);
     for (int r = 0; r < ROWS; r++) {
+        const Floats times = all_floats(rate[r]);
         Words most = all(0);
         for (int i = 0; i < n; i += WORDS) {
-            Words v = silu(lines, normal(l, y + r * n + i, i, rate[r]));
+            Words v = silu(lines, normal(y + r * n + i, times, gamma + i, beta + i));
             if (i + WORDS > n) v = first(v, n - i);
             store_words(x->values[r] + i, v);
             most = larger(most, v);
@@ -71,17 +72,20 @@ static void recur(const Network *net, Inputs in, const int16_t *before, int stri
     float y[(ROWS + 1) * WIDEST] __attribute__((aligned(64))), rate[ROWS];
     const Layer *l = &net->gru;
     const Lines lines = lines_of(net->tanh);
+    const float *gamma = l->gamma, *beta = l->beta;
     const int size = net->hidden;
     sums(l, in, y);
     rates(l, y, rate);
     for (int r = 0; r < ROWS; r++) {
         const float *row = y + r * l->outputs;
+        const Floats times = all_floats(rate[r]);
         Words most = all(0);
         for (int i = 0; i < size; i += WORDS) {
-            const Words reset = tanh_of(lines, normal(l, row + i, i, rate[r]));
-            const Words candidate = normal(l, row + size + i, size + i, rate[r]);
-            const Words update = tanh_of(lines, normal(l, row + 2 * size + i, 2 * size + i, rate[r]));
-            const Words twice = sum(candidate, product(reset, candidate)); /* of UNIT; 2^13 is 4 UNIT */
+            Words gate[3];
+            for (int g = 0; g < 3; g++)
+                gate[g] = normal(row + g * size + i, times, gamma + g * size + i, beta + g * size + i);
+            const Words reset = tanh_of(lines, gate[0]), update = tanh_of(lines, gate[2]);
+            const Words twice = sum(gate[1], product(reset, gate[1])); /* of UNIT; 2^13 is 4 UNIT */
             const Words new = halved(tanh_of(lines, sum(twice, twice)), 1);
             const Words old = halved(load_words(before + r * stride + i), 1);
             Words v = larger(sum(sum(old, new), product(update, new - old)), all(-32767));

@@ -46,6 +46,14 @@ typedef struct {
     Mlp state;
 } Head;
 
+typedef struct { /* from what heads of one output say to J */
+    int32_t rule;   /* after a failure: as `Rule` */
+    int32_t lowest; /* of several heads; else their mean */
+    float mean, std, floor, threshold;
+} Reading;
+
+enum Rule { PAPER, SHIFT, SURVIVAL };
+
 typedef struct {
     int32_t hidden, latent, actions, heads;
     Layer mix, gru, prior, termination, told;
@@ -57,6 +65,7 @@ typedef struct {
     const Head *head; /* [heads] */
     Mlp passing;      /* reads what is on its way, is added to each head; none if its top has no outputs */
     const int16_t *silu, *tanh; /* [2][NODES] each, see `Lines` */
+    Reading reading;
 } Network;
 
 typedef struct {
@@ -66,6 +75,7 @@ typedef struct {
     const float *const *values; /* of the heads */
     const float *passing;       /* of what they share */
     const float *told;          /* [steps][TOLD] what is on its way, if it is followed; else null */
+    float nothing;              /* 0, or not a number where the state is not: bytes know no such thing */
 } Root;
 
 typedef struct {

@@ -56,8 +56,8 @@ INLINE Words tanh_of(Lines l, Words x) {
 
 /* A row of a hidden layer as bytes x = scale * u - LEAST_SILU / UNIT; `most` bounds its words. */
 INLINE float bytes_of_hidden(const int16_t *x, int count, int most, uint8_t *u) {
-    const int rate = (int)(255.0f * 65536.0f / (float)(most + LEAST_SILU));
-    const Words start = all(LEAST_SILU + 32768 / rate), times = all(rate);
+    const int above = most + LEAST_SILU, rate = (int)(255.0f * 65536.0f / (float)above);
+    const Words start = all(LEAST_SILU + above / 510), times = all(rate); /* + half a byte */
     for (int n = 0; n < count; n += 2 * WORDS)
         store_bytes(u + n, product_of_unsigned(load_words(x + n) + start, times),
                     product_of_unsigned(load_words(x + n + WORDS) + start, times));
@@ -66,7 +66,7 @@ INLINE float bytes_of_hidden(const int16_t *x, int count, int most, uint8_t *u) 
 
 /* A row of h as bytes x = scale * (u - 128); `most` bounds its words. */
 INLINE float bytes_of_state(const int16_t *x, int count, int most, uint8_t *u) {
-    const int rate = 127 * 32768 / (most > 128 ? most : 128);
+    const int rate = (int)(127.0f * 32768.0f / (float)(most > 128 ? most : 128));
     const Words zero = all(128), times = all(rate);
     for (int n = 0; n < count; n += 2 * WORDS)
         store_bytes(u + n, zero + product(load_words(x + n), times),
