@@ -254,11 +254,16 @@ def _told(track: Tensor, share: Tensor, yaw: Tensor, config: FlightConfig) -> Te
 
 def later(memory: Tensor, ticks: int | Tensor = 1) -> Tensor:
     """The memory (..., n) that many ticks (or (..., 1)) later, if nothing is seen meanwhile."""
-    left = memory[..., 3:4] - ticks * _DT
-    told = torch.cat([memory[..., :3], left], -1)
-    told = torch.where((memory[..., :1] > 0) & (left > _BEHIND), told, 0.0)
+    told = told_later(memory, ticks)
     passed = memory[..., _SINCE : _LOST + 1] + ticks * _DT
     return torch.cat([told, memory[..., 4:_SINCE], passed, memory[..., _LOST + 1 :]], -1)
+
+
+def told_later(memory: Tensor, ticks: int | Tensor) -> Tensor:
+    """The same of what is told of it, (..., 4), not in units."""
+    left = memory[..., 3:4] - ticks * _DT
+    told = torch.cat([memory[..., :3], left], -1)
+    return torch.where((memory[..., :1] > 0) & (left > _BEHIND), told, 0.0)
 
 
 def in_picture(memory: Tensor, state: Tensor, max_m: float, config: FlightConfig) -> Tensor:

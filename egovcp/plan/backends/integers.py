@@ -7,6 +7,7 @@ rows beside it.
 from __future__ import annotations
 
 import ctypes
+from itertools import accumulate
 from typing import Final, NamedTuple
 
 import torch
@@ -14,11 +15,11 @@ from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.errors import UsageError
-from egovcp.model import WorldModel, value
+from egovcp.model import Carry, WorldModel, value
 from egovcp.model.nets import SplitLinear, SplitMlp, ValueHead
 from egovcp.plan.backends import library
 from egovcp.plan.backends.layers import first_outputs, gru_layer, linears_of, norms_of, weight_of
-from egovcp.plan.backends.root import Root
+from egovcp.plan.backends.root import told_along
 from egovcp.plan.backends.tables import LEAST_SILU, ONE, UNIT, silu_table, tanh_table
 from egovcp.plan.config import PlannerConfig
 
@@ -35,7 +36,7 @@ class Shared(NamedTuple):
 
     description: library.Root
     tensors: tuple[object, ...]
-    root: Root
+    flight: Tensor | None  # (1, n) what is remembered of one
     told: dict[int, Tensor | None]  # (N, 4) by number of steps N
 
 
@@ -48,30 +49,41 @@ class IntegerNetwork:
     """
 
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
-        kernel = library.library()
+        self._kernel = kernel = library.library()
+        self._model = model
         self._heads = len(model.q_heads.states)
         self._outputs = value.width(model.config.value_loss)
         self._width = 1 if self._outputs == 1 else _whole(self._outputs)
         assert self._width <= MOST_FEW
         self._packed = _Packed(model, config, kernel.depth())
+        self._start = self._packed.start
+        parts = self._start.values // self._heads
+        sizes = [self._start.gates, *[parts] * self._heads, self._start.mix, self._start.passing]
+        *self._places, self._sums = accumulate(sizes, initial=0)
         self._threads = library.Threads(kernel, torch.get_num_threads())
 
-    def shared(self, root: Root) -> Shared:
-        """Of one robot, from a root (1, 1, ...)."""
-        h, mix, gates = _words(root.h), _centred(root.mix), _centred(root.gates)
-        values = [_centred(x) for x in root.values]
-        pointers = (ctypes.c_void_p * len(values))(*(x.data_ptr() for x in values))
-        passing = None if root.passing is None else _centred(root.passing)
-        description = library.Root(
+    def shared(self, carry: Carry) -> Shared:
+        """Of one robot, from its state (1, ...)."""
+        h, z = carry.h.contiguous(), carry.z.contiguous()
+        told = self._model.passing(carry).contiguous() if self._start.passing else None
+        words = torch.zeros(self._start.hidden + LANES, dtype=torch.int16)
+        sums = torch.zeros(self._sums)
+        address = sums.data_ptr()
+        nothing = self._kernel.start(
+            ctypes.byref(self._start),
             h.data_ptr(),
-            mix.data_ptr(),
-            gates.data_ptr(),
-            ctypes.cast(pointers, ctypes.c_void_p),
-            None if passing is None else passing.data_ptr(),
-            None,
-            0.0 * float(root.h.sum() + root.mix.sum()),
+            z.data_ptr(),
+            None if told is None else told.data_ptr(),
+            words.data_ptr(),
+            address,
         )
-        return Shared(description, (h, mix, gates, values, pointers, passing), root, {})
+        gates, *each, mix, passing = (address + 4 * place for place in self._places)
+        values = (ctypes.c_void_p * len(each))(*each)
+        description = library.Root(
+            words.data_ptr(), mix, gates, ctypes.addressof(values), passing, None, nothing
+        )
+        flight = carry.flight if self._start.passing else None
+        return Shared(description, (words, sums, values), flight, {})
 
     def worth(self, shared: Shared, actions: Tensor, noise: Tensor | None) -> Tensor | None:
         """J (M,) of plans (M, N, 7), by as many threads as there are.
@@ -104,8 +116,7 @@ class IntegerNetwork:
     ) -> None:
         plans, steps, _ = actions.shape
         if steps not in shared.told:  # the same for every iteration of a search
-            told = shared.root.told_along(steps)
-            shared.told[steps] = None if told is None else told[0].contiguous()
+            shared.told[steps] = None if shared.flight is None else told_along(shared.flight, steps)
         told = shared.told[steps]
         shared.description.told = None if told is None else told.data_ptr()
         actions, noise = actions.contiguous(), None if noise is None else noise.contiguous()
@@ -123,17 +134,6 @@ class IntegerNetwork:
     def soon(self) -> None:
         """There is going to be something to compute."""
         self._threads.call()
-
-
-def _centred(sums: Tensor) -> Tensor:
-    """(1, 1, n) -> (n,), less the mean, which LayerNorm would take away."""
-    return (sums - sums.mean()).flatten().contiguous()
-
-
-def _words(h: Tensor) -> Tensor:
-    """(1, 1, n) in [-1, 1] -> (n + 16,) in 16-bit fixed point, filled up with zeros."""
-    words = (ONE * h).round().clamp(1 - ONE, ONE - 1).nan_to_num().to(torch.int16)
-    return torch.nn.functional.pad(words.flatten(), (0, LANES))
 
 
 def _whole(count: int) -> int:
@@ -176,9 +176,31 @@ class _Packed:
             *map(float, (model.return_mean, model.return_std, model.return_floor)),
             config.termination_threshold,
         )
+        self.start = self._shared(model)
         heads = (library.Head * c.q_heads)(*map(self._head, model.q_heads.states))
         n.head = ctypes.cast(heads, ctypes.c_void_p)
         self._kept.append(heads)
+
+    def _shared(self, model: WorldModel) -> library.Start:
+        """The weights of what candidates share, centred as those of their layers."""
+        of_h, of_z = [gru_layer(model.gru).wide_h], []
+        for head in model.q_heads.states:
+            *state, _ = map(weight_of, head.mlp.first.parts)
+            if head.reduce is not None:
+                state = [state[0] @ weight_of(part) for part in head.reduce.parts]
+            of_h.append(state[0])
+            of_z.append(state[1])
+        of_z.append(weight_of(model.mix.parts[0]))
+        shared = model.q_heads.passing
+        told = (
+            weight_of(model.mix.parts[0])[:0]
+            if shared is None
+            else weight_of(shared.first.parts[0])
+        )
+        h, z = (torch.cat([_centred_columns(w) for w in parts]) for parts in (of_h, of_z))
+        gates, mix = len(of_h[0]), len(of_z[-1])
+        sizes = (model.config.hidden, model.config.latent, gates, len(h) - gates, mix, len(told))
+        return library.Start(*sizes, *(self._keep(w.t()) for w in (h, z, _centred_columns(told))))
 
     def _keep(self, tensor: Tensor, dtype: torch.dtype = torch.float32) -> int:
         """The address of a copy."""

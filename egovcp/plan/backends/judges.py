@@ -74,7 +74,7 @@ class IntegerJudge:
         self._network.soon()
         # One by one: what a robot's plans are worth does not depend on the robots beside it.
         states = (carry.row(e) for e in range(len(carry.h)))
-        robots = [self._network.shared(root_of(self._model, state)) for state in states]
+        robots = [self._network.shared(state) for state in states]
 
         @torch.no_grad()
         def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:

@@ -111,6 +111,16 @@ class Root(ctypes.Structure):
     )
 
 
+class Start(ctypes.Structure):
+    _fields_ = (
+        *(
+            (name, ctypes.c_int32)
+            for name in ("hidden", "latent", "gates", "values", "mix", "passing")
+        ),
+        *((name, ctypes.c_void_p) for name in ("of_h", "of_z", "of_told")),
+    )
+
+
 class Crew(ctypes.Structure):
     _fields_ = tuple((name, ctypes.c_int32) for name in ("next", "turn", "inside", "present"))
 
@@ -201,6 +211,8 @@ def library() -> ctypes.CDLL:
     kernel.learn.argtypes = [i, i, i, i, f, p, p, p, p, p, p, p]
     for function in (kernel.draw, kernel.walk, kernel.learn):
         function.restype = None
+    kernel.start.argtypes = [p, p, p, p, p, p]
+    kernel.start.restype = f
     kernel.lacking.argtypes = [p, i]
     kernel.lacking.restype = i
     kernel.depth.argtypes = []

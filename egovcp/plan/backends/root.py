@@ -28,13 +28,13 @@ class Root(NamedTuple):
             return None
         return flight.told(flight.later(self.flight, k), PASSING_UNIT)
 
-    def told_along(self, steps: int) -> Tensor | None:
-        """(E, steps, 4) the same at the steps from 0 on."""
-        if self.flight is None:
-            return None
-        ticks = torch.arange(steps, device=self.flight.device)[:, None]
-        later = flight.later(self.flight.expand(-1, steps, -1), ticks)
-        return flight.told(later, PASSING_UNIT)
+
+def told_along(memory: Tensor, steps: int) -> Tensor:
+    """(steps, 4) `Root.told` at all of them, of a flight remembered as (1, n)."""
+    ticks = torch.arange(steps, device=memory.device)[:, None]
+    return flight.told_later(memory.expand(steps, -1), ticks) / memory.new_tensor(
+        (1, *PASSING_UNIT)
+    )
 
 
 def root_of(model: WorldModel, carry: Carry) -> Root:

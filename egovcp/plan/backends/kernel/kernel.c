@@ -13,6 +13,7 @@
 #include "crew.h"
 #include "layers.h"
 #include "search.h"
+#include "start.h"
 
 static inline float one_sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
 
