@@ -5,7 +5,7 @@
 #include <stdint.h>
 #include <time.h>
 
-enum { PATIENCE_NS = 1000000, LOOKS = 64, SOON = 4000 };
+enum { PATIENCE_NS = 1000000, LOOKS = 32 };
 
 typedef struct {
     int32_t next;    /* row of the job that is given out next */
@@ -43,6 +43,7 @@ static int32_t wait_for_job(Crew *crew, int32_t seen) {
             change(&crew->inside, -1); /* it has ended */
         }
         if (clock_ns() > until) return 0;
+        sched_yield(); /* whoever else wants this core is to have it */
     }
 }
 
@@ -54,8 +55,8 @@ static void open_job(Crew *crew) {
 /* No helper reads the job any more once this returns. */
 static void close_job(Crew *crew) {
     change(&crew->turn, 1);
-    for (int i = 0; look(&crew->inside); i++) {
-        if (i < SOON) rest();
-        else sched_yield(); /* somebody else has the helper's core */
+    while (look(&crew->inside)) {
+        for (int i = 0; i < LOOKS && look(&crew->inside); i++) rest();
+        sched_yield(); /* a helper may be waiting for this very core */
     }
 }
