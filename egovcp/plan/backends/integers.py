@@ -24,6 +24,7 @@ from egovcp.plan.backends.tables import LEAST_SILU, ONE, UNIT, silu_table, tanh_
 from egovcp.plan.config import PlannerConfig
 
 LANES: Final = 16
+WORDS: Final = 32
 WIDEST: Final = 1024
 MOST_FEW: Final = 128
 LEVELS: Final = 127
@@ -215,15 +216,18 @@ class _Packed:
         packed.state = self._mlp(head.mlp, wide=head.reduce is None)
         return packed
 
-    def _reduced(self, reduce: SplitLinear) -> list[library.Linear]:
+    def _reduced(self, reduce: SplitLinear) -> tuple[library.Linear, library.Narrow]:
         """Two layers whose outputs add up: of h, which comes in words, and of z."""
         h, z = map(weight_of, reduce.parts)
         bias = h.new_zeros(len(h))
-        return [self._linear(w, bias, filled=True) for w in (h / ONE, z)]
+        z, _ = _filled(z, bias)
+        return self._linear(h / ONE, bias, single=False), library.Narrow(
+            z.shape[1], self._keep(z.t())
+        )
 
     def _top(self, top: nn.Linear) -> library.Linear:
         """Of a hidden layer, which comes in words."""
-        return self._linear(top.weight / UNIT, top.bias)
+        return self._linear(top.weight / UNIT, top.bias, single=len(top.bias) == 1)
 
     def _mlp(self, mlp: SplitMlp, wide: bool) -> library.Mlp:
         """Two hidden layers, the first one of h and z if ``wide``, else of a few numbers."""
@@ -315,12 +319,21 @@ class _Packed:
             self._keep(offset * scale * total),
         )
 
-    def _linear(self, weight: Tensor, bias: Tensor, filled: bool = False) -> library.Linear:
-        """A layer in float32; its outputs, if they are several, filled up to whole vectors."""
-        if len(bias) > 1 or filled:
+    def _linear(self, weight: Tensor, bias: Tensor, single: bool) -> library.Linear:
+        """Of a weight (N, K) for words. No lane of a sum may pass 2^31: that limits a row's sum."""
+        inputs, weight = weight.shape[1], weight.detach()
+        if single:
+            blocks = torch.nn.functional.pad(weight, (0, -inputs % WORDS)).view(1, -1, LANES, 2)
+            largest = blocks.abs().sum((1, 3)).amax(1)
+        else:
             weight, bias = _filled(weight, bias)
-        inputs = weight.shape[1]
-        return library.Linear(inputs, len(bias), self._keep(weight.t()), self._keep(bias))
+            blocks = weight.view(-1, LANES, inputs // 2, 2).transpose(1, 2)
+            largest = weight.abs().sum(1)
+        least = weight.abs().amax(1) / (ONE - 1)
+        scale = torch.maximum(largest / (2 * ONE - 2 * WIDEST), least).clamp_min(1e-30)
+        whole = blocks / scale.view(-1, 1, 1 if single else LANES, 1)
+        parts = (self._keep(whole.round(), torch.int16), self._keep(scale), self._keep(bias))
+        return library.Linear(inputs, len(bias), *parts)
 
 
 def _filled(weight: Tensor, bias: Tensor) -> tuple[Tensor, Tensor]:

@@ -65,10 +65,8 @@ class Layer(ctypes.Structure):
 
 class Linear(ctypes.Structure):
     _fields_ = (
-        ("inputs", ctypes.c_int32),
-        ("outputs", ctypes.c_int32),
-        ("weight", ctypes.c_void_p),
-        ("bias", ctypes.c_void_p),
+        *((name, ctypes.c_int32) for name in ("inputs", "outputs")),
+        *((name, ctypes.c_void_p) for name in ("weight", "scale", "bias")),
     )
 
 
@@ -77,7 +75,7 @@ class Mlp(ctypes.Structure):
 
 
 class Head(ctypes.Structure):
-    _fields_ = (("reduce_h", Linear), ("reduce_z", Linear), ("state", Mlp))
+    _fields_ = (("reduce_h", Linear), ("reduce_z", Narrow), ("state", Mlp))
 
 
 class Reading(ctypes.Structure):

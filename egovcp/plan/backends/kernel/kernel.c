@@ -57,7 +57,7 @@ static void tell(const Network *net, const Bytes *h, const Bytes *z, float *told
     Fixed x;
     Few out = {{{0}}};
     hidden(net, &net->told, (Inputs){.wide = h, .beside = z}, &x, 0);
-    linear_of_words(&net->told_top, &x, out.values[0], FEW_STRIDE);
+    linear(&net->told_top, &x, out.values[0], FEW_STRIDE);
     for (int r = 0; r < ROWS; r++) {
         const float coming = one_sigmoid(out.values[r][3]);
         told[r * stride] = coming;
@@ -71,7 +71,7 @@ static void mlp(const Network *net, const Mlp *m, Inputs in, float *q, int strid
     Bytes bytes;
     hidden(net, &m->first, in, &x, &bytes);
     hidden(net, &m->second, (Inputs){.wide = &bytes}, &x, 0);
-    linear_of_words(&m->top, &x, q, stride);
+    linear(&m->top, &x, q, stride);
 }
 
 /* What a block carries from step to step. */
@@ -103,8 +103,8 @@ static void own_part(const Network *net, const Head *head, const float *from, co
     if (k > 0 && reduced) {
         float *to = few->values[0] + net->actions;
         for (int r = 0; r < ROWS; r++) memset(to + r * FEW_STRIDE, 0, reduced * sizeof(float));
-        linear_of_words(&head->reduce_h, &at->h, to, FEW_STRIDE);
-        linear(&head->reduce_z, at->z.values[0], FEW_STRIDE, to, FEW_STRIDE);
+        linear(&head->reduce_h, &at->h, to, FEW_STRIDE);
+        add_narrow(&head->reduce_z, reduced, &at->z, to);
         in.few_inputs = head->state.first.few.inputs;
     } else if (k > 0) {
         in.wide = &at->h_bytes, in.beside = &at->z_bytes;
@@ -141,7 +141,7 @@ static void block(const Network *net, const Root *root, int steps, const float *
         if (k == steps - 1) break; /* nothing follows the last step */
         if (k > 0) {
             hidden(net, &net->termination, (Inputs){.wide = &at.h_bytes, .beside = &at.z_bytes}, &x, 0);
-            linear_of_words(&net->termination_top, &x, dead + k, steps);
+            linear(&net->termination_top, &x, dead + k, steps);
         }
         const Inputs in = {.few = &few,
                            .few_inputs = net->actions,

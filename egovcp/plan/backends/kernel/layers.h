@@ -97,32 +97,39 @@ static void recur(const Network *net, Inputs in, const int16_t *before, int stri
     }
 }
 
-/* out [ROWS][out_stride] += x [ROWS][x_stride] weight + bias. */
-static void linear(const Linear *l, const float *x, int x_stride, float *out, int out_stride) {
-    for (int j = 0; j < l->outputs; j += LANES) {
-        Floats acc[ROWS];
-        for (int r = 0; r < ROWS; r++) acc[r] = load(out + r * out_stride + j) + load(l->bias + j);
-        for (int n = 0; n < l->inputs; n++) {
-            const Floats weight = load(l->weight + (int64_t)n * l->outputs + j);
-            for (int r = 0; r < ROWS; r++) acc[r] = fused(all_floats(x[r * x_stride + n]), weight, acc[r]);
-        }
-        for (int r = 0; r < ROWS; r++) store(out + r * out_stride + j, acc[r]);
-    }
-}
-
-/* The same from words; their unit is in the weight. */
-static void linear_of_words(const Linear *l, const Fixed *x, float *out, int out_stride) {
-    float y[ROWS * WIDEST] __attribute__((aligned(64)));
+/* out [ROWS][stride] += x weight + bias. */
+static void linear(const Linear *l, const Fixed *x, float *out, int stride) {
     if (l->outputs == 1) {
         for (int r = 0; r < ROWS; r++) {
-            Floats sum = {0};
-            for (int n = 0; n < l->inputs; n += LANES)
-                sum = fused(floats_of(x->values[r] + n), load(l->weight + n), sum);
-            out[r * out_stride] += total(sum) + l->bias[0];
+            Ints sum = {0};
+            for (int n = 0; n < l->inputs; n += WORDS)
+                sum = pairs(sum, load_words(x->values[r] + n), load_words(l->weight + n));
+            out[r * stride] += total(__builtin_convertvector(sum, Floats)) * l->scale[0] + l->bias[0];
         }
         return;
     }
-    for (int r = 0; r < ROWS; r++)
-        for (int n = 0; n < l->inputs; n += LANES) store(y + r * l->inputs + n, floats_of(x->values[r] + n));
-    linear(l, y, l->inputs, out, out_stride);
+    const int16_t *weight = l->weight;
+    for (int j = 0; j < l->outputs; j += LANES) {
+        Ints sum[ROWS] = {{0}};
+        for (int n = 0; n < l->inputs; n += 2, weight += WORDS) {
+            const Words w = load_words(weight);
+            for (int r = 0; r < ROWS; r++) sum[r] = pairs(sum[r], w, again(x->values[r] + n));
+        }
+        for (int r = 0; r < ROWS; r++) {
+            float *to = out + r * stride + j;
+            const Floats start = load(to) + load(l->bias + j);
+            store(to, fused(__builtin_convertvector(sum[r], Floats), load(l->scale + j), start));
+        }
+    }
+}
+
+/* out [ROWS][FEW_STRIDE] += x weight. */
+static void add_narrow(const Narrow *l, int outputs, const Few *x, float *out) {
+    for (int j = 0; j < outputs; j += LANES)
+        for (int r = 0; r < ROWS; r++) {
+            Floats sum = load(out + r * FEW_STRIDE + j);
+            for (int k = 0; k < l->inputs; k++)
+                sum = fused(all_floats(x->values[r][k]), load(l->weight + k * outputs + j), sum);
+            store(out + r * FEW_STRIDE + j, sum);
+        }
 }

@@ -30,9 +30,10 @@ typedef struct {
     float epsilon;
 } Layer;
 
-typedef struct {
+typedef struct { /* of few outputs, from words; weights in words, of which no sum leaves 32 bits */
     int32_t inputs, outputs; /* outputs: 1 or a multiple of 16; 0: there is no such layer */
-    const float *weight;     /* [inputs][outputs] */
+    const int16_t *weight;   /* [outputs/16][inputs/2][16][2]; of one output [inputs filled up to 32] */
+    const float *scale;      /* [outputs] of a sum of products */
     const float *bias;       /* [outputs] */
 } Linear;
 
@@ -42,7 +43,8 @@ typedef struct {
 } Mlp;
 
 typedef struct {
-    Linear reduce_h, reduce_z; /* to what `state` reads in place of h and z, if there are any */
+    Linear reduce_h; /* to what `state` reads in place of h and z, if it does */
+    Narrow reduce_z;
     Mlp state;
 } Head;
 

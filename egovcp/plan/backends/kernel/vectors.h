@@ -19,7 +19,6 @@ enum { LANES = 16, WORDS = 32 };
 typedef float Floats __attribute__((vector_size(4 * LANES)));
 typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
 typedef int16_t Words __attribute__((vector_size(2 * WORDS)));
-typedef int16_t HalfWords __attribute__((vector_size(2 * LANES)));
 
 INLINE Floats load(const float *x) {
     Floats v;
@@ -36,13 +35,6 @@ INLINE Words load_words(const int16_t *x) {
 }
 
 INLINE void store_words(int16_t *x, Words v) { memcpy(x, &v, sizeof v); }
-
-/* 16 words as floats. */
-INLINE Floats floats_of(const int16_t *x) {
-    HalfWords v;
-    memcpy(&v, x, sizeof v);
-    return __builtin_convertvector(v, Floats);
-}
 
 /* a b + c, rounded once where the processor can. */
 INLINE Floats fused(Floats a, Floats b, Floats c) {
@@ -155,6 +147,23 @@ INLINE Words product_of_unsigned(Words a, Words b) {
         a[i] = (int16_t)(uint16_t)(((uint32_t)(uint16_t)a[i] * (uint16_t)b[i]) >> 16);
     return a;
 #endif
+}
+
+/* sum + a b, each lane of two neighbours. */
+INLINE Ints pairs(Ints sum, Words a, Words b) {
+#if defined(WIDE_VECTORS)
+    return (Ints)_mm512_dpwssd_epi32((__m512i)sum, (__m512i)a, (__m512i)b);
+#else
+    for (int i = 0; i < LANES; i++) sum[i] += a[2 * i] * b[2 * i] + a[2 * i + 1] * b[2 * i + 1];
+    return sum;
+#endif
+}
+
+/* Two words, again and again. */
+INLINE Words again(const int16_t *x) {
+    int32_t both;
+    memcpy(&both, x, sizeof both);
+    return (Words)((Ints){0} + both);
 }
 
 INLINE Words halved(Words a, int times) {
