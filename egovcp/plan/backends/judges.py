@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from egovcp.model import Carry, WorldModel
+from egovcp.plan.backends.graphs import Recorded
 from egovcp.plan.backends.integers import IntegerNetwork, Shared
 from egovcp.plan.backends.network import PlanningNetwork
 from egovcp.plan.backends.reading import noise_of, q_of
@@ -17,7 +19,7 @@ from egovcp.plan.objective import Worth, mean_value
 
 
 class FloatJudge:
-    """All candidates of all robots at once, on any device.
+    """All candidates of all robots at once, on any device; on a GPU by CUDA graphs.
 
     Args:
         model: is packed as it is now.
@@ -34,15 +36,23 @@ class FloatJudge:
         compiled: bool = False,
     ) -> None:
         self._model, self._config = model, config
+        self._root: Callable[[Carry], Root] = partial(root_of, model)
         self._worth: Callable[[Root, Tensor, Tensor | None], Tensor]
         self._worth = PlanningNetwork(model, config, dtype).worth
         if compiled:
             self._worth = torch.compile(self._worth, dynamic=False)
+        elif model.state_mean.device.type == "cuda":
+            self._root, self._worth = Recorded(self._root), Recorded(self._worth)
+
+    @property
+    def shapes(self) -> int:
+        """Of how many shapes there are CUDA graphs."""
+        return sum(f.shapes for f in (self._root, self._worth) if isinstance(f, Recorded))
 
     @torch.no_grad()
     def at(self, carry: Carry) -> Worth:
         """See `Judge`."""
-        root = root_of(self._model, carry)
+        root = self._root(carry)
 
         @torch.no_grad()
         def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:

@@ -1,0 +1,126 @@
+"""Recordings of a judge: one per shape, into memory of their own."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import pytest
+import torch
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.model import PRESETS, Carry
+from egovcp.plan import PlannerConfig, StepByStep
+from egovcp.plan.backends.graphs import MOST_RECORDINGS, Recorded
+from egovcp.plan.backends.judges import FloatJudge
+from egovcp.testing import toy_model
+
+
+class _Pair(NamedTuple):
+    sum: Tensor
+    parts: tuple[Tensor, ...]
+
+
+def _function(a: Tensor, rest: tuple[Tensor, Tensor | None]) -> _Pair:
+    b, c = rest
+    return _Pair(a + b if c is None else a + b + c, (2 * a,))
+
+
+class _Recorder:
+    """In the place of CUDA: a replay computes again, into the results of the recording."""
+
+    def __init__(self) -> None:
+        self.made = 0
+
+    def __call__(self, function: Callable[[], Any]) -> tuple[Callable[[], object], Any]:
+        self.made += 1
+        results = function()
+
+        def replay() -> None:
+            again = function()
+            results.sum.copy_(again.sum)
+            results.parts[0].copy_(again.parts[0])
+
+        return replay, results
+
+
+def _arguments(size: int, seed: int, third: bool = True) -> tuple[Tensor, Any]:
+    rng = torch.Generator().manual_seed(seed)
+    a, b, c = torch.rand(3, size, generator=rng)
+    return a, (b, c if third else None)
+
+
+def test_a_recording_serves_all_of_its_shape_and_no_other() -> None:
+    recorder = _Recorder()
+    recorded = Recorded(_function, recorder)
+    for seed in range(3):
+        for size, third in ((4, True), (5, True), (4, False)):
+            given = _arguments(size, seed, third)
+            found, expected = recorded(*given), _function(*given)
+            torch.testing.assert_close(found.sum, expected.sum)
+            torch.testing.assert_close(found.parts[0], expected.parts[0])
+    assert recorder.made == recorded.shapes == 3
+
+
+def test_what_was_answered_and_what_was_given_stay_as_they_are() -> None:
+    recorded = Recorded(_function, _Recorder())
+    given = _arguments(4, 0)
+    before = [given[0].clone(), given[1][0].clone()]
+    first = recorded(*given)
+    kept = first.sum.clone()
+    recorded(*_arguments(4, 1))
+    assert first.sum.equal(kept)
+    assert given[0].equal(before[0])
+    assert given[1][0].equal(before[1])
+
+
+def test_recordings_serve_under_either_mode_of_torch() -> None:
+    recorded = Recorded(_function, _Recorder())
+    for mode in (torch.inference_mode, torch.no_grad, torch.inference_mode):
+        with mode():
+            given = _arguments(4, 2)
+            assert recorded(*given).sum.equal(_function(*given).sum)
+
+
+def test_what_cannot_be_recorded_is_computed_and_not_tried_again() -> None:
+    tried = []
+
+    def refuse(function: Callable[[], Any]) -> tuple[Callable[[], object], Any]:
+        tried.append(function)
+        raise RuntimeError("operation not permitted when stream is capturing")
+
+    recorded = Recorded(_function, refuse)
+    for seed in range(3):
+        given = _arguments(4, seed)
+        assert recorded(*given).sum.equal(_function(*given).sum)
+    assert len(tried) == 1
+    assert recorded.shapes == 0
+
+
+def test_shapes_beyond_the_most_are_computed_without_a_recording() -> None:
+    recorder = _Recorder()
+    recorded = Recorded(_function, recorder)
+    for size in range(1, MOST_RECORDINGS + 4):
+        given = _arguments(size, size)
+        assert recorded(*given).sum.equal(_function(*given).sum)
+    assert recorder.made == MOST_RECORDINGS
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("flight", [True, False])
+def test_on_a_gpu_a_replayed_judge_says_what_the_model_says(flight: bool) -> None:
+    model = toy_model(PRESETS["debug"]).cuda()
+    judge = FloatJudge(model, PlannerConfig())
+    reference = StepByStep(model, PlannerConfig())
+    rng = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for _ in range(3):
+            start = model.initial(2)
+            h = torch.rand(start.h.shape, generator=rng).cuda()
+            carry = Carry(h, torch.randn(start.z.shape, generator=rng).cuda())
+            if flight:
+                carry = carry._replace(flight=start.flight)
+            actions = 2 * torch.rand(2, 65, 4, spec.ACTION_DIM, generator=rng).cuda() - 1
+            found, expected = (j.at(carry)(actions, None) for j in (judge, reference))
+            torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
+    assert judge.shapes == 2  # nothing was computed without a recording
