@@ -6,11 +6,14 @@ every step runs every network, in float32. All have the same weights and random 
 `arithmetic_share` says which part of the rate of a plain matrix product of the same precision, in
 the same run, a backend reaches, counting only the arithmetic that a plan needs. `observe` is
 the filter's step; `command` is from an observation to the action, with the backend of `auto`.
+Where there is a GPU, `gpu_*` are plans on it, by CUDA graphs, up to the action in the processor's
+memory.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import deepcopy
 
 import numpy as np
 import torch
@@ -80,6 +83,30 @@ def needed_gflop(model: WorldModel, config: PlannerConfig) -> float:
     return 2e-9 * each * config.samples * config.iterations
 
 
+def gpu_plans(
+    model: WorldModel, carry: Carry, executed: Tensor, config: PlannerConfig
+) -> dict[str, Callable[[], Tensor]]:
+    """Name -> a plan's first action on a GPU; nothing without one."""
+    if not torch.cuda.is_available():
+        return {}
+    there, start = deepcopy(model).cuda(), executed.cuda()
+    state = carry.map(lambda x: x.cuda())
+
+    def planned(judge: Judge[Carry]) -> Callable[[], Tensor]:
+        def run() -> Tensor:
+            generator = torch.Generator("cuda").manual_seed(1)
+            search = optimiser_of(config, "cuda")
+            plan = make_plan(judge, search, state, start, config, generator)
+            return plan.actions[0, 0].cpu()  # waits for it
+
+        return run
+
+    names: tuple[BackendName, ...] = ("eager", "float32", "bfloat16")
+    return {
+        f"gpu_{name}": planned(judge_of_model(there, PlannerConfig(backend=name))) for name in names
+    }
+
+
 def plain_products() -> dict[str, Callable[[], object]]:
     """Precision -> a product of two square matrices, by the fastest call that torch has."""
     a, b = torch.randn(SIDE, SIDE), torch.randn(SIDE, SIDE)
@@ -127,6 +154,7 @@ def main() -> None:
     def plain() -> Tensor:
         return plain_plan(model, carry, executed, config, 1)
 
+    on_gpu = gpu_plans(model, carry, executed, config)
     differences = {name: float((plan() - plain()).abs().max()) for name, plan in plans.items()}
     policy = Policy(model, config, num_envs=1)
     depth = np.full((1, spec.DEPTH_ROWS, spec.DEPTH_COLS), 2000, np.uint16)
@@ -136,6 +164,7 @@ def main() -> None:
     products = plain_products()
     cases: dict[str, Callable[[], object]] = {
         **{f"plan_{name}": plan for name, plan in plans.items()},
+        **on_gpu,
         "plain": plain,
         "observe": lambda: model.observe(carry, executed, *seen, first),
         "command": lambda: policy.act(depth, state),
@@ -169,7 +198,7 @@ def main() -> None:
             figures[f"{name}_arithmetic_share"] = gflop / seconds / rate[PRODUCTS[name]]
     for name in products:
         figures[f"product_{name}_gflops"] = rate[name]
-    for name in ("observe", "command"):
+    for name in ("observe", "command", *on_gpu):
         figures[f"{name}_ms"], figures[f"{name}_ms_p99"] = 1e3 * p50[name], 1e3 * p99[name]
     shape = {"samples": config.samples, "horizon": config.horizon, "iterations": config.iterations}
     publish(figures | shape, args.json)

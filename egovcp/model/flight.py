@@ -297,11 +297,6 @@ def in_picture(memory: Tensor, state: Tensor, max_m: float, config: FlightConfig
 
 def told(memory: Tensor, unit: tuple[float, float, float]) -> Tensor:
     """`TOLD` (..., 4) of a memory (..., n), in units."""
-    return torch.cat([memory[..., :1], memory[..., 1:4] / _constant(unit, memory.device)], -1)
-
-
-@cache
-def _constant(numbers: tuple[float, ...], device: torch.device) -> Tensor:
-    """Kept, for a copy from the processor would be in the way of a CUDA graph."""
-    with torch.inference_mode(False):
-        return torch.tensor(numbers, device=device)
+    # by numbers: a tensor of them, made on the processor, would be in the way of a CUDA graph
+    parts = [memory[..., i : i + 1] / scale for i, scale in enumerate(unit, 1)]
+    return torch.cat([memory[..., :1], *parts], -1)

@@ -1,6 +1,7 @@
 """Every backend says what the world model itself says, as well as its numbers allow."""
 
 import dataclasses
+import time
 from pathlib import Path
 
 import pytest
@@ -161,6 +162,19 @@ def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -
     one = _values(model, config, carry, actions)
     monkeypatch.setattr(torch, "get_num_threads", lambda: threads)
     assert torch.equal(one, _values(model, config, carry, actions))
+
+
+@needs_compiler
+def test_threads_that_have_left_come_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
+    model, config = _model(), PlannerConfig(backend="int8")
+    judge, actions = judge_of_model(model, config), _actions()
+    with torch.no_grad():
+        worth = judge.at(_carry(model))
+        first = worth(actions, None)
+        for pause in (0.0, 0.02, 0.001, 0.02):
+            time.sleep(pause)
+            assert worth(actions, None).equal(first)
 
 
 @pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)

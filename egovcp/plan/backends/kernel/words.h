@@ -1,7 +1,7 @@
 /* Activations in words: 16-bit fixed point, 32 numbers a vector.
  *
  * A word of a hidden layer is x * UNIT; one of the state h, or of tanh, x * 2^15. Functions are
- * pieces of straight lines between NODES places (`tables.py`), of which a word picks one: within 5e-4
+ * pieces of straight lines between NODES places (`tables.py`), of which a word picks one: within 8e-4
  * of their values for SiLU, 2e-4 for tanh. A byte tells no more than 4e-3. */
 #pragma once
 #include "vectors.h"
