@@ -22,8 +22,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from egovcp.model import flight
 from egovcp.model.carry import Carry
 from egovcp.model.losses import Batch, Rollout, masked_mean, motion_error, motion_target, unbroken
+from egovcp.model.recurrence import imagine_window
 from egovcp.model.world_model import WorldModel
 
 
@@ -99,24 +101,30 @@ def imagine_ahead(
     every = min(model.config.loss.foresight_every, length - min(ahead))
     first = int(torch.randint(every, (), generator=generator, device=device))
     start = torch.arange(first, length - min(ahead), every, device=device)
-    carry = carry.map(lambda x: x[:, start])
-    carries: list[Carry] = []
-    rows: list[Tensor] = []
-    known: list[Tensor] = []
-    for k in range(1, max(ahead) + 1):
-        start = start[start + k < length]
-        carry = _first(carry, len(start))
-        carry = model.imagine(carry, batch.action[:, start + k - 1])
-        if k in ahead:
-            carries.append(carry)
-            rows.append(start + k)
-            known.append(unbroken(batch, k)[:, start])
-    seen = Carry.join(carries, lambda parts: torch.cat(parts, 1))
-    return Imagined(seen, torch.cat(rows), torch.cat(known, 1))
+    starts = [start[start + k < length] for k in range(1, max(ahead) + 1)]
+    found = _imagined(model, carry, batch, starts)
+    seen = [_rows(carry, found[k - 1], starts[k - 1], k) for k in ahead]
+    rows = torch.cat([starts[k - 1] + k for k in ahead])
+    known = torch.cat([unbroken(batch, k)[:, starts[k - 1]] for k in ahead], 1)
+    return Imagined(Carry.join(seen, lambda parts: torch.cat(parts, 1)), rows, known)
 
 
-def _first(carry: Carry, rows: int) -> Carry:
-    return carry.map(lambda x: x[:, :rows])
+def _imagined(
+    model: WorldModel, carry: Carry, batch: Batch, starts: Sequence[Tensor]
+) -> list[Carry]:
+    """States (S B, ...) after each tick, imagined from as many rows S as it names."""
+    size = len(batch.valid)
+    h, z = (x[:, starts[0]].transpose(0, 1).flatten(0, 1) for x in (carry.h, carry.z))
+    rows = torch.cat([start + k for k, start in enumerate(starts)])
+    action = batch.action[:, rows].transpose(0, 1).flatten(0, 1)
+    return imagine_window(model, Carry(h, z), action, [size * len(start) for start in starts])
+
+
+def _rows(carry: Carry, imagined: Carry, start: Tensor, ticks: int) -> Carry:
+    """The states (B, S, ...) that are imagined (S B, ...) from some rows of a carry (B, T, ...)."""
+    h, z = (x.view(len(start), -1, x.shape[-1]).transpose(0, 1) for x in imagined[:2])
+    memory = None if carry.flight is None else flight.later(carry.flight[:, start], ticks)
+    return Carry(h, z, memory)
 
 
 def _compare(

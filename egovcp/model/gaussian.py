@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from egovcp.model.shared import row_noise
+
+SHIFT: Final = 0.54  #: softplus of it is 1
 
 
 class Gaussian(NamedTuple):
@@ -21,7 +23,7 @@ class Gaussian(NamedTuple):
     def from_logits(cls, logits: Tensor, min_std: float) -> Gaussian:
         """(..., 2Z) network output -> Gaussian whose deviation is 1 at zero logits."""
         mean, raw = logits.float().chunk(2, -1)
-        return cls(mean, F.softplus(raw + 0.54) + min_std)
+        return cls(mean, F.softplus(raw + SHIFT) + min_std)
 
     def sample(self, generator: torch.Generator | None = None) -> Tensor:
         """One reparametrised draw."""

@@ -22,7 +22,8 @@ from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, within
 from egovcp.model.flight import Sighting
 from egovcp.model.floor import Floor
 from egovcp.model.gaussian import Gaussian, kl_divergence
-from egovcp.model.shared import over_all_rows
+from egovcp.model.recurrence import filter_window
+from egovcp.model.shared import over_all_rows, row_noise
 from egovcp.model.world_model import PASSING_UNIT, Look, WorldModel
 
 #: Pictures that are looked at together where no gradient is asked for: what the layers make of more
@@ -74,27 +75,26 @@ def filter_sequence(
     state = model.standardise(batch.state)
     embedding = _embed(model, near, state.flatten(0, 1)).view(size, length, -1)
     carry = model.initial(size) if carry is None else carry
-    hs: list[Tensor] = []
-    zs: list[Tensor] = []
-    posteriors: list[Gaussian] = []
     followed = _followed(model, batch, near, embedding, carry)
-    for t in range(length):
-        h = model.advance(carry, batch.prev_action[:, t], batch.is_first[:, t])
-        posterior = model.infer(h, embedding[:, t])
-        carry = Carry(h, posterior.sample(generator) if sample else posterior.mean)
-        hs.append(carry.h)
-        zs.append(carry.z)
-        posteriors.append(posterior)
-    h_seq = torch.stack(hs, 1)
-    means, stds = (torch.stack(s, 1) for s in zip(*posteriors, strict=True))
+    noise = _noise(model, batch, generator) if sample else None
+    states, posterior = filter_window(
+        model, carry, batch.prev_action, batch.is_first, embedding, noise
+    )
     return Rollout(
-        Carry(h_seq, torch.stack(zs, 1), followed),
-        Gaussian(means, stds),
-        model.predict(h_seq),
+        states._replace(flight=followed),
+        posterior,
+        model.predict(states.h),
         near.view(size, length, *near.shape[1:]),
         state,
         embedding,
     )
+
+
+def _noise(model: WorldModel, batch: Batch, generator: torch.Generator | None) -> Tensor:
+    """(T, B, Z), drawn a tick at a time."""
+    size, length = batch.valid.shape
+    shape, device = (size, model.config.latent), batch.state.device
+    return torch.stack([row_noise(shape, generator, device) for _ in range(length)])
 
 
 def _embed(model: WorldModel, near: Tensor, state: Tensor) -> Tensor:
