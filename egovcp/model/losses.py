@@ -179,8 +179,9 @@ def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
     config = model.config.loss
     weight = torch.ones_like(near)
     if config.moving > 0:
-        moving = moving_pixels(near, config.moving_threshold)
-        weight += config.moving * moving.masked_fill(batch.is_first[..., None, None], 0.0)
+        moving = _changed(near, config.moving_threshold)
+        moving &= ~batch.is_first[:, 1:, None, None]
+        weight[:, 1:].add_(moving, alpha=config.moving)
     if config.near > 0:
         weight += config.near * (near > config.near_threshold)
     place = batch.passing[..., spec.IN_PICTURE]
@@ -196,10 +197,16 @@ def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
 def moving_pixels(near: Tensor, threshold: float) -> Tensor:
     """(B, T, H, W) nearness -> 1 where a pixel differs from all 3 x 3 around it in the previous
     frame, else 0: the robot's own sway moves edges by a pixel and slides along the floor."""
+    return F.pad(_changed(near, threshold), (0, 0, 0, 0, 1, 0)).to(near.dtype)
+
+
+def _changed(near: Tensor, threshold: float) -> Tensor:
+    """(B, T - 1, H, W) bool: `moving_pixels` of all frames that have a previous one."""
     before = near[:, :-1].flatten(0, 1)
     low, high = (f(before).view_as(near[:, 1:]) for f in (lowest_3x3, highest_3x3))
-    change = (near[:, 1:] > high + threshold) | (near[:, 1:] < low - threshold)
-    return F.pad(change, (0, 0, 0, 0, 1, 0)).to(near.dtype)
+    changed = near[:, 1:] > high.add_(threshold)
+    changed |= near[:, 1:] < low.sub_(threshold)
+    return changed
 
 
 def motion_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:

@@ -171,10 +171,12 @@ class DepthDecoder(nn.Module):
             nn.Conv2d(channels, channels, 3, padding=1),
             nn.SiLU(),
             nn.Conv2d(channels, self.PATCH**2, 1),
-            nn.PixelShuffle(self.PATCH),
         )
 
     def forward(self, features: Tensor) -> Tensor:
         maps = self.project(features).view(-1, *self.shape)
-        image: Tensor = self.layers(maps.contiguous(memory_format=torch.channels_last))
-        return image.squeeze(1)
+        patches: Tensor = self.layers(maps.contiguous(memory_format=torch.channels_last))
+        # What `F.pixel_shuffle` does, which takes three times as long on a CPU.
+        rows, cols = self.shape[1:]
+        cells = patches.permute(0, 2, 3, 1).reshape(-1, rows, cols, self.PATCH, self.PATCH)
+        return cells.transpose(2, 3).reshape(-1, spec.DEPTH_ROWS, spec.DEPTH_COLS)
