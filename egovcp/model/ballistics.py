@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from egovcp.model.config import FlightConfig
+from egovcp.model.kept import constant
 
 GRAVITY: Final = 9.81  # m/s^2
 _LEAST_SPEED: Final = 1.0  # m/s towards the robot
@@ -62,7 +63,7 @@ def variance(sums: Tensor, prior: Tensor, t: Tensor) -> Tensor:
 
 def believed(crossing: Tensor, variance: Tensor, config: FlightConfig) -> tuple[Tensor, Tensor]:
     """How sure a crossing (N, 2) is, (N, 1), and where, drawn towards the mean of all throws."""
-    mean, deviation = crossing.new_tensor(config.aim).unbind(-1)
+    mean, deviation = constant(config.aim, crossing).unbind(-1)
     sure = 1.0 / (1.0 + config.doubt * variance / deviation.square())
     return sure[:, :1], mean + sure * (crossing - mean).clamp(-1.0, 1.0)
 

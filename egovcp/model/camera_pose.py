@@ -16,6 +16,7 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.model.config import CameraGeometry
+from egovcp.model.kept import constant
 from egovcp.robot.g1 import WAIST
 from egovcp.robot.kinematics import COS_ROTATION, LINK_OFFSET, REST_ROTATION, SIN_ROTATION
 
@@ -84,8 +85,8 @@ def camera_pose(state: Tensor, camera: CameraGeometry) -> CameraPose:
     ends, turns = _end(_chain(_WAIST_AND_LEGS, state.device), joints)
     torso, feet, turn = ends[:, 0], ends[:, 1:], turns[:, 0]
     level = heading_rotation(state[:, spec.STATE_SLICES["projected_gravity"]])
-    mount = torso + turn @ state.new_tensor(camera.position)
-    tilt = state.new_tensor(_tilt(camera.pitch))
+    mount = torso + turn @ constant(camera.position, state)
+    tilt = constant(_tilt(camera.pitch), state)
     position = (level @ mount[..., None])[..., 0]
     lowest = (level[:, None] @ feet[..., None])[..., 2, 0].amin(1)
     position = torch.cat([position[:, :2], position[:, 2:] - lowest[:, None] - STANDING], 1)
@@ -108,9 +109,9 @@ def earlier(state: Tensor, age: Tensor) -> Tensor:
     return then
 
 
-def _tilt(pitch: float) -> list[list[float]]:
+def _tilt(pitch: float) -> tuple[tuple[float, ...], ...]:
     c, s = float(np.cos(pitch)), float(np.sin(pitch))
-    return [[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]]
+    return (c, 0.0, s), (0.0, 1.0, 0.0), (-s, 0.0, c)
 
 
 def heading_rotation(gravity: Tensor) -> Tensor:

@@ -33,6 +33,7 @@ from egovcp.model.ballistics import (
 from egovcp.model.camera_pose import CameraPose, camera_pose, earlier
 from egovcp.model.config import AGES, FlightConfig
 from egovcp.model.floor import Floor
+from egovcp.model.kept import constant
 
 TOLD: Final = slice(0, 4)
 """What a memory (..., `SIZE`) tells: how sure its path is (0: nothing is on its way; 1: quite);
@@ -44,6 +45,8 @@ _EVIDENCE = slice(33, 33 + picture_age.SIZE)  # of how old the pictures are
 SUMS = slice(_EVIDENCE.stop, _EVIDENCE.stop + 3 + 2 * 3 * AGES)
 """Of the weights, and for each age of the places and their moments."""
 SIZE: Final = SUMS.stop
+_TICK: Final = (-spec.PLANNER_DT, 0.0, *[spec.PLANNER_DT] * 2, *[0.0] * (SIZE - SUMS.start))
+_FALL: Final = (0.0, 0.0, 0.5 * GRAVITY)
 _DT: Final = spec.PLANNER_DT
 _MIN_PIXELS: Final = 2
 _MANY: Final = 32  # pictures among which it pays to pick; graphs are traced with fewer
@@ -150,7 +153,7 @@ def follow_all(
     now = torch.cat([axes.flatten(-2), position], -1)  # (N, T, 12)
     before = _one_earlier(now, memory[:, _POSE], first)
     earliest = _one_earlier(before, memory[:, _BEFORE], first)
-    then = picture_age.at_ages([now, before, earliest], config)
+    then = picture_age.at_ages(torch.stack([now, before, earliest], -2), config)
     evidence = picture_age.gathered(memory[:, _EVIDENCE], then, floor, first, config)
     ages = picture_age.shares(evidence, config)  # (N, T, A)
 
@@ -197,11 +200,10 @@ def _tracks(
         (N, T, 4 + `SUMS`) time left, sightings, time since the first and since the last of them,
         and the sums of the fits; and (N, T) bool, whether anything is on its way.
     """
-    prior = memory.new_tensor(config.prior)  # (3, 5)
-    tick = memory.new_tensor([-_DT, 0.0, _DT, _DT, *[0.0] * (SIZE - SUMS.start)])
-    fall = memory.new_tensor([0.0, 0.0, 0.5 * GRAVITY])
+    prior = constant(config.prior, memory)  # (3, 5)
+    tick, fall = constant(_TICK, memory), constant(_FALL, memory)
     heading = torch.stack([yaw.cos(), yaw.sin()], -1)
-    old = (ages * memory.new_tensor(config.picture_ages)).sum(-1)
+    old = ages @ constant(config.picture_ages, ages)
     track = torch.cat([memory[:, 3:4], memory[:, _SEEN : _LOST + 1], memory[:, SUMS]], -1)
     found, coming = [], []
     for new, now, gain, share, age, ahead in zip(
@@ -243,10 +245,10 @@ def _path(sums: Tensor, share: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
 
 def _told(track: Tensor, share: Tensor, yaw: Tensor, config: FlightConfig) -> Tensor:
     """`TOLD` (N, 4) of (N, 4 + `SUMS`) `_tracks`."""
-    prior = track.new_tensor(config.prior)
+    prior = constant(config.prior, track)
     left, since, sums = track[:, 0], track[:, 2], track[:, 4:]
     p, v = _path(sums, share, prior)
-    t = since + (share * share.new_tensor(config.picture_ages)).sum(-1)
+    t = since + share @ constant(config.picture_ages, share)
     place = crossing(p, v, t, left, yaw)
     sure, place = believed(place, variance(sums[:, :3], prior, t + left), config)
     return torch.cat([sure, place, left[:, None]], -1)
@@ -280,10 +282,10 @@ def in_picture(memory: Tensor, state: Tensor, max_m: float, config: FlightConfig
         its surface, log-odds that it is there; below 0 where its path is not known.
     """
     share = picture_age.shares(memory[:, _EVIDENCE], config)
-    age = (share * share.new_tensor(config.picture_ages)).sum(-1)
+    age = share @ constant(config.picture_ages, share)
     pose = camera_pose(earlier(state, age), config.camera)
     since, turn = memory[:, _SINCE], about_vertical(memory[:, _YAW] - age * pose.yaw_rate)
-    p, v = _path(memory[:, SUMS], share, memory.new_tensor(config.prior))
+    p, v = _path(memory[:, SUMS], share, constant(config.prior, memory))
     place = fallen(p + v * since[:, None], since, -1.0)
     from_camera = place - (turn @ pose.position[..., None])[..., 0]
     x, left, up = ((turn @ pose.axes).mT @ from_camera[..., None])[..., 0].unbind(-1)

@@ -13,7 +13,6 @@ Where no floor is seen all of them are believed alike.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import torch
@@ -22,6 +21,7 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.model.config import AGES, FlightConfig
 from egovcp.model.floor import LEVEL, Floor
+from egovcp.model.kept import constant
 
 SIZE: Final = 1 + 2 + 2 * 2 * AGES
 """Numbers of the evidence: ticks since the episode began, up to two; for each half of a picture how
@@ -43,17 +43,13 @@ class Poses(NamedTuple):
         return seen
 
 
-def at_ages(poses: Sequence[Tensor], config: FlightConfig) -> Poses:
-    """Interpolated from those of now, a tick ago and two ticks ago, (N, T, 12): axes, position."""
-    now, before, earliest = poses
-    then = []
-    for age in config.picture_ages:
-        ticks = age / spec.PLANNER_DT
-        a, b, part = (now, before, ticks) if ticks <= 1 else (before, earliest, ticks - 1)
-        then.append(a + part * (b - a))
-    stacked = torch.stack(then, -2)  # (N, T, A, 12)
-    axes = stacked[..., :9]
-    return Poses(axes.reshape(*axes.shape[:-1], 3, 3), stacked[..., 9:])
+def at_ages(poses: Tensor, config: FlightConfig) -> Poses:
+    """Interpolated from (N, T, 3, 12), axes and position of now, a tick ago and two ticks ago."""
+    ticks = (age / spec.PLANNER_DT for age in config.picture_ages)
+    parts = tuple((1 - t, t, 0.0) if t <= 1 else (0.0, 2 - t, t - 1) for t in ticks)
+    then = constant(parts, poses) @ poses  # (N, T, A, 12)
+    axes = then[..., :9]
+    return Poses(axes.reshape(*axes.shape[:-1], 3, 3), then[..., 9:])
 
 
 def gathered(
