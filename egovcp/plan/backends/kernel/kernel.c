@@ -21,9 +21,7 @@ static inline float one_sigmoid(float x) { return 1.0f / (1.0f + expf(-x)); }
 static void bytes_of_z(const Few *z, int latent, Bytes *bytes) {
     for (int r = 0; r < ROWS; r++) {
         const float *x = z->values[r];
-        float most = 1e-6f;
-        for (int i = 0; i < latent; i++) most = fabsf(x[i]) > most ? fabsf(x[i]) : most;
-        const float scale = most / 127.0f, rate = 1.0f / scale;
+        const float scale = farthest(x, latent, 1e-6f) / 127.0f, rate = 1.0f / scale;
         for (int i = 0; i < latent; i += 2 * WORDS)
             store_bytes(bytes->values[r] + i,
                         all(128) + words_of(load(x + i) * rate, load(x + i + LANES) * rate),
@@ -42,7 +40,7 @@ static void next_z(const Network *net, const Bytes *h, const float *noise, Few *
     wide_product(&net->prior_top, outputs, &between, net->prior_bias, 0, out);
     for (int r = 0; r < ROWS; r++) {
         const float *mean = out + r * outputs;
-        for (int i = 0; i < latent; i++) z->values[r][i] = mean[i];
+        memcpy(z->values[r], mean, latent * sizeof(float));
         for (int i = 0; noise && i < latent; i++) {
             const float raw = mean[latent + i] + 0.54f;
             const float std = log1pf(expf(-fabsf(raw))) + (raw > 0.0f ? raw : 0.0f) + net->min_std;

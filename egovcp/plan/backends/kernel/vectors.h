@@ -57,6 +57,21 @@ INLINE float total(Floats v) {
 #endif
 }
 
+/* The largest of |x| [count], and at least `least`. */
+INLINE float farthest(const float *x, int count, float least) {
+#if defined(WIDE_VECTORS)
+    __m512 most = _mm512_set1_ps(least);
+    for (int i = 0; i < count; i += LANES) {
+        const __mmask16 lanes = count - i < LANES ? (1u << (count - i)) - 1u : 0xffffu;
+        most = _mm512_max_ps(most, _mm512_abs_ps(_mm512_maskz_loadu_ps(lanes, x + i)));
+    }
+    return _mm512_reduce_max_ps(most);
+#else
+    for (int i = 0; i < count; i++) least = fabsf(x[i]) > least ? fabsf(x[i]) : least;
+    return least;
+#endif
+}
+
 /* Rounded to whole numbers, to the nearest word where there is none. */
 INLINE Words words_of(Floats a, Floats b) {
 #if defined(WIDE_VECTORS)
