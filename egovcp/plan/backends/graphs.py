@@ -18,16 +18,22 @@ WARM_UP: Final = 3
 """Calls before a recording: libraries choose their kernels, constants are made and kept."""
 
 type Replay = Callable[[], object]
-type Record = Callable[[Callable[[], Any]], tuple[Replay, Any]]
-"""Makes of a function without arguments its replay, and what that writes its results to."""
+type Record = Callable[[Callable[[], Any], torch.device], tuple[Replay, Any]]
+"""Makes of a function without arguments, which works on a device, its replay, and what that writes
+its results to."""
 
 
-def record(function: Callable[[], Any]) -> tuple[Replay, Any]:
+def record(function: Callable[[], Any], device: torch.device) -> tuple[Replay, Any]:
     """As a CUDA graph.
 
     Raises:
         RuntimeError: something in it cannot be recorded, such as a copy from the processor.
     """
+    with torch.cuda.device(device):  # whose streams are meant; a recording of another's is empty
+        return _record(function)
+
+
+def _record(function: Callable[[], Any]) -> tuple[Replay, Any]:
     stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
@@ -35,7 +41,7 @@ def record(function: Callable[[], Any]) -> tuple[Replay, Any]:
             function()
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph):
+    with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # others go on meanwhile
         results = function()
     return graph.replay, results
 
@@ -82,7 +88,8 @@ class Recorded:
     def _record(self, arguments: tuple[Any, ...]) -> _Recording | None:
         own = _map(arguments, lambda x: x.detach().clone(memory_format=torch.contiguous_format))
         try:
-            replay, results = self._how(lambda: self._function(*own))
+            device = next(_tensors(own)).device
+            replay, results = self._how(lambda: self._function(*own), device)
         except RuntimeError:
             return None
         return _Recording(list(_tensors(own)), replay, results)

@@ -31,7 +31,10 @@ class _Recorder:
     def __init__(self) -> None:
         self.made = 0
 
-    def __call__(self, function: Callable[[], Any]) -> tuple[Callable[[], object], Any]:
+    def __call__(
+        self, function: Callable[[], Any], device: torch.device
+    ) -> tuple[Callable[[], object], Any]:
+        assert device == torch.device("cpu")
         self.made += 1
         results = function()
 
@@ -84,7 +87,9 @@ def test_recordings_serve_under_either_mode_of_torch() -> None:
 def test_what_cannot_be_recorded_is_computed_and_not_tried_again() -> None:
     tried = []
 
-    def refuse(function: Callable[[], Any]) -> tuple[Callable[[], object], Any]:
+    def refuse(
+        function: Callable[[], Any], device: torch.device
+    ) -> tuple[Callable[[], object], Any]:
         tried.append(function)
         raise RuntimeError("operation not permitted when stream is capturing")
 
