@@ -29,7 +29,7 @@ from true_state import Array, Columns, true_states
 
 from egovcp import spec
 from egovcp.artefact import Artefact, load_artefact
-from egovcp.cli import DatasetConfig, run_command
+from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.data.index import EpisodeIndex, require_mixable
 from egovcp.data.split import in_split
@@ -53,9 +53,9 @@ class ReachableConfig:
 
     output_dir: str
     """Folder that keeps the true states."""
-    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
     """Dataset with the episodes."""
-    datasets: tuple[DatasetConfig, ...] = ()
+    datasets: tuple[SelectedDatasetConfig, ...] = ()
     """Several datasets instead, '[{root: data/ball}, {root: data/wall}]'."""
     policy: PolicyOptions = field(default_factory=PolicyOptions)
     """Policy whose Q is judged, too."""
