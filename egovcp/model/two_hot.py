@@ -9,7 +9,6 @@ far outlier does not pull as it does on a squared error.
 from __future__ import annotations
 
 import math
-from functools import cache
 from typing import Final
 
 import torch
@@ -26,14 +25,7 @@ _VALUES: Final = [math.copysign(math.expm1(abs(x)), x) for x in _EVEN]
 
 def bins(like: Tensor) -> Tensor:
     """The values (BINS,), ascending, of ``like``'s device and in float32."""
-    return _bins(like.device)
-
-
-@cache
-def _bins(device: torch.device) -> Tensor:
-    """Kept, for a copy from the processor would be in the way of a CUDA graph."""
-    with torch.inference_mode(False):
-        return torch.tensor(_VALUES, device=device)
+    return torch.tensor(_VALUES, device=like.device)
 
 
 def encode(x: Tensor) -> Tensor:
