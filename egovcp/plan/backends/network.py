@@ -2,7 +2,7 @@
 
 What it leaves out: the products that all candidates share at k = 0 are made once a plan, the
 prior's deviation where nothing is drawn, termination where nobody asks, and whatever would follow
-the last step. `egovcp.plan.objective.evaluate` says the same, slowly; `kernel.c` is this in
+the last step. `egovcp.plan.objective.evaluate` says the same, slowly; `kernel/` is this in
 8-bit integers.
 """
 
