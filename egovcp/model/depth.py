@@ -31,13 +31,11 @@ def nearness(depth_mm: Tensor, max_m: float) -> Tensor:
 def _extreme_3x3(x: Tensor, extreme: Callable[..., Tensor]) -> Tensor:
     """(B, H, W) -> maximum or minimum over each pixel's 3 x 3 neighbourhood; no gradient."""
     for dim in (1, 2):
-        size = x.shape[dim]
-        pair = extreme(x.narrow(dim, 0, size - 1), x.narrow(dim, 1, size - 1))
-        x = torch.empty_like(x)
-        x.narrow(dim, 0, 1).copy_(pair.narrow(dim, 0, 1))
-        x.narrow(dim, size - 1, 1).copy_(pair.narrow(dim, size - 2, 1))
-        inner = x.narrow(dim, 1, size - 2)
-        extreme(pair.narrow(dim, 0, size - 2), pair.narrow(dim, 1, size - 2), out=inner)
+        size, out = x.shape[dim], x.clone()
+        for to, of in ((0, 1), (1, 0)):
+            part = out.narrow(dim, to, size - 1)
+            extreme(part, x.narrow(dim, of, size - 1), out=part)
+        x = out
     return x
 
 

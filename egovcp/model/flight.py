@@ -95,7 +95,9 @@ def _measured(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) -
     own = (near > 0) & ((z - x).abs() < config.search) & (away < config.search**2)
     own = own.to(near.dtype)
     count = own.sum((1, 2))
-    mean = [(own * v).sum((1, 2)) / count.clamp_min(1) for v in (z, -z * col, -z * row)]
+    z = own * z
+    sums = [z.sum((1, 2)), -(z.sum(1) * col).sum(1), -(z.sum(2) * row[:, 0]).sum(1)]
+    mean = [total / count.clamp_min(1) for total in sums]
     cut = own[:, [0, -1]].sum((1, 2)) + own[:, :, [0, -1]].sum((1, 2))  # its middle is lost
     found = (count >= _MIN_PIXELS) & (cut == 0)
     point = torch.where(found[:, None], torch.stack(mean, -1), guess)

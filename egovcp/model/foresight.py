@@ -25,6 +25,7 @@ from torch import Tensor
 from egovcp.model import flight
 from egovcp.model.carry import Carry
 from egovcp.model.losses import Batch, Rollout, masked_mean, motion_error, motion_target, unbroken
+from egovcp.model.picture_error import picture_error
 from egovcp.model.recurrence import imagine_window
 from egovcp.model.world_model import WorldModel
 
@@ -141,8 +142,8 @@ def _compare(
         return {}
     carry, rows, known = seen
     near = rollout.near[:, rows]
-    image = model.decode_depth(carry.features.flatten(0, 1)).float().view_as(near)
-    picture = (0.5 * weight[:, rows] * (image - near).square()).mean((-2, -1))
+    image = model.decode_depth(carry.features.flatten(0, 1)).view_as(near)
+    picture = picture_error(image, near, weight[:, rows])
     foreseen = model.decode_state(carry.h, carry.z).float()
     state = 0.5 * (foreseen - rollout.state[:, rows]).square().mean(-1)
     terms = {

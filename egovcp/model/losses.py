@@ -22,6 +22,7 @@ from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, within
 from egovcp.model.flight import Sighting
 from egovcp.model.floor import Floor
 from egovcp.model.gaussian import Gaussian, kl_divergence
+from egovcp.model.picture_error import picture_error
 from egovcp.model.recurrence import filter_window
 from egovcp.model.shared import over_all_rows, row_noise
 from egovcp.model.world_model import PASSING_UNIT, Look, WorldModel
@@ -163,10 +164,9 @@ def depth_loss(
     every = min(every, valid.shape[1])
     first = int(torch.randint(every, (), generator=generator, device=valid.device))
     rows = (slice(None), slice(first, None, every))
-    image = model.decode_depth(rollout.carry.features[rows].flatten(0, 1)).float()
-    error = 0.5 * (image - rollout.near[rows].flatten(0, 1)).square()
-    error = error * weight[rows].flatten(0, 1)
-    return masked_mean(error.mean((-2, -1)), valid[rows].flatten())
+    near = rollout.near[rows]
+    image = model.decode_depth(rollout.carry.features[rows].flatten(0, 1)).view_as(near)
+    return masked_mean(picture_error(image, near, weight[rows]), valid[rows])
 
 
 def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
@@ -180,7 +180,7 @@ def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
     weight = torch.ones_like(near)
     if config.moving > 0:
         moving = _changed(near, config.moving_threshold)
-        moving &= ~batch.is_first[:, 1:, None, None]
+        moving[batch.is_first[:, 1:]] = False
         weight[:, 1:].add_(moving, alpha=config.moving)
     if config.near > 0:
         weight += config.near * (near > config.near_threshold)
@@ -202,8 +202,8 @@ def moving_pixels(near: Tensor, threshold: float) -> Tensor:
 
 def _changed(near: Tensor, threshold: float) -> Tensor:
     """(B, T - 1, H, W) bool: `moving_pixels` of all frames that have a previous one."""
-    before = near[:, :-1].flatten(0, 1)
-    low, high = (f(before).view_as(near[:, 1:]) for f in (lowest_3x3, highest_3x3))
+    around = (f(near.flatten(0, 1)).view_as(near) for f in (lowest_3x3, highest_3x3))
+    low, high = (x[:, :-1] for x in around)
     changed = near[:, 1:] > high.add_(threshold)
     changed |= near[:, 1:] < low.sub_(threshold)
     return changed

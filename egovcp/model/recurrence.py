@@ -25,7 +25,15 @@ from torch.autograd.function import once_differentiable
 
 from egovcp.model.carry import Carry
 from egovcp.model.gaussian import SHIFT, Gaussian
-from egovcp.model.recurrence_gradient import Found, Kept, Norm, Norms, Weights, way_back
+from egovcp.model.recurrence_gradient import (
+    Found,
+    Kept,
+    Norm,
+    Norms,
+    Weights,
+    beginnings,
+    way_back,
+)
 from egovcp.model.world_model import WorldModel
 
 
@@ -177,8 +185,9 @@ def _way_there(
         return [None] * len(rows) if x is None else x.split_with_sizes(list(rows))
 
     seen = None if embedding is None else embedding.to(p)
-    given = map(ticks, (action.to(p), seen, first, noise))
-    for act, look, new, luck in zip(*given, strict=True):
+    begun = beginnings(first, constants.rows)
+    given = map(ticks, (action.to(p), seen, noise))
+    for act, look, luck, new in zip(*given, begun, strict=True):
         h, z = h[: len(act)], z[: len(act)]
         if new is not None:  # replaced, not multiplied by zero: a reset heals NaN, too
             h, z = h.masked_fill(new, 0.0), z.masked_fill(new, 0.0)

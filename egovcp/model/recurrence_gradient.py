@@ -148,18 +148,17 @@ def way_back(
     alone, by_latent = _of_logits(outer, kept.spread, noise)
     slopes = _gate_slopes(kept, norms.gates.y)
     d_new = outer.h.clone()  # what comes from later ticks is added
-    begun = [None] * len(rows) if first is None else ticks(first)
     of_tick = zip(
         *map(ticks, (d_new, alone, by_latent, slopes, 1 - kept.update.to(d_new.dtype))),
         *(norm.ticks(rows) for norm in norms),
-        begun,
+        beginnings(first, rows),
         strict=True,
     )
     d_h, d_z = d_new[:0], outer.z[:0]
     steps: list[tuple[Tensor, ...]] = []
     for new, known, latent, slope, keep, mixed, gates, read, again in reversed(list(of_tick)):
         later = len(d_h)
-        known[:later].addcmul_(d_z.repeat(1, 2), latent[:later])
+        known[:later].addcmul_(torch.cat([d_z, d_z], 1), latent[:later])
         logits = known.to(p)
         e_read = _silu_back(logits @ out, read.y)
         d_read = read.back(e_read, w.head_scale).to(p)
@@ -191,6 +190,16 @@ def way_back(
     return Gradients(d_h, d_z, d_mixed, d_read, weights)
 
 
+def beginnings(first: Tensor | None, rows: Sequence[int]) -> list[Tensor | None]:
+    """Of each tick (B, 1) bool, the rows at which an episode begins; None where none does, which
+    saves two operations. Where there are beginnings all ticks have as many rows."""
+    if first is None:
+        return [None] * len(rows)
+    ticks = first.view(len(rows), -1)
+    some = ticks.any(1).tolist()
+    return [tick[:, None] if any_ else None for tick, any_ in zip(ticks, some, strict=True)]
+
+
 def _silu_back(gradient: Tensor, y: Tensor) -> Tensor:
     found: Tensor = torch.ops.aten.silu_backward(gradient.to(y.dtype), y)
     return found
@@ -219,4 +228,4 @@ def _of_logits(outer: Found, spread: Tensor, noise: Tensor | None) -> tuple[Tens
     luck = torch.zeros_like(slope) if noise is None else noise * slope
     by_latent = torch.cat([torch.ones_like(slope), luck], -1)
     alone = torch.cat([outer.mean, outer.std * slope], -1)
-    return alone.addcmul_(outer.z.repeat(1, 2), by_latent), by_latent
+    return alone.addcmul_(torch.cat([outer.z, outer.z], 1), by_latent), by_latent
