@@ -11,6 +11,8 @@ or an action is projected for all ticks before:
 
 With few rows an operation costs its call more than its arithmetic. On the way back autograd would
 call some 80 of them a tick, and add up the gradient of every weight tick by tick.
+
+A subclass of `WorldModel` may have steps of its own, and is asked for one after the other.
 """
 
 from __future__ import annotations
@@ -62,6 +64,8 @@ def filter_window(
         embedding: (B, T, U) of the observations.
         noise: (T, B, Z) with which z is drawn; None: z is the mean.
     """
+    if type(model) is not WorldModel:
+        return _filter_by_steps(model, start, action, first, embedding, noise)
     size, length = first.shape
     head = model.posterior
     found = _run(
@@ -90,10 +94,43 @@ def imagine_window(
         rows: of each tick, at most N, and at most those of the tick before: the rest is not
             imagined further.
     """
+    if type(model) is not WorldModel:
+        return _imagine_by_steps(model, start, action, rows)
     weights = _weights(model, model.prior.first.parts[0], model.prior.rest)
     found = _run(model, weights, rows, start, action)
     parts = (x.split_with_sizes(list(rows)) for x in (found.h, found.z))
     return [Carry(h, z) for h, z in zip(*parts, strict=True)]
+
+
+def _filter_by_steps(
+    model: WorldModel,
+    carry: Carry,
+    action: Tensor,
+    first: Tensor,
+    embedding: Tensor,
+    noise: Tensor | None,
+) -> tuple[Carry, Gaussian]:
+    carries: list[Carry] = []
+    posteriors: list[Gaussian] = []
+    for t in range(first.shape[1]):
+        h = model.advance(carry, action[:, t], first[:, t])
+        posterior = model.infer(h, embedding[:, t])
+        z = posterior.mean if noise is None else posterior.mean + posterior.std * noise[t]
+        carry = Carry(h, z)
+        carries.append(carry)
+        posteriors.append(posterior)
+    means, stds = (torch.stack(part, 1) for part in zip(*posteriors, strict=True))
+    return Carry.join(carries, lambda parts: torch.stack(parts, 1)), Gaussian(means, stds)
+
+
+def _imagine_by_steps(
+    model: WorldModel, carry: Carry, action: Tensor, rows: Sequence[int]
+) -> list[Carry]:
+    carries: list[Carry] = []
+    for act in action.split_with_sizes(list(rows)):
+        carry = model.imagine(Carry(carry.h[: len(act)], carry.z[: len(act)]), act)
+        carries.append(carry)
+    return carries
 
 
 def _weights(model: WorldModel, head: nn.Module, rest: nn.Sequential) -> Weights:
