@@ -131,7 +131,7 @@ class Policy:
 
     def advance(self, sent: NDArray[np.floating]) -> None:
         """Tell the recurrence which action (E, 7) was really sent."""
-        self._sent = torch.as_tensor(sent, dtype=torch.float32, device=self._device).clone()
+        self._sent = torch.from_numpy(np.array(sent, np.float32)).to(self._device)
 
     @property
     def _device(self) -> torch.device:
