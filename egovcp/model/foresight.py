@@ -123,7 +123,8 @@ def _imagined(
 
 def _rows(carry: Carry, imagined: Carry, start: Tensor, ticks: int) -> Carry:
     """The states (B, S, ...) that are imagined (S B, ...) from some rows of a carry (B, T, ...)."""
-    h, z = (x.view(len(start), -1, x.shape[-1]).transpose(0, 1) for x in imagined[:2])
+    shape = (len(start), len(carry.h))  # of no rows, where a window is too short
+    h, z = (x.view(*shape, x.shape[-1]).transpose(0, 1) for x in (imagined.h, imagined.z))
     memory = None if carry.flight is None else flight.later(carry.flight[:, start], ticks)
     return Carry(h, z, memory)
 

@@ -164,7 +164,7 @@ def way_back(
         d_read = read.back(e_read, w.head_scale).to(p)
         new += d_read @ head
         new[:later] += d_h
-        e_gates = (new.to(slope.dtype)[:, None] * slope.view(len(new), 3, -1)).flatten(1)
+        e_gates = (new.to(slope.dtype)[:, None] * slope.view(len(new), 3, new.shape[1])).flatten(1)
         d_gates = gates.back(e_gates, w.gru_scale).to(p)
         d_inputs = d_gates @ gru
         e_mixed = _silu_back(d_inputs[:, :units], mixed.y)

@@ -13,7 +13,7 @@ from egovcp.model.recurrence import filter_window, imagine_window
 from egovcp.testing import toy_model
 
 SIZE, LENGTH = 3, 6
-ROWS = [4, 4, 3, 3, 1]  # of each imagined tick
+ROWS = [4, 4, 3, 3, 1, 0]  # of each imagined tick: a window may be too short
 
 type Run = Callable[[WorldModel, Sequence[Tensor]], list[Tensor]]
 
