@@ -32,9 +32,7 @@ class Root(NamedTuple):
 def told_along(memory: Tensor, steps: int) -> Tensor:
     """(steps, 4) `Root.told` at all of them, of a flight remembered as (1, n)."""
     ticks = torch.arange(steps, device=memory.device)[:, None]
-    return flight.told_later(memory.expand(steps, -1), ticks) / memory.new_tensor(
-        (1, *PASSING_UNIT)
-    )
+    return flight.told(flight.told_later(memory.expand(steps, -1), ticks), PASSING_UNIT)
 
 
 def root_of(model: WorldModel, carry: Carry) -> Root:
