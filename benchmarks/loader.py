@@ -17,7 +17,8 @@ epoch from the disk (``hub_ratio``), and, with --growth, rate and memory of the 
 datasets of many more episodes.
 
     python benchmarks/loader.py --root data/wall
-    uv venv outputs/swm && uv pip install --python outputs/swm/bin/python stable-worldmodel
+    uv venv outputs/swm
+    uv pip install --python outputs/swm/bin/python stable-worldmodel opencv-python-headless imageio
     python benchmarks/loader.py --lance_python outputs/swm/bin/python --growth 100 1000 10000
 """
 
@@ -137,7 +138,7 @@ def main() -> None:
     options.add_argument("--window", type=int, default=128, help="episodes in memory")
     options.add_argument("--reuse", type=float, default=1.0, help="uses of each row while there")
     options.add_argument("--lance_python", type=Path, help="Python that has stable-worldmodel")
-    options.add_argument("--hub_episodes", type=int, default=200, help="streamed; 0: none")
+    options.add_argument("--hub_episodes", type=int, default=400, help="streamed; 0: none")
     options.add_argument(
         "--growth", type=int, nargs="*", default=[], help="numbers of episodes, multiples of 100"
     )
@@ -151,6 +152,8 @@ def main() -> None:
         if args.root is None:
             write(root, [make_episode(i, 150) for i in range(args.episodes)])
         index = EpisodeIndex.of([open_dataset(root)], "train")
+        if args.hub_episodes:  # first: by the clock, and with files that want memory, alone
+            figures |= from_hub(home / "remote", args.hub_episodes, args.length, args.rounds)
         lance = None
         if args.lance_python is None:
             print("stable-worldmodel's reader is left out: no --lance_python")
@@ -159,8 +162,6 @@ def main() -> None:
                 lance_reader(args.lance_python, index, home / "lance", args.length, BATCH)
             )
         figures |= compare(index, args.length, args.rounds, shuffle, lance)
-        if args.hub_episodes:
-            figures |= from_hub(home / "remote", args.hub_episodes, args.length, args.rounds)
         if args.growth:
             config = StreamConfig(batch_size=BATCH, length=args.length)
             figures |= growth(home / "growth", args.growth, config, shuffle, seconds=5.0)

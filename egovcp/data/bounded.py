@@ -15,6 +15,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.data.digests import Digests
 from egovcp.data.episode import Episode
 from egovcp.data.index import EpisodeIndex
 from egovcp.data.mix import Mix, group
@@ -163,9 +164,10 @@ class BoundedStream:
         self._batches = int(state["batches"])
         self._order.load_state_dict(state["order"])
         self._left = np.array(state["left"])
-        for slot, episode in enumerate(state["held"]):
-            if episode >= 0 and self._left[slot]:
-                self._read(slot, episode)
+        with Digests() as digests:
+            for slot, episode in enumerate(state["held"]):
+                if episode >= 0 and self._left[slot]:
+                    self._read(slot, episode, digests)
         self._held = np.array(state["held"])
         return self
 
@@ -175,18 +177,26 @@ class BoundedStream:
 
     def _refill(self) -> None:
         """Give every slot that is used up the next episode that has a window to give."""
-        for slot in np.flatnonzero(self._left == 0).tolist():
-            while self._left[slot] == 0:
-                episode = self._order.draw(self._rng)
-                windows = self.index.length[episode] * self._shuffle.reuse / self.config.length
-                self._left[slot] = int(windows + self._rng.random())  # on average exactly so many
-            self._read(slot, episode)
-            if self.index.is_remote:
-                self.index.expect(self._order.upcoming())
+        with Digests() as digests:
+            for slot in np.flatnonzero(self._left == 0).tolist():
+                episode = self._draw(slot)
+                if self.index.is_remote:  # before it is read: other files need not wait for its own
+                    self.index.expect(self._order.upcoming())
+                self._read(slot, episode, digests)
 
-    def _read(self, slot: int, number: int) -> None:
-        read = self.index.read_again if self._checked[number] else self.index.read
-        episode, store = read(number), self._slots
+    def _draw(self, slot: int) -> int:
+        """The next episode that has a window to give."""
+        while True:
+            episode = self._order.draw(self._rng)
+            windows = self.index.length[episode] * self._shuffle.reuse / self.config.length
+            self._left[slot] = int(windows + self._rng.random())  # on average exactly so many
+            if self._left[slot]:
+                return episode
+
+    def _read(self, slot: int, number: int, digests: Digests) -> None:
+        index, store = self.index, self._slots
+        checked = bool(self._checked[number])
+        episode = index.read_again(number) if checked else index.read(number, digests)
         self._checked[number] = True
         store.dataset[slot] = self.index.dataset[number]
         store.fill(slot, episode, self._returns)

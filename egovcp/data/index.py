@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp.data.columns import EPISODE_FEATURES
+from egovcp.data.digests import Digests
 from egovcp.data.episode import Episode
 from egovcp.data.reader import DatasetReader
 from egovcp.data.split import HELDOUT_FRACTION, in_split
@@ -125,14 +126,14 @@ class EpisodeIndex:
                 places = map(self._place, episodes)
                 reader.expect([number for other, number in places if other is reader])
 
-    def read(self, episode: int) -> Episode:
-        """Read one episode and validate it.
+    def read(self, episode: int, digests: Digests | None = None) -> Episode:
+        """Read one episode and validate it (see `DatasetReader.read`).
 
         Raises:
             DataError: the file is damaged or its content violates the specification.
         """
         reader, number = self._place(episode)
-        return reader.read(number)
+        return reader.read(number, digests)
 
     def read_again(self, episode: int) -> Episode:
         """Read one episode that has been validated before.

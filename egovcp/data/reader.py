@@ -18,6 +18,7 @@ from egovcp import spec
 from egovcp.cli import DatasetConfig, SelectedDatasetConfig
 from egovcp.data import metadata, schema
 from egovcp.data.columns import EPISODE_FEATURES, Columns, open_data_file, to_numpy
+from egovcp.data.digests import Digests
 from egovcp.data.episode import Episode
 from egovcp.data.paths import require_file
 from egovcp.data.selection import select_episodes
@@ -184,17 +185,24 @@ class DatasetReader:
         seed, number = facts.get("seed", self._collection.get("seed")), facts.get("episode", index)
         return f"{self.task(index)}/{seed}/{number}"
 
-    def read(self, index: int) -> Episode:
+    def read(self, index: int, digests: Digests | None = None) -> Episode:
         """Read one episode, validate it and compare it with its recorded digest.
+
+        Args:
+            index: its number.
+            digests: compares it while others are read, and raises what is wrong then; None: it is
+                compared at once.
 
         Raises:
             DataError: the file is damaged or its content violates the specification.
             IndexError: there is no such episode.
         """
-        episode, problems = self.inspect(index)
+        episode, problems = self._examined(index) if digests is not None else self.inspect(index)
         for error in problems:
             raise error
         assert episode is not None
+        if digests is not None:
+            digests.compare(episode, self.digest(index), self._changed(index))
         return episode
 
     def inspect(self, index: int) -> tuple[Episode | None, list[DataError]]:
@@ -203,6 +211,14 @@ class DatasetReader:
         Raises:
             IndexError: there is no such episode.
         """
+        episode, problems = self._examined(index)
+        known = self.digest(index)
+        if episode is not None and not problems and known not in ("", episode.digest()):
+            problems = [self._changed(index)]
+        return episode, problems
+
+    def _examined(self, index: int) -> tuple[Episode | None, list[DataError]]:
+        """As `inspect`, but for the digest."""
         path = self.data_path(index)
         try:
             columns = self._columns(index, tuple(schema.FEATURES))
@@ -215,9 +231,14 @@ class DatasetReader:
             metadata=self.metadata(index),
         )
         found = [*self._index_problems(index, columns), *episode.problems()]
-        if not found and self.digest(index) not in ("", episode.digest()):
-            found = [(None, "differs from what was collected: its sha256 is not the recorded one")]
         return episode, [DataError.at(path, problem, index, frame) for frame, problem in found]
+
+    def _changed(self, index: int) -> DataError:
+        return DataError.at(
+            self.data_path(index),
+            "differs from what was collected: its sha256 is not the recorded one",
+            index,
+        )
 
     def read_columns(self, names: Sequence[str]) -> Columns:
         """Whole columns over all frames, ``(N, ...)`` each, in episode order.

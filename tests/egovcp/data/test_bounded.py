@@ -247,6 +247,32 @@ def test_memory_does_not_grow_with_the_number_of_episodes(make_index: MakeIndex)
     assert _peak(many) < 1.1 * _peak(few)
 
 
+@pytest.mark.parametrize("checked", [True, False])
+def test_what_is_not_checked_yet_is_compared_with_its_digest_before_it_is_drawn(
+    make_index: MakeIndex, checked: bool
+) -> None:
+    root = make_index(6).readers[0].root
+    path = root / "meta" / "collection.json"
+    collection = json.loads(path.read_text())
+    collection["episodes"][4]["sha256"] = "0" * 64
+    path.write_text(json.dumps(collection))
+    index = EpisodeIndex.of([DatasetReader.open(DatasetConfig(root=str(root)))])
+    stream = BoundedStream(index, _config(), shuffle=ShuffleConfig(2), checked=checked)
+    drawn: list[int] = []
+
+    def draw() -> None:
+        for batch in islice(stream, 40):
+            drawn.extend(batch["episode"])
+
+    if checked:
+        draw()
+        assert 4 in drawn
+    else:
+        with pytest.raises(DataError, match=r"episode 4.*differs from what was collected"):
+            draw()
+        assert 4 not in drawn
+
+
 def test_a_file_that_is_damaged_under_way_is_named(make_index: MakeIndex) -> None:
     index = make_index(20)
     stream = BoundedStream(index, _config(), shuffle=FEW)
