@@ -10,8 +10,8 @@
 * ``data``: a step with its batch drawn from the stream and made into tensors, as in training.
 
 The cases take turns; ratios are medians of the ratios of one turn. Processor time counts, so that
-other programs on the machine do not; with several threads that is the time of all of them, and the
-rates, which are by the clock, want a quiet machine.
+other programs on the machine do not; with several threads that is the time of all of them, waiting
+for each other included. ``clock_ratio`` and the rates are by the clock and want a quiet machine.
 
     python benchmarks/train_step.py --root data/ball --return_steps 20
 """
@@ -171,8 +171,8 @@ def timed(case: Callable[[], object]) -> tuple[float, float]:
 def figures(turns: list[Times], name: str, frames: int) -> dict[str, object]:
     """What the turns of one case come to; keys begin with ``name``."""
 
-    def ratio(a: str, b: str) -> float:
-        return statistics.median(turn[a][0] / turn[b][0] for turn in turns)
+    def ratio(a: str, b: str, of: int = 0) -> float:
+        return statistics.median(turn[a][of] / turn[b][of] for turn in turns)
 
     cpu = {key: statistics.median(turn[key][0] for turn in turns) for key in turns[0]}
     clock = statistics.median(turn["data"][1] for turn in turns)
@@ -181,6 +181,7 @@ def figures(turns: list[Times], name: str, frames: int) -> dict[str, object]:
         f"{name}_float32_cpu_ms": 1e3 * cpu["float32"],
         f"{name}_plain_cpu_ms": 1e3 * cpu["plain"],
         f"{name}_ratio": ratio("plain", "step"),
+        f"{name}_clock_ratio": ratio("plain", "step", of=1),
         f"{name}_float32_ratio": ratio("plain", "float32"),
         f"{name}_data_ratio": ratio("data", "step"),
         f"{name}_wait_share": ratio("wait", "data"),
