@@ -14,10 +14,12 @@ from egovcp.errors import DataError
 
 
 class Digests:
-    """Compares what it is given until its block ends, and raises there what is wrong::
+    """Compares what it is given until its block ends, and raises there what is wrong.
 
-    with Digests() as digests:
-        episodes = [reader.read(index, digests) for index in range(8)]
+    As a context manager::
+
+        with Digests() as digests:
+            episodes = [reader.read(index, digests) for index in range(8)]
     """
 
     def __init__(self) -> None:
