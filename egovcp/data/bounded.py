@@ -15,7 +15,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.data.digests import Digests
+from egovcp.data.digests import Digests, comparing
 from egovcp.data.episode import Episode
 from egovcp.data.index import EpisodeIndex
 from egovcp.data.mix import Mix, group
@@ -164,7 +164,7 @@ class BoundedStream:
         self._batches = int(state["batches"])
         self._order.load_state_dict(state["order"])
         self._left = np.array(state["left"])
-        with Digests() as digests:
+        with comparing() as digests:
             for slot, episode in enumerate(state["held"]):
                 if episode >= 0 and self._left[slot]:
                     self._read(slot, episode, digests)
@@ -177,7 +177,7 @@ class BoundedStream:
 
     def _refill(self) -> None:
         """Give every slot that is used up the next episode that has a window to give."""
-        with Digests() as digests:
+        with comparing() as digests:
             for slot in np.flatnonzero(self._left == 0).tolist():
                 episode = self._draw(slot)
                 if self.index.is_remote:  # before it is read: other files need not wait for its own

@@ -5,26 +5,20 @@ To hash an episode takes a third as long as to decode it, and leaves the interpr
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from types import TracebackType
-from typing import Self
+from contextlib import contextmanager
 
 from egovcp.data.episode import Episode
 from egovcp.errors import DataError
 
 
 class Digests:
-    """Compares what it is given until its block ends, and raises there what is wrong.
+    """Those of the episodes of one block; see `comparing`."""
 
-    As a context manager::
-
-        with Digests() as digests:
-            episodes = [reader.read(index, digests) for index in range(8)]
-    """
-
-    def __init__(self) -> None:
-        """No thread is started before there is an episode."""
-        self._pool = ThreadPoolExecutor(1, thread_name_prefix="digests")
+    def __init__(self, pool: ThreadPoolExecutor) -> None:
+        """Nothing is hashed yet."""
+        self._pool = pool
         self._pending: list[tuple[Future[str], str, DataError]] = []
 
     def compare(self, episode: Episode, digest: str, otherwise: DataError) -> None:
@@ -38,18 +32,21 @@ class Digests:
         if digest:
             self._pending.append((self._pool.submit(episode.digest), digest, otherwise))
 
-    def __enter__(self) -> Self:
-        return self
+    def settle(self) -> None:
+        """Wait, and raise `DataError` for the first episode that differs."""
+        for found, digest, otherwise in self._pending:
+            if found.result() != digest:
+                raise otherwise
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Raise `DataError` for the first episode that differs, unless something else is raised."""
-        self._pool.shutdown()
-        if kind is None:
-            for found, digest, otherwise in self._pending:
-                if found.result() != digest:
-                    raise otherwise
+
+@contextmanager
+def comparing() -> Iterator[Digests]:
+    """Compare episodes while others are read; what is wrong is raised when the block ends.
+
+    Raises:
+        DataError: an episode differs from what was recorded; unless the block raises itself.
+    """
+    with ThreadPoolExecutor(1, thread_name_prefix="digests") as pool:
+        digests = Digests(pool)
+        yield digests
+        digests.settle()
