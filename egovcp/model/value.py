@@ -7,6 +7,7 @@ the bins under `two_hot`.
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from egovcp.model import two_hot
@@ -16,6 +17,11 @@ from egovcp.model.config import ValueLoss
 def width(kind: ValueLoss) -> int:
     """Outputs of a head."""
     return 1 if kind == "mse" else two_hot.BINS
+
+
+def bins(kind: ValueLoss) -> Tensor | None:
+    """The numbers (width,) whose log-odds the outputs are; None: an output is the value itself."""
+    return None if kind == "mse" else two_hot.bins(torch.empty(0))
 
 
 def read(outputs: Tensor, kind: ValueLoss) -> Tensor:

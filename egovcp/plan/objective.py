@@ -102,25 +102,6 @@ class Tally(Survival):
         return j
 
 
-def mean_value(q: Tensor, dead: Tensor, config: PlannerConfig, floor: Tensor) -> Tensor:
-    """J (...) of values (..., N), as `Tally` sums them, but all at once.
-
-    Args:
-        q: at every step; is written to.
-        dead: probabilities (..., N) of a failure; those of steps 1 to N - 2 count.
-        config: of the planner.
-        floor: the data's worst return.
-    """
-    base = torch.zeros_like(floor) if config.termination_rule == "paper" else floor
-    gain, risk = q.sub_(base), dead[..., 1:-1]
-    if config.termination_rule == "survival":
-        alive = 1.0 - risk
-    else:
-        alive = (risk <= config.termination_threshold).to(q.dtype)
-    gain[..., 2:].mul_(alive.cumprod(-1))
-    return gain.mean(-1).add_(base)
-
-
 class Earnings(Survival):
     """The running return of a plan, discounted, under a rule of what follows a failure.
 

@@ -16,6 +16,7 @@ from torch import Tensor, nn
 from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel, value
+from egovcp.model.config import ValueLoss
 from egovcp.model.nets import SplitLinear, SplitMlp, ValueHead
 from egovcp.plan.backends import library
 from egovcp.plan.backends.layers import first_outputs, gru_layer, linears_of, norms_of, weight_of
@@ -52,14 +53,14 @@ class IntegerNetwork:
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
         self._kernel = kernel = library.library()
         self._model = model
-        self._heads = len(model.q_heads.states)
-        self._outputs = value.width(model.config.value_loss)
-        self._width = 1 if self._outputs == 1 else _whole(self._outputs)
+        heads = len(model.q_heads.states)
+        outputs = value.width(model.config.value_loss)
+        self._width = 1 if outputs == 1 else _whole(outputs)
         assert self._width <= MOST_FEW
         self._packed = _Packed(model, config, kernel.depth())
         self._start = self._packed.start
-        parts = self._start.values // self._heads
-        sizes = [self._start.gates, *[parts] * self._heads, self._start.mix, self._start.passing]
+        parts = self._start.values // heads
+        sizes = [self._start.gates, *[parts] * heads, self._start.mix, self._start.passing]
         *self._places, self._sums = accumulate(sizes, initial=0)
         self._threads = library.Threads(kernel, torch.get_num_threads())
 
@@ -86,36 +87,10 @@ class IntegerNetwork:
         flight = carry.flight if self._start.passing else None
         return Shared(description, (words, sums, values), flight, {})
 
-    def worth(self, shared: Shared, actions: Tensor, noise: Tensor | None) -> Tensor | None:
-        """J (M,) of plans (M, N, 7), by as many threads as there are.
-
-        None where a head has several outputs: ask for `outputs`, and read them.
-        """
-        if self._outputs > 1:
-            return None
-        values = torch.empty(len(actions))
-        self._judge(shared, actions, noise, q=None, dead=None, worth=values.data_ptr())
-        return values
-
-    def outputs(
-        self, shared: Shared, actions: Tensor, noise: Tensor | None
-    ) -> tuple[Tensor, Tensor]:
-        """Along plans (M, N, 7).
-
-        Returns:
-            Outputs of the heads of Q (M, N, heads, width), and log-odds of a failure (M, N), those
-            of the steps 1 to N - 2 only.
-        """
+    def worth(self, shared: Shared, actions: Tensor, noise: Tensor | None) -> Tensor:
+        """J (M,) of plans (M, N, 7), by as many threads as there are."""
         plans, steps, _ = actions.shape
-        q = torch.empty(plans, steps, self._heads, self._width)
-        dead = torch.empty(plans, steps)
-        self._judge(shared, actions, noise, q=q.data_ptr(), dead=dead.data_ptr(), worth=None)
-        return q[..., : self._outputs], dead
-
-    def _judge(
-        self, shared: Shared, actions: Tensor, noise: Tensor | None, **results: int | None
-    ) -> None:
-        plans, steps, _ = actions.shape
+        values = torch.empty(plans)
         if steps not in shared.told:  # the same for every iteration of a search
             shared.told[steps] = None if shared.flight is None else told_along(shared.flight, steps)
         told = shared.told[steps]
@@ -129,8 +104,9 @@ class IntegerNetwork:
             width=self._width,
             actions=actions.data_ptr(),
             noise=None if noise is None else noise.data_ptr(),
-            **results,
+            worth=values.data_ptr(),
         )
+        return values
 
     def soon(self) -> None:
         """There is going to be something to compute."""
@@ -174,6 +150,7 @@ class _Packed:
         n.reading = library.Reading(
             RULES.index(config.termination_rule),
             config.ensemble == "min",
+            *self._bins(c.value_loss),
             *map(float, (model.return_mean, model.return_std, model.return_floor)),
             config.termination_threshold,
         )
@@ -181,6 +158,13 @@ class _Packed:
         heads = (library.Head * c.q_heads)(*map(self._head, model.q_heads.states))
         n.head = ctypes.cast(heads, ctypes.c_void_p)
         self._kept.append(heads)
+
+    def _bins(self, kind: ValueLoss) -> tuple[int, int | None]:
+        """How many numbers the outputs of a head are a distribution over, and these."""
+        values = value.bins(kind)
+        if values is None:
+            return 0, None
+        return len(values), self._keep(nn.functional.pad(values, (0, -len(values) % LANES)))
 
     def _shared(self, model: WorldModel) -> library.Start:
         """The weights of what candidates share, centred as those of their layers."""

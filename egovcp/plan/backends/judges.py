@@ -10,12 +10,12 @@ from torch import Tensor
 
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.backends.graphs import Recorded
-from egovcp.plan.backends.integers import IntegerNetwork, Shared
+from egovcp.plan.backends.integers import IntegerNetwork
 from egovcp.plan.backends.network import PlanningNetwork
-from egovcp.plan.backends.reading import noise_of, q_of
+from egovcp.plan.backends.reading import noise_of
 from egovcp.plan.backends.root import Root, root_of
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.objective import Worth, mean_value
+from egovcp.plan.objective import Worth
 
 
 class FloatJudge:
@@ -90,17 +90,6 @@ class IntegerJudge:
         def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:
             noise = noise_of(self._model, self._config, actions.shape[-2], generator)
             each = zip(robots, actions, strict=True)
-            return torch.stack([self._one(robot, plans, noise) for robot, plans in each])
+            return torch.stack([self._network.worth(robot, plans, noise) for robot, plans in each])
 
         return worth
-
-    def _one(self, robot: Shared, actions: Tensor, noise: Tensor | None) -> Tensor:
-        """J (M,) of plans (M, N, 7) of a robot."""
-        worth = self._network.worth(robot, actions, noise)
-        if worth is not None:
-            return worth
-        outputs, dead = self._network.outputs(robot, actions, noise)
-        q, risk = q_of(self._model, self._config, outputs), torch.sigmoid(dead)
-        value = mean_value(q, risk, self._config, self._model.return_floor)
-        nothing = robot.description.nothing  # bytes know no NaN
-        return value.add_(actions.sum((1, 2)), alpha=0.0).add_(nothing)

@@ -80,7 +80,8 @@ class Head(ctypes.Structure):
 
 class Reading(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int32) for name in ("rule", "lowest")),
+        *((name, ctypes.c_int32) for name in ("rule", "lowest", "bins")),
+        ("each", ctypes.c_void_p),
         *((name, ctypes.c_float) for name in ("mean", "std", "floor", "threshold")),
     )
 
@@ -128,7 +129,7 @@ class Job(ctypes.Structure):
         ("network", ctypes.c_void_p),
         ("root", ctypes.c_void_p),
         *((name, ctypes.c_int32) for name in ("rows", "steps", "width")),
-        *((name, ctypes.c_void_p) for name in ("actions", "noise", "q", "dead", "worth")),
+        *((name, ctypes.c_void_p) for name in ("actions", "noise", "worth")),
         ("crew", Crew),
     )
 

@@ -33,6 +33,7 @@ MODELS = [
     {"flight": FlightConfig(enabled=False)},
     {"q_heads": 3},
     {"value_loss": "two_hot"},
+    {"value_loss": "two_hot", "q_heads": 2},
     {"hidden": 48, "units": 64, "latent": 12},
 ]
 QUESTIONS = [
@@ -194,10 +195,11 @@ def test_what_is_not_a_number_stays_so_and_harms_nobody_else(
 
 
 @needs_compiler
+@pytest.mark.parametrize("kind", ["mse", "two_hot"])
 def test_the_kernel_says_the_same_where_there_are_no_wide_vectors(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    kind: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    model, config = _model(), PlannerConfig(backend="int8")
+    model, config = _model(value_loss=kind), PlannerConfig(backend="int8")
     carry, actions = _carry(model), _actions()
     here = _values(model, config, carry, actions)
     plain = tuple(flag for flag in library.FLAGS if not flag.startswith("-m"))

@@ -152,38 +152,52 @@ static void block(const Network *net, const Root *root, int steps, const float *
 /* How many inputs a wide product takes at once; weights are filled up to that with zeros. */
 int32_t depth(void) { return DEPTH; }
 
-/* Plans of one robot. Asked for are either what the heads say, or what plans are worth. */
+/* Plans of one robot. */
 typedef struct {
     const Network *net;
     const Root *root;
-    int32_t rows, steps, width;
+    int32_t rows, steps, width; /* width: of a head's outputs, filled up to 16 if there are several */
     const float *actions; /* [rows][steps][actions] */
     const float *noise;   /* [steps - 1][latent] or null */
-    float *q;             /* [rows][steps][heads][width] */
-    float *dead;          /* [rows][steps] log-odds of a failure at steps 1 to steps - 2 */
-    float *worth;         /* [rows] J, of heads of one output; null: q and dead are asked for */
+    float *worth;         /* [rows] J */
     Crew crew;
 } Job;
 
-/* Q in units of return, from the outputs of the heads. */
-static float value_of(const Network *net, const float *q) {
-    float value = q[0];
-    for (int i = 1; i < net->heads; i++) {
-        if (!net->reading.lowest) value += q[i];
-        else if (q[i] < value) value = q[i];
+/* What a head says: its output, or the mean of the distribution whose log-odds its outputs are. */
+static float said(const Reading *as, const float *outputs) {
+    if (!as->bins) return outputs[0];
+    const Floats most = all_floats(largest(outputs, as->bins));
+    Floats weights = {0}, sum = {0};
+    for (int i = 0; i < as->bins; i += LANES) {
+        Floats weight = exponential(load(outputs + i) - most);
+        if (as->bins - i < LANES) weight = first_floats(weight, as->bins - i);
+        weights += weight;
+        sum = fused(weight, load(as->each + i), sum);
     }
-    if (!net->reading.lowest) value /= (float)net->heads;
-    return net->reading.mean + value * net->reading.std;
+    return total(sum) / total(weights);
 }
 
-/* J of a plan, as `Tally` sums it: q [steps][heads], dead [steps], actions [steps][actions]. */
+/* Q in units of return, from the outputs of the heads [heads][width]. */
+static float value_of(const Network *net, const float *q, int width) {
+    const Reading *as = &net->reading;
+    float value = said(as, q);
+    for (int i = 1; i < net->heads; i++) {
+        const float one = said(as, q + i * width);
+        if (!as->lowest) value += one;
+        else if (one < value) value = one;
+    }
+    if (!as->lowest) value /= (float)net->heads;
+    return as->mean + value * as->std;
+}
+
+/* J of a plan, as `Tally` sums it: q [steps][heads][width], dead [steps], actions [steps][actions]. */
 static float worth_of(const Job *job, const float *q, const float *dead, const float *actions) {
     const Network *net = job->net;
     const Reading *as = &net->reading;
     const float base = as->rule == PAPER ? 0.0f : as->floor;
     float total = 0.0f, share = 1.0f, nothing = job->root->nothing;
-    for (int k = 0; k < job->steps; k++, q += net->heads) {
-        total += share * (value_of(net, q) - base);
+    for (int k = 0; k < job->steps; k++, q += net->heads * job->width) {
+        total += share * (value_of(net, q, job->width) - base);
         if (k == 0) continue; /* the first state was seen alive */
         const float risk = one_sigmoid(dead[k]);
         share *= as->rule == SURVIVAL ? 1.0f - risk : risk <= as->threshold;
@@ -207,13 +221,8 @@ static void judge_block(const Job *job, int row) {
         actions = some;
     }
     block(job->net, job->root, steps, actions, job->noise, q, job->width, dead);
-    if (job->worth) {
-        for (int r = 0; r < count; r++)
-            job->worth[row + r] = worth_of(job, q + r * q_row, dead + r * steps, actions + r * per_row);
-        return;
-    }
-    memcpy(job->q + (int64_t)row * q_row, q, count * q_row * sizeof(float));
-    memcpy(job->dead + (int64_t)row * steps, dead, count * steps * sizeof(float));
+    for (int r = 0; r < count; r++)
+        job->worth[row + r] = worth_of(job, q + r * q_row, dead + r * steps, actions + r * per_row);
 }
 
 static void blocks(Job *job) {

@@ -48,9 +48,11 @@ typedef struct {
     Mlp state;
 } Head;
 
-typedef struct { /* from what heads of one output say to J */
-    int32_t rule;   /* after a failure: as `Rule` */
-    int32_t lowest; /* of several heads; else their mean */
+typedef struct { /* from what heads say to J */
+    int32_t rule;      /* after a failure: as `Rule` */
+    int32_t lowest;    /* of several heads; else their mean */
+    int32_t bins;      /* of the distribution whose log-odds a head's outputs are; 0: its one output is Q */
+    const float *each; /* [bins filled up to 16] their values */
     float mean, std, floor, threshold;
 } Reading;
 

@@ -72,6 +72,47 @@ INLINE float farthest(const float *x, int count, float least) {
 #endif
 }
 
+/* The largest of x [count]. */
+INLINE float largest(const float *x, int count) {
+#if defined(WIDE_VECTORS)
+    __m512 most = _mm512_set1_ps(x[0]);
+    for (int i = 0; i < count; i += LANES) {
+        const __mmask16 lanes = count - i < LANES ? (1u << (count - i)) - 1u : 0xffffu;
+        most = _mm512_mask_max_ps(most, lanes, most, _mm512_maskz_loadu_ps(lanes, x + i));
+    }
+    return _mm512_reduce_max_ps(most);
+#else
+    float most = x[0];
+    for (int i = 1; i < count; i++) most = x[i] > most ? x[i] : most;
+    return most;
+#endif
+}
+
+/* The first `count` lanes, the others zero. */
+INLINE Floats first_floats(Floats v, int count) {
+#if defined(WIDE_VECTORS)
+    return (Floats)_mm512_maskz_mov_ps((1u << count) - 1u, (__m512)v);
+#else
+    for (int i = count; i < LANES; i++) v[i] = 0.0f;
+    return v;
+#endif
+}
+
+/* exp(x) of x <= 0, to 1e-7; what is below exp(-80) counts as that. */
+INLINE Floats exponential(Floats x) {
+    const Ints far = x < -80.0f;
+    x = (Floats)((far & (Ints)all_floats(-80.0f)) | (~far & (Ints)x));
+    const Floats power = x * 1.44269504f; /* of two */
+    const Ints whole = __builtin_convertvector(power - 0.5f, Ints); /* to the nearest: none is positive */
+    const Floats f = (power - __builtin_convertvector(whole, Floats)) * 0.69314718f;
+    Floats sum = all_floats(1.0f / 720.0f);
+    for (int k = 5; k >= 0; k--) {
+        static const float FACTOR[] = {1.0f, 1.0f, 1.0f / 2.0f, 1.0f / 6.0f, 1.0f / 24.0f, 1.0f / 120.0f};
+        sum = fused(sum, f, all_floats(FACTOR[k]));
+    }
+    return sum * (Floats)((whole + 127) << 23);
+}
+
 /* Rounded to whole numbers, to the nearest word where there is none. */
 INLINE Words words_of(Floats a, Floats b) {
 #if defined(WIDE_VECTORS)
