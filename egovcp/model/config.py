@@ -34,7 +34,7 @@ class LossConfig:
     (`paint_flight`); 0: none."""
     moving_threshold: float = 0.04
     """Change of nearness (fraction of the depth range) that counts as moving."""
-    near: float = 0.0
+    near: float = 10.0
     """Extra weight of near pixels; 0: none."""
     near_threshold: float = 0.7
     """Nearness (1 at the camera, 0 at the end of the depth range) beyond which a pixel is near."""
@@ -247,6 +247,7 @@ PAPER_LOSS = LossConfig(
     depth=float(spec.DEPTH_ROWS * spec.DEPTH_COLS),
     decode_every=1,
     moving=0.0,
+    near=0.0,
     flight=0.0,
     motion=0.0,
     passing=0.0,

@@ -94,8 +94,12 @@ def small() -> ExperimentConfig:
                 "--eval_freq=0",
                 "--tensorboard=false",
             ),
-            # nothing flies at a wall (docs/log.md)
-            task_flags={"wall": ("--value_fit.told_steps=0",)},
+            # A Q that is a distribution blocks more balls, and does not brace (docs/log.md, "Q as a
+            # distribution"); nothing flies at a wall.
+            task_flags={
+                "ball": ("--policy.value_loss=two_hot",),
+                "wall": ("--value_fit.told_steps=0",),
+            },
             # an arch is passed seconds after one has to crouch for it
             return_steps={"arch": 50},
         ),
@@ -117,7 +121,7 @@ def small() -> ExperimentConfig:
             task_flags={
                 "ball": ("--planner.process=ramp",),
                 "wall": ("--planner.process=ramp", "--planner.hands_cost=0.3"),
-                "arch": ("--planner.hands_cost=1",),
+                "arch": ("--planner.hands_cost=0.3",),
             },
         ),
     )

@@ -32,7 +32,7 @@ CHOICES: Final[dict[str, Flags]] = {
     "no_moving": {"policy.loss.moving": 0},
     "no_flight": {"policy.loss.flight": 0},
     "no_foresight": {"policy.loss.foresight_depth": 0, "policy.loss.foresight_state": 0},
-    "near": {"policy.loss.near": 10},
+    "no_near": {"policy.loss.near": 0},
     "no_paint_flight": {"policy.paint_flight": False},
     "not_followed": {"policy.flight.enabled": False},
     "no_motion": {

@@ -37,7 +37,7 @@ def _config(**changes: object) -> WorldModelConfig:
 
 
 OPTIONS: dict[str, dict[str, object]] = {
-    "near": {"loss__near": 10.0},
+    "no near": {"loss__near": 0.0},
     "dimension": {"loss__free_nats_per": "dimension"},
     "two_hot": {"value_loss": "two_hot"},
     "heads": {"q_heads": 3},
