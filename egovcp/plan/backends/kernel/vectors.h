@@ -105,11 +105,9 @@ INLINE Floats exponential(Floats x) {
     const Floats power = x * 1.44269504f; /* of two */
     const Ints whole = __builtin_convertvector(power - 0.5f, Ints); /* to the nearest: none is positive */
     const Floats f = (power - __builtin_convertvector(whole, Floats)) * 0.69314718f;
-    Floats sum = all_floats(1.0f / 720.0f);
-    for (int k = 5; k >= 0; k--) {
-        static const float FACTOR[] = {1.0f, 1.0f, 1.0f / 2.0f, 1.0f / 6.0f, 1.0f / 24.0f, 1.0f / 120.0f};
-        sum = fused(sum, f, all_floats(FACTOR[k]));
-    }
+    static const float SERIES[] = {1.0f, 1.0f, 1.0f / 2, 1.0f / 6, 1.0f / 24, 1.0f / 120, 1.0f / 720};
+    Floats sum = all_floats(SERIES[6]);
+    for (int k = 5; k >= 0; k--) sum = fused(sum, f, all_floats(SERIES[k]));
     return sum * (Floats)((whole + 127) << 23);
 }
 
