@@ -92,11 +92,6 @@ class PlannerConfig:
             raise UsageError(f"kept_elites is {self.kept_elites}; expected a share, 0 to 1")
         if self.sample_decay < 1:
             raise UsageError(f"sample_decay is {self.sample_decay}; expected at least 1")
-        if self.objective != "value" and self.backend not in ("auto", "eager"):
-            raise UsageError(
-                f"backend={self.backend} computes objective=value only; for objective="
-                f"{self.objective} choose auto or eager"
-            )
 
     @property
     def actions(self) -> int:

@@ -3,12 +3,16 @@
 value     J = 1/N sum_{k<N} Q(h_{t+k}, z^_{t+k}, a_{t+k})                       the paper's
 reward    J = sum_{k<N} gamma^k r(h_{t+k}, z^_{t+k}, a_{t+k})                   Rew-MPC
 td        J = the same + gamma^N Q(h_{t+N}, z^_{t+N}, a_{t+N})                  TD-MPC
+
+TD-MPC asks Q_N about what its policy would do, which is trained to say the best action; here there
+is none, and Q_N is asked about one action more of the candidate's own walk, which the search looks
+for.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
@@ -68,70 +72,69 @@ class StepByStep[L](NamedTuple):
         return worth
 
 
-class Survival:
-    """How much of what comes next counts, under a rule of what follows a failure."""
+class Account:
+    """J of plans, step by step: which head a step is asked for, and what it adds.
 
-    def __init__(self, config: PlannerConfig) -> None:
-        self._config = config
-        self.share: Tensor | float = 1.0
+    A plan that has failed is worth the floor, or earns (1 - gamma) floor at each tick: for ever,
+    that is the floor. So a failure at tick j is worth gamma^j floor, however many of the later
+    ticks are looked at.
 
-    def risk(self, dead: Tensor) -> None:
-        """The state of the last step is a failure with probability ``dead``."""
-        if self._config.termination_rule == "survival":
-            self.share = self.share * (1.0 - dead)
-        else:
-            self.share = self.share * (dead <= self._config.termination_threshold)
+    Args:
+        config: the objective, and the rule of what follows a failure.
+        model: a `Dynamics`; under ``reward`` and ``td`` it must foresee rewards.
+        steps: of a plan, `PlannerConfig.actions`.
 
-
-class Tally(Survival):
-    """The running sum of a plan's values, under a rule of what follows a failure."""
-
-    def __init__(self, config: PlannerConfig, floor: Tensor) -> None:
-        super().__init__(config)
-        self._floor = 0.0 if config.termination_rule == "paper" else floor
-        self._total: Tensor | float = 0.0
-
-    def value(self, q: Tensor) -> None:
-        """The next step is worth ``q``."""
-        self._total = self._total + self.share * (q - self._floor)
-
-    def mean(self, horizon: int) -> Tensor:
-        """J."""
-        j = self._total / horizon + self._floor
-        assert isinstance(j, Tensor)
-        return j
-
-
-class Earnings(Survival):
-    """The running return of a plan, discounted, under a rule of what follows a failure.
-
-    A plan that has failed earns (1 - gamma) floor at each tick: for ever, that is the floor. So a
-    failure at tick j is worth gamma^j floor, however many of the later ticks are looked at.
+    Raises:
+        UsageError: the model does not know what is asked of it.
     """
 
-    def __init__(self, config: PlannerConfig, floor: Tensor, discount: Tensor) -> None:
-        super().__init__(config)
-        self._floor = 0.0 if config.termination_rule == "paper" else floor
-        self._discount = discount
+    def __init__(self, config: PlannerConfig, model: Dynamics[Any], steps: int) -> None:
+        self._config, self._steps = config, steps
+        self._means = config.objective == "value"
+        self._discount = 1.0 if self._means else earning(model).discount
+        self._floor = 0.0 if config.termination_rule == "paper" else model.return_floor
         self._weight: Tensor | float = 1.0
-        self._total: Tensor | float = 0.0
+        self._share: Tensor | float = 1.0
+        self._above: Tensor | float = 0.0
+        self._below: Tensor | float = 0.0
+
+    def asks_value(self, k: int) -> bool:
+        """Whether step k is asked for Q, else for its reward."""
+        at_the_end = self._config.objective == "td" and k == self._steps - 1
+        return self._means or at_the_end
+
+    def asks_risk(self, k: int) -> bool:
+        """Whether it matters if step k is a failure: o_t was seen alive, and nothing follows the
+        last step."""
+        return 0 < k < self._steps - 1
+
+    def value(self, q: Tensor) -> None:
+        """The step is worth ``q``, or all that comes from it on."""
+        self._add(q, self._floor)
 
     def reward(self, r: Tensor) -> None:
-        """The next step earns ``r``."""
+        """The step earns ``r``."""
         self._add(r, (1.0 - self._discount) * self._floor)
         self._weight = self._weight * self._discount
 
-    def value(self, q: Tensor) -> None:
-        """All that comes after the last reward is worth ``q``."""
-        self._add(q, self._floor)
+    def risk(self, dead: Tensor) -> None:
+        """The state of the step is a failure with probability ``dead``."""
+        if self._config.termination_rule == "survival":
+            self._share = self._share * (1.0 - dead)
+        else:
+            self._share = self._share * (dead <= self._config.termination_threshold)
+
+    def worth(self) -> Tensor:
+        """J, (...)."""
+        j = self._above + self._below
+        if self._means:
+            j = j / self._steps
+        assert isinstance(j, Tensor)
+        return j
 
     def _add(self, worth: Tensor, floor: Tensor | float) -> None:
-        self._total = self._total + self._weight * (self.share * (worth - floor) + floor)
-
-    def total(self) -> Tensor:
-        """J."""
-        assert isinstance(self._total, Tensor)
-        return self._total
+        self._above = self._above + self._weight * self._share * (worth - floor)
+        self._below = self._below + self._weight * floor
 
 
 def evaluate[L](
@@ -149,47 +152,17 @@ def evaluate[L](
     Raises:
         UsageError: the model does not know what is asked of it.
     """
+    account = Account(config, model, actions.shape[-2])
+    judge = judge_of(model, model.value, config.ensemble)
     states = _states(model, carry, actions, config, generator)
-    if config.objective == "value":
-        return _mean_value(model, states, actions, config)
-    return _discounted(model, states, actions, config)
-
-
-def _mean_value[L](
-    model: Dynamics[L], states: Iterator[L], actions: Tensor, config: PlannerConfig
-) -> Tensor:
-    """1/N sum_k Q_k."""
-    judge = judge_of(model, model.value, config.ensemble)
-    tally = Tally(config, model.return_floor)
-    steps = actions.unbind(-2)
-    for k, (state, action) in enumerate(zip(states, steps, strict=True)):
-        tally.value(judge(state, action))
-        if 0 < k < len(steps) - 1:  # o_t was seen alive; and nothing follows the last step
-            tally.risk(model.termination(state))
-    return tally.mean(len(steps))
-
-
-def _discounted[L](
-    model: Dynamics[L], states: Iterator[L], actions: Tensor, config: PlannerConfig
-) -> Tensor:
-    """sum_{k<N} gamma^k r_k, and under ``td`` gamma^N Q_N.
-
-    Q_N is asked about one action more of the candidate's own walk. TD-MPC asks its policy, which
-    is trained to say the best action; here there is none, and the search looks for it.
-    """
-    earner = earning(model)
-    judge = judge_of(model, model.value, config.ensemble)
-    earnings = Earnings(config, model.return_floor, earner.discount)
-    steps = actions.unbind(-2)
-    last = len(steps) - 1
-    for k, (state, action) in enumerate(zip(states, steps, strict=True)):
-        if k == last and config.objective == "td":
-            earnings.value(judge(state, action))
+    for k, (state, action) in enumerate(zip(states, actions.unbind(-2), strict=True)):
+        if account.asks_value(k):
+            account.value(judge(state, action))
         else:
-            earnings.reward(earner.reward(state, action))
-        if 0 < k < last:
-            earnings.risk(model.termination(state))
-    return earnings.total()
+            account.reward(earning(model).reward(state, action))
+        if account.asks_risk(k):
+            account.risk(model.termination(state))
+    return account.worth()
 
 
 def _states[L](

@@ -94,8 +94,8 @@ def small() -> ExperimentConfig:
                 "--eval_freq=0",
                 "--tensorboard=false",
             ),
-            # A Q that is a distribution blocks more balls, and does not brace (docs/log.md, "Q as a
-            # distribution"); nothing flies at a wall.
+            # A Q that is a distribution earns more with balls, and does not brace (docs/log.md, "Q
+            # as a distribution"); nothing flies at a wall.
             task_flags={
                 "ball": ("--policy.value_loss=two_hot",),
                 "wall": ("--value_fit.told_steps=0",),

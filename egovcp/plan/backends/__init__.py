@@ -18,8 +18,8 @@ __all__ = ["judge_of_model"]
 def judge_of_model(model: WorldModel, config: PlannerConfig) -> Judge[Carry]:
     """The judge that ``config.backend`` names, made from the model's weights as they are now.
 
-    A subclass of the world model may think differently from its networks, and the networks are
-    packed for ``objective=value``: under ``auto`` anything else is asked step by step.
+    A subclass of the world model may think differently from its networks: under ``auto`` it is
+    asked step by step.
 
     Raises:
         UsageError: the model does not know what the planner asks; int8 is asked for and the model
@@ -28,8 +28,7 @@ def judge_of_model(model: WorldModel, config: PlannerConfig) -> Judge[Carry]:
     """
     require_answers(model.config, config)
     backend = config.backend
-    plain = type(model) is WorldModel and config.objective == "value"
-    if backend == "eager" or (backend == "auto" and not plain):
+    if backend == "eager" or (backend == "auto" and type(model) is not WorldModel):
         return StepByStep(model, config)
     if backend == "int8":
         return _integers(model, config)

@@ -20,7 +20,7 @@ from egovcp.model.config import ValueLoss
 from egovcp.model.nets import SplitLinear, SplitMlp, ValueHead
 from egovcp.plan.backends import library
 from egovcp.plan.backends.layers import first_outputs, gru_layer, linears_of, norms_of, weight_of
-from egovcp.plan.backends.root import told_along
+from egovcp.plan.backends.root import heads_of, told_along
 from egovcp.plan.backends.tables import LEAST_SILU, ONE, UNIT, silu_table, tanh_table
 from egovcp.plan.config import PlannerConfig
 
@@ -29,6 +29,7 @@ WORDS: Final = 32
 WIDEST: Final = 1024
 MOST_FEW: Final = 128
 LEVELS: Final = 127
+OBJECTIVES: Final = ("value", "reward", "td")
 RULES: Final = ("paper", "shift", "survival")
 """As the kernel counts them."""
 
@@ -53,7 +54,7 @@ class IntegerNetwork:
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
         self._kernel = kernel = library.library()
         self._model = model
-        heads = len(model.q_heads.states)
+        heads = len(heads_of(model))
         outputs = value.width(model.config.value_loss)
         self._width = 1 if outputs == 1 else _whole(outputs)
         assert self._width <= MOST_FEW
@@ -148,15 +149,19 @@ class _Packed:
             n.told, top = self._one_hidden(model.decode_passing)
             n.told_top = self._top(top)
         n.reading = library.Reading(
+            OBJECTIVES.index(config.objective),
             RULES.index(config.termination_rule),
             config.ensemble == "min",
             *self._bins(c.value_loss),
             *map(float, (model.return_mean, model.return_std, model.return_floor)),
             config.termination_threshold,
+            float(model.discount),
         )
         self.start = self._shared(model)
         heads = (library.Head * c.q_heads)(*map(self._head, model.q_heads.states))
         n.head = ctypes.cast(heads, ctypes.c_void_p)
+        if model.reward_head is not None:
+            n.reward = self._head(model.reward_head)
         self._kept.append(heads)
 
     def _bins(self, kind: ValueLoss) -> tuple[int, int | None]:
@@ -169,7 +174,7 @@ class _Packed:
     def _shared(self, model: WorldModel) -> library.Start:
         """The weights of what candidates share, centred as those of their layers."""
         of_h, of_z = [gru_layer(model.gru).wide_h], []
-        for head in model.q_heads.states:
+        for head in heads_of(model):
             *state, _ = map(weight_of, head.mlp.first.parts)
             if head.reduce is not None:
                 state = [state[0] @ weight_of(part) for part in head.reduce.parts]

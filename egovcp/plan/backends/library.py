@@ -80,9 +80,9 @@ class Head(ctypes.Structure):
 
 class Reading(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int32) for name in ("rule", "lowest", "bins")),
+        *((name, ctypes.c_int32) for name in ("objective", "rule", "lowest", "bins")),
         ("each", ctypes.c_void_p),
-        *((name, ctypes.c_float) for name in ("mean", "std", "floor", "threshold")),
+        *((name, ctypes.c_float) for name in ("mean", "std", "floor", "threshold", "discount")),
     )
 
 
@@ -96,6 +96,7 @@ class Network(ctypes.Structure):
         *((name, Linear) for name in ("termination_top", "told_top")),
         ("min_std", ctypes.c_float),
         ("head", ctypes.c_void_p),
+        ("reward", Head),
         ("passing", Mlp),
         ("silu", ctypes.c_void_p),
         ("tanh", ctypes.c_void_p),

@@ -1,4 +1,4 @@
-"""The world model as the planner needs it: imagination, value and termination, packed.
+"""The world model as the planner needs it: imagination, value, reward and termination, packed.
 
 What it leaves out: the products that all candidates share at k = 0 are made once a plan, the
 prior's deviation where nothing is drawn, termination where nobody asks, and whatever would follow
@@ -17,9 +17,9 @@ from egovcp.model.nets import SplitMlp, ValueHead
 from egovcp.plan.backends.floats import FloatHidden, FloatLinear, FloatRecurrence
 from egovcp.plan.backends.layers import HiddenLayer, gru_layer, hidden_layers, weight_of
 from egovcp.plan.backends.reading import q_of
-from egovcp.plan.backends.root import Root
+from egovcp.plan.backends.root import Root, heads_of
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.objective import Tally
+from egovcp.plan.objective import Account
 
 
 class _QNetwork:
@@ -41,7 +41,7 @@ class _QNetwork:
 
 
 class _Head:
-    """What a head of Q does not share with the others."""
+    """A head of Q, or of the reward, without what heads share."""
 
     def __init__(self, head: ValueHead, dtype: torch.dtype) -> None:
         self._reduced: FloatLinear | None = None
@@ -72,7 +72,8 @@ class PlanningNetwork:
         wanted = None if config.latent == "sample" else model.config.latent
         self._prior = FloatHidden(hidden_layers(model.prior, True, wanted)[0], dtype)
         self._termination = FloatHidden(hidden_layers(model.termination_head, True)[0], dtype)
-        self._heads = [_Head(head, dtype) for head in model.q_heads.states]
+        self._heads = [_Head(head, dtype) for head in heads_of(model)]
+        self._q_heads = self._heads[: model.config.q_heads]
         self._shared: _QNetwork | None = None
         if (shared := model.q_heads.passing) is not None:
             self._shared = _QNetwork(shared, False, dtype)
@@ -81,22 +82,31 @@ class PlanningNetwork:
     def worth(self, root: Root, actions: Tensor, noise: Tensor | None) -> Tensor:
         """J (...) of plans (..., N, 7); noise (N - 1, latent) under ``latent=sample``."""
         each = actions.unbind(-2)
-        tally = Tally(self._config, self._model.return_floor)
-        own = [head.start(add, each[0]) for head, add in zip(self._heads, root.values, strict=True)]
-        tally.value(self._read(own, self._shared_start(root, each[0])))
+        account = Account(self._config, self._model, len(each))
+        if account.asks_value(0):
+            own = [
+                head.start(add, each[0])
+                for head, add in zip(self._q_heads, root.values, strict=False)
+            ]
+            account.value(self._read(own, self._shared_start(root, each[0])))
+        else:
+            account.reward(self._earned(self._heads[-1].start(root.values[-1], each[0])))
         x = self._mix_start.between(None, each[0], root.mix)
         wide_h: Tensor | None = None
         h, add = root.h, root.gates
         for k in range(1, len(each)):
             h, wide_h = self._recur(x, wide_h, add if k == 1 else None, h)
             z = self._next_z(wide_h, None if noise is None else noise[k - 1])
-            own = [head.later(wide_h, h, z, each[k]) for head in self._heads]
-            tally.value(self._read(own, self._shared_later(root, k, wide_h, z, each[k])))
+            if account.asks_value(k):
+                own = [head.later(wide_h, h, z, each[k]) for head in self._q_heads]
+                account.value(self._read(own, self._shared_later(root, k, wide_h, z, each[k])))
+            else:
+                account.reward(self._earned(self._heads[-1].later(wide_h, h, z, each[k])))
             if k == len(each) - 1:
                 break  # nothing follows the last step
-            tally.risk(torch.sigmoid(self._termination.last(wide_h, z, None)[..., 0]))
+            account.risk(torch.sigmoid(self._termination.last(wide_h, z, None)[..., 0]))
             x = self._mix.between(None, torch.cat([z, each[k]], -1), None)
-        return tally.mean(len(each))
+        return account.worth()
 
     def _shared_start(self, root: Root, action: Tensor) -> Tensor | float:
         """What the heads of Q share, (..., width) at k = 0."""
@@ -128,6 +138,10 @@ class PlanningNetwork:
         out = self._passing.last(wide_h, z, None)
         coming = torch.sigmoid(out[..., 3:])
         return torch.cat([coming, coming * out[..., :3]], -1)
+
+    def _earned(self, outputs: Tensor) -> Tensor:
+        """The reward (...) in its own units, of outputs (..., 1)."""
+        return outputs[..., 0] * self._model.return_std
 
     def _read(self, own: list[Tensor], shared: Tensor | float) -> Tensor:
         outputs = torch.stack([q + shared for q in own], -2)

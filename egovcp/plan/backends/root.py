@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from egovcp.model import Carry, WorldModel, flight
-from egovcp.model.nets import SplitMlp
+from egovcp.model.nets import SplitMlp, ValueHead
 from egovcp.model.world_model import PASSING_UNIT
 
 
@@ -18,7 +18,7 @@ class Root(NamedTuple):
     h: Tensor
     mix: Tensor  # sums of the first layer that leads to the GRU
     gates: Tensor  # sums of the GRU's gates
-    values: tuple[Tensor, ...]  # sums of the first layers of Q's heads
+    values: tuple[Tensor, ...]  # sums of the first layers of `heads_of`
     passing: Tensor | None  # and of the part that they share
     flight: Tensor | None  # what is remembered of a flight
 
@@ -35,12 +35,18 @@ def told_along(memory: Tensor, steps: int) -> Tensor:
     return flight.told(flight.told_later(memory.expand(steps, -1), ticks), PASSING_UNIT)
 
 
+def heads_of(model: WorldModel) -> list[ValueHead]:
+    """Q's heads, and after them the one of the reward, if the model has one."""
+    reward = model.reward_head
+    return [*model.q_heads.states, *([] if reward is None else [reward])]
+
+
 def root_of(model: WorldModel, carry: Carry) -> Root:
     """From the robots' states (E, ...)."""
     carry = model.spread(carry)
     state = (carry.h, carry.z)
     values: list[Tensor] = []
-    for head in model.q_heads.states:
+    for head in heads_of(model):
         reduce = head.reduce
         values.append(_but_action(head.mlp, *(state if reduce is None else [reduce(*state)])))
     shared = model.q_heads.passing

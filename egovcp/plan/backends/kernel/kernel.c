@@ -110,14 +110,37 @@ static void own_part(const Network *net, const Head *head, const float *from, co
     mlp(net, &head->state, in, q, stride);
 }
 
-/* Everything of a block: actions [ROWS][steps][actions] -> q [ROWS][steps][heads][width], zero before,
- * and the log-odds of a failure, dead [ROWS][steps]. */
+/* Whether step k of a plan is asked for Q, else for its reward. */
+static inline int asks_value(const Reading *as, int k, int steps) {
+    return as->objective == VALUE || (as->objective == TD && k == steps - 1);
+}
+
+/* q [ROWS][stride], of which a row has the outputs [heads][width], += Q's heads at step k. */
+static void judged(const Network *net, const Root *root, const Carry *at, int k, Few *few, float *q, int width,
+                   int stride) {
+    const int shared = net->passing.top.outputs;
+    float both[ROWS * MOST_FEW] = {0}; /* [ROWS][width] */
+    if (shared) shared_part(net, root, at, k, few, both, width);
+    for (int i = 0; i < net->heads; i++, q += width) {
+        own_part(net, net->head + i, root->values[i], at, k, few, q, stride);
+        for (int r = 0; shared && r < ROWS; r++)
+            for (int j = 0; j < width; j++) q[r * stride + j] += both[r * width + j];
+    }
+}
+
+/* What heads say of a block, zero before: where Q is asked its outputs q [ROWS][steps][heads][width],
+ * elsewhere rewards earned [ROWS][steps]; and the log-odds of a failure, dead [ROWS][steps]. */
+typedef struct {
+    float *q, *earned, *dead;
+} Answers;
+
+/* Everything of a block of plans, actions [ROWS][steps][actions]. */
 static void block(const Network *net, const Root *root, int steps, const float *actions, const float *noise,
-                  float *q, int width, float *dead) {
+                  int width, Answers to) {
     Carry at;
     Fixed x;
     Few few;
-    const int q_stride = steps * net->heads * width;
+    const int q_step = net->heads * width;
     for (int k = 0; k < steps; k++) {
         for (int r = 0; r < ROWS; r++)
             memcpy(few.values[r], actions + (r * steps + k) * net->actions, net->actions * sizeof(float));
@@ -127,19 +150,14 @@ static void block(const Network *net, const Root *root, int steps, const float *
             recur(net, (Inputs){.wide = &at.x, .beside = &at.h_bytes}, at.h.values[0], WIDEST, &at.h,
                   &at.h_bytes);
         if (k > 0) next_z(net, &at.h_bytes, noise ? noise + (k - 1) * net->latent : 0, &at.z, &at.z_bytes);
-        const int shared = net->passing.top.outputs;
-        float both[ROWS * MOST_FEW] = {0}; /* [ROWS][width] */
-        if (shared) shared_part(net, root, &at, k, &few, both, width);
-        for (int i = 0; i < net->heads; i++) {
-            float *to = q + (k * net->heads + i) * width;
-            own_part(net, net->head + i, root->values[i], &at, k, &few, to, q_stride);
-            for (int r = 0; shared && r < ROWS; r++)
-                for (int j = 0; j < width; j++) to[r * q_stride + j] += both[r * width + j];
-        }
+        if (asks_value(&net->reading, k, steps))
+            judged(net, root, &at, k, &few, to.q + k * q_step, width, steps * q_step);
+        else
+            own_part(net, &net->reward, root->values[net->heads], &at, k, &few, to.earned + k, steps);
         if (k == steps - 1) break; /* nothing follows the last step */
         if (k > 0) {
             hidden(net, &net->termination, (Inputs){.wide = &at.h_bytes, .beside = &at.z_bytes}, &x, 0);
-            linear(&net->termination_top, &x, dead + k, steps);
+            linear(&net->termination_top, &x, to.dead + k, steps);
         }
         const Inputs in = {.few = &few,
                            .few_inputs = net->actions,
@@ -190,20 +208,25 @@ static float value_of(const Network *net, const float *q, int width) {
     return as->mean + value * as->std;
 }
 
-/* J of a plan, as `Tally` sums it: q [steps][heads][width], dead [steps], actions [steps][actions]. */
-static float worth_of(const Job *job, const float *q, const float *dead, const float *actions) {
+/* J of a plan, as `Account` sums it; `of` and `actions` are those of its row. */
+static float worth_of(const Job *job, Answers of, const float *actions) {
     const Network *net = job->net;
     const Reading *as = &net->reading;
     const float base = as->rule == PAPER ? 0.0f : as->floor;
-    float total = 0.0f, share = 1.0f, nothing = job->root->nothing;
-    for (int k = 0; k < job->steps; k++, q += net->heads * job->width) {
-        total += share * (value_of(net, q, job->width) - base);
+    float above = 0.0f, below = 0.0f, share = 1.0f, weight = 1.0f, nothing = job->root->nothing;
+    for (int k = 0; k < job->steps; k++, of.q += net->heads * job->width) {
+        const int value = asks_value(as, k, job->steps);
+        const float worth = value ? value_of(net, of.q, job->width) : of.earned[k] * as->std;
+        const float floor = value ? base : (1.0f - as->discount) * base;
+        above += weight * share * (worth - floor);
+        below += weight * floor;
+        if (!value) weight *= as->discount;
         if (k == 0) continue; /* the first state was seen alive */
-        const float risk = one_sigmoid(dead[k]);
+        const float risk = one_sigmoid(of.dead[k]);
         share *= as->rule == SURVIVAL ? 1.0f - risk : risk <= as->threshold;
     }
     for (int i = 0; i < job->steps * net->actions; i++) nothing += 0.0f * actions[i];
-    return total / (float)job->steps + base + nothing;
+    return (as->objective == VALUE ? above / (float)job->steps + base : above + below) + nothing;
 }
 
 /* A block of candidates from `row` on; rows beyond the last repeat the first. */
@@ -212,17 +235,19 @@ static void judge_block(const Job *job, int row) {
     const int q_row = steps * job->net->heads * job->width;
     const int count = row + ROWS <= job->rows ? ROWS : job->rows - row;
     const float *actions = job->actions + (int64_t)row * per_row;
-    float some[ROWS * per_row], q[ROWS * q_row], dead[ROWS * steps];
+    float some[ROWS * per_row], q[ROWS * q_row], earned[ROWS * steps], dead[ROWS * steps];
     memset(q, 0, sizeof q);
+    memset(earned, 0, sizeof earned);
     memset(dead, 0, sizeof dead);
     if (count < ROWS) {
         for (int r = 0; r < ROWS; r++)
             memcpy(some + r * per_row, actions + (r < count ? r : 0) * per_row, per_row * sizeof(float));
         actions = some;
     }
-    block(job->net, job->root, steps, actions, job->noise, q, job->width, dead);
+    block(job->net, job->root, steps, actions, job->noise, job->width, (Answers){q, earned, dead});
     for (int r = 0; r < count; r++)
-        job->worth[row + r] = worth_of(job, q + r * q_row, dead + r * steps, actions + r * per_row);
+        job->worth[row + r] = worth_of(job, (Answers){q + r * q_row, earned + r * steps, dead + r * steps},
+                                       actions + r * per_row);
 }
 
 static void blocks(Job *job) {

@@ -49,13 +49,15 @@ typedef struct {
 } Head;
 
 typedef struct { /* from what heads say to J */
+    int32_t objective; /* what is added up: as `Objective` */
     int32_t rule;      /* after a failure: as `Rule` */
     int32_t lowest;    /* of several heads; else their mean */
     int32_t bins;      /* of the distribution whose log-odds a head's outputs are; 0: its one output is Q */
     const float *each; /* [bins filled up to 16] their values */
-    float mean, std, floor, threshold;
+    float mean, std, floor, threshold, discount;
 } Reading;
 
+enum Objective { VALUE, REWARD, TD };
 enum Rule { PAPER, SHIFT, SURVIVAL };
 
 typedef struct {
@@ -66,7 +68,8 @@ typedef struct {
     int32_t prior_outputs;  /* a multiple of 16 */
     Linear termination_top, told_top;
     float min_std;
-    const Head *head; /* [heads] */
+    const Head *head; /* [heads] of Q */
+    Head reward;      /* if it is foreseen */
     Mlp passing;      /* reads what is on its way, is added to each head; none if its top has no outputs */
     const int16_t *silu, *tanh; /* [2][NODES] each, see `Lines` */
     Reading reading;
@@ -76,7 +79,7 @@ typedef struct {
     const int16_t *h;    /* [hidden + 16] words */
     const float *mix;    /* sums of the first layers that do not depend on the candidate */
     const float *gates;
-    const float *const *values; /* of the heads */
+    const float *const *values; /* of the heads, then of the reward's */
     const float *passing;       /* of what they share */
     const float *told;          /* [steps][TOLD] what is on its way, if it is followed; else null */
     float nothing;              /* 0, or not a number where the state is not: bytes know no such thing */

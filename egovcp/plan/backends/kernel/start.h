@@ -4,7 +4,7 @@
 
 typedef struct {
     int32_t hidden, latent;
-    int32_t gates, values, mix, passing; /* sums of each; of all heads; 0: there is no such part */
+    int32_t gates, values, mix, passing; /* sums of each; `values` of all heads; 0: there is no such part */
     const float *of_h;    /* [hidden][gates + values] */
     const float *of_z;    /* [latent][values + mix] */
     const float *of_told; /* [TOLD][passing] */
