@@ -26,6 +26,7 @@ from egovcp.plan.config import PlannerConfig
 
 LANES: Final = 16
 WORDS: Final = 32
+"""Vectors of the widest kernel: outputs are filled up to whole ones."""
 WIDEST: Final = 1024
 MOST_FEW: Final = 128
 LEVELS: Final = 127
@@ -58,7 +59,7 @@ class IntegerNetwork:
         outputs = value.width(model.config.value_loss)
         self._width = 1 if outputs == 1 else _whole(outputs)
         assert self._width <= MOST_FEW
-        self._packed = _Packed(model, config, kernel.depth())
+        self._packed = _Packed(model, config, library.layout(kernel))
         self._start = self._packed.start
         parts = self._start.values // heads
         sizes = [self._start.gates, *[parts] * heads, self._start.mix, self._start.passing]
@@ -122,9 +123,9 @@ def _whole(count: int) -> int:
 class _Packed:
     """A network's description for the kernel, and the tensors that it points into."""
 
-    def __init__(self, model: WorldModel, config: PlannerConfig, depth: int) -> None:
+    def __init__(self, model: WorldModel, config: PlannerConfig, layout: library.Layout) -> None:
         self._kept: list[object] = []
-        self._depth = depth
+        self._layout = layout
         c = model.config
         if max(2 * c.latent, c.value_state) > MOST_FEW:
             raise UsageError(
@@ -291,7 +292,7 @@ class _Packed:
         """Of a weight (N, K) for inputs of h or z (symmetric), or of a hidden layer."""
         zero, offset = (128, 0.0) if state else (0, LEAST_SILU)
         weight = torch.nn.functional.pad(
-            weight.detach().float(), (0, -weight.shape[1] % self._depth)
+            weight.detach().float(), (0, -weight.shape[1] % self._layout.depth)
         )
         outputs, inputs = weight.shape
         if inputs > WIDEST:
@@ -299,7 +300,8 @@ class _Packed:
         scale = weight.abs().amax(1).clamp_min(1e-12) / LEVELS
         whole = (weight / scale[:, None]).round()
         total = whole.sum(1)
-        blocks = whole.view(outputs // LANES, LANES, inputs // 4, 4).transpose(1, 2)
+        _, lanes, group = self._layout
+        blocks = whole.view(outputs // lanes, lanes, inputs // group, group).transpose(1, 2)
         return library.Wide(
             inputs,
             self._keep(blocks, torch.int8),
@@ -310,17 +312,17 @@ class _Packed:
 
     def _linear(self, weight: Tensor, bias: Tensor, single: bool) -> library.Linear:
         """Of a weight (N, K) for words. No lane of a sum may pass 2^31: that limits a row's sum."""
-        inputs, weight = weight.shape[1], weight.detach()
+        inputs, weight, lanes = weight.shape[1], weight.detach(), self._layout.lanes
         if single:
-            blocks = torch.nn.functional.pad(weight, (0, -inputs % WORDS)).view(1, -1, LANES, 2)
+            blocks = torch.nn.functional.pad(weight, (0, -inputs % WORDS)).view(1, -1, lanes, 2)
             largest = blocks.abs().sum((1, 3)).amax(1)
         else:
             weight, bias = _filled(weight, bias)
-            blocks = weight.view(-1, LANES, inputs // 2, 2).transpose(1, 2)
+            blocks = weight.view(-1, lanes, inputs // 2, 2).transpose(1, 2)
             largest = weight.abs().sum(1)
         least = weight.abs().amax(1) / (ONE - 1)
         scale = torch.maximum(largest / (2 * ONE - 2 * WIDEST), least).clamp_min(1e-30)
-        whole = blocks / scale.view(-1, 1, 1 if single else LANES, 1)
+        whole = blocks / scale.view(-1, 1, 1 if single else lanes, 1)
         parts = (self._keep(whole.round(), torch.int16), self._keep(scale), self._keep(bias))
         return library.Linear(inputs, len(bias), *parts)
 

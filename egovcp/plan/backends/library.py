@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 from threading import Lock
-from typing import Final
+from typing import Final, NamedTuple
 
 from egovcp.errors import EnvironmentFailure
 
@@ -170,8 +170,9 @@ class Threads:
 
 
 def processor_is_fast() -> bool:
-    """Whether this processor multiplies 512-bit vectors of bytes (AVX-512 VNNI)."""
-    return processor_has("avx512_vnni")
+    """Whether this processor has the vectors that the kernel is written for: of 512 bits with
+    products of bytes (AVX-512 VNNI), or of 256 (AVX2)."""
+    return processor_has("avx512_vnni") or (processor_has("avx2") and processor_has("fma"))
 
 
 def processor_has(feature: str) -> bool:
@@ -215,9 +216,24 @@ def library() -> ctypes.CDLL:
     kernel.start.restype = f
     kernel.lacking.argtypes = [p, i]
     kernel.lacking.restype = i
-    kernel.depth.argtypes = []
-    kernel.depth.restype = i
+    kernel.layout.argtypes = [p, p, p]
+    kernel.layout.restype = None
     return kernel
+
+
+class Layout(NamedTuple):
+    """How the kernel on this processor wants the weights of wide products."""
+
+    depth: int  # their inputs are filled up with zeros to a multiple of
+    lanes: int  # outputs of a vector
+    group: int  # inputs that lie together
+
+
+def layout(kernel: ctypes.CDLL) -> Layout:
+    """That of a kernel."""
+    found = [ctypes.c_int32() for _ in Layout._fields]
+    kernel.layout(*map(ctypes.byref, found))
+    return Layout(*(x.value for x in found))
 
 
 def tiles_are_refused() -> bool:

@@ -222,17 +222,32 @@ def test_what_is_not_a_number_stays_so_and_harms_nobody_else(
 
 @needs_compiler
 @pytest.mark.parametrize(
+    "vectors",
+    [
+        (),
+        pytest.param(
+            ("-mavx2", "-mfma"),
+            marks=pytest.mark.skipif(not library.processor_has("avx2"), reason="no AVX2"),
+        ),
+    ],
+    ids=["no vectors", "AVX2"],
+)
+@pytest.mark.parametrize(
     ("kind", "objective"), [("mse", "value"), ("two_hot", "value"), ("mse", "td")]
 )
-def test_the_kernel_says_the_same_where_there_are_no_wide_vectors(
-    kind: str, objective: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_the_kernel_says_the_same_with_other_vectors(
+    kind: str,
+    objective: Any,
+    vectors: tuple[str, ...],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
     model = _model(value_loss=kind, loss=LossConfig(reward=1.0))
     config = PlannerConfig(backend="int8", objective=objective)
     carry, actions = _carry(model), _actions(horizon=config.actions)
     here = _values(model, config, carry, actions)
     plain = tuple(flag for flag in library.FLAGS if not flag.startswith("-m"))
-    monkeypatch.setattr(library, "FLAGS", plain)
+    monkeypatch.setattr(library, "FLAGS", (*plain, *vectors))
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     library.library.cache_clear()
     try:
@@ -259,7 +274,7 @@ def test_where_tiles_are_refused_vectors_say_exactly_the_same(
     library.library.cache_clear()
     try:
         vectors = _values(model, config, carry, actions)
-        assert library.library().depth() < 64
+        assert library.layout(library.library()).depth < 64
     finally:
         library.library.cache_clear()
     assert torch.equal(tiles, vectors)

@@ -5,8 +5,8 @@
  *
  * A wide input row x (K numbers) is kept as x = scale * (u - zero) + offset with u in 0..255: zero and
  * offset belong to its kind, scale to the row. Weights are w = weight_scale[n] * i, i in -127..127,
- * in blocks [N/16][K/4][16][4] of which one vector register holds the last two axes, and one tile of
- * AMX the last three for 64 of the inputs. Few, exact inputs (the action above all) stay in float32;
+ * in blocks [N/LANES][K/GROUP][LANES][GROUP] of which one vector register holds the last two axes, and
+ * one tile of AMX the last three for 64 of the inputs. Few, exact inputs (the action above all) stay in float32;
  * what a layer activates, and h, is in 16-bit fixed point (`words.h`).
  * The weights of a normalised layer are centred (their mean over the outputs is zero), and so are its
  * sums. No state, no allocation. */
@@ -167,8 +167,11 @@ static void block(const Network *net, const Root *root, int steps, const float *
     }
 }
 
-/* How many inputs a wide product takes at once; weights are filled up to that with zeros. */
-int32_t depth(void) { return DEPTH; }
+/* How wide products want their weights: inputs filled up to multiples of DEPTH with zeros, outputs in
+ * LANES, inputs in GROUPs. */
+void layout(int32_t *depth, int32_t *lanes, int32_t *group) {
+    *depth = DEPTH, *lanes = LANES, *group = GROUP;
+}
 
 /* Plans of one robot. */
 typedef struct {

@@ -5,13 +5,20 @@
 enum { WIDEST = 1024, MOST_FEW = 128, TOLD = 4, FEW_STRIDE = MOST_FEW + LANES };
 #if defined(TILES)
 enum { ROWS = 16, COLUMNS = 4, DEPTH = 64 }; /* a tile: rows, and inputs; and tiles that sum up */
+#elif defined(HALF_VECTORS)
+enum { ROWS = 8, COLUMNS = 1, DEPTH = 4 }; /* sums of a block of rows in half of the registers */
 #else
 enum { ROWS = 8, COLUMNS = 2, DEPTH = 4 };
+#endif
+#if defined(HALF_VECTORS)
+enum { GROUP = 2 }; /* inputs that an instruction multiplies and adds up */
+#else
+enum { GROUP = 4 };
 #endif
 
 typedef struct {
     int32_t inputs;       /* K, a multiple of DEPTH; 0: there is no such input */
-    const int8_t *weight; /* [N/16][K/4][16][4] */
+    const int8_t *weight; /* [N/LANES][K/GROUP][LANES][GROUP] */
     const float *scale;   /* [N] */
     const int32_t *start; /* [N] -zero * sum of the column's integers */
     const float *shift;   /* [N] offset * sum of the column's weights */
@@ -32,7 +39,7 @@ typedef struct {
 
 typedef struct { /* of few outputs, from words; weights in words, of which no sum leaves 32 bits */
     int32_t inputs, outputs; /* outputs: 1 or a multiple of 16; 0: there is no such layer */
-    const int16_t *weight;   /* [outputs/16][inputs/2][16][2]; of one output [inputs filled up to 32] */
+    const int16_t *weight;   /* [outputs/LANES][inputs/2][LANES][2]; of one output [inputs filled up to 32] */
     const float *scale;      /* [outputs] of a sum of products */
     const float *bias;       /* [outputs] */
 } Linear;
@@ -86,7 +93,7 @@ typedef struct {
 } Root;
 
 typedef struct {
-    uint8_t values[ROWS][WIDEST];
+    Byte values[ROWS][WIDEST];
     float scale[ROWS];
 } Bytes;
 

@@ -53,32 +53,40 @@ static void release_tiles(void) {}
 
 /* Dot products of a block of rows with `columns` times 16 outputs from `n` on. */
 INLINE void dots(const Wide *w, int n, int columns, const Bytes *in, Ints dot[][ROWS]) {
-    const int quads = w->inputs / 4;
+    const int groups = w->inputs / GROUP;
     const int8_t *weight = w->weight + (int64_t)n * w->inputs;
     for (int c = 0; c < columns; c++) {
         Ints start;
         memcpy(&start, w->start + n + c * LANES, sizeof start);
         for (int r = 0; r < ROWS; r++) dot[c][r] = start;
     }
-    for (int q = 0; q < quads; q++) {
+    for (int g = 0; g < groups; g++) {
 #if defined(WIDE_VECTORS)
         __m512i b[COLUMNS];
         for (int c = 0; c < columns; c++)
-            b[c] = _mm512_loadu_si512(weight + ((int64_t)c * quads + q) * 4 * LANES);
+            b[c] = _mm512_loadu_si512(weight + ((int64_t)c * groups + g) * GROUP * LANES);
         for (int r = 0; r < ROWS; r++) {
             int32_t four;
-            memcpy(&four, in->values[r] + 4 * q, sizeof four);
+            memcpy(&four, in->values[r] + GROUP * g, sizeof four);
             const __m512i x = _mm512_set1_epi32(four);
             for (int c = 0; c < columns; c++)
                 dot[c][r] = (Ints)_mm512_dpbusd_epi32((__m512i)dot[c][r], x, b[c]);
         }
+#elif defined(HALF_VECTORS)
+        for (int c = 0; c < columns; c++) {
+            const int8_t *two_by_lane = weight + ((int64_t)c * groups + g) * GROUP * LANES;
+            const __m256i b = _mm256_cvtepi8_epi16(_mm_loadu_si128((const __m128i *)two_by_lane));
+            for (int r = 0; r < ROWS; r++)
+                dot[c][r] = pairs(dot[c][r], again(in->values[r] + GROUP * g), (Words)b);
+        }
 #else
         for (int c = 0; c < columns; c++) {
-            const int8_t *four_by_lane = weight + ((int64_t)c * quads + q) * 4 * LANES;
+            const int8_t *group_by_lane = weight + ((int64_t)c * groups + g) * GROUP * LANES;
             for (int r = 0; r < ROWS; r++)
                 for (int i = 0; i < LANES; i++)
-                    for (int j = 0; j < 4; j++)
-                        dot[c][r][i] += (int32_t)in->values[r][4 * q + j] * four_by_lane[4 * i + j];
+                    for (int j = 0; j < GROUP; j++)
+                        dot[c][r][i] +=
+                            (int32_t)in->values[r][GROUP * g + j] * group_by_lane[GROUP * i + j];
         }
 #endif
     }
@@ -108,9 +116,11 @@ static void wide_product(const Wide *w, int outputs, const Bytes *in, const floa
     for (; n < outputs; n += LANES) columns_of_product(w, n, 1, in, from, from_stride, y, outputs);
 }
 
+enum { NARROW_COLUMNS = COLUMNS > 1 ? 2 : 1 };
+
 INLINE void columns_of_narrow(const Narrow *w, int inputs, int outputs, int n, int columns, const Few *x,
                               const float *from, float *y) {
-    Floats acc[2][ROWS];
+    Floats acc[NARROW_COLUMNS][ROWS];
     for (int c = 0; c < columns; c++)
         for (int r = 0; r < ROWS; r++) acc[c][r] = load(from + n + c * LANES);
     for (int k = 0; k < inputs; k++) {
@@ -127,7 +137,7 @@ INLINE void columns_of_narrow(const Narrow *w, int inputs, int outputs, int n, i
 static void narrow_product(const Narrow *w, int inputs, int outputs, const Few *x, const float *from,
                            float *y) {
     int n = 0;
-    for (; n + 2 * LANES <= outputs; n += 2 * LANES)
-        columns_of_narrow(w, inputs, outputs, n, 2, x, from, y);
+    for (; n + NARROW_COLUMNS * LANES <= outputs; n += NARROW_COLUMNS * LANES)
+        columns_of_narrow(w, inputs, outputs, n, NARROW_COLUMNS, x, from, y);
     for (; n < outputs; n += LANES) columns_of_narrow(w, inputs, outputs, n, 1, x, from, y);
 }

@@ -1,4 +1,4 @@
-/* Vectors of 16 floats and of 32 fixed-point numbers, with and without AVX-512. */
+/* Vectors of LANES floats and of twice as many fixed-point numbers: of AVX-512, of AVX2, or of neither. */
 #pragma once
 #include <math.h>
 #include <stdint.h>
@@ -7,14 +7,31 @@
 #define TILES 1
 #endif
 #if defined(__AVX512VNNI__) && defined(__AVX512BW__)
-#define WIDE_VECTORS 1
+#define WIDE_VECTORS 1 /* of 512 bits */
+#elif defined(__AVX2__) && defined(__FMA__)
+#define HALF_VECTORS 1 /* of 256 bits */
 #endif
-#if defined(WIDE_VECTORS) || defined(TILES)
+#if defined(WIDE_VECTORS) || defined(HALF_VECTORS) || defined(TILES)
 #include <immintrin.h>
 #endif
 #define INLINE static inline __attribute__((always_inline))
 
-enum { LANES = 16, WORDS = 32 };
+#if defined(WIDE_VECTORS)
+#define SIMD(name) _mm512_##name
+typedef __m512i Integers;
+typedef __m512 Numbers;
+#elif defined(HALF_VECTORS)
+#define SIMD(name) _mm256_##name
+typedef __m256i Integers;
+typedef __m256 Numbers;
+#endif
+
+#if defined(HALF_VECTORS)
+enum { LANES = 8 };
+#else
+enum { LANES = 16 };
+#endif
+enum { WORDS = 2 * LANES };
 
 typedef float Floats __attribute__((vector_size(4 * LANES)));
 typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
@@ -38,8 +55,8 @@ INLINE void store_words(int16_t *x, Words v) { memcpy(x, &v, sizeof v); }
 
 /* a b + c, rounded once where the processor can. */
 INLINE Floats fused(Floats a, Floats b, Floats c) {
-#if defined(WIDE_VECTORS)
-    return (Floats)_mm512_fmadd_ps((__m512)a, (__m512)b, (__m512)c);
+#if defined(SIMD)
+    return (Floats)SIMD(fmadd_ps)((Numbers)a, (Numbers)b, (Numbers)c);
 #else
     return a * b + c;
 #endif
@@ -50,6 +67,10 @@ INLINE Floats all_floats(float x) { return (Floats){0} + x; }
 INLINE float total(Floats v) {
 #if defined(WIDE_VECTORS)
     return _mm512_reduce_add_ps((__m512)v);
+#elif defined(HALF_VECTORS)
+    __m128 four = _mm_add_ps(_mm256_castps256_ps128((__m256)v), _mm256_extractf128_ps((__m256)v, 1));
+    four = _mm_add_ps(four, _mm_movehl_ps(four, four));
+    return _mm_cvtss_f32(_mm_add_ss(four, _mm_movehdup_ps(four)));
 #else
     float sum = 0.0f;
     for (int i = 0; i < LANES; i++) sum += v[i];
@@ -117,6 +138,10 @@ INLINE Words words_of(Floats a, Floats b) {
     const __m512i each =
         _mm512_packs_epi32(_mm512_cvtps_epi32((__m512)a), _mm512_cvtps_epi32((__m512)b));
     return (Words)_mm512_permutexvar_epi64(_mm512_setr_epi64(0, 2, 4, 6, 1, 3, 5, 7), each);
+#elif defined(HALF_VECTORS)
+    const __m256i each =
+        _mm256_packs_epi32(_mm256_cvtps_epi32((__m256)a), _mm256_cvtps_epi32((__m256)b));
+    return (Words)_mm256_permute4x64_epi64(each, 0xd8);
 #else
     Words v;
     for (int i = 0; i < WORDS; i++) {
@@ -138,8 +163,8 @@ INLINE Words first(Words v, int count) {
 }
 
 INLINE Words larger(Words a, Words b) {
-#if defined(WIDE_VECTORS)
-    return (Words)_mm512_max_epi16((__m512i)a, (__m512i)b);
+#if defined(SIMD)
+    return (Words)SIMD(max_epi16)((Integers)a, (Integers)b);
 #else
     const Words this = a > b;
     return (a & this) | (b & ~this);
@@ -148,8 +173,8 @@ INLINE Words larger(Words a, Words b) {
 
 /* Of -32768: itself, which is 32768 to whom words have no sign. */
 INLINE Words absolute(Words a) {
-#if defined(WIDE_VECTORS)
-    return (Words)_mm512_abs_epi16((__m512i)a);
+#if defined(SIMD)
+    return (Words)SIMD(abs_epi16)((Integers)a);
 #else
     const Words negative = a < 0;
     return (a ^ negative) - negative;
@@ -158,8 +183,8 @@ INLINE Words absolute(Words a) {
 
 /* a + b, at most the largest word and at least the least. */
 INLINE Words sum(Words a, Words b) {
-#if defined(WIDE_VECTORS)
-    return (Words)_mm512_adds_epi16((__m512i)a, (__m512i)b);
+#if defined(SIMD)
+    return (Words)SIMD(adds_epi16)((Integers)a, (Integers)b);
 #else
     for (int i = 0; i < WORDS; i++) {
         const int v = a[i] + b[i];
@@ -171,8 +196,8 @@ INLINE Words sum(Words a, Words b) {
 
 /* The same of words without a sign. */
 INLINE Words sum_of_unsigned(Words a, Words b) {
-#if defined(WIDE_VECTORS)
-    return (Words)_mm512_adds_epu16((__m512i)a, (__m512i)b);
+#if defined(SIMD)
+    return (Words)SIMD(adds_epu16)((Integers)a, (Integers)b);
 #else
     for (int i = 0; i < WORDS; i++) {
         const int v = (uint16_t)a[i] + (uint16_t)b[i];
@@ -184,8 +209,8 @@ INLINE Words sum_of_unsigned(Words a, Words b) {
 
 /* a b / 2^15, rounded. */
 INLINE Words product(Words a, Words b) {
-#if defined(WIDE_VECTORS)
-    return (Words)_mm512_mulhrs_epi16((__m512i)a, (__m512i)b);
+#if defined(SIMD)
+    return (Words)SIMD(mulhrs_epi16)((Integers)a, (Integers)b);
 #else
     for (int i = 0; i < WORDS; i++) a[i] = (int16_t)((a[i] * b[i] + (1 << 14)) >> 15);
     return a;
@@ -194,8 +219,8 @@ INLINE Words product(Words a, Words b) {
 
 /* a b / 2^16 of words without a sign, rounded down. */
 INLINE Words product_of_unsigned(Words a, Words b) {
-#if defined(WIDE_VECTORS)
-    return (Words)_mm512_mulhi_epu16((__m512i)a, (__m512i)b);
+#if defined(SIMD)
+    return (Words)SIMD(mulhi_epu16)((Integers)a, (Integers)b);
 #else
     for (int i = 0; i < WORDS; i++)
         a[i] = (int16_t)(uint16_t)(((uint32_t)(uint16_t)a[i] * (uint16_t)b[i]) >> 16);
@@ -207,6 +232,8 @@ INLINE Words product_of_unsigned(Words a, Words b) {
 INLINE Ints pairs(Ints sum, Words a, Words b) {
 #if defined(WIDE_VECTORS)
     return (Ints)_mm512_dpwssd_epi32((__m512i)sum, (__m512i)a, (__m512i)b);
+#elif defined(HALF_VECTORS)
+    return sum + (Ints)_mm256_madd_epi16((__m256i)a, (__m256i)b);
 #else
     for (int i = 0; i < LANES; i++) sum[i] += a[2 * i] * b[2 * i] + a[2 * i + 1] * b[2 * i + 1];
     return sum;
@@ -221,8 +248,8 @@ INLINE Words again(const int16_t *x) {
 }
 
 INLINE Words halved(Words a, int times) {
-#if defined(WIDE_VECTORS)
-    return (Words)_mm512_srai_epi16((__m512i)a, times);
+#if defined(SIMD)
+    return (Words)SIMD(srai_epi16)((Integers)a, times);
 #else
     return a >> times;
 #endif
@@ -246,6 +273,10 @@ INLINE int highest(Words v) {
 #if defined(WIDE_VECTORS)
     const __m256i half = _mm256_max_epi16(_mm512_castsi512_si256((__m512i)v),
                                           _mm512_extracti64x4_epi64((__m512i)v, 1));
+#elif defined(HALF_VECTORS)
+    const __m256i half = (__m256i)v;
+#endif
+#if defined(SIMD)
     const __m128i eight =
         _mm_max_epi16(_mm256_castsi256_si128(half), _mm256_extracti128_si256(half, 1));
     const __m128i lacking = _mm_minpos_epu16(_mm_sub_epi16(_mm_set1_epi16(0x7fff), eight));
@@ -257,12 +288,23 @@ INLINE int highest(Words v) {
 #endif
 }
 
-/* 64 words as bytes without a sign, to the nearest byte where there is none. */
-INLINE void store_bytes(uint8_t *u, Words a, Words b) {
+/* A number of eight bits without a sign, as `dots` reads it: AVX2 multiplies words. */
+#if defined(HALF_VECTORS)
+typedef int16_t Byte;
+#else
+typedef uint8_t Byte;
+#endif
+
+/* Two vectors of words as bytes, to the nearest byte where there is none. */
+INLINE void store_bytes(Byte *u, Words a, Words b) {
 #if defined(WIDE_VECTORS)
     const __m512i each = _mm512_packus_epi16((__m512i)a, (__m512i)b);
     _mm512_storeu_si512(u,
                         _mm512_permutexvar_epi64(_mm512_setr_epi64(0, 2, 4, 6, 1, 3, 5, 7), each));
+#elif defined(HALF_VECTORS)
+    const __m256i least = _mm256_setzero_si256(), most = _mm256_set1_epi16(255);
+    store_words(u, (Words)_mm256_min_epi16(_mm256_max_epi16((__m256i)a, least), most));
+    store_words(u + WORDS, (Words)_mm256_min_epi16(_mm256_max_epi16((__m256i)b, least), most));
 #else
     for (int i = 0; i < 2 * WORDS; i++) {
         const int x = i < WORDS ? a[i] : b[i - WORDS];

@@ -8,25 +8,59 @@
 
 enum { UNIT = 2048, NODES = 64, LEAST_SILU = 571 }; /* in words, negative */
 
+/* NODES words. */
 typedef struct {
-    Words value[2], slope[2];
+#if defined(HALF_VECTORS)
+    __m256i bytes[4]; /* of 16 nodes each: their low ones, then their high ones */
+#else
+    Words node[NODES / WORDS];
+#endif
+} Table;
+
+typedef struct {
+    Table value, slope;
 } Lines;
 
-/* From [2][NODES]: the values at the nodes, and half of what a piece rises. */
-INLINE Lines lines_of(const int16_t *table) {
-    return (Lines){{load_words(table), load_words(table + WORDS)},
-                   {load_words(table + NODES), load_words(table + NODES + WORDS)}};
+INLINE Table table_of(const int16_t *node) {
+    Table t;
+#if defined(HALF_VECTORS)
+    for (int i = 0; i < 4; i++) {
+        uint8_t bytes[2][16];
+        for (int j = 0; j < 16; j++)
+            bytes[0][j] = (uint8_t)node[16 * i + j], bytes[1][j] = (uint8_t)(node[16 * i + j] >> 8);
+        memcpy(t.bytes + i, bytes, sizeof bytes);
+    }
+#else
+    for (int i = 0; i < NODES / WORDS; i++) t.node[i] = load_words(node + i * WORDS);
+#endif
+    return t;
 }
 
+/* From [2][NODES]: the values at the nodes, and half of what a piece rises. */
+INLINE Lines lines_of(const int16_t *table) { return (Lines){table_of(table), table_of(table + NODES)}; }
+
 /* The entries at `index`, of which the last six bits count. */
-INLINE Words entries(const Words table[2], Words index) {
+INLINE Words entries(const Table *t, Words index) {
 #if defined(WIDE_VECTORS)
-    return (Words)_mm512_permutex2var_epi16((__m512i)table[0], (__m512i)index, (__m512i)table[1]);
+    return (Words)_mm512_permutex2var_epi16((__m512i)t->node[0], (__m512i)index, (__m512i)t->node[1]);
+#elif defined(HALF_VECTORS)
+    /* Bytes are looked up where the index is less than 16, and are zero where its highest bit is set. */
+    const __m256i words = _mm256_and_si256((__m256i)index, _mm256_set1_epi16(NODES - 1));
+    const __m256i at = _mm256_permute4x64_epi64(_mm256_packus_epi16(words, words), 0x88);
+    __m256i each = _mm256_setzero_si256();
+    for (int i = 0; i < 4; i++) {
+        const __m256i from = _mm256_xor_si256(at, _mm256_set1_epi8((char)(16 * i)));
+        const __m256i here = _mm256_adds_epu8(from, _mm256_set1_epi8(0x70));
+        each = _mm256_or_si256(each, _mm256_shuffle_epi8(t->bytes[i], here));
+    }
+    const __m256i other = _mm256_permute2x128_si256(each, each, 1);
+    return (Words)_mm256_permute2x128_si256(_mm256_unpacklo_epi8(each, other),
+                                            _mm256_unpackhi_epi8(each, other), 0x20);
 #else
     Words v;
     for (int i = 0; i < WORDS; i++) {
         const int at = index[i] & (NODES - 1);
-        v[i] = table[at / WORDS][at % WORDS];
+        v[i] = t->node[at / WORDS][at % WORDS];
     }
     return v;
 #endif
@@ -36,7 +70,7 @@ INLINE Words entries(const Words table[2], Words index) {
 INLINE Words on_lines(Lines l, Words far, const int bits) {
     const int below = 65536 - (NODES << bits); /* so that far places saturate */
     const Words node = right(sum_of_unsigned(far, all(below + (1 << (bits - 1)))), bits);
-    return entries(l.value, node) + product(entries(l.slope, node), left(far, 16 - bits));
+    return entries(&l.value, node) + product(entries(&l.slope, node), left(far, 16 - bits));
 }
 
 /* x in UNIT -> SiLU(x) = max(x, 0) + SiLU(-|x|) in UNIT. */
@@ -48,6 +82,8 @@ INLINE Words tanh_of(Lines l, Words x) {
 #if defined(WIDE_VECTORS)
     const __mmask32 negative = _mm512_movepi16_mask((__m512i)x);
     return (Words)_mm512_mask_sub_epi16((__m512i)v, negative, _mm512_setzero_si512(), (__m512i)v);
+#elif defined(HALF_VECTORS)
+    return (Words)_mm256_sign_epi16((__m256i)v, (__m256i)x); /* that of 0 is 0 */
 #else
     const Words negative = x < 0;
     return (v ^ negative) - negative;
@@ -55,7 +91,7 @@ INLINE Words tanh_of(Lines l, Words x) {
 }
 
 /* A row of a hidden layer as bytes x = scale * u - LEAST_SILU / UNIT; `most` bounds its words. */
-INLINE float bytes_of_hidden(const int16_t *x, int count, int most, uint8_t *u) {
+INLINE float bytes_of_hidden(const int16_t *x, int count, int most, Byte *u) {
     const int above = most + LEAST_SILU, rate = (int)(255.0f * 65536.0f / (float)above);
     const Words start = all(LEAST_SILU + above / 510), times = all(rate); /* + half a byte */
     for (int n = 0; n < count; n += 2 * WORDS)
@@ -65,7 +101,7 @@ INLINE float bytes_of_hidden(const int16_t *x, int count, int most, uint8_t *u) 
 }
 
 /* A row of h as bytes x = scale * (u - 128); `most` bounds its words. */
-INLINE float bytes_of_state(const int16_t *x, int count, int most, uint8_t *u) {
+INLINE float bytes_of_state(const int16_t *x, int count, int most, Byte *u) {
     const int rate = (int)(127.0f * 32768.0f / (float)(most > 128 ? most : 128));
     const Words zero = all(128), times = all(rate);
     for (int n = 0; n < count; n += 2 * WORDS)
