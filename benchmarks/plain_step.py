@@ -147,7 +147,8 @@ def pixel_weights(near: Tensor, batch: Batch, loss: LossConfig) -> Tensor:
     moving = F.pad(moving, (0, 0, 0, 0, 1, 0)) & ~batch.is_first[..., None, None]
     place = batch.passing[..., spec.IN_PICTURE].flatten(0, 1)
     disc = within(near.flatten(0, 1), place).view_as(near)
-    return (1 + loss.moving * moving.float()) * (~disc).float()
+    close = near > loss.near_threshold
+    return (1 + loss.moving * moving.float() + loss.near * close.float()) * (~disc).float()
 
 
 def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> Tensor:
@@ -179,6 +180,7 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
 
     weight = pixel_weights(near, batch, loss)
     error = (0.5 * (model.decode_state(features) - state) ** 2).mean(-1)
+    foreseen = foresight_terms(model, (h, z), near, state, weight, batch, generator)
     terms = [
         loss.depth * depth_loss(model, features, near, weight, batch, generator),
         loss.motion * motion_loss(model, features, sight, batch),
@@ -186,7 +188,7 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
         loss.state * mean_where(error, batch.valid),
         *kl_terms(model, (mean, std), (prior_mean, prior_std), batch),
         *value_terms(model, h, z, batch),
-        *foresight_terms(model, (h, z), near, state, weight, batch, generator),
+        *foreseen,
     ]
     return torch.stack(terms).sum()
 

@@ -3,7 +3,7 @@
 from egovcp.model.carry import Carry
 from egovcp.model.config import PRESETS, LossConfig, WorldModelConfig
 from egovcp.model.losses import Batch
-from egovcp.model.objective import world_model_loss
+from egovcp.model.objective import world_model_gradients, world_model_loss
 from egovcp.model.world_model import WorldModel
 
 __all__ = [
@@ -13,5 +13,6 @@ __all__ = [
     "LossConfig",
     "WorldModel",
     "WorldModelConfig",
+    "world_model_gradients",
     "world_model_loss",
 ]

@@ -24,6 +24,7 @@ from torch import Tensor
 
 from egovcp.model import flight
 from egovcp.model.carry import Carry
+from egovcp.model.config import LossConfig
 from egovcp.model.losses import Batch, Rollout, masked_mean, motion_error, motion_target, unbroken
 from egovcp.model.picture_error import picture_error
 from egovcp.model.recurrence import imagine_window
@@ -51,7 +52,7 @@ def foresight_losses(
     rollout: Rollout,
     batch: Batch,
     weight: Tensor,
-    generator: torch.Generator | None = None,
+    first: int,
 ) -> dict[str, Tensor]:
     """Picture, proprioception and what flies, of states imagined ``foresight_ahead`` ticks ahead.
 
@@ -60,13 +61,13 @@ def foresight_losses(
         rollout: the filtered batch.
         batch: what was recorded.
         weight: (B, T, H, W) of the pixels.
-        generator: draws the first row from which is imagined.
+        first: row from which is imagined, see `first_row`.
     """
     config = model.config.loss
     weights = Weights(config.foresight_depth, config.foresight_state, config.foresight_motion)
     if not any(weights):
         return {}
-    seen = imagine_ahead(model, rollout.carry, batch, config.foresight_ahead, generator)
+    seen = imagine_ahead(model, rollout.carry, batch, config.foresight_ahead, first)
     return _compare("foresight", model, seen, rollout, batch, weight, weights)
 
 
@@ -81,7 +82,8 @@ def autoregressive_losses(
     config = model.config.loss
     weights = Weights(config.depth, config.state, config.motion)
     ahead = range(1, config.autoregressive_steps + 1)
-    seen = imagine_ahead(model, rollout.carry, batch, ahead, generator)
+    first = first_row(model.config.loss, ahead, batch, generator)
+    seen = imagine_ahead(model, rollout.carry, batch, ahead, first)
     return _compare("autoregressive", model, seen, rollout, batch, weight, weights)
 
 
@@ -90,24 +92,35 @@ def imagine_ahead(
     carry: Carry,
     batch: Batch,
     ahead: Sequence[int],
-    generator: torch.Generator | None = None,
+    first: int,
 ) -> Imagined | None:
-    """Imagine ``ahead`` ticks from every n-th filtered state (B, T, ...) with the recorded actions;
-    None if the window is too short for any."""
+    """Imagine ``ahead`` ticks from every n-th filtered state (B, T, ...) on, beginning at row
+    ``first``, with the recorded actions; None if the window is too short for any."""
     length = batch.valid.shape[1]
     ahead = [k for k in ahead if k < length]
     if not ahead:
         return None
-    device = batch.state.device
-    every = min(model.config.loss.foresight_every, length - min(ahead))
-    first = int(torch.randint(every, (), generator=generator, device=device))
-    start = torch.arange(first, length - min(ahead), every, device=device)
+    every = _every(model.config.loss, ahead, length)
+    start = torch.arange(first, length - min(ahead), every, device=batch.state.device)
     starts = [start[start + k < length] for k in range(1, max(ahead) + 1)]
     found = _imagined(model, carry, batch, starts)
     seen = [_rows(carry, found[k - 1], starts[k - 1], k) for k in ahead]
     rows = torch.cat([starts[k - 1] + k for k in ahead])
     known = torch.cat([unbroken(batch, k)[:, starts[k - 1]] for k in ahead], 1)
     return Imagined(Carry.join(seen, lambda parts: torch.cat(parts, 1)), rows, known)
+
+
+def first_row(
+    config: LossConfig, ahead: Sequence[int], batch: Batch, generator: torch.Generator | None
+) -> int:
+    """The first of every n-th row from which `imagine_ahead` goes, drawn at random."""
+    every = _every(config, ahead, batch.valid.shape[1])
+    return int(torch.randint(every, (), generator=generator, device=batch.state.device))
+
+
+def _every(config: LossConfig, ahead: Sequence[int], length: int) -> int:
+    """n: at least one row is to be imagined from, if the window is long enough for any."""
+    return max(1, min(config.foresight_every, length - min(ahead, default=length)))
 
 
 def _imagined(

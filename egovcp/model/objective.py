@@ -1,15 +1,32 @@
-"""The training objective: equation 6, the sum of its terms."""
+"""The training objective: equation 6, the sum of its terms, and its gradient.
+
+What filtered states are asked for and what is foreseen from them share nothing but these states,
+and take about as long. So the gradient is found in three pieces: of either with respect to the
+states and the weights it uses, the two side by side where the processor has threads for both; and
+of the filter, back from the sum of the two.
+"""
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from egovcp.model import losses
-from egovcp.model.foresight import autoregressive_losses, foresight_losses
-from egovcp.model.losses import Batch
+from egovcp.model.beside import beside
+from egovcp.model.carry import Carry
+from egovcp.model.foresight import autoregressive_losses, first_row, foresight_losses
+from egovcp.model.gaussian import Gaussian
+from egovcp.model.losses import Batch, Rollout
 from egovcp.model.outcomes import value_and_termination_losses
+from egovcp.model.shared import WHOLE, present_share
 from egovcp.model.world_model import QHeads, WorldModel
+
+type Terms = dict[str, Tensor]
+type Part = Callable[[], Terms]
 
 
 def world_model_loss(
@@ -17,7 +34,7 @@ def world_model_loss(
     batch: Batch,
     generator: torch.Generator | None = None,
     heads: QHeads | None = None,
-) -> tuple[Tensor, dict[str, Tensor]]:
+) -> tuple[Tensor, Terms]:
     """Total loss of equation 6 and its terms (scalars, detached).
 
     Args:
@@ -26,21 +43,117 @@ def world_model_loss(
         generator: of the latent noise and of the drawn rows; None: torch's own.
         heads: of Q, for its TD target (`egovcp.model.td`); None: the model's own.
     """
-    config = model.config.loss
     rollout = losses.filter_sequence(model, batch, generator=generator)
+    told, foreseen = _parts(model, rollout, batch, generator, heads)
+    terms = told() | foreseen()
+    return _sum(terms), _named(terms)
+
+
+def world_model_gradients(
+    model: WorldModel,
+    batch: Batch,
+    generator: torch.Generator | None = None,
+    heads: QHeads | None = None,
+    precision: Callable[[], AbstractContextManager[object]] = nullcontext,
+) -> tuple[Tensor, Terms]:
+    """`world_model_loss`, detached, and its gradient in the ``grad`` of the model's parameters, in
+    the place of what was there.
+
+    Args:
+        model: the world model.
+        batch: windows.
+        generator: as there.
+        heads: as there.
+        precision: a context in which the losses, not their gradients, are computed.
+    """
+    parameters = [p for p in model.parameters() if p.requires_grad]
+    with precision():  # all of it: who leaves the last one takes casts of weights from the others
+        rollout = losses.filter_sequence(model, batch, generator=generator)
+        cut, outer, states = _cut(rollout)
+
+        def with_gradient(part: Part) -> tuple[Terms, list[Tensor | None]]:
+            with precision():
+                terms = part()
+                total = _sum(terms)
+            inputs = [*states, *parameters]
+            if not terms:
+                return terms, [None] * len(inputs)
+            with torch.autocast(batch.state.device.type, enabled=False):
+                return terms, list(torch.autograd.grad(total, inputs, allow_unused=True))
+
+        told, foreseen = _parts(model, cut, batch, generator, heads)
+        first, second = partial(with_gradient, told), partial(with_gradient, foreseen)
+        # Processes that share a batch meet at every mean, and so in one order.
+        if batch.state.device.type == "cpu" and present_share() is WHOLE:
+            (terms, gradients), (more, others) = beside(first, second)
+        else:
+            (terms, gradients), (more, others) = first(), second()
+    for parameter in parameters:
+        parameter.grad = None
+    ends = [*outer, *parameters]
+    known = [(x, g) for x, g in zip(2 * ends, gradients + others, strict=True) if g is not None]
+    torch.autograd.backward([x for x, _ in known], [g for _, g in known])  # adds up each end's
+    terms |= more
+    return _sum(terms).detach(), _named(terms)
+
+
+def _parts(
+    model: WorldModel,
+    rollout: Rollout,
+    batch: Batch,
+    generator: torch.Generator | None,
+    heads: QHeads | None,
+) -> tuple[Part, Part]:
+    """What filtered states are asked for, and what is foreseen from them; only the former draws."""
+    config = model.config.loss
     weight = losses.pixel_weights(rollout.near, batch, model)
-    depth = losses.depth_loss(model, rollout, batch.valid, weight, config.decode_every, generator)
-    terms = {
-        "depth": config.depth * depth,
-        "motion": config.motion * losses.motion_loss(model, rollout, batch),
-        "passing": config.passing * losses.passing_loss(model, rollout, batch),
-        "state": config.state * losses.state_loss(model, rollout, batch),
-    }
-    if model.config.dynamics == "joint":
-        terms |= losses.kl_losses(rollout, batch.valid, config)
-    else:
-        terms |= autoregressive_losses(model, rollout, batch, weight, generator)
-    terms |= value_and_termination_losses(model, rollout, batch, config, heads)
-    terms |= foresight_losses(model, rollout, batch, weight, generator)
-    total = torch.stack(list(terms.values())).sum()
-    return total, {f"loss/{name}": term.detach() for name, term in terms.items()}
+    first = first_row(config, config.foresight_ahead, batch, generator)
+
+    def told() -> Terms:
+        every = config.decode_every
+        depth = losses.depth_loss(model, rollout, batch.valid, weight, every, generator)
+        terms = {
+            "depth": config.depth * depth,
+            "motion": config.motion * losses.motion_loss(model, rollout, batch),
+            "passing": config.passing * losses.passing_loss(model, rollout, batch),
+            "state": config.state * losses.state_loss(model, rollout, batch),
+        }
+        if model.config.dynamics == "joint":
+            terms |= losses.kl_losses(rollout, batch.valid, config)
+        else:
+            terms |= autoregressive_losses(model, rollout, batch, weight, generator)
+        return terms | value_and_termination_losses(model, rollout, batch, config, heads)
+
+    def foreseen() -> Terms:
+        return foresight_losses(model, rollout, batch, weight, first)
+
+    return told, foreseen
+
+
+def _cut(rollout: Rollout) -> tuple[Rollout, list[Tensor], list[Tensor]]:
+    """A rollout whose gradient ends there; what its gradient goes on from, and where it ends."""
+    outer: list[Tensor] = []
+    inner: list[Tensor] = []
+
+    def ending(x: Tensor) -> Tensor:
+        if not x.requires_grad:
+            return x
+        outer.append(x)
+        inner.append(x.detach().requires_grad_())
+        return inner[-1]
+
+    cut = rollout._replace(
+        carry=Carry.map(rollout.carry, ending),
+        posterior=Gaussian(*map(ending, rollout.posterior)),
+        prior=Gaussian(*map(ending, rollout.prior)),
+        embedding=ending(rollout.embedding),
+    )
+    return cut, outer, inner
+
+
+def _sum(terms: Terms) -> Tensor:
+    return torch.stack(list(terms.values())).sum() if terms else torch.zeros(())
+
+
+def _named(terms: Terms) -> Terms:
+    return {f"loss/{name}": term.detach() for name, term in terms.items()}

@@ -47,6 +47,11 @@ def sharing(share: Share) -> Iterator[None]:
         _SHARE.reset(token)
 
 
+def present_share() -> Share:
+    """That of the losses which are being computed."""
+    return _SHARE.get()
+
+
 def over_all_rows(count: Tensor) -> Tensor:
     """A sum over this process' rows -> over the rows of the whole batch; not differentiable."""
     return _SHARE.get().add_up(count)

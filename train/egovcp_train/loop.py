@@ -6,12 +6,13 @@ import copy
 import math
 import time
 from collections.abc import Callable
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from egovcp.errors import DataError
-from egovcp.model import Batch, WorldModel, world_model_loss
+from egovcp.model import Batch, WorldModel, world_model_gradients
 from egovcp.model.shared import sharing
 from egovcp.model.td import SlowHeads
 from egovcp_train.config import OptimizerConfig
@@ -51,12 +52,13 @@ class Learner:
         self.model.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(progress)
-        with sharing(self.ranks.share), precision(batch.state.device, self.bf16):
-            heads = self.slow.heads if self.slow else None
-            loss, metrics = world_model_loss(self.model, batch, self.generator, heads)
-        self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        terms = {**metrics, "loss/total": loss.detach()}
+        heads = self.slow.heads if self.slow else None
+        in_precision = partial(precision, batch.state.device, self.bf16)
+        with sharing(self.ranks.share):
+            loss, metrics = world_model_gradients(
+                self.model, batch, self.generator, heads, in_precision
+            )
+        terms = {**metrics, "loss/total": loss}
         terms = self.ranks.add_up(self.model.parameters(), terms)
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
         if self._finite(norm + terms["loss/total"]):

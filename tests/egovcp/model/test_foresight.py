@@ -22,7 +22,7 @@ def _model(**loss: object) -> WorldModel:
 def _losses(model: WorldModel, batch: Batch) -> dict[str, torch.Tensor]:
     rollout = filter_sequence(model, batch, sample=False)
     weight = pixel_weights(rollout.near, batch, model)
-    return foresight_losses(model, rollout, batch, weight)
+    return foresight_losses(model, rollout, batch, weight, first=0)
 
 
 def test_it_is_the_error_of_the_state_imagined_so_far_ahead() -> None:
