@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 
 from egovcp.model import losses
-from egovcp.model.beside import beside
 from egovcp.model.carry import Carry
 from egovcp.model.foresight import autoregressive_losses, first_row, foresight_losses
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.losses import Batch, Rollout
 from egovcp.model.outcomes import value_and_termination_losses
 from egovcp.model.shared import WHOLE, present_share
+from egovcp.model.threads import beside
 from egovcp.model.world_model import QHeads, WorldModel
 
 type Terms = dict[str, Tensor]

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from egovcp.model import PRESETS, WorldModel, world_model_gradients, world_model_loss
-from egovcp.model.beside import beside
 from egovcp.model.config import LossConfig
+from egovcp.model.threads import beside, one_thread
 from egovcp.testing import CountingModel, random_batch, toy_model
 
 BF16 = partial(torch.autocast, "cpu", torch.bfloat16)
@@ -114,4 +114,10 @@ def test_an_error_of_either_is_raised_when_both_have_ended(fails: int, threads: 
     with pytest.raises(ValueError, match=f"part {fails}"):
         beside(partial(work, 0), partial(work, 1))
     assert ended == ([] if threads == 1 and fails == 0 else [1 - fails])
+    assert torch.get_num_threads() == threads
+
+
+def test_what_is_too_small_to_be_shared_has_one_thread(threads: int) -> None:
+    with one_thread():
+        assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == threads

@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from egovcp import spec
 from egovcp.data import EpisodeStore
+from egovcp.model.threads import one_thread
 from egovcp.robot.kinematics import rotate
 from egovcp_train.labels.camera import Array, turn
 from egovcp_train.labels.config import PassingConfig
@@ -27,12 +28,13 @@ from egovcp_train.labels.throw import Throw, find_throw
 def label(store: EpisodeStore, config: PassingConfig) -> EpisodeStore:
     """The same episodes with ``passing`` filled in."""
     passing = np.zeros((store.num_frames, spec.PASSING_DIM), dtype=np.float32)
-    episodes = zip(store.start, store.length, strict=True)
-    for start, length in tqdm(
-        episodes, total=len(store.start), unit="ep", desc="label", leave=False
-    ):
-        rows = slice(start, start + length)
-        passing[rows] = label_episode(store.depth[rows], store.state[rows], config)
+    spans = zip(store.start, store.length, strict=True)
+    with one_thread():
+        for start, length in tqdm(
+            spans, total=len(store.start), unit="ep", desc="label", leave=False
+        ):
+            rows = slice(start, start + length)
+            passing[rows] = label_episode(store.depth[rows], store.state[rows], config)
     return replace(store, passing=passing)
 
 

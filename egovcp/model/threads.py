@@ -1,4 +1,4 @@
-"""Two computations at once, each on its half of the processor's threads.
+"""Who gets the processor's threads: two computations at once, or a single one.
 
 Of many small operations a second thread helps with few. Two that have nothing to do with each other
 keep two busy.
@@ -6,8 +6,9 @@ keep two busy.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
+from contextlib import contextmanager
 from functools import cache
 
 import torch
@@ -35,6 +36,18 @@ def beside[A, B](first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]
         wait([task])  # nothing goes on behind the caller's back
         torch.set_num_threads(threads)
     return mine, task.result()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """What is computed within is too small to be shared: threads would wait for each other, and
+    beside another busy program for long."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 @cache
