@@ -16,7 +16,7 @@ static void take_tiles(void) {
 
 static void release_tiles(void) { _tile_release(); }
 
-/* Dot products of a block of rows with `columns` (COLUMNS or 1) times 16 outputs from `n` on. */
+/* Dot products of a block of rows with `columns` (COLUMNS or 1) times LANES outputs from `n` on. */
 INLINE void dots(const Wide *w, int n, int columns, const Bytes *in, Ints dot[][ROWS]) {
     const int8_t *weight = w->weight + (int64_t)n * w->inputs;
     const int column = LANES * w->inputs, tile = LANES * DEPTH, each = 4 * LANES;
@@ -51,7 +51,7 @@ static void take_tiles(void) {}
 
 static void release_tiles(void) {}
 
-/* Dot products of a block of rows with `columns` times 16 outputs from `n` on. */
+/* Dot products of a block of rows with `columns` times LANES outputs from `n` on. */
 INLINE void dots(const Wide *w, int n, int columns, const Bytes *in, Ints dot[][ROWS]) {
     const int groups = w->inputs / GROUP;
     const int8_t *weight = w->weight + (int64_t)n * w->inputs;
