@@ -11,7 +11,7 @@ export GOMP_SPINCOUNT := 20000
 .PHONY: help install quickstart test check bench build cards clean
 
 help:
-	@echo "make quickstart   install, then collect, train, evaluate and record the ball task (~11 min)"
+	@echo "make quickstart   install, then collect, train, evaluate and record the ball task (10 to 20 min)"
 	@echo "make test         the test suite"
 	@echo "make check        linter, formatter, type checker, lock file"
 	@echo "make bench        benchmarks, ratios measured side by side"
