@@ -36,7 +36,7 @@ def threads(request: pytest.FixtureRequest) -> Iterator[int]:
 
 
 def _gradients(model: WorldModel) -> dict[str, Tensor | None]:
-    return {name: None if p.grad is None else p.grad for name, p in model.named_parameters()}
+    return {name: p.grad for name, p in model.named_parameters()}
 
 
 @pytest.mark.parametrize("name", CONFIGS)
