@@ -66,6 +66,13 @@ class TrainingConfig:
     """Task -> horizon of the returns of its data, ticks, in its own model and in the multi-task
     one, '{arch: 50}'; where a task is not named, --returns.steps."""
 
+    @property
+    def budget(self) -> str:
+        """For how long a model is trained, in words."""
+        if self.max_minutes:
+            return f"{self.max_minutes:g} minutes"
+        return f"{self.steps} gradient steps"
+
 
 @dataclass(frozen=True)
 class PlayConfig:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from egovcp.artefact import MANIFEST
 from egovcp_experiment.cell import Cell, Output
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.report.document import Plot, Report, Table
@@ -161,3 +163,19 @@ def test_multitask_says_which_models_are_played_otherwise() -> None:
     alike = replace(small, play=replace(small.play, task_flags={}))
     plain = EXPERIMENTS["multitask"].report(alike, records("multitask", 1.0))
     assert "played with" not in str(plain.parts[0])
+
+
+def test_multitask_says_for_how_long_models_were_trained(tmp_path: Path) -> None:
+    def words(policies: dict[str, str]) -> str:
+        small = SCALES["small"]()
+        config = replace(small, train=replace(small.train, policies=policies))
+        return str(EXPERIMENTS["multitask"].report(config, records("multitask", 1.0)).parts[0])
+
+    assert words({}).startswith("Every model was trained for 10 minutes: the one on mixed data")
+    assert "Returns of arch reach 50 ticks" in words({})
+    (tmp_path / MANIFEST).write_text('{"step": 4321}')
+    some = words({"ball": str(tmp_path), "all": "me/model"})
+    assert "of ball alone, 4321 gradient steps; on mixed data, `me/model`. Every other" in some
+    assert "Returns of" not in some
+    every = words(dict.fromkeys(("ball", "wall", "arch", "all"), str(tmp_path)))
+    assert "10 minutes" not in every

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
+from egovcp.artefact import MANIFEST
 from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.experiment import Experiment
@@ -16,7 +18,7 @@ from egovcp_experiment.report.comparison import comparison
 from egovcp_experiment.report.document import Plot, Report, Table, number
 from egovcp_experiment.report.svg import drawn
 from egovcp_experiment.store import Record
-from egovcp_experiment.tools import study
+from egovcp_experiment.tools import read_json, study
 
 SINGLE: Final = "single"
 MIXED: Final = "mixed"
@@ -89,27 +91,50 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
 
 
 def _training(config: ExperimentConfig) -> str:
-    limit = config.train.max_minutes
-    words = f"{limit:g} minutes" if limit else f"{config.train.steps} gradient steps"
     horizons = "".join(
         f" Returns of {task} reach {steps} ticks, in its own model and in the mixed one."
         for task, steps in config.train.return_steps.items()
-        if task in config.tasks
+        if task in config.tasks and not {task, ALL} & config.train.policies.keys()
     )
+    return f"{_lengths(config)}{horizons}{_planners(config)}"
+
+
+def _lengths(config: ExperimentConfig) -> str:
+    """For how long the models were trained, those that were given included."""
+    given = {who: p for who, p in config.train.policies.items() if who in _models(config)}
+    if not given:
+        return (
+            f"Every model was trained for {config.train.budget}: the one on mixed data sees each "
+            f"task {len(config.tasks)} times less often than a single-task model does, and is told "
+            "nothing of which task it is."
+        )
+    named = "; ".join(f"{_models(config)[who]}, {_steps(path)}" for who, path in given.items())
+    rest = len(given) < len(_models(config))
+    others = f" Every other model was trained for {config.train.budget}." if rest else ""
     return (
-        f"Every model was trained for {words}: the one on mixed data sees each task "
-        f"{len(config.tasks)} times less often than a single-task model does, and is told nothing "
-        f"of which task it is.{horizons}{_planners(config)}"
+        f"Models that were there before (`--train.policies`): {named}.{others} The one on mixed "
+        "data is told nothing of which task it is."
     )
+
+
+def _steps(policy: str) -> str:
+    manifest = Path(policy).expanduser() / MANIFEST
+    if not manifest.is_file():
+        return f"`{policy}`"  # on the Hub
+    return f"{read_json(manifest)['step']} gradient steps"
+
+
+def _models(config: ExperimentConfig) -> dict[str, str]:
+    """Task, or `ALL` -> what its model is called."""
+    return {**{task: f"of {task} alone" for task in config.tasks}, ALL: "on mixed data"}
 
 
 def _planners(config: ExperimentConfig) -> str:
     """In what the models' planners differ; empty if they do not."""
-    who = {**{task: f"of {task} alone" for task in config.tasks}, ALL: "on mixed data"}
     own = config.play.task_flags
     return "".join(
         f" The model {words} is played with `{' '.join(own[model])}`."
-        for model, words in who.items()
+        for model, words in _models(config).items()
         if own.get(model)
     )
 

@@ -105,12 +105,10 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
 
 
 def _training(config: ExperimentConfig) -> str:
-    limit = config.train.max_minutes
-    words = f"{limit:g} minutes" if limit else f"{config.train.steps} gradient steps"
     return (
-        f"Every model was trained for {words} on the first episodes of one random dataset, "
-        "whatever their number; a twentieth of them is held out. The model-free baseline (PPO, "
-        "dashed) makes its transitions itself: its curve is one training, which updates "
+        f"Every model was trained for {config.train.budget} on the first episodes of one random "
+        "dataset, whatever their number; a twentieth of them is held out. The model-free baseline "
+        "(PPO, dashed) makes its transitions itself: its curve is one training, which updates "
         "as it goes."
     )
 
