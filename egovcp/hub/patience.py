@@ -68,6 +68,19 @@ def patient(patience: Patience) -> Iterator[None]:
         line.close()
 
 
+def is_plain() -> bool:
+    """Whether requests go out as the library sends them by itself, and not by a client with a
+    proxy, certificates or the like that this process has set."""
+    from huggingface_hub.utils import _http
+
+    factory = _http._GLOBAL_CLIENT_FACTORY
+    line = getattr(factory, "__self__", None)
+    while isinstance(line, Line):
+        factory = line._before
+        line = getattr(factory, "__self__", None)
+    return factory is _http.default_client_factory
+
+
 class Line:
     """`patient` for many blocks: connections stay open in between, threads share them.
 

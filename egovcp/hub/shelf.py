@@ -11,9 +11,10 @@ from typing import Any, Final, Self
 from tqdm import tqdm
 
 from egovcp.errors import DataError, EgovcpError
+from egovcp.hub.carrier import Errand, carrier
 from egovcp.hub.failures import explained, token
 from egovcp.hub.fetch import snapshot
-from egovcp.hub.patience import Line, Patience
+from egovcp.hub.patience import Line, Patience, is_plain
 
 #: Files that come at a time: one connection rarely fills a line to the Hub.
 AHEAD: Final = 3
@@ -37,7 +38,7 @@ class Shelf:
     def __init__(self, repo_id: str, folder: Path, cache_dir: Path, patience: Patience) -> None:
         """See `open`; the folder is named by the commit."""
         self.repo_id, self.folder, self.commit = repo_id, folder, folder.name
-        self._cache_dir, self._line = cache_dir, Line(patience)
+        self._cache_dir, self._patience, self._line = cache_dir, patience, Line(patience)
         self._here: set[str] = set()
         self._locks: dict[str, threading.Lock] = {}
         self._coming: dict[str, threading.Thread] = {}
@@ -95,10 +96,26 @@ class Shelf:
 
     def _try(self, name: str) -> None:
         try:
-            with contextlib.suppress(EgovcpError, OSError):
-                self.bring(name)
+            with (
+                self._locks.setdefault(name, threading.Lock()),
+                contextlib.suppress(EgovcpError, OSError),
+            ):
+                if not self._carried(name):
+                    self._fetch(name)
         finally:
             del self._coming[name]
+
+    def _carried(self, name: str) -> bool:
+        """Whether the file is here, or came by a process that takes no time of this one's."""
+        if self.has(name):
+            return True
+        if not is_plain():
+            return False
+        from huggingface_hub import constants
+
+        where = (str(self._cache_dir), constants.ENDPOINT)
+        errand = Errand(self.repo_id, self.commit, name, *where, token(), self._patience.timeout_s)
+        return carrier().carry(errand) and self.has(name)
 
     def _fetch(self, name: str) -> None:
         if self.has(name):  # whoever held the lock brought it

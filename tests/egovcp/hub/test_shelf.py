@@ -48,14 +48,14 @@ def test_a_file_that_is_on_its_way_is_not_asked_for_twice(
     shelf: Shelf, hub: FakeHub, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     begun, go_on = threading.Event(), threading.Event()
-    fetch = Shelf._fetch
+    carried = Shelf._carried
 
-    def slow(self: Shelf, name: str) -> None:
+    def slow(self: Shelf, name: str) -> bool:
         begun.set()
         go_on.wait(20)
-        fetch(self, name)
+        return carried(self, name)
 
-    monkeypatch.setattr(Shelf, "_fetch", slow)
+    monkeypatch.setattr(Shelf, "_carried", slow)
     hub.heal()
     shelf.expect([DATA])
     assert begun.wait(20)

@@ -1,0 +1,135 @@
+"""Files that a process beside this one brings."""
+
+import io
+import json
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import httpx
+import huggingface_hub
+import pytest
+from huggingface_hub.utils import _http
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.hub import Patience, Publication, Shelf, publish
+from egovcp.hub import shelf as shelves
+from egovcp.hub.carrier import Carrier, Errand, serve
+from egovcp.hub.patience import Line, is_plain
+from egovcp.testing.hub import FakeHub
+
+DATA = "data/chunk-000/file-000.parquet"
+
+
+@pytest.fixture
+def carrier(monkeypatch: pytest.MonkeyPatch) -> Iterator[Carrier]:
+    """One that is ready, in the place of the process's own."""
+    found = Carrier()
+    monkeypatch.setattr(shelves, "carrier", lambda: found)
+    _until(lambda: found._ready)
+    yield found
+    found.close()
+
+
+@pytest.fixture
+def shelf(hub: FakeHub, publication: Publication, quick: Patience, tmp_path: Path) -> Shelf:
+    publish(publication, quick)
+    return Shelf.open("me/small", "", quick, tmp_path / "cache", ["meta/*"])
+
+
+def _until(true: Callable[[], object], seconds: float = 60.0) -> None:
+    end = time.monotonic() + seconds
+    while not true():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def _expect(shelf: Shelf) -> None:
+    shelf.expect([DATA])
+    _until(lambda: not shelf._coming)
+
+
+def _errand(hub: FakeHub, shelf: Shelf) -> Errand:
+    return Errand("me/small", shelf.commit, DATA, str(shelf._cache_dir), hub.endpoint, None, 5.0)
+
+
+def test_what_is_expected_comes_by_the_process(
+    carrier: Carrier, shelf: Shelf, publication: Publication, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Shelf, "_fetch", lambda *_: pytest.fail("fetched by this process"))
+    _expect(shelf)
+    assert shelf.bring(DATA).read_bytes() == publication.contents[DATA].source
+
+
+def test_what_the_process_fails_to_bring_is_fetched_as_ever(
+    carrier: Carrier, shelf: Shelf, hub: FakeHub
+) -> None:
+    hub.fail("*", 503)
+    assert not carrier.carry(_errand(hub, shelf))
+    _expect(shelf)
+    with pytest.raises(EnvironmentFailure, match="503"):
+        shelf.bring(DATA)
+    hub.heal()
+    _expect(shelf)
+    assert shelf.has(DATA)
+
+
+def test_a_process_that_dies_leaves_nobody_waiting(
+    carrier: Carrier, shelf: Shelf, hub: FakeHub
+) -> None:
+    assert carrier._process is not None
+    os.kill(carrier._process.pid, signal.SIGSTOP)
+    with ThreadPoolExecutor(1) as pool:
+        answer = pool.submit(carrier.carry, _errand(hub, shelf))
+        _until(lambda: carrier._waiting)
+        os.kill(carrier._process.pid, signal.SIGKILL)
+        assert not answer.result(20)
+    assert not carrier.carry(_errand(hub, shelf))
+    _expect(shelf)
+    assert shelf.has(DATA)
+
+
+def test_the_process_ends_with_whoever_has_it(carrier: Carrier) -> None:
+    assert carrier._process is not None
+    carrier.close()
+    assert carrier._process.returncode == 0
+
+
+def test_it_starts_nothing_that_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.executable", "/nowhere/python")
+    found = Carrier()
+    assert not found.carry(Errand("me/small", "", DATA, "", "", None, 1.0))
+    found.close()
+
+
+def test_errands_are_answered_by_their_numbers(hub: FakeHub, shelf: Shelf) -> None:
+    good = _errand(hub, shelf)
+    orders = [[7, vars(good)], [8, {**vars(good), "name": "data/other.parquet"}]]
+    answers = io.StringIO()
+    serve(io.StringIO("".join(json.dumps(order) + "\n" for order in orders)), answers)
+    _until(lambda: answers.getvalue().count("\n") == 3)
+    said = [json.loads(line) for line in answers.getvalue().splitlines()]
+    assert said[0] is None
+    assert sorted(said[1:]) == [[7, True], [8, False]]
+
+
+def test_a_client_of_ones_own_is_used(
+    shelf: Shelf, quick: Patience, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(shelves, "carrier", lambda: pytest.fail("by a process without it"))
+    assert is_plain()
+    before = _http._GLOBAL_CLIENT_FACTORY
+    huggingface_hub.set_client_factory(lambda: httpx.Client(follow_redirects=True))
+    try:
+        assert not is_plain()
+        with Line(quick).open():
+            assert not is_plain()
+        _expect(shelf)
+        assert shelf.has(DATA)
+    finally:
+        huggingface_hub.set_client_factory(before)
+    with Line(quick).open():
+        assert is_plain()
