@@ -20,14 +20,23 @@ import sys
 import threading
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
-from functools import cache
-from typing import IO, Final
+from typing import IO, Any, Final
+
+from tqdm import tqdm
 
 from egovcp.hub.patience import Line, Patience
 
 _LOG = logging.getLogger(__name__)
-_WORKERS: Final = 4
+_WORKERS: Final = 16  # more than are asked for at a time: shelves limit themselves
 _FAREWELL_S: Final = 5.0
+
+
+class _NoBar(tqdm):  # type: ignore[misc]
+    """A progress bar that does not appear in the middle of another one."""
+
+    def __init__(self, *args: Any, **options: Any) -> None:
+        options.pop("name", None)  # what Hugging Face's own bars take
+        super().__init__(*args, **options | {"disable": True})
 
 
 @dataclass(frozen=True)
@@ -40,21 +49,34 @@ class Errand:
     cache_dir: str
     endpoint: str
     token: str | None
-    timeout_s: float
-    """Longest silence within a request, s."""
+
+    def run(self) -> None:
+        """Bring it, or go on with what has come of it; raises what the library raises."""
+        from huggingface_hub import hf_hub_download
+
+        hf_hub_download(
+            self.repo_id,
+            self.name,
+            repo_type="dataset",
+            revision=self.commit,
+            cache_dir=self.cache_dir,
+            endpoint=self.endpoint,
+            token=self.token or False,
+            tqdm_class=_NoBar,
+        )
 
 
 class Carrier:
     """The process. It is ready a second after it was started, and not started again if it dies."""
 
-    def __init__(self) -> None:
-        """Start it."""
+    def __init__(self, timeout_s: float) -> None:
+        """Start it; ``timeout_s`` is the longest silence within a request."""
         self._lock = threading.Lock()
         self._numbers = itertools.count()
         self._waiting: dict[int, Future[bool]] = {}
         self._ready = False
         self._owner = os.getpid()
-        self._process = _started()
+        self._process = _started(timeout_s)
         if self._process is not None:
             threading.Thread(target=self._listen, args=(self._process,), daemon=True).start()
             atexit.register(self.close)
@@ -108,20 +130,23 @@ class Carrier:
         _LOG.debug("the process that brings files has ended; this one brings them")
 
 
-def carrier() -> Carrier:
-    """The carrier of this process, started by the first call."""
-    return _of(os.getpid())
+_carriers: dict[tuple[int, float], Carrier] = {}  # a fork's are its own
+_making = threading.Lock()
 
 
-@cache
-def _of(process: int) -> Carrier:
-    return Carrier()
+def carrier(timeout_s: float) -> Carrier:
+    """The one of this process with that limit of time, started by the first call."""
+    with _making:
+        key = (os.getpid(), timeout_s)
+        if key not in _carriers:
+            _carriers[key] = Carrier(timeout_s)
+        return _carriers[key]
 
 
-def _started() -> subprocess.Popen[str] | None:
+def _started(timeout_s: float) -> subprocess.Popen[str] | None:
     try:
         return subprocess.Popen(
-            [sys.executable, "-P", "-m", __name__],
+            [sys.executable, "-P", "-m", __name__, str(timeout_s)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL,  # what goes wrong is told by who tries next
@@ -133,55 +158,31 @@ def _started() -> subprocess.Popen[str] | None:
         return None
 
 
-class _Lines:
-    """A line to the Hub for each limit of time; one try each, for others follow."""
+def serve(orders: IO[str], answers: IO[str], timeout_s: float) -> None:
+    """Do the errands of ``orders``, several at a time, until it ends.
 
-    def __init__(self) -> None:
-        self._lines: dict[float, Line] = {}
-        self._lock = threading.Lock()
-
-    def of(self, timeout_s: float) -> Line:
-        with self._lock:
-            patience = Patience(attempts=1, timeout_s=timeout_s)
-            return self._lines.setdefault(timeout_s, Line(patience))
-
-
-def _bring(errand: Errand, lines: _Lines) -> bool:
-    from huggingface_hub import hf_hub_download
-
-    try:
-        with lines.of(errand.timeout_s).open():
-            hf_hub_download(
-                errand.repo_id,
-                errand.name,
-                repo_type="dataset",
-                revision=errand.commit,
-                cache_dir=errand.cache_dir,
-                endpoint=errand.endpoint,
-                token=errand.token or False,
-            )
-    except Exception:  # noqa: BLE001  whatever it is: who asked tries again, and explains
-        return False
-    return True
-
-
-def serve(orders: IO[str], answers: IO[str]) -> None:
-    """Do the errands of ``orders``, several at a time, until it ends: lines of JSON, [number,
-    fields of `Errand`]. ``answers`` gets ``null`` first and then [number, whether it was brought]
-    for each."""
+    Args:
+        orders: lines of JSON, [number, fields of `Errand`].
+        answers: gets ``null`` first and then, for each, [number, whether it was brought].
+        timeout_s: longest silence within a request, s.
+    """
     import huggingface_hub.file_download  # noqa: F401  takes a while, so before the first errand
-    from huggingface_hub.utils.tqdm import disable_progress_bars
 
-    lines, lock = _Lines(), threading.Lock()
+    line, lock = Line(Patience(attempts=1, timeout_s=timeout_s)), threading.Lock()
 
     def say(what: object) -> None:
         with lock:
             print(json.dumps(what), file=answers, flush=True)
 
     def run(number: int, errand: Errand) -> None:
-        say([number, _bring(errand, lines)])
+        try:
+            with line.open():
+                errand.run()
+        except Exception:  # noqa: BLE001  whatever it is: who asked tries again, and explains
+            say([number, False])
+        else:
+            say([number, True])
 
-    disable_progress_bars()
     pool = ThreadPoolExecutor(_WORKERS)
     say(None)
     for order in orders:
@@ -193,7 +194,7 @@ def serve(orders: IO[str], answers: IO[str]) -> None:
 def main() -> None:
     """Entry point of the process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    serve(sys.stdin, sys.stdout)
+    serve(sys.stdin, sys.stdout, float(sys.argv[1]))
     os._exit(
         0
     )  # whoever wanted the files has ended; what is half brought, the next one goes on with

@@ -75,9 +75,8 @@ def is_plain() -> bool:
 
     factory = _http._GLOBAL_CLIENT_FACTORY
     line = getattr(factory, "__self__", None)
-    while isinstance(line, Line):
+    if isinstance(line, Line):  # another thread is in its block
         factory = line._before
-        line = getattr(factory, "__self__", None)
     return factory is _http.default_client_factory
 
 

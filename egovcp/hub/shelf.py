@@ -6,9 +6,7 @@ import contextlib
 import threading
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, Final, Self
-
-from tqdm import tqdm
+from typing import Final, Self
 
 from egovcp.errors import DataError, EgovcpError
 from egovcp.hub.carrier import Errand, carrier
@@ -18,14 +16,6 @@ from egovcp.hub.patience import Line, Patience, is_plain
 
 #: Files that come at a time: one connection rarely fills a line to the Hub.
 AHEAD: Final = 3
-
-
-class _NoBar(tqdm):  # type: ignore[misc]
-    """A progress bar that does not appear in the middle of another one."""
-
-    def __init__(self, *args: Any, **options: Any) -> None:
-        options.pop("name", None)  # what Hugging Face's own bars take
-        super().__init__(*args, **options | {"disable": True})
 
 
 class Shelf:
@@ -111,31 +101,24 @@ class Shelf:
             return True
         if not is_plain():
             return False
-        from huggingface_hub import constants
-
-        where = (str(self._cache_dir), constants.ENDPOINT)
-        errand = Errand(self.repo_id, self.commit, name, *where, token(), self._patience.timeout_s)
-        return carrier().carry(errand) and self.has(name)
+        return carrier(self._patience.timeout_s).carry(self._errand(name)) and self.has(name)
 
     def _fetch(self, name: str) -> None:
         if self.has(name):  # whoever held the lock brought it
             return
         with explained(self.repo_id, self.commit), self._line.open():
-            from huggingface_hub import hf_hub_download
             from huggingface_hub.errors import EntryNotFoundError
 
             try:
-                hf_hub_download(
-                    self.repo_id,
-                    name,
-                    repo_type="dataset",
-                    revision=self.commit,
-                    cache_dir=self._cache_dir,
-                    token=token(),
-                    tqdm_class=_NoBar,
-                )
+                self._errand(name).run()
             except EntryNotFoundError as error:
                 raise DataError(
                     f"{self.repo_id}@{self.commit} has no {name}; the dataset on the Hub is "
                     "incomplete"
                 ) from error
+
+    def _errand(self, name: str) -> Errand:
+        from huggingface_hub import constants
+
+        cache_dir, endpoint = str(self._cache_dir), constants.ENDPOINT
+        return Errand(self.repo_id, self.commit, name, cache_dir, endpoint, token())

@@ -120,7 +120,7 @@ def _lengths(config: ExperimentConfig) -> str:
 def _steps(policy: str) -> str:
     manifest = Path(policy).expanduser() / MANIFEST
     if not manifest.is_file():
-        return f"`{policy}`"  # on the Hub
+        return f"`{policy}`"  # on the Hub, or gone since
     return f"{read_json(manifest)['step']} gradient steps"
 
 

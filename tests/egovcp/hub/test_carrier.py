@@ -4,6 +4,8 @@ import io
 import json
 import os
 import signal
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -11,11 +13,13 @@ from pathlib import Path
 
 import httpx
 import huggingface_hub
+import psutil
 import pytest
 from huggingface_hub.utils import _http
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.hub import Patience, Publication, Shelf, publish
+from egovcp.hub import carrier as carriers
 from egovcp.hub import shelf as shelves
 from egovcp.hub.carrier import Carrier, Errand, serve
 from egovcp.hub.patience import Line, is_plain
@@ -27,8 +31,8 @@ DATA = "data/chunk-000/file-000.parquet"
 @pytest.fixture
 def carrier(monkeypatch: pytest.MonkeyPatch) -> Iterator[Carrier]:
     """One that is ready, in the place of the process's own."""
-    found = Carrier()
-    monkeypatch.setattr(shelves, "carrier", lambda: found)
+    found = Carrier(20.0)
+    monkeypatch.setattr(shelves, "carrier", lambda _: found)
     _until(lambda: found._ready)
     yield found
     found.close()
@@ -53,7 +57,7 @@ def _expect(shelf: Shelf) -> None:
 
 
 def _errand(hub: FakeHub, shelf: Shelf) -> Errand:
-    return Errand("me/small", shelf.commit, DATA, str(shelf._cache_dir), hub.endpoint, None, 5.0)
+    return Errand("me/small", shelf.commit, DATA, str(shelf._cache_dir), hub.endpoint, None)
 
 
 def test_what_is_expected_comes_by_the_process(
@@ -98,10 +102,38 @@ def test_the_process_ends_with_whoever_has_it(carrier: Carrier) -> None:
     assert carrier._process.returncode == 0
 
 
+def test_the_process_ends_with_a_killed_one() -> None:
+    script = (
+        "import time; from egovcp.hub.carrier import Carrier; c = Carrier(5.0)\n"
+        "while not c._ready: time.sleep(0.01)\n"
+        "print(c._process.pid, flush=True); time.sleep(60)"
+    )
+    command = [sys.executable, "-c", script]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as owner:
+        assert owner.stdout is not None
+        child = psutil.Process(int(owner.stdout.readline()))
+        owner.kill()
+    _until(lambda: not child.is_running() or child.status() == psutil.STATUS_ZOMBIE)
+
+
+def test_threads_that_come_at_once_share_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[float] = []
+
+    def slow(timeout_s: float) -> None:
+        time.sleep(0.1)
+        made.append(timeout_s)
+
+    monkeypatch.setattr(carriers, "_carriers", {})
+    monkeypatch.setattr(carriers, "Carrier", slow)
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(carriers.carrier, [5.0] * 3))
+    assert made == [5.0]
+
+
 def test_it_starts_nothing_that_cannot_be_started(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("sys.executable", "/nowhere/python")
-    found = Carrier()
-    assert not found.carry(Errand("me/small", "", DATA, "", "", None, 1.0))
+    found = Carrier(1.0)
+    assert not found.carry(Errand("me/small", "", DATA, "", "", None))
     found.close()
 
 
@@ -109,7 +141,7 @@ def test_errands_are_answered_by_their_numbers(hub: FakeHub, shelf: Shelf) -> No
     good = _errand(hub, shelf)
     orders = [[7, vars(good)], [8, {**vars(good), "name": "data/other.parquet"}]]
     answers = io.StringIO()
-    serve(io.StringIO("".join(json.dumps(order) + "\n" for order in orders)), answers)
+    serve(io.StringIO("".join(json.dumps(order) + "\n" for order in orders)), answers, 5.0)
     _until(lambda: answers.getvalue().count("\n") == 3)
     said = [json.loads(line) for line in answers.getvalue().splitlines()]
     assert said[0] is None
@@ -119,7 +151,7 @@ def test_errands_are_answered_by_their_numbers(hub: FakeHub, shelf: Shelf) -> No
 def test_a_client_of_ones_own_is_used(
     shelf: Shelf, quick: Patience, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shelves, "carrier", lambda: pytest.fail("by a process without it"))
+    monkeypatch.setattr(shelves, "carrier", lambda _: pytest.fail("by a process without it"))
     assert is_plain()
     before = _http._GLOBAL_CLIENT_FACTORY
     huggingface_hub.set_client_factory(lambda: httpx.Client(follow_redirects=True))
