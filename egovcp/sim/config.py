@@ -116,7 +116,10 @@ class WallConfig:
     impact_force: float = 300.0
     """Hand force that costs ``impact_cost`` in full, N."""
     pose_cost: float = 0.03
-    """Per tick, times the mean squared action; makes a permanent guard expensive."""
+    """Per tick, times the mean squared action."""
+    guard_cost: float = 0.27
+    """In addition, as long as nothing has pushed: an episode stands for a life in which pushes are
+    rarer, and waiting for one with raised hands is paid for all the while."""
     fall_cost: float = 1.0
     """Once, at a fall."""
 

@@ -23,7 +23,7 @@ _BRACE_FORCE: Final = 5.0  # N, a hand that presses less only brushes the wall
 class WallTask(Task):
     """One push, towards the wall or (sometimes) away from it, at the event."""
 
-    terms: ClassVar = ("brace", "upright", "contact", "impact", "pose", "fall")
+    terms: ClassVar = ("brace", "upright", "contact", "impact", "pose", "guard", "fall")
 
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
         super().__init__(config, scenario, robot)
@@ -92,10 +92,12 @@ class WallTask(Task):
         return 0.0 <= self.since_event <= self._disturbed_time
 
     def rewards(self, action: Array) -> dict[str, float]:
-        """``brace`` and ``upright`` while disturbed; contact, impact and pose in every tick."""
+        """``brace`` and ``upright`` while disturbed; contact, impact and pose in every tick,
+        ``guard`` before the push."""
         c = self.config
         hand_force = float(self.forces[_HANDS].max())
         upright = math.cos(self.robot.tilt) if self.disturbed else 0.0
+        pose = float(np.mean(action**2))
         leaning = bool(self.forces[_OTHERS].any())
         braced = hand_force > _BRACE_FORCE and not leaning and not self.away
         return {
@@ -103,7 +105,8 @@ class WallTask(Task):
             "upright": c.upright_reward * upright,
             "contact": -c.contact_cost * leaning,
             "impact": -c.impact_cost * min(1.0, hand_force / c.impact_force),
-            "pose": -c.pose_cost * float(np.mean(action**2)),
+            "pose": -c.pose_cost * pose,
+            "guard": -c.guard_cost * pose if self.since_event < 0.0 else 0.0,
         }
 
     @property

@@ -7,7 +7,7 @@ import pytest
 
 from egovcp.errors import UsageError
 from egovcp.robot.stance import StanceController
-from egovcp.sim.config import ArchConfig, BallConfig, EnvConfig, WallConfig
+from egovcp.sim.config import ArchConfig, BallConfig, EnvConfig, EpisodeConfig, WallConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.robot import Touch
 from egovcp.sim.scenario import Scenario
@@ -137,6 +137,21 @@ def test_leaving_the_neutral_pose_costs(env: VectorEnv) -> None:
     task = thrown(env)
     assert task.rewards(np.zeros(ACTION_DIM))["pose"] == 0.0
     assert task.rewards(np.ones(ACTION_DIM))["pose"] == pytest.approx(-task.config.pose_cost)
+
+
+@pytest.mark.parametrize(("empty", "dear"), [(0.0, 4), (1.0, 8)])
+def test_a_guard_at_the_wall_costs_more_until_the_push(
+    config: EnvConfig, empty: float, dear: int
+) -> None:
+    timing = EpisodeConfig(ticks=20, event_ticks=(5, 5), empty_probability=empty)
+    env = VectorEnv(replace(config, wall_episode=timing), 1)
+    begin(env, "wall")
+    guard = np.full((1, ACTION_DIM), 0.25)  # within what one tick allows
+    terms = [env.step(guard).reward_terms for _ in range(8)]
+    # the fifth tick ends when the push begins, and counts as disturbed
+    expected = [-config.wall.guard_cost / 16] * dear + [0.0] * (8 - dear)
+    assert [float(t["guard"][0]) for t in terms] == pytest.approx(expected)
+    assert [float(t["pose"][0]) for t in terms] == pytest.approx([-config.wall.pose_cost / 16] * 8)
 
 
 def test_a_push_gives_the_base_its_speed(config: EnvConfig) -> None:
