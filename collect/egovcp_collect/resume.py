@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
-import draccus
-
 from egovcp.data import Provenance
 from egovcp.errors import UsageError
-from egovcp_collect.config import SHAPING, CollectConfig
+from egovcp_collect.older import completed
 
 _SHOWN: Final = 5
 
@@ -19,7 +17,7 @@ def require_same(now: Provenance, before: Provenance) -> None:
     what = {
         "--seed": (before.seed, now.seed),
         "low-level controller": (before.controller_id, now.controller_id),
-        **dict(_differences("--", _completed(before.config), now.config)),
+        **dict(_differences("--", completed(before.config), now.config)),
         **dict(_differences("version of ", before.versions, now.versions)),
     }
     changed = [
@@ -33,20 +31,6 @@ def require_same(now: Provenance, before: Provenance) -> None:
             f"--resume cannot go on with other episodes: {'; '.join(changed[:_SHOWN])}{more}; use "
             "what was used before, or another --dataset.root"
         )
-
-
-def _completed(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """With the defaults of options that are newer than the settings: what they were made with."""
-    defaults: Mapping[str, Any] = draccus.encode(CollectConfig())
-    return _over({k: v for k, v in defaults.items() if k in SHAPING}, settings)
-
-
-def _over(defaults: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:
-    out = {**defaults, **settings}
-    for name, value in settings.items():
-        if isinstance(value, Mapping) and isinstance(defaults.get(name), Mapping):
-            out[name] = _over(defaults[name], value)
-    return out
 
 
 def _differences(

@@ -29,3 +29,14 @@ def test_an_option_newer_than_the_dataset_was_made_with_its_default() -> None:
     other["env"]["ball"]["shape"] = "box"
     with pytest.raises(UsageError, match=r"--env\.ball\.shape was sphere, is box"):
         require_same(replace(now, config=other), replace(now, config=older))
+
+
+def test_no_wall_of_before_gets_rows_in_which_a_guard_has_a_price() -> None:
+    now = made()
+    older: dict[str, Any] = copy.deepcopy(dict(now.config))
+    del older["env"]["wall"]["guard_cost"]
+    with pytest.raises(UsageError, match=r"--env\.wall\.guard_cost was 0\.0, is 0\.27"):
+        require_same(now, replace(now, config=older))
+    free = copy.deepcopy(dict(now.config))
+    free["env"]["wall"]["guard_cost"] = 0.0
+    require_same(replace(now, config=free), replace(now, config=older))

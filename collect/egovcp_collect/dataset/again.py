@@ -15,6 +15,7 @@ from egovcp.robot.controllers import make_controller
 from egovcp.sim.scenario import Scenario
 from egovcp_collect.config import SHAPING, CollectConfig
 from egovcp_collect.dataset.origin import origin_of, source_of
+from egovcp_collect.older import completed
 from egovcp_collect.simulation import Simulation, Watch
 from egovcp_collect.versions import installed_versions
 
@@ -101,7 +102,7 @@ def _collection(reader: DatasetReader, index: int) -> CollectConfig:
     if "env" not in settings:
         raise DataError.at(path, "records no configuration of the simulator to repeat", index)
     try:
-        config: CollectConfig = draccus.decode(CollectConfig, settings)
+        config: CollectConfig = draccus.decode(CollectConfig, completed(settings))
     except (DraccusException, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())
         problem = f"its configuration is not one of this version of egovcp: {reason}"

@@ -36,6 +36,15 @@ def test_chosen_episodes_come_out_the_same(collected: Path, tmp_path: Path) -> N
     }
 
 
+def test_data_older_than_the_price_of_a_guard_come_out_the_same(tmp_path: Path) -> None:
+    root = tmp_path / "wall"
+    episode = ["--env.wall_episode.ticks=5", "--env.wall_episode.event_ticks=[3,4]"]
+    flags = [*episode, "--task=wall", "--env.wall.guard_cost=0", "--episodes=1", "--num_workers=1"]
+    assert collect.main([f"--dataset.root={root}", *flags]) == 0
+    d.edit(d.COLLECTION, lambda c: c["config"]["env"]["wall"].pop("guard_cost"))(root)
+    assert main(["audit", str(root)]) == 0
+
+
 def test_an_episode_of_another_seed_is_told_with_the_versions(
     copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
