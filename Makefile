@@ -4,6 +4,8 @@ SHELL := /bin/bash
 BIN := .venv/bin
 PATH := $(CURDIR)/$(BIN):$(PATH)
 OUT ?= outputs/quickstart
+# Processes that share the tests, a file at a time; a test has one computing thread.
+WORKERS ?= 2
 export PATH
 # Threads that spin at barriers for long slow each other down tenfold beside any other program.
 export GOMP_SPINCOUNT := 20000
@@ -25,7 +27,7 @@ install: .venv/installed
 	@touch $@
 
 test: install
-	pytest -m "not slow and not gpu"
+	pytest --numprocesses=$(WORKERS) --dist=loadfile -m "not slow and not gpu"
 
 # Laptop scale: the throw comes at once, so that each simulated second teaches something, and the
 # robot stands by the stance law, which is cheaper to simulate and keeps the camera still. Hands
