@@ -7,18 +7,22 @@ from typing import Any, Final
 
 import draccus
 
-from egovcp_collect.config import SHAPING, CollectConfig
+from egovcp_collect.config import ALL_TASKS, SHAPING, CollectConfig
 
-#: What was done before an option was there, if that is not its default: nothing was paid for a
-#: guard at the wall until November 2026.
-_BEFORE: Final[Mapping[str, Any]] = {"env": {"wall": {"guard_cost": 0.0}}}
+#: Task -> what was done in it before an option was there, if that is not its default: nothing was
+#: paid for a guard at the wall until November 2026.
+_BEFORE: Final[Mapping[str, Any]] = {"wall": {"env": {"wall": {"guard_cost": 0.0}}}}
 
 
 def completed(settings: Mapping[str, Any]) -> dict[str, Any]:
     """Recorded settings of what shapes an episode, with those that were not options yet as they
     were then."""
     defaults = draccus.encode(CollectConfig())
-    return _over(_over({name: defaults[name] for name in SHAPING}, _BEFORE), settings)
+    found: Mapping[str, Any] = {name: defaults[name] for name in SHAPING}
+    for task, before in _BEFORE.items():
+        if settings.get("task") in (task, ALL_TASKS):
+            found = _over(found, before)
+    return _over(found, settings)
 
 
 def _over(defaults: Mapping[str, Any], settings: Mapping[str, Any]) -> dict[str, Any]:

@@ -15,8 +15,8 @@ from egovcp_collect.config import SHAPING, CollectConfig
 from egovcp_collect.resume import require_same
 
 
-def made() -> Provenance:
-    settings: dict[str, Any] = draccus.encode(CollectConfig())
+def made(task: str = "ball") -> Provenance:
+    settings: dict[str, Any] = draccus.encode(CollectConfig(task=task))
     return Provenance("walk", seed=0, config={name: settings[name] for name in SHAPING})
 
 
@@ -31,8 +31,9 @@ def test_an_option_newer_than_the_dataset_was_made_with_its_default() -> None:
         require_same(replace(now, config=other), replace(now, config=older))
 
 
-def test_no_wall_of_before_gets_rows_in_which_a_guard_has_a_price() -> None:
-    now = made()
+@pytest.mark.parametrize("task", ["wall", "all"])
+def test_no_wall_of_before_gets_rows_in_which_a_guard_has_a_price(task: str) -> None:
+    now = made(task)
     older: dict[str, Any] = copy.deepcopy(dict(now.config))
     del older["env"]["wall"]["guard_cost"]
     with pytest.raises(UsageError, match=r"--env\.wall\.guard_cost was 0\.0, is 0\.27"):
@@ -40,3 +41,10 @@ def test_no_wall_of_before_gets_rows_in_which_a_guard_has_a_price() -> None:
     free = copy.deepcopy(dict(now.config))
     free["env"]["wall"]["guard_cost"] = 0.0
     require_same(replace(now, config=free), replace(now, config=older))
+
+
+def test_a_ball_of_before_goes_on_though_walls_have_changed() -> None:
+    now = made("ball")
+    older: dict[str, Any] = copy.deepcopy(dict(now.config))
+    del older["env"]["wall"]["guard_cost"]
+    require_same(now, replace(now, config=older))
