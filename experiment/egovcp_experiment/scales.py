@@ -99,6 +99,7 @@ def small() -> ExperimentConfig:
             task_flags={
                 "ball": ("--policy.value_loss=two_hot",),
                 "wall": ("--value_fit.told_steps=0",),
+                "all": ("--value_fit.told_where=coming",),
             },
             # an arch is passed seconds after one has to crouch for it
             return_steps={"arch": 50},

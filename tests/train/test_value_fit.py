@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +19,19 @@ from egovcp.data import (
     StreamConfig,
 )
 from egovcp.errors import UsageError
-from egovcp.model import Batch, Carry, WorldModel
+from egovcp.model import PRESETS, Batch, Carry, WorldModel, value
+from egovcp.model.config import ValueLoss
 from egovcp.testing import CountingModel, toy_model
 from egovcp_train import batches, value_fit
 from egovcp_train.batches import set_normalisation, to_tensors, whole_episodes
-from egovcp_train.value_fit import Rows, ValueFitConfig, _fit_heads, collect_rows, fit_value
+from egovcp_train.value_fit import (
+    Rows,
+    ToldWhere,
+    ValueFitConfig,
+    _fit_heads,
+    collect_rows,
+    fit_value,
+)
 
 COUNT, IMAGINED = CountingModel.COUNT, CountingModel.IMAGINED
 
@@ -158,6 +167,35 @@ def test_the_part_told_of_flights_may_stay_silent(steps: int) -> None:
     assert bool((said == 0).all()) == (steps == 0)
     learned = said[:, 0] if steps else q
     assert (learned - target).square().mean() < 0.2 * target.var()
+
+
+@pytest.mark.parametrize("kind", ["mse", "two_hot"])
+def test_the_part_told_of_flights_may_judge_nothing_but_flights(kind: ValueLoss) -> None:
+    """Where something comes it says what the action is worth, elsewhere nothing."""
+    model = toy_model(replace(PRESETS["debug"], value_loss=kind))
+    rng = torch.Generator().manual_seed(0)
+    count, config = 2048, model.config
+    h = torch.randn(count, config.hidden, generator=rng)
+    z = torch.randn(count, config.latent, generator=rng)
+    action = torch.rand((count, 7), generator=rng) * 2 - 1
+    told = torch.rand((count, 4), generator=rng) * 0.5 + 0.5
+    coming = torch.rand(count, generator=rng) < 0.5
+    told[~coming] = 0.0
+    rows = Rows(h, z, told, action, 2 * action[:, 0], torch.zeros(count))
+
+    def spread(where: ToldWhere) -> list[float]:
+        fit = ValueFitConfig(steps=1, passes=0.0, told_steps=300, told_where=where, rows=512)
+        _fit_heads(model, rows, fit, torch.Generator().manual_seed(0))
+        passing = model.q_heads.passing
+        assert passing is not None
+        with torch.no_grad():
+            said = value.read(passing(told, action), kind)
+        return [float(said[some].std() / rows.target[some].std()) for some in (coming, ~coming)]
+
+    flights, others = spread("coming")
+    assert flights > 0.6
+    assert others < 0.2
+    assert min(spread("everywhere")) > 0.6
 
 
 def test_a_seed_repeats_the_fit_and_no_steps_leave_the_model_alone(store: EpisodeStore) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -23,6 +23,11 @@ from egovcp.model import Batch, Carry, WorldModel, value
 from egovcp.model.losses import filter_sequence
 from egovcp.model.nets import SplitMlp, ValueHead
 from egovcp.model.outcomes import value_target
+
+ToldWhere = Literal["everywhere", "coming"]
+
+_COMING: Final = 0.01
+"""How sure the path of a flight has to be to count as one; zero where none is followed."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +50,10 @@ class ValueFitConfig:
     there is more to be learned than from the state, which is soon known by heart (docs/log.md).
     0: the part stays silent. Where nothing flies it judges an action by what followed on actions
     like it in all states; on the wall the other part is better off without."""
+    told_where: ToldWhere = "everywhere"
+    """Rows that that part judges. coming: those on which something is on its way, and elsewhere it
+    learns to say nothing: where tasks are mixed, what followed on actions like one in all states
+    of all tasks misleads the wall."""
     told_rows: int = 2048
     """States per step of that part."""
     told_lr: float = 2e-3
@@ -150,7 +159,11 @@ def _fit_told(
         return q
 
     def told_error(x: Rows, known: Tensor | None) -> Tensor:
-        return value.error(told(x), x.target, kind).mean()
+        said = told(x)
+        error = value.error(said, x.target, kind)
+        if config.told_where == "coming":
+            error = torch.where(x.told[:, 0] > _COMING, error, said.square().mean(-1))
+        return error.mean()
 
     thorough = replace(config, steps=config.told_steps, rows=config.told_rows, lr=config.told_lr)
     _descend(passing, told_error, rows, None, thorough, generator)
