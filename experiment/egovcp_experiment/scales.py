@@ -95,7 +95,8 @@ def small() -> ExperimentConfig:
                 "--tensorboard=false",
             ),
             # A Q that is a distribution earns more with balls, and does not brace (docs/log.md, "Q
-            # as a distribution"); nothing flies at a wall.
+            # as a distribution"); nothing flies at a wall, where the part of Q that is told of
+            # flights misleads.
             task_flags={
                 "ball": ("--policy.value_loss=two_hot",),
                 "wall": ("--value_fit.told_steps=0",),
