@@ -41,6 +41,14 @@ SEAL = "manifest_sha256"
 CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
 _PATTERNS = ("*.json", "*.safetensors")
 _PATIENCE = Patience()
+#: What decoding the options of another version may raise.
+_UNREADABLE: Final = (
+    KeyError,
+    TypeError,
+    UsageError,
+    ValueError,
+    draccus.utils.DraccusException,
+)
 
 
 @dataclass(frozen=True)
@@ -199,21 +207,31 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
         planner = _decode(PlannerConfig, config, "planner")
         require_answers(model.config, planner)
         model.load_state_dict(load_file(folder / WEIGHTS))
-    except (
-        KeyError,
-        RuntimeError,
-        SafetensorError,
-        TypeError,
-        UsageError,
-        ValueError,
-        draccus.utils.DraccusException,
-    ) as error:
+    except (*_UNREADABLE, RuntimeError, SafetensorError) as error:
         reason = " ".join(str(error).split())[:300]
         raise ArtefactError(
             f"{folder}: weights and configuration disagree: {reason}; a policy of another version "
             "of egovcp has to be trained again with this one"
         ) from error
     return Artefact(folder, model.eval(), planner, manifest)
+
+
+def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
+    """What the policy in a folder is and how it plans, without its weights, nothing validated.
+
+    Raises:
+        ArtefactError: they are missing or not readable.
+    """
+    config = _read_json(folder / CONFIG)
+    try:
+        model = _decode(WorldModelConfig, config, "world_model", _BEFORE)
+        return model, _decode(PlannerConfig, config, "planner")
+    except _UNREADABLE as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ArtefactError(
+            f"{folder / CONFIG}: {reason}; a policy of another version of egovcp has to be trained "
+            "again with this one"
+        ) from error
 
 
 def _decode[C](

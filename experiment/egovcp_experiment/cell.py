@@ -113,10 +113,11 @@ def filled(value: Any, fill: Callable[[Reference], Any]) -> Any:
 
 def written(flags: Flags) -> list[str]:
     """``--name=value`` of flags without references."""
-    return [f"--{name}={_text(value)}" for name, value in flags.items()]
+    return [f"--{name}={text(value)}" for name, value in flags.items()]
 
 
-def _text(value: Any) -> str:
+def text(value: Any) -> str:
+    """A flag's value as it is written."""
     return value if isinstance(value, str) else json.dumps(value)
 
 

@@ -10,10 +10,12 @@ bounds-TASK                the same without constant, whose search costs the mos
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Final
 
-from egovcp_experiment.cell import Cell, Flags, Given, Output
+from egovcp.artefact import CONFIG, read_options
+from egovcp_experiment.cell import Cell, Flags, Given, Output, references, text
 from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.tools import ARTEFACT, COLLECT, PLAY, TRAIN
 
@@ -109,7 +111,8 @@ class Grid:
         return self.add(cell)
 
     def play(self, task: str, seed: int, variant: Variant, learned_from: str = "") -> Cell:
-        """The planner in closed loop. A variant that asks for what is done anyway is the default.
+        """The planner in closed loop. A variant that asks for what is done anyway is the default:
+        by the flags of egovcp-eval or, of a model that is there already, by its own options.
 
         Args:
             task: what is played.
@@ -121,7 +124,14 @@ class Grid:
         policy = self.model(teacher, seed, variant.model)
         own = _named(self.config.play.task_flags.get(teacher, ()))
         flags = {**self.scenarios(task), **own, "controllers": "planner", "policy.path": policy}
-        changes = {name: value for name, value in variant.play.items() if flags.get(name) != value}
+        anyway = {**_brought(policy), **flags}
+        changes = {
+            name: value
+            for name, value in variant.play.items()
+            if name not in anyway or _written(anyway[name]) != _written(value)
+        }
+        if anyway.get("policy.q_heads") == 1:  # the least of one is its mean
+            changes.pop("planner.ensemble", None)
         differs = changes or variant.model.flags or teacher != task
         name = f"play-{task}-{variant.name if differs else DEFAULT}-s{seed}"
         return self.add(Cell(name, PLAY, {**flags, **changes}))
@@ -165,6 +175,20 @@ class Grid:
             "seed": config.seed,
             **given,
         }
+
+
+def _written(value: Any) -> Any:
+    """Text of a flag's value, to be compared; what another cell will find is only itself."""
+    return value if any(references(value)) else text(value)
+
+
+def _brought(policy: Output | Given) -> Flags:
+    """What is known of a model before anything is run: its planner's options, and its heads."""
+    if isinstance(policy, Output) or not (Path(policy.path) / CONFIG).is_file():
+        return {}
+    model, planner = read_options(Path(policy.path))
+    options = {f"planner.{name}": value for name, value in asdict(planner).items()}
+    return {**options, "policy.q_heads": model.q_heads}
 
 
 def _named(flags: Sequence[str]) -> dict[str, str]:

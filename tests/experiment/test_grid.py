@@ -6,13 +6,18 @@ import importlib
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from egovcp.artefact import save_artefact
 from egovcp.cli import parse_config
 from egovcp.errors import UsageError
-from egovcp_experiment.cell import Cell, Found, Given, Output, filled, in_order, written
+from egovcp.model import PRESETS
+from egovcp.plan import PlannerConfig
+from egovcp.testing import toy_model
+from egovcp_experiment.cell import Cell, Flags, Found, Given, Output, filled, in_order, written
 from egovcp_experiment.config import DataConfig, ExperimentConfig, PlayConfig, TrainingConfig
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.grid import ALL, Grid, Model, Variant
@@ -60,6 +65,28 @@ def test_a_variant_that_asks_for_what_is_done_anyway_is_the_default() -> None:
     assert grid.play("ball", 0, ramp) == grid.play("ball", 0, Variant("default"))
     assert grid.play("ball", 0, walk).name == "play-ball-process_walk-s0"
     assert grid.play("wall", 0, ramp).name == "play-wall-process_ramp-s0"
+
+
+@pytest.mark.parametrize(
+    ("heads", "asked", "known"),
+    [
+        (1, {"planner.horizon": 5}, True),
+        (1, {"planner.horizon": 4}, False),
+        (1, {"planner.termination_rule": "shift"}, True),
+        (1, {"planner.ensemble": "mean"}, True),
+        (2, {"planner.ensemble": "mean"}, False),
+    ],
+)
+def test_what_a_model_that_is_there_does_by_itself_is_the_default(
+    tmp_path: Path, heads: int, asked: Flags, known: bool
+) -> None:
+    model = toy_model(replace(PRESETS["debug"], q_heads=heads))
+    save_artefact(tmp_path / "p", model, PlannerConfig(horizon=5), {"controller_id": "stance"})
+    grid = Grid(ExperimentConfig(train=TrainingConfig(policies={"ball": str(tmp_path / "p")})))
+    variant = Variant("asked", play=asked)
+    assert grid.play("ball", 0, variant).name == f"play-ball-{'default' if known else 'asked'}-s0"
+    other = grid.play("wall", 0, variant)  # of a model that is still to be trained
+    assert (other.name, other.flags | asked) == ("play-wall-asked-s0", other.flags)
 
 
 def test_what_is_there_already_is_not_made_again() -> None:
