@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from egovcp.artefact import CONFIG, MANIFEST, WEIGHTS, load_artefact
+from egovcp.artefact import CONFIG, MANIFEST, WEIGHTS, load_artefact, read_options
 from egovcp.errors import ArtefactError
+from egovcp.model import PRESETS
 from egovcp.processors import PROCESSORS
 
 from .conftest import FILES, PLANNER, Json, edit, sign
@@ -113,6 +114,28 @@ def test_a_configuration_that_cannot_be_is_refused(
     sign(folder)
     with pytest.raises(ArtefactError, match="copy"):
         load_artefact(str(folder))
+
+
+def test_options_are_read_without_weights(folder: Path) -> None:
+    (folder / WEIGHTS).unlink()
+    assert read_options(folder) == (PRESETS["debug"], PLANNER)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda c: c.pop("planner"),
+        lambda c: c["world_model"].update(surprise=1),
+        lambda c: c["planner"].update(samples=0),
+        lambda c: c.update(planner=None),
+    ],
+)
+def test_options_of_another_version_are_refused(
+    folder: Path, change: Callable[[Json], object]
+) -> None:
+    edit(folder / CONFIG, change)
+    with pytest.raises(ArtefactError, match=CONFIG):
+        read_options(folder)
 
 
 class _Bomb:
