@@ -41,14 +41,6 @@ SEAL = "manifest_sha256"
 CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
 _PATTERNS = ("*.json", "*.safetensors")
 _PATIENCE = Patience()
-#: What decoding the options of another version may raise.
-_UNREADABLE: Final = (
-    KeyError,
-    TypeError,
-    UsageError,
-    ValueError,
-    draccus.utils.DraccusException,
-)
 
 
 @dataclass(frozen=True)
@@ -201,13 +193,12 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
     folder = _locate(path, revision, patience)
     manifest = _read_json(folder / MANIFEST)
     _check_manifest(folder, manifest)
-    config = _read_json(folder / CONFIG)
+    config, planner = read_options(folder)
     try:
-        model = WorldModel(_decode(WorldModelConfig, config, "world_model", _BEFORE))
-        planner = _decode(PlannerConfig, config, "planner")
-        require_answers(model.config, planner)
+        require_answers(config, planner)
+        model = WorldModel(config)
         model.load_state_dict(load_file(folder / WEIGHTS))
-    except (*_UNREADABLE, RuntimeError, SafetensorError) as error:
+    except (RuntimeError, SafetensorError, UsageError, ValueError) as error:
         reason = " ".join(str(error).split())[:300]
         raise ArtefactError(
             f"{folder}: weights and configuration disagree: {reason}; a policy of another version "
@@ -226,7 +217,13 @@ def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
     try:
         model = _decode(WorldModelConfig, config, "world_model", _BEFORE)
         return model, _decode(PlannerConfig, config, "planner")
-    except _UNREADABLE as error:
+    except (
+        KeyError,
+        TypeError,
+        UsageError,
+        ValueError,
+        draccus.utils.DraccusException,
+    ) as error:
         reason = " ".join(str(error).split())[:300]
         raise ArtefactError(
             f"{folder / CONFIG}: {reason}; a policy of another version of egovcp has to be trained "
