@@ -108,14 +108,15 @@ def small() -> ExperimentConfig:
         # Four elites earn more than 16, with hands and steps that cost something, and on ball and
         # wall ramps more than walks; who follows an arch's Q closely rises too soon, and needs
         # hands that cost more (docs/planner.md). All this was chosen on the scenarios of seeds 0,
-        # 1 and 3, so others are reported. The budget is a little more than 256 candidates take on
-        # one core.
+        # 1 and 3, so others are reported. A quarter of README's candidates does as well, in less
+        # than half of the time (docs/log.md, "A quarter of the candidates"). The budget is what
+        # they take on a core without AVX-512.
         play=PlayConfig(
             seed=2,
             branches=6,
             budget_ms=12.0,
             flags=(
-                "--planner.samples=256",
+                "--planner.samples=64",
                 "--planner.elites=4",
                 "--planner.hands_cost=0.1",
                 "--planner.step_cost=0.2",
