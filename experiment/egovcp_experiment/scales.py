@@ -96,11 +96,17 @@ def small() -> ExperimentConfig:
             ),
             # A Q that is a distribution earns more with balls, and does not brace (docs/log.md, "Q
             # as a distribution"); nothing flies at a wall, where the part of Q that is told of
-            # flights misleads.
+            # flights misleads. Q of all tasks has as many numbers to see each of them through, and
+            # a mirror for what there is too little of ("Three times eight numbers").
             task_flags={
                 "ball": ("--policy.value_loss=two_hot",),
                 "wall": ("--value_fit.told_steps=0",),
-                "all": ("--value_fit.told_where=coming",),
+                "all": (
+                    "--policy.value_state=24",
+                    "--value_fit.told_where=coming",
+                    "--value_fit.mirror=flights",
+                    "--sampling.tasks={ball: 2}",
+                ),
             },
             # an arch is passed seconds after one has to crouch for it
             return_steps={"arch": 50},
@@ -125,6 +131,7 @@ def small() -> ExperimentConfig:
                 "ball": ("--planner.process=ramp",),
                 "wall": ("--planner.process=ramp", "--planner.hands_cost=0.3"),
                 "arch": ("--planner.hands_cost=0.3",),
+                "all": ("--planner.process=ramp", "--planner.hands_cost=0.3"),
             },
         ),
     )

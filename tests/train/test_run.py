@@ -210,6 +210,18 @@ def test_a_place_that_cannot_be_written_is_a_matter_of_the_surroundings(
         ({"planner__elites": 99}, "elites"),
         ({"sampling__length": 0}, "length"),
         ({"stpes": 3}, "did you mean '--steps'"),
+        (
+            {
+                "value_fit__mirror": "flights",
+                "policy__value_of_passing": "false",
+                "policy__paint_flight": "false",
+                "policy__flight__enabled": "false",
+            }
+            | {
+                f"policy__loss__{x}": 0 for x in ("passing", "flight", "motion", "foresight_motion")
+            },
+            "--value_fit.mirror=flights",
+        ),
         ({"config_path": "absent.yaml"}, "--preset=debug and --config_path=absent.yaml"),
     ],
 )

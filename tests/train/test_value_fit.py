@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
@@ -23,8 +24,14 @@ from egovcp.model import PRESETS, Batch, Carry, WorldModel, value
 from egovcp.model.config import ValueLoss
 from egovcp.testing import CountingModel, toy_model
 from egovcp_train import batches, value_fit
-from egovcp_train.batches import set_normalisation, to_tensors, whole_episodes
+from egovcp_train.batches import (
+    mirrored_episodes,
+    set_normalisation,
+    to_tensors,
+    whole_episodes,
+)
 from egovcp_train.value_fit import (
+    Mirrored,
     Rows,
     ToldWhere,
     ValueFitConfig,
@@ -55,7 +62,7 @@ def _collect(model: WorldModel, store: EpisodeStore, ahead: int) -> Rows:
     return collect_rows(model, _whole(store), ahead, torch.Generator().manual_seed(0))
 
 
-def _whole(store: EpisodeStore, mirror: bool = False) -> Iterator[Batch]:
+def _whole(store: EpisodeStore, mirror: Mirrored = "none") -> Iterator[Batch]:
     return whole_episodes(store, torch.device("cpu"), mirror)
 
 
@@ -66,7 +73,7 @@ def test_every_row_with_a_complete_return_is_collected_once(store: EpisodeStore)
     expected = torch.from_numpy(store.mc_return[store.mc_valid])
     torch.testing.assert_close(rows.target.sort().values, expected.sort().values)
     assert not rows.h[:, IMAGINED].any()
-    mirrored = collect_rows(model, _whole(store, mirror=True), 0, torch.Generator().manual_seed(0))
+    mirrored = collect_rows(model, _whole(store, mirror="all"), 0, torch.Generator().manual_seed(0))
     assert len(mirrored.target) == 2 * len(rows.target)
 
 
@@ -203,7 +210,7 @@ def test_a_seed_repeats_the_fit_and_no_steps_leave_the_model_alone(store: Episod
         model = toy_model()
         fit_value(
             model,
-            _whole(store, mirror=True),
+            _whole(store, mirror="all"),
             ValueFitConfig(steps, passes=0.0, told_steps=steps, rows=16),
             seed,
         )
@@ -275,10 +282,22 @@ def test_whole_episodes_are_whole_and_in_their_order(store: EpisodeStore) -> Non
     assert batch.is_first[:, 0].all()
     assert batch.is_first.sum() == 3
     assert batch.valid.sum(1).tolist() == store.length[:3].tolist()
-    plain, mirrored = whole_episodes(store, torch.device("cpu"), mirror=True, limit=2)
+    plain, mirrored = whole_episodes(store, torch.device("cpu"), mirror="all", limit=2)
     torch.testing.assert_close(mirrored.depth, plain.depth.flip(-1))
     everything = sum(int(b.valid.sum()) for b in whole_episodes(store, torch.device("cpu")))
     assert everything == store.num_frames
+
+
+def test_mirror_images_may_be_those_of_flights_only(store: EpisodeStore) -> None:
+    passing = np.zeros_like(store.passing)
+    passing[store.start[3] - 1, 3] = 1.0  # something flies on the last row of the third episode
+    store = replace(store, passing=passing)
+    plain, mirrored = whole_episodes(store, torch.device("cpu"), "flights")
+    assert len(plain.valid) == len(store.length)
+    third = plain.depth[2:3, : store.length[2]]
+    torch.testing.assert_close(mirrored.depth, third.flip(-1))
+    assert not len(mirrored_episodes(store, "flights", 2))
+    assert mirrored_episodes(store, "all", 2).tolist() == [0, 1]
 
 
 def test_whole_episodes_are_padded_to_the_longest_beside_them(

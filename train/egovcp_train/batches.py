@@ -14,6 +14,7 @@ from egovcp.data.windows import gather, mirror_rows
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
 from egovcp.model.statistics import set_statistics
+from egovcp_train.value_fit import Mirrored
 
 EPISODES_AT_ONCE = 32
 DEFAULT_RETURNS = ReturnConfig()
@@ -29,23 +30,32 @@ def to_tensors(arrays: Mapping[str, NDArray[Any]], device: torch.device) -> Batc
 
 
 def whole_episodes(
-    store: EpisodeStore, device: torch.device, mirror: bool = False, limit: int | None = None
+    store: EpisodeStore, device: torch.device, mirror: Mirrored = "none", limit: int | None = None
 ) -> Iterator[Batch]:
     """Whole episodes from their start, as a robot lives through them, padded to the longest of a
     batch: episodes of one task are often several times as long as those of another.
 
     Args:
-        mirror: and then their mirror images.
+        mirror: and then the mirror images of these.
         limit: at most this many episodes, the first ones; None: all.
     """
     count = len(store.length) if limit is None else min(limit, len(store.length))
-    for mirrored in (False, True) if mirror else (False,):
-        for first in range(0, count, EPISODES_AT_ONCE):
-            which = np.arange(first, min(first + EPISODES_AT_ONCE, count))
+    everyone, images = np.arange(count), mirrored_episodes(store, mirror, count)
+    for group in (everyone, images):
+        for first in range(0, len(group), EPISODES_AT_ONCE):
+            which = group[first : first + EPISODES_AT_ONCE]
             arrays = gather(store, store.start[which], which, int(store.length[which].max()))
-            if mirrored:
+            if group is images:
                 mirror_rows(arrays, np.arange(len(which)))
             yield to_tensors(arrays, device)
+
+
+def mirrored_episodes(store: EpisodeStore, mirror: Mirrored, count: int) -> NDArray[np.intp]:
+    """Which of the first ``count`` episodes are shown in the mirror as well."""
+    if mirror == "flights":
+        flies = np.maximum.reduceat(store.passing[:, 3], store.start)
+        return np.flatnonzero(flies[:count] > 0)
+    return np.arange(count if mirror == "all" else 0)
 
 
 def set_normalisation(

@@ -36,6 +36,7 @@ from egovcp.model import Batch, WorldModel
 from egovcp_train.batches import (
     EPISODES_AT_ONCE,
     fix_normalisation,
+    mirrored_episodes,
     set_normalisation,
     whole_episodes,
 )
@@ -43,6 +44,7 @@ from egovcp_train.config import TrainConfig
 from egovcp_train.labels.passing import label, label_episode
 from egovcp_train.ranks import ALONE, Ranks
 from egovcp_train.return_scale import ReturnScale, on_task_scales, task_scales
+from egovcp_train.value_fit import Mirrored
 
 EVALUATION_EPISODES = 64  # of each task
 FIT_EPISODES = 2048  # of a dataset that is not in memory: half a GB of states to fit Q to
@@ -73,18 +75,19 @@ class Material:
 
     @property
     def training_count(self) -> int:
-        """How many `training_episodes` there are, mirror images included."""
+        """How many `training_episodes` there are, mirror images included; at most, where which of
+        those on the disk have any shows only when they are read."""
+        mirror = mirrored(self.config)
         if isinstance(self.fitting, EpisodeIndex):
-            count = min(len(self.fitting), FIT_EPISODES)
-        else:
-            count = len(self.fitting.length)
-        return count * (2 if self.config.sampling.mirror else 1)
+            return min(len(self.fitting), FIT_EPISODES) * (1 if mirror == "none" else 2)
+        count = len(self.fitting.length)
+        return count + len(mirrored_episodes(self.fitting, mirror, count))
 
     def training_episodes(self, device: torch.device) -> Iterator[Batch]:
         """Whole training episodes, and their mirror images; a random part of a large dataset."""
         if isinstance(self.fitting, EpisodeIndex):
             return _from_disk(self.fitting, self.config, device)
-        return whole_episodes(self.fitting, device, self.config.sampling.mirror)
+        return whole_episodes(self.fitting, device, mirrored(self.config))
 
 
 def prepare(config: TrainConfig, model: WorldModel, ranks: Ranks = ALONE) -> Material:
@@ -115,6 +118,12 @@ def _prepare(config: TrainConfig, model: WorldModel, ranks: Ranks) -> Material:
     if config.loading.sample_files < 1:
         raise UsageError(f"--loading.sample_files={config.loading.sample_files}: at least 1")
     config.targets.check()
+    if mirrored(config) == "flights" and not needs_labels(config):
+        raise UsageError(
+            "--value_fit.mirror=flights asks in which episodes something flies, and nothing looks "
+            "for that: --policy.loss.passing, .flight, .motion and .foresight_motion are 0; raise "
+            "one of them, or choose all or none"
+        )
     readers = open_readers(config)
     config = pinned(_decided(config, readers, ranks), readers)
     if config.loading.mode == "ram" and any(reader.is_remote for reader in readers):
@@ -184,6 +193,11 @@ def stream_config(config: TrainConfig) -> StreamConfig:
         mirror=sampling.mirror,
         seed=config.seed,
     )
+
+
+def mirrored(config: TrainConfig) -> Mirrored:
+    """Whose mirror images the last fit of Q goes over as well."""
+    return config.value_fit.mirror if config.sampling.mirror else "none"
 
 
 def needs_labels(config: TrainConfig) -> bool:
@@ -303,6 +317,6 @@ def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -
         store = EpisodeStore.read(part, config.targets)
         if needs_labels(config):
             store = label(store, config.passing)
-        yield from whole_episodes(store, device, config.sampling.mirror)
+        yield from whole_episodes(store, device, mirrored(config))
 
     return chain.from_iterable(map(batches, range(0, len(chosen), EPISODES_AT_ONCE)))

@@ -25,6 +25,7 @@ from egovcp.model.nets import SplitMlp, ValueHead
 from egovcp.model.outcomes import value_target
 
 ToldWhere = Literal["everywhere", "coming"]
+Mirrored = Literal["all", "flights", "none"]
 
 _COMING: Final = 0.01
 """How sure the path of a flight has to be to count as one; zero where none is followed."""
@@ -39,6 +40,11 @@ class ValueFitConfig:
     passes: float = 8.0
     """How often all rows are gone over at least: of many, the least steps would see a part only,
     and after two passes another seed is another policy."""
+    mirror: Mirrored = "all"
+    """Whose mirror images the fit goes over as well, if windows are mirrored (--sampling.mirror).
+    flights: those of episodes in which something flies, of which there are never enough; a model of
+    several tasks whose Q had seen every wall from both sides explained more of its returns, and let
+    go of it more often (docs/log.md)."""
     imagined_steps: int = 3
     """States are imagined 0 to this many ticks ahead, as far as the planner looks."""
     rows: int = 1024
