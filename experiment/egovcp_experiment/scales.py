@@ -97,7 +97,7 @@ def small() -> ExperimentConfig:
             # A Q that is a distribution earns more with balls, and does not brace (docs/log.md, "Q
             # as a distribution"); nothing flies at a wall, where the part of Q that is told of
             # flights misleads. Q of all tasks has as many numbers to see each of them through, and
-            # a mirror for what there is too little of ("Three times eight numbers").
+            # throws, of which there are fewest, count twice ("Three times eight numbers").
             task_flags={
                 "ball": ("--policy.value_loss=two_hot",),
                 "wall": ("--value_fit.told_steps=0",),

@@ -42,9 +42,8 @@ class ValueFitConfig:
     and after two passes another seed is another policy."""
     mirror: Mirrored = "all"
     """Whose mirror images the fit goes over as well, if windows are mirrored (--sampling.mirror).
-    flights: those of episodes in which something flies, of which there are never enough; a model of
-    several tasks whose Q had seen every wall from both sides explained more of its returns, and let
-    go of it more often (docs/log.md)."""
+    flights: those of episodes in which something flies, whose rows are few beside others' where
+    tasks are mixed."""
     imagined_steps: int = 3
     """States are imagined 0 to this many ticks ahead, as far as the planner looks."""
     rows: int = 1024
