@@ -157,7 +157,9 @@ def test_multitask_says_which_models_are_played_otherwise() -> None:
         "The model of ball alone is played with `--planner.process=ramp`. "
         "The model of wall alone is played with "
         "`--planner.process=ramp --planner.hands_cost=0.3`. "
-        "The model of arch alone is played with `--planner.hands_cost=0.3`."
+        "The model of arch alone is played with `--planner.hands_cost=0.3`. "
+        "The model on mixed data is played with "
+        "`--planner.process=ramp --planner.hands_cost=0.3`."
     )
     small = SCALES["small"]()
     alike = replace(small, play=replace(small.play, task_flags={}))

@@ -104,9 +104,9 @@ def _lengths(config: ExperimentConfig) -> str:
     given = {who: p for who, p in config.train.policies.items() if who in _models(config)}
     if not given:
         return (
-            f"Every model was trained for {config.train.budget}: the one on mixed data sees each "
-            f"task {len(config.tasks)} times less often than a single-task model does, and is told "
-            "nothing of which task it is."
+            f"Every model was trained for {config.train.budget}: the one on mixed data learns "
+            f"{len(config.tasks)} tasks in the time that a single-task model has for one, and is "
+            "told nothing of which task it is."
         )
     named = "; ".join(f"{_models(config)[who]}, {_steps(path)}" for who, path in given.items())
     rest = len(given) < len(_models(config))
