@@ -97,7 +97,7 @@ def small() -> ExperimentConfig:
             # A Q that is a distribution earns more with balls, and does not brace (docs/log.md, "Q
             # as a distribution"); nothing flies at a wall, where the part of Q that is told of
             # flights misleads. Q of all tasks has as many numbers to see each of them through, and
-            # throws, of which there are fewest, count twice ("Three times eight numbers").
+            # throws, of which it knows least, count twice ("Three times eight numbers").
             task_flags={
                 "ball": ("--policy.value_loss=two_hot",),
                 "wall": ("--value_fit.told_steps=0",),
@@ -114,9 +114,9 @@ def small() -> ExperimentConfig:
         # Four elites earn more than 16, with hands and steps that cost something, and on ball and
         # wall ramps more than walks; who follows an arch's Q closely rises too soon, and needs
         # hands that cost more (docs/planner.md). All this was chosen on the scenarios of seeds 0,
-        # 1 and 3, so others are reported. A quarter of README's candidates does as well, in less
-        # than half of the time (docs/log.md, "A quarter of the candidates"). The budget is what
-        # they take on a core without AVX-512.
+        # 1 and 3, so others are reported. 256 candidates do no better, in more than twice the
+        # time (docs/planner.md, "A quarter of the candidates"). The budget is what 64 take on a
+        # core without AVX-512.
         play=PlayConfig(
             seed=2,
             branches=6,
