@@ -131,7 +131,7 @@ def small() -> ExperimentConfig:
                 "ball": ("--planner.process=ramp",),
                 "wall": ("--planner.process=ramp", "--planner.hands_cost=0.3"),
                 "arch": ("--planner.hands_cost=0.3",),
-                "all": ("--planner.process=ramp", "--planner.hands_cost=0.3"),
+                "all": ("--planner.process=ramp", "--planner.hands_cost=0.6"),
             },
         ),
     )

@@ -159,7 +159,7 @@ def test_multitask_says_which_models_are_played_otherwise() -> None:
         "`--planner.process=ramp --planner.hands_cost=0.3`. "
         "The model of arch alone is played with `--planner.hands_cost=0.3`. "
         "The model on mixed data is played with "
-        "`--planner.process=ramp --planner.hands_cost=0.3`."
+        "`--planner.process=ramp --planner.hands_cost=0.6`."
     )
     small = SCALES["small"]()
     alike = replace(small, play=replace(small.play, task_flags={}))
