@@ -49,7 +49,7 @@ _TICK: Final = (-spec.PLANNER_DT, 0.0, *[spec.PLANNER_DT] * 2, *[0.0] * (SIZE - 
 _FALL: Final = (0.0, 0.0, 0.5 * GRAVITY)
 _DT: Final = spec.PLANNER_DT
 _MIN_PIXELS: Final = 2
-_MANY: Final = 32  # pictures among which it pays to pick; graphs are traced with fewer
+_MANY: Final = 32  # pictures among which a processor better picks; graphs are traced with fewer
 _BEHIND: Final = -0.08  # s, the time left at which it has passed
 
 
@@ -70,7 +70,7 @@ def sighting(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) ->
         config: of the filter.
     """
     seen = torch.sigmoid(sight[:, 3]) > 0.5
-    if len(sight) < _MANY:
+    if len(sight) < _MANY or near.device.type != "cpu":
         found = _measured(near, sight, max_m, config)
         point = torch.where(seen[:, None], found.point, 0.0)
         return Sighting(point, torch.where(seen, found.weight, 0.0))
@@ -98,7 +98,8 @@ def _measured(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) -
     z = own * z
     sums = [z.sum((1, 2)), -(z.sum(1) * col).sum(1), -(z.sum(2) * row[:, 0]).sum(1)]
     mean = [total / count.clamp_min(1) for total in sums]
-    cut = own[:, [0, -1]].sum((1, 2)) + own[:, :, [0, -1]].sum((1, 2))  # its middle is lost
+    edges = own[:, :: height - 1], own[:, :, :: width - 1]  # first and last: no list, see kept.py
+    cut = sum(edge.sum((1, 2)) for edge in edges)  # its middle is lost
     found = (count >= _MIN_PIXELS) & (cut == 0)
     point = torch.where(found[:, None], torch.stack(mean, -1), guess)
     deviation = config.deviation * point[:, 0].clamp_min(1.0) * torch.where(found, 1.0, 2.5)

@@ -76,15 +76,18 @@ def autoregressive_losses(
     rollout: Rollout,
     batch: Batch,
     weight: Tensor,
-    generator: torch.Generator | None = None,
+    first: int,
 ) -> dict[str, Tensor]:
     """The same at each of ``autoregressive_steps`` ticks, weighted as the reconstruction is."""
     config = model.config.loss
     weights = Weights(config.depth, config.state, config.motion)
-    ahead = range(1, config.autoregressive_steps + 1)
-    first = first_row(model.config.loss, ahead, batch, generator)
-    seen = imagine_ahead(model, rollout.carry, batch, ahead, first)
+    seen = imagine_ahead(model, rollout.carry, batch, autoregressive_ticks(config), first)
     return _compare("autoregressive", model, seen, rollout, batch, weight, weights)
+
+
+def autoregressive_ticks(config: LossConfig) -> range:
+    """How far ahead `autoregressive_losses` looks."""
+    return range(1, config.autoregressive_steps + 1)
 
 
 def imagine_ahead(
@@ -101,8 +104,8 @@ def imagine_ahead(
     if not ahead:
         return None
     every = _every(model.config.loss, ahead, length)
-    start = torch.arange(first, length - min(ahead), every, device=batch.state.device)
-    starts = [start[start + k < length] for k in range(1, max(ahead) + 1)]
+    ends = [max(first, length - max(k, min(ahead))) for k in range(1, max(ahead) + 1)]
+    starts = [torch.arange(first, end, every, device=batch.state.device) for end in ends]
     found = _imagined(model, carry, batch, starts)
     seen = [_rows(carry, found[k - 1], starts[k - 1], k) for k in ahead]
     rows = torch.cat([starts[k - 1] + k for k in ahead])

@@ -13,9 +13,9 @@ type Numbers = float | tuple[Any, ...]
 """Nested tuples."""
 
 
-def constant(numbers: Numbers, like: Tensor) -> Tensor:
-    """Of the type and on the device of ``like``; never to be written to."""
-    return _made(numbers, like.dtype, like.device)
+def constant(numbers: Numbers, like: Tensor, dtype: torch.dtype | None = None) -> Tensor:
+    """Of the type, if it is not said, and on the device of ``like``; never to be written to."""
+    return _made(numbers, dtype or like.dtype, like.device)
 
 
 @cache

@@ -8,7 +8,7 @@ because it is not conditioned on an action and the terminal observation is not s
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -22,6 +22,7 @@ from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, within
 from egovcp.model.flight import Sighting
 from egovcp.model.floor import Floor
 from egovcp.model.gaussian import Gaussian, kl_divergence
+from egovcp.model.kept import constant
 from egovcp.model.picture_error import picture_error
 from egovcp.model.recurrence import filter_window
 from egovcp.model.shared import over_all_rows, row_noise
@@ -66,10 +67,12 @@ def filter_sequence(
     generator: torch.Generator | None = None,
     *,
     sample: bool = True,
+    noise: Tensor | None = None,
 ) -> Rollout:
     """Run the posterior over whole sequences, as `WorldModel.observe` does step by step.
 
-    Training samples z; without ``sample`` z is the posterior mean, as it is on the robot.
+    Training samples z, with ``noise`` (`latent_noise`) if it is drawn already; without ``sample``
+    z is the posterior mean, as it is on the robot.
     """
     size, length = batch.valid.shape
     near = nearness(batch.depth.flatten(0, 1), model.config.depth_max_m)
@@ -77,7 +80,8 @@ def filter_sequence(
     embedding = _embed(model, near, state.flatten(0, 1)).view(size, length, -1)
     carry = model.initial(size) if carry is None else carry
     followed = _followed(model, batch, near, embedding, carry)
-    noise = _noise(model, batch, generator) if sample else None
+    if sample and noise is None:
+        noise = latent_noise(model, batch, generator)
     states, posterior = filter_window(
         model, carry, batch.prev_action, batch.is_first, embedding, noise
     )
@@ -91,8 +95,10 @@ def filter_sequence(
     )
 
 
-def _noise(model: WorldModel, batch: Batch, generator: torch.Generator | None) -> Tensor:
-    """(T, B, Z), drawn a tick at a time."""
+def latent_noise(
+    model: WorldModel, batch: Batch, generator: torch.Generator | None = None
+) -> Tensor:
+    """What z is sampled with, (T, B, Z), drawn a tick at a time."""
     size, length = batch.valid.shape
     shape, device = (size, model.config.latent), batch.state.device
     return torch.stack([row_noise(shape, generator, device) for _ in range(length)])
@@ -149,7 +155,7 @@ def depth_loss(
     valid: Tensor,
     weight: Tensor,
     every: int = 1,
-    generator: torch.Generator | None = None,
+    first: int = 0,
 ) -> Tensor:
     """Gaussian negative log likelihood of every n-th image, pixels weighted.
 
@@ -158,15 +164,19 @@ def depth_loss(
         rollout: the filtered batch.
         valid: (B, T) bool, rows that count.
         weight: (B, T, H, W) of the pixels.
-        every: n; the first image is drawn at random.
-        generator: draws it.
+        every: n.
+        first: the first of them, see `first_image`.
     """
-    every = min(every, valid.shape[1])
-    first = int(torch.randint(every, (), generator=generator, device=valid.device))
-    rows = (slice(None), slice(first, None, every))
+    rows = (slice(None), slice(first, None, min(every, valid.shape[1])))
     near = rollout.near[rows]
     image = model.decode_depth(rollout.carry.features[rows].flatten(0, 1)).view_as(near)
     return masked_mean(picture_error(image, near, weight[rows]), valid[rows])
+
+
+def first_image(every: int, batch: Batch, generator: torch.Generator | None = None) -> int:
+    """The first of every n-th image that is decoded, drawn at random."""
+    every = min(every, batch.valid.shape[1])
+    return int(torch.randint(every, (), generator=generator, device=batch.valid.device))
 
 
 def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
@@ -180,17 +190,20 @@ def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
     weight = torch.ones_like(near)
     if config.moving > 0:
         moving = _changed(near, config.moving_threshold)
-        moving[batch.is_first[:, 1:]] = False
+        moving &= ~batch.is_first[:, 1:, None, None]
         weight[:, 1:].add_(moving, alpha=config.moving)
     if config.near > 0:
         weight += config.near * (near > config.near_threshold)
     place = batch.passing[..., spec.IN_PICTURE]
-    flies = place[..., 2] > 0
-    disc = within(near[flies], place[flies])
+    if not model.config.paint_flight and config.flight == 0:
+        return weight
+    # In few pictures anything flies, but who picks them waits for a GPU to say which.
+    rows: Any = place[..., 2] > 0 if near.device.type == "cpu" else slice(None)
+    disc = within(near[rows].flatten(0, -3), place[rows].flatten(0, -2)).view_as(near[rows])
     if model.config.paint_flight:
-        weight[flies] *= ~disc
-    elif config.flight > 0:
-        weight[flies] += config.flight * disc
+        weight[rows] *= ~disc
+    else:
+        weight[rows] += config.flight * disc
     return weight
 
 
@@ -263,7 +276,7 @@ def passing_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
     output = model.decode_passing(rollout.carry.h, rollout.carry.z).float()
     place, on, known = batch.passing[..., :3], batch.passing[..., 3], batch.passing[..., 4] > 0
     known = known & batch.valid
-    unit = place.new_tensor(PASSING_UNIT)
+    unit = constant(PASSING_UNIT, place)
     error = F.huber_loss(output[..., :3], place / unit, reduction="none", delta=0.5).sum(-1)
     presence = F.binary_cross_entropy_with_logits(output[..., 3], on, reduction="none")
     return masked_mean(error, known & (on > 0)) + masked_mean(presence, known)

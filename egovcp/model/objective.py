@@ -11,13 +11,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from functools import partial
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from egovcp.model import losses
 from egovcp.model.carry import Carry
-from egovcp.model.foresight import autoregressive_losses, first_row, foresight_losses
+from egovcp.model.foresight import (
+    autoregressive_losses,
+    autoregressive_ticks,
+    first_row,
+    foresight_losses,
+)
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.losses import Batch, Rollout
 from egovcp.model.outcomes import value_and_termination_losses
@@ -29,10 +35,32 @@ type Terms = dict[str, Tensor]
 type Part = Callable[[], Terms]
 
 
+class Draws(NamedTuple):
+    """What a step leaves to chance."""
+
+    noise: Tensor  # (T, B, Z) with which z is sampled
+    image: int  # the first that is decoded
+    foresight: int  # the first row from which is imagined
+    autoregressive: int  # the same of autoregressive training; 0 without it
+
+
+def draws_for(model: WorldModel, batch: Batch, generator: torch.Generator | None = None) -> Draws:
+    """For a batch of this shape; ``generator``: None is torch's own."""
+    config = model.config.loss
+    noise = losses.latent_noise(model, batch, generator)
+    foresight = first_row(config, config.foresight_ahead, batch, generator)
+    image = losses.first_image(config.decode_every, batch, generator)
+    if model.config.dynamics == "joint":
+        return Draws(noise, image, foresight, 0)
+    return Draws(
+        noise, image, foresight, first_row(config, autoregressive_ticks(config), batch, generator)
+    )
+
+
 def world_model_loss(
     model: WorldModel,
     batch: Batch,
-    generator: torch.Generator | None = None,
+    chance: Draws | torch.Generator | None = None,
     heads: QHeads | None = None,
 ) -> tuple[Tensor, Terms]:
     """Total loss of equation 6 and its terms (scalars, detached).
@@ -40,11 +68,12 @@ def world_model_loss(
     Args:
         model: the world model.
         batch: windows.
-        generator: of the latent noise and of the drawn rows; None: torch's own.
+        chance: what is drawn, or what draws it; None: torch's own generator.
         heads: of Q, for its TD target (`egovcp.model.td`); None: the model's own.
     """
-    rollout = losses.filter_sequence(model, batch, generator=generator)
-    told, foreseen = _parts(model, rollout, batch, generator, heads)
+    draws = chance if isinstance(chance, Draws) else draws_for(model, batch, chance)
+    rollout = losses.filter_sequence(model, batch, noise=draws.noise)
+    told, foreseen = _parts(model, rollout, batch, draws, heads)
     terms = told() | foreseen()
     return _sum(terms), _named(terms)
 
@@ -52,23 +81,23 @@ def world_model_loss(
 def world_model_gradients(
     model: WorldModel,
     batch: Batch,
-    generator: torch.Generator | None = None,
+    draws: Draws,
     heads: QHeads | None = None,
     precision: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> tuple[Tensor, Terms]:
     """`world_model_loss`, detached, and its gradient in the ``grad`` of the model's parameters, in
-    the place of what was there.
+    the place of what was there. On a GPU nothing in it waits for what is computed there.
 
     Args:
         model: the world model.
         batch: windows.
-        generator: as there.
+        draws: what is left to chance.
         heads: as there.
         precision: a context in which the losses, not their gradients, are computed.
     """
     parameters = [p for p in model.parameters() if p.requires_grad]
     with precision():  # all of it: who leaves the last one takes casts of weights from the others
-        rollout = losses.filter_sequence(model, batch, generator=generator)
+        rollout = losses.filter_sequence(model, batch, noise=draws.noise)
         cut, outer, states = _cut(rollout)
 
         def with_gradient(part: Part) -> tuple[Terms, list[Tensor | None]]:
@@ -81,7 +110,7 @@ def world_model_gradients(
             with torch.autocast(batch.state.device.type, enabled=False):
                 return terms, list(torch.autograd.grad(total, inputs, allow_unused=True))
 
-        told, foreseen = _parts(model, cut, batch, generator, heads)
+        told, foreseen = _parts(model, cut, batch, draws, heads)
         first, second = partial(with_gradient, told), partial(with_gradient, foreseen)
         # Processes that share a batch meet at every mean, and so in one order.
         if batch.state.device.type == "cpu" and present_share() is WHOLE:
@@ -101,17 +130,16 @@ def _parts(
     model: WorldModel,
     rollout: Rollout,
     batch: Batch,
-    generator: torch.Generator | None,
+    draws: Draws,
     heads: QHeads | None,
 ) -> tuple[Part, Part]:
-    """What filtered states are asked for, and what is foreseen from them; only the former draws."""
+    """What filtered states are asked for, and what is foreseen from them."""
     config = model.config.loss
     weight = losses.pixel_weights(rollout.near, batch, model)
-    first = first_row(config, config.foresight_ahead, batch, generator)
 
     def told() -> Terms:
         every = config.decode_every
-        depth = losses.depth_loss(model, rollout, batch.valid, weight, every, generator)
+        depth = losses.depth_loss(model, rollout, batch.valid, weight, every, draws.image)
         terms = {
             "depth": config.depth * depth,
             "motion": config.motion * losses.motion_loss(model, rollout, batch),
@@ -121,11 +149,11 @@ def _parts(
         if model.config.dynamics == "joint":
             terms |= losses.kl_losses(rollout, batch.valid, config)
         else:
-            terms |= autoregressive_losses(model, rollout, batch, weight, generator)
+            terms |= autoregressive_losses(model, rollout, batch, weight, draws.autoregressive)
         return terms | value_and_termination_losses(model, rollout, batch, config, heads)
 
     def foreseen() -> Terms:
-        return foresight_losses(model, rollout, batch, weight, first)
+        return foresight_losses(model, rollout, batch, weight, draws.foresight)
 
     return told, foreseen
 

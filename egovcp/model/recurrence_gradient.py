@@ -192,10 +192,13 @@ def way_back(
 
 def beginnings(first: Tensor | None, rows: Sequence[int]) -> list[Tensor | None]:
     """Of each tick (B, 1) bool, the rows at which an episode begins; None where none does, which
-    saves two operations. Where there are beginnings all ticks have as many rows."""
+    saves two operations, unless a GPU has to be waited for. Where there are beginnings all ticks
+    have as many rows."""
     if first is None:
         return [None] * len(rows)
     ticks = first.view(len(rows), -1)
+    if first.device.type != "cpu":
+        return [tick[:, None] for tick in ticks]
     some = ticks.any(1).tolist()
     return [tick[:, None] if any_ else None for tick, any_ in zip(ticks, some, strict=True)]
 

@@ -14,18 +14,20 @@ from typing import Final
 import torch
 from torch import Tensor
 
+from egovcp.model.kept import constant
+
 BINS: Final = 81
 REACH: Final = 4.0
 """symlog of the outermost bins; in return deviations they are +- 53.6, and what lies beyond
 counts as lying there."""
 
 _EVEN: Final = [REACH * (2 * i / (BINS - 1) - 1) for i in range(BINS)]
-_VALUES: Final = [math.copysign(math.expm1(abs(x)), x) for x in _EVEN]
+_VALUES: Final = tuple(math.copysign(math.expm1(abs(x)), x) for x in _EVEN)
 
 
 def bins(like: Tensor) -> Tensor:
     """The values (BINS,), ascending, of ``like``'s device and in float32."""
-    return torch.tensor(_VALUES, device=like.device)
+    return constant(_VALUES, like, torch.float32)
 
 
 def encode(x: Tensor) -> Tensor:

@@ -14,8 +14,10 @@ if TYPE_CHECKING:
     from egovcp.testing.episodes import random_episode
     from egovcp.testing.models import CountingModel, toy_model, toy_reactive
     from egovcp.testing.planning import Point, PointWorld, ScriptedWorld
+    from egovcp.testing.recordings import AgainRecorder
 
 __all__ = [
+    "AgainRecorder",
     "CountingEnv",
     "CountingModel",
     "Point",
@@ -43,6 +45,7 @@ _HOME = {
     "Point": "planning",
     "PointWorld": "planning",
     "ScriptedWorld": "planning",
+    "AgainRecorder": "recordings",
 }
 
 

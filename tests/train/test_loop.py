@@ -2,13 +2,15 @@
 
 import dataclasses
 import itertools
+from typing import Any, Literal
 
 import pytest
 import torch
 
+from egovcp.cuda_graphs import Recorded
 from egovcp.errors import DataError
-from egovcp.model import Batch
-from egovcp.testing import random_batch, toy_model
+from egovcp.model import PRESETS, Batch
+from egovcp.testing import AgainRecorder, random_batch, toy_model
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.loop import Budget, Learner
 
@@ -89,6 +91,58 @@ def test_the_state_restores_a_learner_bit_for_bit() -> None:
     assert _same(_weights(straight), _weights(other))
     assert _same(straight.averaged.state_dict(), other.averaged.state_dict())
     assert straight.step == other.step == 4
+
+
+# --- recorded steps -------------------------------------------------------------------------
+@pytest.mark.parametrize("dynamics", ["joint", "autoregressive"])
+@pytest.mark.parametrize("q_target", ["mc", "td"])
+def test_recorded_steps_learn_the_same_bit_for_bit(
+    dynamics: Literal["joint", "autoregressive"], q_target: Literal["mc", "td"]
+) -> None:
+    loss = dataclasses.replace(PRESETS["debug"].loss, q_target=q_target, decode_every=2)
+    config = dataclasses.replace(PRESETS["debug"], dynamics=dynamics, loss=loss)
+    plain, recorded = (Learner(toy_model(config), CONFIG, seed=0) for _ in range(2))
+    recorder = AgainRecorder()
+    recorded._gradients = Recorded(recorded._find, recorder, most=64, copies=False)
+    for seed in range(12):
+        expected = plain.update(random_batch(2, 6, seed), 0.0)
+        found = recorded.update(random_batch(2, 6, seed), 0.0)
+        assert found.keys() == expected.keys()
+        assert all(found[name].equal(value) for name, value in expected.items())
+    assert _same(_weights(plain), _weights(recorded))
+    assert 1 < recorder.made < 12  # one for each row that may be the first
+    assert not recorded.unrecorded
+
+
+def test_a_step_that_cannot_be_recorded_is_made_and_says_why() -> None:
+    def refuse(function: object, device: torch.device) -> Any:
+        raise RuntimeError("operation not permitted")
+
+    learner, plain = _learner(), _learner()
+    assert not learner.unrecorded
+    learner._gradients = Recorded(learner._find, refuse, copies=False)
+    for seed in range(3):
+        learner.update(random_batch(2, 3, seed), 0.0)
+        plain.update(random_batch(2, 3, seed), 0.0)
+    assert _same(_weights(learner), _weights(plain))
+    assert learner.unrecorded == "operation not permitted"
+
+
+@pytest.mark.gpu
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("bf16", [False, True])
+def test_on_a_gpu_steps_are_recorded_and_the_same(bf16: bool) -> None:
+    recorded, plain = (Learner(toy_model().cuda(), CONFIG, seed=0, bf16=bf16) for _ in range(2))
+    assert isinstance(recorded._gradients, Recorded)
+    plain._gradients = plain._find
+    for seed in range(24):
+        batch = Batch(*(x.cuda() for x in random_batch(4, 8, seed)))
+        found, expected = (x.update(batch, 0.0) for x in (recorded, plain))
+        assert found.keys() == expected.keys()
+        for name, value in expected.items():
+            torch.testing.assert_close(found[name], value, rtol=2e-2, atol=2e-3, msg=name)
+    assert not recorded.unrecorded
+    assert recorded._gradients.shapes > 1  # one for each row that may be the first
 
 
 # --- averaging ------------------------------------------------------------------------------

@@ -7,22 +7,34 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import Final
 
 import torch
 from torch import Tensor
 
+from egovcp.cuda_graphs import Recorded
 from egovcp.errors import DataError
-from egovcp.model import Batch, WorldModel, world_model_gradients
+from egovcp.model import Batch, Draws, WorldModel, draws_for, world_model_gradients
 from egovcp.model.shared import sharing
 from egovcp.model.td import SlowHeads
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.device import precision
 from egovcp_train.ranks import ALONE, Ranks
 
+_MOST_GRAPHS: Final = 64
+"""One for each row or image that may be the first (`egovcp.model.Draws`): 8 of the default."""
+
+type Found = tuple[tuple[str, ...], Tensor, tuple[Tensor | None, ...]]
+"""Names and values (n,) of the terms, and the gradients of all parameters."""
+
 
 class Learner:
     """Model, averaged model, optimiser, the random stream of the latent noise, and under
-    ``q_target=td`` the slow heads of Q."""
+    ``q_target=td`` the slow heads of Q.
+
+    A step is some thousand small kernels. On a GPU calling them takes longer than they do, so that
+    there its gradient is recorded and replayed (`egovcp.cuda_graphs`).
+    """
 
     def __init__(
         self,
@@ -46,21 +58,29 @@ class Learner:
         self.generator = torch.Generator(device=device).manual_seed(seed)
         self.step = 0
         self._not_finite = 0
+        self._parameters = list(model.parameters())
+        self._gradients: Callable[[Batch, Draws], Found] = self._find
+        if device.type == "cuda" and ranks.count == 1:
+            self._gradients = Recorded(self._find, most=_MOST_GRAPHS, copies=False)
+
+    @property
+    def unrecorded(self) -> str:
+        """Why a step could not be recorded on this GPU, if so; it is right, but slow."""
+        return self._gradients.refused if isinstance(self._gradients, Recorded) else ""
 
     def update(self, batch: Batch, progress: float) -> dict[str, Tensor]:
         """One gradient step at ``progress`` in [0, 1] of the run; returns scalar metrics."""
         self.model.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(progress)
-        heads = self.slow.heads if self.slow else None
-        in_precision = partial(precision, batch.state.device, self.bf16)
         with sharing(self.ranks.share):
-            loss, metrics = world_model_gradients(
-                self.model, batch, self.generator, heads, in_precision
-            )
-        terms = {**metrics, "loss/total": loss}
-        terms = self.ranks.add_up(self.model.parameters(), terms)
-        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), self.config.grad_clip)
+            draws = draws_for(self.model, batch, self.generator)
+            names, values, gradients = self._gradients(batch, draws)
+        for parameter, gradient in zip(self._parameters, gradients, strict=True):
+            parameter.grad = gradient
+        terms = dict(zip(names, values.clone(), strict=True))
+        terms = self.ranks.add_up(self._parameters, terms)
+        norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.config.grad_clip)
         if self._finite(norm + terms["loss/total"]):
             self.optimizer.step()
             self._average()
@@ -68,6 +88,15 @@ class Learner:
                 self.slow.follow(self.model, self.model.config.loss.td_decay)
         self.step += 1
         return {**terms, "grad_norm": norm}
+
+    def _find(self, batch: Batch, draws: Draws) -> Found:
+        heads = self.slow.heads if self.slow else None
+        in_precision = partial(precision, batch.state.device, self.bf16)
+        with torch.enable_grad():
+            loss, terms = world_model_gradients(self.model, batch, draws, heads, in_precision)
+        terms = {**terms, "loss/total": loss}
+        gradients = tuple(parameter.grad for parameter in self._parameters)
+        return tuple(terms), torch.stack(list(terms.values())), gradients
 
     def learning_rate(self, progress: float) -> float:
         """Linear warm-up, then cosine decay to a tenth of the peak."""

@@ -47,6 +47,10 @@ from egovcp_train.wandb_records import WandbRecorder, require_wandb
 
 PROG = "egovcp-train"
 LAUNCHER_ECHO_S = 5.0
+_UNRECORDED = (
+    f"{PROG}: steps are right but many times slower than this GPU could make them, because they "
+    "cannot be recorded as a CUDA graph ({reason}); --device=cpu may be as fast; please report it"
+)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -186,6 +190,8 @@ class Run:
                 if learner.step % config.log_freq == 0:
                     self.recorder.scalars(learner.step, {k: float(v) for k, v in terms.items()})
                     bar.set_postfix(self._summary(terms, bar, frames))
+                    if learner.unrecorded and learner.step == start + config.log_freq:
+                        bar.write(_UNRECORDED.format(reason=learner.unrecorded))
                 if config.eval_freq and learner.step % config.eval_freq == 0:
                     self.evaluate(learner.averaged)
 

@@ -15,7 +15,7 @@ from typing import Final, Literal, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 from tqdm import tqdm
 
 from egovcp.errors import UsageError
@@ -174,7 +174,7 @@ def _fit_told(
     _descend(passing, told_error, rows, None, thorough, generator)
     with torch.no_grad():
         chunks = torch.split(torch.arange(len(rows.target)), 65536)
-        return torch.cat([told(_pick(rows, some, _device(passing))).cpu() for some in chunks])
+        return torch.cat([told(_pick(rows, some)) for some in chunks])
 
 
 def _fit_state(
@@ -213,25 +213,21 @@ def _descend(
     """Fit ``head`` from scratch to a small ``loss`` of rows and of what is ``known`` of them."""
     head.restart()
     head.requires_grad_(True)
-    device = _device(head)
     optimizer = torch.optim.AdamW(head.parameters(), lr=config.lr, weight_decay=config.weight_decay)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, config.lr, total_steps=config.steps)
     for _ in tqdm(range(config.steps), unit="step", desc="fit Q", mininterval=1.0, leave=False):
         pick = torch.randint(len(rows.target), (config.rows,), generator=generator)
         optimizer.zero_grad(set_to_none=True)
-        beyond = None if known is None else known[pick].to(device)
-        loss(_pick(rows, pick, device), beyond).backward()  # type: ignore[no-untyped-call]
+        beyond = None if known is None else known[pick.to(known.device)]
+        loss(_pick(rows, pick), beyond).backward()  # type: ignore[no-untyped-call]
         optimizer.step()
         schedule.step()
     head.requires_grad_(False)
 
 
-def _device(head: nn.Module) -> torch.device:
-    return next(head.parameters()).device
-
-
-def _pick(rows: Rows, which: Tensor, device: torch.device) -> Rows:
-    return Rows(*(x[which].to(device, torch.float32) for x in rows))
+def _pick(rows: Rows, which: Tensor) -> Rows:
+    which = which.to(rows.target.device)
+    return Rows(*(x[which].float() for x in rows))
 
 
 @torch.no_grad()
@@ -241,7 +237,7 @@ def collect_rows(
     imagined_steps: int,
     generator: torch.Generator,
 ) -> Rows:
-    """Every row whose target is known, as the planner would meet it.
+    """Every row whose target is known, as the planner would meet it; where the model is.
 
     The planner judges filtered states (k = 0) and states imagined k < N steps ahead, so
     each row is reached by a k drawn from 0 .. ``imagined_steps``.
@@ -268,7 +264,7 @@ def _rows_of(
         ahead = (x[:, k:][mask] for x in (batch.action, target, reward))
         told = model.passing(carry)
         found.append((carry.h[mask], carry.z[mask], told[mask], *ahead))
-    columns = (torch.cat(column).cpu() for column in zip(*found, strict=True))
+    columns = (torch.cat(column) for column in zip(*found, strict=True))
     h, z, told, action, *targets = columns
     return Rows(h.half(), z.half(), told, action.half(), *targets)
 

@@ -8,8 +8,8 @@ from functools import partial
 import torch
 from torch import Tensor
 
+from egovcp.cuda_graphs import Recorded
 from egovcp.model import Carry, WorldModel
-from egovcp.plan.backends.graphs import Recorded
 from egovcp.plan.backends.integers import IntegerNetwork
 from egovcp.plan.backends.network import PlanningNetwork
 from egovcp.plan.backends.reading import noise_of

@@ -28,7 +28,9 @@ def _model(**loss: object) -> WorldModel:
 
 def _losses(model: WorldModel, batch: Batch) -> dict[str, Tensor]:
     rollout = filter_sequence(model, batch, sample=False)
-    return autoregressive_losses(model, rollout, batch, pixel_weights(rollout.near, batch, model))
+    return autoregressive_losses(
+        model, rollout, batch, pixel_weights(rollout.near, batch, model), 0
+    )
 
 
 def test_predictions_take_the_place_of_the_kl_and_of_nothing_else(batch: Batch) -> None:

@@ -4,16 +4,28 @@ import dataclasses
 from collections.abc import Iterator
 from functools import partial
 from threading import current_thread, main_thread
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch._subclasses.fake_tensor import FakeTensorMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
-from egovcp.model import PRESETS, WorldModel, world_model_gradients, world_model_loss
+from egovcp.model import (
+    PRESETS,
+    Batch,
+    WorldModel,
+    draws_for,
+    world_model_gradients,
+    world_model_loss,
+)
 from egovcp.model.config import LossConfig
 from egovcp.model.threads import beside, one_thread
 from egovcp.testing import CountingModel, random_batch, toy_model
 
+NOWHERE = FakeTensorMode()  # one for all: constants are kept for each device
 BF16 = partial(torch.autocast, "cpu", torch.bfloat16)
 CONFIGS = {
     "debug": PRESETS["debug"],
@@ -24,6 +36,8 @@ CONFIGS = {
     ),
     "rewards": dataclasses.replace(PRESETS["debug"], loss=LossConfig(reward=1.0)),
     "autoregressive": dataclasses.replace(PRESETS["debug"], dynamics="autoregressive"),
+    "temporal differences": dataclasses.replace(PRESETS["debug"], loss=LossConfig(q_target="td")),
+    "bins": dataclasses.replace(PRESETS["debug"], value_loss="two_hot"),
 }
 
 
@@ -48,8 +62,8 @@ def test_it_is_the_gradient_of_the_loss(name: str, threads: int) -> None:
     loss, terms = world_model_loss(model, batch, torch.Generator().manual_seed(0))
     loss.backward()  # type: ignore[no-untyped-call]
     for _ in range(2):  # what a step before has left does not count
-        generator = torch.Generator().manual_seed(0)
-        found, parts = world_model_gradients(other, batch, generator)
+        draws = draws_for(other, batch, torch.Generator().manual_seed(0))
+        found, parts = world_model_gradients(other, batch, draws)
     assert not found.requires_grad
     torch.testing.assert_close(found, loss.detach())
     torch.testing.assert_close(parts, terms)
@@ -64,7 +78,8 @@ def test_a_model_with_steps_of_its_own_learns_the_same_way() -> None:
     model, other = CountingModel().train(), CountingModel().train()
     other.load_state_dict(model.state_dict())
     world_model_loss(model, batch, torch.Generator().manual_seed(0))[0].backward()  # type: ignore[no-untyped-call]
-    world_model_gradients(other, batch, torch.Generator().manual_seed(0))
+    draws = draws_for(other, batch, torch.Generator().manual_seed(0))
+    world_model_gradients(other, batch, draws)
     torch.testing.assert_close(_gradients(other), _gradients(model), rtol=1e-3, atol=1e-5)
 
 
@@ -76,8 +91,8 @@ def test_gradients_are_the_same_numbers_each_time() -> None:
         found = []
         for _ in range(6):
             model = toy_model().train()
-            generator = torch.Generator().manual_seed(0)
-            world_model_gradients(model, batch, generator, precision=BF16)
+            draws = draws_for(model, batch, torch.Generator().manual_seed(0))
+            world_model_gradients(model, batch, draws, precision=BF16)
             found.append(_gradients(model))
     finally:
         torch.set_num_threads(threads)
@@ -121,3 +136,49 @@ def test_what_is_too_small_to_be_shared_has_one_thread(threads: int) -> None:
     with one_thread():
         assert torch.get_num_threads() == 1
     assert torch.get_num_threads() == threads
+
+
+class NoCopies(TorchDispatchMode):
+    """Fails where something is copied from the processor to a GPU: so are the numbers of a list in
+    brackets."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        found = func(*args, **(kwargs or {}))
+        copies = "copy" in str(func)
+        given = {
+            x.device.type
+            for x in tree_leaves((args, kwargs))
+            if isinstance(x, Tensor) and (x.ndim or copies)  # a number is an argument
+        }
+        made = {x.device.type for x in tree_leaves(found) if isinstance(x, Tensor)}
+        assert not ("cpu" in given and "cuda" in made), func
+        return found
+
+
+@pytest.mark.skipif(
+    torch.cuda.is_available(), reason="what is kept for a device would be no tensor"
+)
+@pytest.mark.parametrize(
+    "name", ["rewards", "autoregressive", "temporal differences", "bins", "default"]
+)
+def test_nothing_of_a_loss_waits_for_a_gpu(name: str) -> None:
+    """Tensors without numbers, on a device that is not there: what depends on a number fails."""
+    model, batch = toy_model(CONFIGS.get(name, name)).train(), random_batch(3, 12)
+
+    def on_gpu(x: Tensor) -> Tensor:
+        with NOWHERE:
+            return torch.empty_strided(x.size(), x.stride(), dtype=x.dtype, device="cuda")
+
+    drawn = draws_for(model, batch)
+    draws = drawn._replace(noise=on_gpu(drawn.noise))
+    for part in model.modules():
+        for key, parameter in part.named_parameters(recurse=False):
+            setattr(part, key, torch.nn.Parameter(on_gpu(parameter), parameter.requires_grad))
+        for key, buffer in part.named_buffers(recurse=False):
+            setattr(part, key, on_gpu(buffer))
+    with NOWHERE:
+        world_model_loss(model, Batch(*map(on_gpu, batch)), draws)  # constants are made and kept
+        with NoCopies():
+            loss, _ = world_model_loss(model, Batch(*map(on_gpu, batch)), draws)
+    assert loss.device.type == "cuda"
+    assert loss.requires_grad

@@ -1,4 +1,4 @@
-"""Recordings of a judge: one per shape, into memory of their own."""
+"""Recordings of a plan or a step: one per shape, into memory of their own."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -8,11 +8,11 @@ import torch
 from torch import Tensor
 
 from egovcp import spec
+from egovcp.cuda_graphs import MOST_RECORDINGS, Recorded
 from egovcp.model import PRESETS, Carry
 from egovcp.plan import PlannerConfig, StepByStep
-from egovcp.plan.backends.graphs import MOST_RECORDINGS, Recorded
 from egovcp.plan.backends.judges import FloatJudge
-from egovcp.testing import toy_model
+from egovcp.testing import AgainRecorder, toy_model
 
 
 class _Pair(NamedTuple):
@@ -25,27 +25,6 @@ def _function(a: Tensor, rest: tuple[Tensor, Tensor | None]) -> _Pair:
     return _Pair(a + b if c is None else a + b + c, (2 * a,))
 
 
-class _Recorder:
-    """In the place of CUDA: a replay computes again, into the results of the recording."""
-
-    def __init__(self) -> None:
-        self.made = 0
-
-    def __call__(
-        self, function: Callable[[], Any], device: torch.device
-    ) -> tuple[Callable[[], object], Any]:
-        assert device == torch.device("cpu")
-        self.made += 1
-        results = function()
-
-        def replay() -> None:
-            again = function()
-            results.sum.copy_(again.sum)
-            results.parts[0].copy_(again.parts[0])
-
-        return replay, results
-
-
 def _arguments(size: int, seed: int, third: bool = True) -> tuple[Tensor, Any]:
     rng = torch.Generator().manual_seed(seed)
     a, b, c = torch.rand(3, size, generator=rng)
@@ -53,7 +32,7 @@ def _arguments(size: int, seed: int, third: bool = True) -> tuple[Tensor, Any]:
 
 
 def test_a_recording_serves_all_of_its_shape_and_no_other() -> None:
-    recorder = _Recorder()
+    recorder = AgainRecorder()
     recorded = Recorded(_function, recorder)
     for seed in range(3):
         for size, third in ((4, True), (5, True), (4, False)):
@@ -65,7 +44,7 @@ def test_a_recording_serves_all_of_its_shape_and_no_other() -> None:
 
 
 def test_what_was_answered_and_what_was_given_stay_as_they_are() -> None:
-    recorded = Recorded(_function, _Recorder())
+    recorded = Recorded(_function, AgainRecorder())
     given = _arguments(4, 0)
     before = [given[0].clone(), given[1][0].clone()]
     first = recorded(*given)
@@ -77,7 +56,7 @@ def test_what_was_answered_and_what_was_given_stay_as_they_are() -> None:
 
 
 def test_recordings_serve_under_either_mode_of_torch() -> None:
-    recorded = Recorded(_function, _Recorder())
+    recorded = Recorded(_function, AgainRecorder())
     for mode in (torch.inference_mode, torch.no_grad, torch.inference_mode):
         with mode():
             given = _arguments(4, 2)
@@ -99,15 +78,38 @@ def test_what_cannot_be_recorded_is_computed_and_not_tried_again() -> None:
         assert recorded(*given).sum.equal(_function(*given).sum)
     assert len(tried) == 1
     assert recorded.shapes == 0
+    assert recorded.refused == "operation not permitted when stream is capturing"
 
 
 def test_shapes_beyond_the_most_are_computed_without_a_recording() -> None:
-    recorder = _Recorder()
+    recorder = AgainRecorder()
     recorded = Recorded(_function, recorder)
     for size in range(1, MOST_RECORDINGS + 4):
         given = _arguments(size, size)
         assert recorded(*given).sum.equal(_function(*given).sum)
     assert recorder.made == MOST_RECORDINGS
+
+
+def test_what_is_no_tensor_has_a_recording_of_its_own() -> None:
+    def scaled(x: Tensor, by: int) -> tuple[str, Tensor]:
+        return f"by {by}", by * x
+
+    recorder = AgainRecorder()
+    recorded = Recorded(scaled, recorder)
+    for by in (2, 3, 2, 3):
+        x = torch.rand(4)
+        name, found = recorded(x, by)
+        assert name == f"by {by}"
+        assert found.equal(by * x)
+    assert recorder.made == 2
+
+
+def test_results_that_are_not_copied_are_those_of_the_last_call() -> None:
+    recorded = Recorded(_function, AgainRecorder(), copies=False)
+    first = recorded(*_arguments(4, 0))
+    second = recorded(*_arguments(4, 1))
+    assert first.sum is second.sum
+    assert second.sum.equal(_function(*_arguments(4, 1)).sum)
 
 
 @pytest.mark.gpu

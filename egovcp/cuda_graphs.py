@@ -1,7 +1,8 @@
-"""CUDA graphs: the many small kernels of a judge, recorded once per shape and replayed as one.
+"""CUDA graphs: the many small kernels of a plan, or of a gradient step, recorded once per shape and
+replayed as one.
 
-A recording reads and writes memory of its own: inputs are copied into it, outputs out of it. What
-cannot be recorded is computed as before, and is not tried again.
+A recording reads and writes memory of its own: inputs are copied into it. What cannot be recorded
+is computed as before, and is not tried again.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 MOST_RECORDINGS: Final = 8
-"""Each keeps its own memory; searches have few shapes, and further ones are computed as before."""
+"""By default: searches have few shapes, and further ones are computed as before."""
 WARM_UP: Final = 3
 """Calls before a recording: libraries choose their kernels, constants are made and kept."""
 
@@ -23,17 +24,28 @@ type Record = Callable[[Callable[[], Any], torch.device], tuple[Replay, Any]]
 its results to."""
 
 
-def record(function: Callable[[], Any], device: torch.device) -> tuple[Replay, Any]:
-    """As a CUDA graph.
+class Recorder:
+    """Makes CUDA graphs, none of which may be replayed while another is: they share the memory of
+    what is no result."""
 
-    Raises:
-        RuntimeError: something in it cannot be recorded, such as a copy from the processor.
-    """
-    with torch.cuda.device(device):  # whose streams are meant; a recording of another's is empty
-        return _record(function)
+    def __init__(self) -> None:
+        self._pools: dict[torch.device, Any] = {}
+
+    def __call__(self, function: Callable[[], Any], device: torch.device) -> tuple[Replay, Any]:
+        """See `Record`.
+
+        Raises:
+            RuntimeError: something in it cannot be recorded, such as a copy from the processor.
+        """
+        with torch.cuda.device(
+            device
+        ):  # whose streams are meant: a recording of another's is empty
+            if device not in self._pools:
+                self._pools[device] = torch.cuda.graph_pool_handle()
+            return _record(function, self._pools[device])
 
 
-def _record(function: Callable[[], Any]) -> tuple[Replay, Any]:
+def _record(function: Callable[[], Any], pool: Any) -> tuple[Replay, Any]:
     stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
@@ -41,7 +53,7 @@ def _record(function: Callable[[], Any]) -> tuple[Replay, Any]:
             function()
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, capture_error_mode="thread_local"):  # others go on meanwhile
+    with torch.cuda.graph(graph, pool, capture_error_mode="thread_local"):  # others go on meanwhile
         results = function()
     return graph.replay, results
 
@@ -53,22 +65,34 @@ class _Recording(NamedTuple):
 
 
 class Recorded:
-    """A function of tensors, in tuples or None as well, that does the same to equal shapes.
+    """A function of tensors, in tuples or None as well, that does the same to equal shapes; what is
+    no tensor is part of the shape.
 
     Args:
         function: waits for nothing, draws nothing, and has no effect but its results.
-        how: makes a recording; a `RuntimeError` says that there can be none.
+        how: makes a recording; a `RuntimeError` says that there can be none. None: a `Recorder`.
+        most: recordings.
+        copies: of the results, so that no later call changes them.
     """
 
-    def __init__(self, function: Callable[..., Any], how: Record = record) -> None:
-        self._function, self._how = function, how
+    def __init__(
+        self,
+        function: Callable[..., Any],
+        how: Record | None = None,
+        most: int = MOST_RECORDINGS,
+        copies: bool = True,
+    ) -> None:
+        self._function, self._how = function, how or Recorder()
+        self._most, self._copies = most, copies
         self._recordings: dict[object, _Recording | None] = {}
+        self.refused = ""
+        """Why something could not be recorded; empty: nothing was tried in vain."""
 
     def __call__(self, *arguments: Any) -> Any:
-        """The function's results, which no later call changes."""
+        """The function's results."""
         key = _shape(arguments)
         if key not in self._recordings:
-            full = len(self._recordings) >= MOST_RECORDINGS
+            full = len(self._recordings) >= self._most
             self._recordings[key] = None if full else self._record(arguments)
         recording = self._recordings[key]
         if recording is None:
@@ -76,7 +100,7 @@ class Recorded:
         for buffer, given in zip(recording.inputs, _tensors(arguments), strict=True):
             buffer.copy_(given)
         recording.replay()
-        return _map(recording.results, Tensor.clone)
+        return _map(recording.results, Tensor.clone) if self._copies else recording.results
 
     @property
     def shapes(self) -> int:
@@ -90,7 +114,8 @@ class Recorded:
         try:
             device = next(_tensors(own)).device
             replay, results = self._how(lambda: self._function(*own), device)
-        except RuntimeError:
+        except RuntimeError as error:
+            self.refused = " ".join(str(error).split())[:200]
             return None
         return _Recording(list(_tensors(own)), replay, results)
 
@@ -99,21 +124,21 @@ def _tensors(tree: Any) -> Iterator[Tensor]:
     """In the order of the tuples they are in."""
     if isinstance(tree, Tensor):
         yield tree
-    elif tree is not None:
+    elif isinstance(tree, tuple):
         for part in tree:
             yield from _tensors(part)
 
 
 def _map(tree: Any, function: Callable[[Tensor], Tensor]) -> Any:
     """The same tuples of other tensors."""
-    if tree is None or isinstance(tree, Tensor):
-        return None if tree is None else function(tree)
+    if not isinstance(tree, tuple):
+        return function(tree) if isinstance(tree, Tensor) else tree
     parts = [_map(part, function) for part in tree]
     return type(tree)(*parts) if hasattr(tree, "_fields") else tuple(parts)
 
 
 def _shape(tree: Any) -> object:
     """What a recording depends on."""
-    if tree is None or isinstance(tree, Tensor):
-        return None if tree is None else (tree.shape, tree.dtype, tree.device)
+    if not isinstance(tree, tuple):
+        return (tree.shape, tree.dtype, tree.device) if isinstance(tree, Tensor) else tree
     return (type(tree), *(_shape(part) for part in tree))

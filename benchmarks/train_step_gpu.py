@@ -1,0 +1,128 @@
+"""Gradient steps and frames per second on a GPU, beside one thread of the same machine's processor.
+
+By the clock, what waits for the GPU included, with each number of windows:
+
+* ``step``: `egovcp_train.loop.Learner.update` on one batch in the GPU's memory, in the precision
+  that ``egovcp-train`` takes there by itself (``bf16`` says which);
+* ``float32``: the same in float32;
+* ``data``: a step with its batch drawn from the stream and copied there, as in training;
+* ``cpu``: a step on one thread of the processor, in its own precision (``cpu_bf16``).
+
+The cases take turns, after as many steps as it takes to record them (`egovcp.cuda_graphs`).
+
+    python benchmarks/train_step_gpu.py --root data/ball --return_steps 20
+"""
+
+from __future__ import annotations
+
+import copy
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from report import interleaved, parser, publish
+from writer import make_episode
+from writer import writer as write
+
+from egovcp.data import (
+    EpisodeIndex,
+    EpisodeStore,
+    ReturnConfig,
+    SequenceStream,
+    StreamConfig,
+    open_dataset,
+)
+from egovcp.model import Batch, WorldModel, WorldModelConfig
+from egovcp_train.batches import set_normalisation, to_tensors
+from egovcp_train.config import OptimizerConfig, SamplingConfig
+from egovcp_train.device import choose_bf16
+from egovcp_train.labels.config import PassingConfig
+from egovcp_train.labels.passing import label
+from egovcp_train.loop import Learner
+
+LENGTH = SamplingConfig().length
+EPISODES = 100  # of each task
+RECORDED = 64  # steps, after which each row that may be drawn was drawn
+CPU, GPU = torch.device("cpu"), torch.device("cuda")
+
+
+def cases(store: EpisodeStore, size: int, on_cpu: bool) -> dict[str, Callable[[], object]]:
+    """Name -> a step that is over when the call returns."""
+    model = WorldModel(WorldModelConfig())
+    set_normalisation(model, store)
+    config = OptimizerConfig(warmup_steps=0)
+    stream = SequenceStream(store, StreamConfig(batch_size=size, length=LENGTH))
+
+    def learner(device: torch.device, bf16: bool) -> Learner:
+        return Learner(copy.deepcopy(model).to(device), config, seed=0, bf16=bf16)
+
+    def batch(device: torch.device) -> Batch:
+        return to_tensors(next(stream), device)
+
+    def stepping(device: torch.device, bf16: bool, fresh: bool = False) -> Callable[[], object]:
+        mine, kept = learner(device, bf16), batch(device)
+
+        def step() -> None:
+            mine.update(batch(device) if fresh else kept, 0.0)
+            if device.type == "cuda":
+                torch.cuda.synchronize()
+
+        for _ in range(RECORDED if device.type == "cuda" else 0):
+            step()
+        if mine.unrecorded:
+            raise SystemExit(f"a step cannot be recorded: {mine.unrecorded}")
+        return step
+
+    own = choose_bf16("auto", GPU)
+    found = {
+        "step": stepping(GPU, own),
+        "float32": stepping(GPU, bf16=False),
+        "data": stepping(GPU, own, fresh=True),
+    }
+    return found | ({"cpu": stepping(CPU, choose_bf16("auto", CPU))} if on_cpu else {})
+
+
+def main() -> None:
+    """Measure and print."""
+    options = parser(__doc__)
+    options.add_argument("--root", type=Path, help="dataset to train on; none: one is made")
+    options.add_argument("--batches", type=int, nargs="+", default=[16, 64, 256], help="windows")
+    options.add_argument(
+        "--cpu_batches", type=int, nargs="*", default=[16], help="of these, also on the processor"
+    )
+    options.add_argument(
+        "--return_steps", type=int, default=ReturnConfig().steps, help="horizon of returns, ticks"
+    )
+    args = options.parse_args()
+    if not torch.cuda.is_available():
+        raise SystemExit("torch finds no CUDA device here; benchmarks/train_step.py needs none")
+    torch.set_num_threads(1)
+    out: dict[str, object] = {
+        "window": LENGTH,
+        "bf16": choose_bf16("auto", GPU),
+        "cpu_bf16": choose_bf16("auto", CPU),
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        root = args.root or Path(folder) / "dataset"
+        if args.root is None:
+            write(root, [make_episode(i, 150) for i in range(EPISODES)])
+        index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
+        store = label(
+            EpisodeStore.read(index, ReturnConfig(steps=args.return_steps)), PassingConfig()
+        )
+        for size in args.batches:
+            seconds = interleaved(cases(store, size, size in args.cpu_batches), args.rounds)
+            for name, value in seconds.items():
+                out[f"{name}_{size}_ms"] = 1e3 * value
+            out[f"steps_{size}_per_s"] = 1 / seconds["data"]
+            out[f"frames_{size}_per_s"] = size * LENGTH / seconds["data"]
+            if "cpu" in seconds:
+                out[f"cpu_ratio_{size}"] = seconds["cpu"] / seconds["step"]
+            out[f"memory_{size}_gb"] = torch.cuda.max_memory_allocated() / 1e9
+            torch.cuda.reset_peak_memory_stats()
+    publish(out, args.json)
+
+
+if __name__ == "__main__":
+    main()
