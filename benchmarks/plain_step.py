@@ -2,7 +2,8 @@
 
 The same mathematics as `egovcp.model` and `egovcp_train.loop`: the same weights, loss terms and
 random draws, optimiser and averaging. Every network is a plain module on concatenated inputs, the
-encoder and all heads work on whole stacked sequences, and the recurrence is a loop over time.
+encoder and all heads work on whole stacked sequences, and the recurrence is a loop over time, in
+which what flies is followed as it is on the robot, a picture at a time.
 """
 
 from __future__ import annotations
@@ -14,8 +15,10 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from egovcp import spec
-from egovcp.model import Batch, LossConfig, WorldModel
+from egovcp.model import Batch, LossConfig, WorldModel, flight
+from egovcp.model.camera_pose import camera_pose
 from egovcp.model.depth import within
+from egovcp.model.floor import floor
 from egovcp.model.nets import SplitLinear, SplitMlp
 from egovcp.model.world_model import PASSING_UNIT
 from egovcp_train.config import OptimizerConfig
@@ -101,12 +104,21 @@ class PlainModel(nn.Module):
         output: Tensor = self.decode_motion(features)
         return output.unflatten(-1, (len(self.config.motion_ahead), 4))
 
-    def value(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
+    @torch.no_grad()
+    def follow(
+        self, memory: Tensor, near: Tensor, state: Tensor, sight: Tensor, first: Tensor
+    ) -> Tensor:
+        """What is remembered of a flight (N, ...) after one more picture."""
+        max_m, config = self.config.depth_max_m, self.config.flight
+        seen = flight.sighting(near, sight, max_m, config)
+        pose = camera_pose(state, config.camera)
+        ground = floor(near, pose, max_m, config.camera)
+        return flight.follow(memory, pose, seen, ground, first, config)
+
+    def value(self, h: Tensor, z: Tensor, memory: Tensor, action: Tensor) -> Tensor:
         """Standardised, of each head, (..., heads)."""
         features = torch.cat([h, z], -1)
-        out = self.decode_passing(features).detach()
-        coming = torch.sigmoid(out[..., 3:])
-        passing = torch.cat([coming, coming * out[..., :3]], -1)
+        passing = flight.told(memory, PASSING_UNIT)
         own = [
             head(torch.cat([reduce(features), action], -1))
             for reduce, head in zip(self.reduce, self.value_heads, strict=True)
@@ -164,17 +176,21 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
     near = near.view(size, length, *near.shape[1:])
 
     h, z = torch.zeros(size, config.hidden), torch.zeros(size, config.latent)
-    hs, zs, means, stds = [], [], [], []
+    memory = torch.zeros(size, flight.SIZE)
+    hs, zs, means, stds, memories = [], [], [], [], []
     for t in range(length):
         keep = (~batch.is_first[:, t, None]).float()
         h = model.transition(h * keep, z * keep, batch.prev_action[:, t] * keep)
         mean, std = model.gaussian(model.posterior(model.posterior_h(h) + observation[:, t]))
         z = mean + std * torch.randn(mean.shape, generator=generator)
+        seen = near[:, t], batch.state[:, t], sight[:, t]
+        memory = model.follow(memory, *seen, batch.is_first[:, t])
         hs.append(h)
         zs.append(z)
         means.append(mean)
         stds.append(std)
-    h, z, mean, std = (torch.stack(x, 1) for x in (hs, zs, means, stds))
+        memories.append(memory)
+    h, z, mean, std, memory = (torch.stack(x, 1) for x in (hs, zs, means, stds, memories))
     features = torch.cat([h, z], -1)
     prior_mean, prior_std = model.gaussian(model.prior(h))
 
@@ -187,7 +203,7 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
         loss.passing * passing_loss(model, features, batch),
         loss.state * mean_where(error, batch.valid),
         *kl_terms(model, (mean, std), (prior_mean, prior_std), batch),
-        *value_terms(model, h, z, batch),
+        *value_terms(model, h, z, memory, batch),
         *foreseen,
     ]
     return torch.stack(terms).sum()
@@ -263,11 +279,13 @@ def value_error(q: Tensor, target: Tensor) -> Tensor:
     return ((q - target[..., None]) ** 2).mean(-1)
 
 
-def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[Tensor]:
+def value_terms(
+    model: PlainModel, h: Tensor, z: Tensor, memory: Tensor, batch: Batch
+) -> list[Tensor]:
     loss = model.config.loss
     target = (batch.mc_return - model.return_mean) / model.return_std  # type: ignore[operator]
     usable = batch.valid & batch.mc_valid
-    value = mean_where(value_error(model.value(h, z, batch.action), target), usable)
+    value = mean_where(value_error(model.value(h, z, memory, batch.action), target), usable)
     h = model.transition(h, z, batch.action)
     z = model.gaussian(model.prior(h))[0]
     fall = F.binary_cross_entropy_with_logits(
@@ -275,7 +293,8 @@ def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[T
         batch.terminal_next.float(),
         reduction="none",
     )
-    q = model.value(h[:, :-1], z[:, :-1], batch.action[:, 1:])
+    later = flight.later(memory)[:, :-1]
+    q = model.value(h[:, :-1], z[:, :-1], later, batch.action[:, 1:])
     error = value_error(q, target[:, 1:])
     imagined = mean_where(error, usable[:, 1:] & unbroken(batch, 1))
     return [
