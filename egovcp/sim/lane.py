@@ -166,5 +166,5 @@ class Lane:
         self.tick += 1
         terms = self.task.end_tick(action)
         self.terminated = self.task.fallen
-        self.truncated = not self.terminated and self.tick >= self.task.ticks_limit
+        self.truncated = not self.terminated and self.task.is_over
         return terms

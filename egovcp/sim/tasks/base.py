@@ -79,6 +79,11 @@ class Task(ABC):
         return self.physics_steps * PHYSICS_DT
 
     @property
+    def is_over(self) -> bool:
+        """Whether the time limit is reached."""
+        return self.physics_steps >= self.ticks_limit * PHYSICS_STEPS_PER_TICK
+
+    @property
     def since_event(self) -> float:
         """Seconds since the event; negative before it, -inf in an empty episode."""
         if self.event_tick is None:

@@ -17,7 +17,7 @@ from egovcp.sim.robot import SimulatedRobot, Touch
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.arch import ArchTask
 from egovcp.sim.tasks.ball import BallTask
-from egovcp.sim.tasks.base import PHYSICS_STEPS_PER_TICK, Array, ObjectState, Solid, Task
+from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
 from egovcp.sim.tasks.wall import WallTask
 
 SINGLE: Final[dict[str, type[Task]]] = {"ball": BallTask, "wall": WallTask, "arch": ArchTask}
@@ -80,17 +80,22 @@ class SequenceTask(Task):
         """Go on to the next part if the present one is over."""
         super().begin_tick()
         self._settled_ticks += self._part.settled
-        if self._part is not self._parts[-1] and self._is_over:
+        if self._part is not self._parts[-1] and self._is_decided(self._settled_ticks):
             self._part.park()
             self._at, self._settled_ticks = self._at + 1, 0
             self._part.place()
         self._part.begin_tick()
 
-    @property
-    def _is_over(self) -> bool:
+    def _is_decided(self, settled_ticks: int) -> bool:
         """Whether the present part has been decided for a while, or its time is up."""
-        time_is_up = self._part.physics_steps >= self._part.ticks_limit * PHYSICS_STEPS_PER_TICK
-        return self._settled_ticks > self._pause or time_is_up
+        return settled_ticks > self._pause or self._part.is_over
+
+    @property
+    def is_over(self) -> bool:
+        """Whether that is so of the last part: an oracle that has braced on a wall for as long as
+        wall episodes last lets go of it afterwards, and falls."""
+        last = self._part is self._parts[-1]
+        return last and self._is_decided(self._settled_ticks + self._part.settled)
 
     def park(self) -> None:
         """Take all objects away."""
