@@ -37,9 +37,8 @@ class Recorder:
         Raises:
             RuntimeError: something in it cannot be recorded, such as a copy from the processor.
         """
-        with torch.cuda.device(
-            device
-        ):  # whose streams are meant: a recording of another's is empty
+        # Whose streams are meant: a recording of another's is empty.
+        with torch.cuda.device(device):
             if device not in self._pools:
                 self._pools[device] = torch.cuda.graph_pool_handle()
             return _record(function, self._pools[device])

@@ -98,7 +98,8 @@ def _measured(near: Tensor, sight: Tensor, max_m: float, config: FlightConfig) -
     z = own * z
     sums = [z.sum((1, 2)), -(z.sum(1) * col).sum(1), -(z.sum(2) * row[:, 0]).sum(1)]
     mean = [total / count.clamp_min(1) for total in sums]
-    edges = own[:, :: height - 1], own[:, :, :: width - 1]  # first and last: no list, see kept.py
+    # First and last lines; a list of them in brackets would be copied to a GPU at each call.
+    edges = own[:, :: height - 1], own[:, :, :: width - 1]
     cut = sum(edge.sum((1, 2)) for edge in edges)  # its middle is lost
     found = (count >= _MIN_PIXELS) & (cut == 0)
     point = torch.where(found[:, None], torch.stack(mean, -1), guess)

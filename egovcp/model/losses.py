@@ -199,7 +199,8 @@ def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
         return weight
     # In few pictures anything flies, but who picks them waits for a GPU to say which.
     rows: Any = place[..., 2] > 0 if near.device.type == "cpu" else slice(None)
-    disc = within(near[rows].flatten(0, -3), place[rows].flatten(0, -2)).view_as(near[rows])
+    seen = near[rows]
+    disc = within(seen.flatten(0, -3), place[rows].flatten(0, -2)).view_as(seen)
     if model.config.paint_flight:
         weight[rows] *= ~disc
     else:

@@ -58,6 +58,19 @@ def test_a_run_writes_checkpoints_and_an_artefact_that_plans(
     assert str(output / "checkpoints" / "000006" / "pretrained_model") in printed
 
 
+def test_a_gpu_that_cannot_record_steps_is_said_once(
+    arguments: Arguments,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Learner, "unrecorded", "operation not permitted")
+    assert main(arguments(tmp_path / "run", log_freq=1)) == 0
+    said = re.findall("cannot be recorded as a CUDA graph .*", capsys.readouterr().out)
+    assert len(said) == 1
+    assert "operation not permitted" in said[0]
+
+
 def test_the_options_of_a_run_are_kept_and_repeat_it(arguments: Arguments, tmp_path: Path) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
     assert main(arguments(one)) == 0

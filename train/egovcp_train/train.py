@@ -167,6 +167,7 @@ class Run:
         config, learner, start = self.config, self.learner, self.learner.step
         ticks = config.sampling.length + config.sampling.burn_in
         frames = self.ranks.count * config.batch_size * ticks
+        warned = False
         with tqdm(
             total=config.steps,
             initial=start,
@@ -190,7 +191,8 @@ class Run:
                 if learner.step % config.log_freq == 0:
                     self.recorder.scalars(learner.step, {k: float(v) for k, v in terms.items()})
                     bar.set_postfix(self._summary(terms, bar, frames))
-                    if learner.unrecorded and learner.step == start + config.log_freq:
+                    if learner.unrecorded and not warned:
+                        warned = True
                         bar.write(_UNRECORDED.format(reason=learner.unrecorded))
                 if config.eval_freq and learner.step % config.eval_freq == 0:
                     self.evaluate(learner.averaged)
