@@ -235,7 +235,7 @@ def _in_memory(
     set_normalisation(model, learning, config.targets)
     heldout = label(heldout, config.passing)
     if needs_labels(config):
-        learning = label(learning, config.passing)
+        learning = label(learning, config.passing, torch.get_num_threads())
     rows = ranks.rows(sampling.batch_size)
     sampling = dataclasses.replace(sampling, batch_size=ranks.count * sampling.batch_size)
     stream = Ahead(SequenceStream(learning, sampling, mix, rows))

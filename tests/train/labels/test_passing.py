@@ -1,19 +1,27 @@
 """Labels of what is on its way, from pictures alone."""
 
+import dataclasses
+import os
+import signal
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from egovcp import spec
+from egovcp.data import DatasetConfig, DatasetReader, EpisodeStore
 from egovcp.data.mirror import mirror_depth, mirror_passing, mirror_state
+from egovcp.errors import EnvironmentFailure
 from egovcp.robot.kinematics import LINK_NAMES, link_transforms
 from egovcp.sim.config import CameraConfig, EnvConfig, EpisodeConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.truth import Truth
+from egovcp_train.labels import passing
 from egovcp_train.labels.camera import camera_track
 from egovcp_train.labels.config import PassingConfig
-from egovcp_train.labels.passing import label_episode
+from egovcp_train.labels.passing import label, label_episode
 from egovcp_train.labels.throw import find_throw, fit_path
 
 CONFIG = PassingConfig(camera_pitch=0.0)
@@ -221,3 +229,43 @@ def _true_crossing(truth: Truth, row: int) -> np.ndarray:
     flight = (CONFIG.plane - truth.object_b[row, 0]) / truth.object_velocity_b[row, 0]
     at = truth.object_b[row] + truth.object_velocity_b[row] * flight + 0.5 * GRAVITY * flight**2
     return np.array([at[1], at[2] + truth.pelvis_w[row, 2] - spec.ACTION_BOX.neutral[-1]])
+
+
+# --- many episodes --------------------------------------------------------------------------
+def _thrown(dataset_root: Path) -> EpisodeStore:
+    """Six throws, each to another place."""
+    made = EpisodeStore.load([DatasetReader.open(DatasetConfig(root=str(dataset_root)))], "train")
+    throws = [throw((0.1 * i - 0.2, 0.3)) for i in range(6)]
+    return dataclasses.replace(
+        made,
+        depth=np.concatenate(throws),
+        state=np.concatenate([standing().astype(np.float32)] * len(throws)),
+        start=np.arange(len(throws)) * TICKS,
+        length=np.full(len(throws), TICKS),
+    )
+
+
+def test_several_processes_label_alike(dataset_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    store = _thrown(dataset_root)
+    alone = label(store, CONFIG)
+    monkeypatch.setattr(passing, "ALONE", 2)
+    monkeypatch.setattr(passing, "_AT_ONCE", 2)
+    shared = label(store, CONFIG, workers=2)
+    assert alone.passing[:, 3].any()
+    assert np.array_equal(shared.passing, alone.passing)
+    for i in range(6):
+        rows = slice(i * TICKS, (i + 1) * TICKS)
+        own = label_episode(store.depth[rows], store.state[rows], CONFIG)
+        assert np.array_equal(alone.passing[rows], own)
+
+
+def _killed(episodes: object, config: PassingConfig) -> list[np.ndarray]:
+    os.kill(os.getpid(), signal.SIGKILL)
+    return []
+
+
+def test_a_killed_process_is_said(dataset_root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(passing, "ALONE", 2)
+    monkeypatch.setattr(passing, "_all_labelled", _killed)
+    with pytest.raises(EnvironmentFailure, match="try fewer --threads"):
+        label(_thrown(dataset_root), CONFIG, workers=2)

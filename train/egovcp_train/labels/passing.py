@@ -9,7 +9,13 @@ world model (`egovcp.model.losses.passing_loss`) and say which pixels are the th
 
 from __future__ import annotations
 
+import multiprocessing
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
+from functools import partial
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,25 +23,72 @@ from tqdm import tqdm
 
 from egovcp import spec
 from egovcp.data import EpisodeStore
+from egovcp.errors import EnvironmentFailure
 from egovcp.model.threads import one_thread
 from egovcp.robot.kinematics import rotate
+from egovcp.workers import inherited_by_workers
 from egovcp_train.labels.camera import Array, turn
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.labels.flight import in_picture
 from egovcp_train.labels.throw import Throw, find_throw
 
+ALONE: Final = 1000
+"""Episodes that are labelled in the time that other processes need to begin."""
+_AT_ONCE: Final = 32  # episodes for a process
 
-def label(store: EpisodeStore, config: PassingConfig) -> EpisodeStore:
-    """The same episodes with ``passing`` filled in."""
-    passing = np.zeros((store.num_frames, spec.PASSING_DIM), dtype=np.float32)
-    spans = zip(store.start, store.length, strict=True)
-    with one_thread():
-        for start, length in tqdm(
-            spans, total=len(store.start), unit="ep", desc="label", leave=False
-        ):
-            rows = slice(start, start + length)
-            passing[rows] = label_episode(store.depth[rows], store.state[rows], config)
+type _Episode = tuple[NDArray[np.uint16], NDArray[np.float32]]  # depth, state
+
+
+def label(store: EpisodeStore, config: PassingConfig, workers: int = 1) -> EpisodeStore:
+    """The same episodes with ``passing`` filled in.
+
+    Args:
+        store: the episodes.
+        config: of the labels.
+        workers: processes for more than `ALONE` episodes; the labels are the same.
+
+    Raises:
+        EnvironmentFailure: such a process was killed.
+    """
+    spans = [slice(a, a + n) for a, n in zip(store.start, store.length, strict=True)]
+    passing = np.zeros((len(store.state), spec.PASSING_DIM), dtype=np.float32)
+    episodes = [(store.depth[rows], store.state[rows]) for rows in spans]
+    alone = workers == 1 or len(episodes) <= ALONE
+    found = _labelled(episodes, config) if alone else _shared(episodes, config, workers)
+    with tqdm(zip(spans, found, strict=True), total=len(spans), unit="ep", leave=False) as bar:
+        bar.set_description("label")
+        for rows, labels in bar:
+            passing[rows] = labels
     return replace(store, passing=passing)
+
+
+def _shared(
+    episodes: list[_Episode], config: PassingConfig, workers: int
+) -> Iterator[NDArray[np.float32]]:
+    parts = [episodes[i : i + _AT_ONCE] for i in range(0, len(episodes), _AT_ONCE)]
+    work = partial(_all_labelled, config=config)
+    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+    try:
+        with inherited_by_workers():
+            found = pool.map(work, parts)
+        for part in found:
+            yield from part
+    except BrokenProcessPool as error:
+        raise EnvironmentFailure(
+            "a process that labels episodes was killed (out of memory?); try fewer --threads"
+        ) from error
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _all_labelled(episodes: list[_Episode], config: PassingConfig) -> list[NDArray[np.float32]]:
+    return list(_labelled(episodes, config))
+
+
+def _labelled(episodes: list[_Episode], config: PassingConfig) -> Iterator[NDArray[np.float32]]:
+    with one_thread():
+        for depth, state in episodes:
+            yield label_episode(depth, state, config)
 
 
 def label_episode(
