@@ -32,9 +32,10 @@ from egovcp_train.labels.config import PassingConfig
 from egovcp_train.labels.flight import in_picture
 from egovcp_train.labels.throw import Throw, find_throw
 
-ALONE: Final = 1000
+ALONE: Final = 2000
 """Episodes that are labelled in the time that other processes need to begin."""
 _AT_ONCE: Final = 32  # episodes for a process
+_MOST: Final = 8  # processes, each of which needs memory for torch
 
 type _Episode = tuple[NDArray[np.uint16], NDArray[np.float32]]  # depth, state
 
@@ -45,7 +46,7 @@ def label(store: EpisodeStore, config: PassingConfig, workers: int = 1) -> Episo
     Args:
         store: the episodes.
         config: of the labels.
-        workers: processes for more than `ALONE` episodes; the labels are the same.
+        workers: processes, at most 8, for more than `ALONE` episodes; the labels are the same.
 
     Raises:
         EnvironmentFailure: such a process was killed.
@@ -67,7 +68,7 @@ def _shared(
 ) -> Iterator[NDArray[np.float32]]:
     parts = [episodes[i : i + _AT_ONCE] for i in range(0, len(episodes), _AT_ONCE)]
     work = partial(_all_labelled, config=config)
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"))
+    pool = ProcessPoolExecutor(min(workers, _MOST), multiprocessing.get_context("spawn"))
     try:
         with inherited_by_workers():
             found = pool.map(work, parts)
