@@ -56,10 +56,9 @@ def label(store: EpisodeStore, config: PassingConfig, workers: int = 1) -> Episo
     episodes = [(store.depth[rows], store.state[rows]) for rows in spans]
     alone = workers == 1 or len(episodes) <= ALONE
     found = _labelled(episodes, config) if alone else _shared(episodes, config, workers)
-    with tqdm(zip(spans, found, strict=True), total=len(spans), unit="ep", leave=False) as bar:
-        bar.set_description("label")
-        for rows, labels in bar:
-            passing[rows] = labels
+    pairs = zip(spans, found, strict=True)
+    for rows, labels in tqdm(pairs, total=len(spans), unit="ep", desc="label", leave=False):
+        passing[rows] = labels
     return replace(store, passing=passing)
 
 
