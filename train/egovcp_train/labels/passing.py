@@ -33,7 +33,7 @@ from egovcp_train.labels.flight import in_picture
 from egovcp_train.labels.throw import Throw, find_throw
 
 ALONE: Final = 2000
-"""Episodes that are labelled in the time that other processes need to begin."""
+"""Episodes up to which other processes, which need seconds to begin, gain little."""
 _AT_ONCE: Final = 32  # episodes for a process
 _MOST: Final = 8  # processes, each of which needs memory for torch
 
