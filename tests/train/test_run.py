@@ -1,5 +1,6 @@
 """egovcp-train from its command line: what it writes, what it refuses."""
 
+import errno
 import os
 import re
 import shutil
@@ -56,6 +57,22 @@ def test_a_run_writes_checkpoints_and_an_artefact_that_plans(
     printed = capsys.readouterr().out
     assert "done at step 6" in printed
     assert str(output / "checkpoints" / "000006" / "pretrained_model") in printed
+
+
+@pytest.mark.parametrize("broken", ["record", "draw"])
+def test_pictures_that_fail_do_not_take_the_finished_model_with_them(
+    arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
+) -> None:
+    whole, output = tmp_path / "whole", tmp_path / "broken"
+    assert main(arguments(whole, tensorboard="true")) == 0
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(f"egovcp_train.train.{broken}", full)
+    assert main(arguments(output, tensorboard="true")) == 5
+    kept = [_last(o) / "pretrained_model" / "model.safetensors" for o in (whole, output)]
+    assert kept[0].read_bytes() == kept[1].read_bytes()
 
 
 def test_a_gpu_that_cannot_record_steps_is_said_once(

@@ -195,21 +195,23 @@ class Run:
                         warned = True
                         bar.write(_UNRECORDED.format(reason=learner.unrecorded))
                 if config.eval_freq and learner.step % config.eval_freq == 0:
-                    self.evaluate(learner.averaged)
+                    self.show(self.measure(learner.averaged))
 
     def finish(self, fit: bool) -> None:
-        """Fit Q on the states of the finished model, evaluate, and save what is shipped.
+        """Fit Q on the states of the finished model, measure, save what is shipped, and show it.
 
         A launcher leaves its processes 30 s to stop: there an unfinished model is only saved.
         """
-        shipped = self.learner.averaged
+        shipped, report = self.learner.averaged, None
         if self.ranks.is_first and (fit or self.ranks.count == 1):
             shipped = copy.deepcopy(shipped)
             if fit:
                 fit_value(shipped, self._states(), self.config.value_fit, self.config.seed)
-            report = self.evaluate(shipped)
-            record(report, self.output, shipped.config.depth_max_m)
+            report = self.measure(shipped)
         self.save(shipped)
+        if report is not None:  # after the model is safe: pictures may fail, of a full disk or else
+            self.show(report)
+            record(report, self.output, shipped.config.depth_max_m)
 
     def _states(self) -> Iterator[Batch]:
         """Whole training episodes, with a bar: to filter them all takes minutes."""
@@ -219,22 +221,23 @@ class Run:
                 yield batch
                 bar.update(len(batch.valid))
 
-    def evaluate(self, model: WorldModel) -> Report:
+    def measure(self, model: WorldModel) -> Report:
         """Measure a model on held-out episodes, and in simulation if that is asked for."""
-        config, step = self.config, self.learner.step
         heldout = self.material.heldout
-        episodes = recorded(heldout, self.device, EVALUATION_EPISODES)
-        report = measure(model, episodes)
+        report = measure(model, recorded(heldout, self.device, EVALUATION_EPISODES))
         self.metrics, self.tasks = report.metrics, report.tasks
-        found = self.metrics | scalars(self.tasks)
+        if self.simulation is not None:
+            self.played = self.simulation.play(model, self.config.planner)
+        return report
+
+    def show(self, report: Report) -> None:
+        """Record what the last measurement found, and draw it where something takes pictures."""
+        step, found = self.learner.step, self.metrics | scalars(self.tasks)
         self.recorder.scalars(step, {f"heldout/{k}": v for k, v in found.items()})
+        self.recorder.scalars(step, {f"closed_loop/{k}": v for k, v in self.played.items()})
         if len(self.recorder):
             for name, picture in draw(report).items():
                 self.recorder.picture(step, f"heldout/{name}", picture)
-        if self.simulation is not None:
-            self.played = self.simulation.play(model, config.planner)
-            self.recorder.scalars(step, {f"closed_loop/{k}": v for k, v in self.played.items()})
-        return report
 
     def save(self, model: WorldModel) -> None:
         """Write a checkpoint: the model as artefact, and the training state of all processes.
