@@ -5,8 +5,8 @@ One model for each choice, with equal steps and seeds, on the data of all tasks 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Final
+from collections.abc import Mapping, Sequence
+from typing import Final
 
 from egovcp import spec
 from egovcp_experiment.cell import Cell, Flags
@@ -14,6 +14,7 @@ from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.experiment import Experiment
 from egovcp_experiment.grid import ALL, Grid, Model
 from egovcp_experiment.report.document import Report, Table
+from egovcp_experiment.report.heldout import COLUMNS, OVER_SEEDS, measured, over_seeds
 from egovcp_experiment.store import Record
 
 _PIXELS: Final = spec.DEPTH_ROWS * spec.DEPTH_COLS
@@ -53,30 +54,6 @@ CHOICES: Final[dict[str, Flags]] = {
 }
 
 
-def _depth(task: Mapping[str, Any], region: str, k: int) -> float | None:
-    """How many times smaller the error is than that of the last image repeated."""
-    return _gain(task["depth"][region][str(k)], "model_mm", "repeat_mm")
-
-
-def _gain(errors: Mapping[str, float | None], model: str, repeat: str) -> float | None:
-    ours, theirs = errors[model], errors[repeat]
-    return None if not ours or theirs is None else theirs / ours
-
-
-_COLUMNS: Final[Mapping[str, Callable[[Mapping[str, Any]], float | None]]] = {
-    "ball, 4 ahead (x)": lambda task: _depth(task, "ball_watched", 4),
-    "ball, 8 (x)": lambda task: _depth(task, "ball_watched", 8),
-    "near, 8 (x)": lambda task: _depth(task, "near", 8),
-    "all pixels, 8 (x)": lambda task: _depth(task, "valid", 8),
-    "joints, 4 (x)": lambda task: _gain(task["state"]["joint_position"]["4"], "model", "repeat"),
-    "AUC within 5": lambda task: task["termination"]["5"]["auc"],
-    "Q R2": lambda task: task["value"]["r2"],
-    "Q slope": lambda task: task["value"]["slope"],
-    "z active": lambda task: task["latent"]["active"],
-    "KL (nats)": lambda task: task["latent"]["kl_nats"],
-}
-
-
 def _trainings(config: ExperimentConfig, grid: Grid) -> dict[str, list[Cell]]:
     """Choice -> its cells, one for each seed."""
     task = ALL if len(config.tasks) > 1 else config.tasks[0]
@@ -101,14 +78,14 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
         name: [records[cell.name]["figures"]["tasks"] for cell in cells if cell.name in records]
         for name, cells in _trainings(config, Grid(config)).items()
     }
-    measured = {
-        task: {name: _measured([run[task] for run in runs]) for name, runs in found.items() if runs}
+    found_by_task = {
+        task: {name: measured([run[task] for run in runs]) for name, runs in found.items() if runs}
         for task in config.tasks
     }
-    tables = tuple(_table(task, rows) for task, rows in measured.items())
+    tables = tuple(_table(task, rows) for task, rows in found_by_task.items())
     return Report(
         title="Ablations: what each choice of the world model is worth on held-out episodes",
-        shows=tuple(line for task, rows in measured.items() for line in _shows(task, rows)),
+        shows=tuple(line for task, rows in found_by_task.items() for line in _shows(task, rows)),
         parts=(
             f"Every model was trained for {config.train.compared_steps} gradient steps on the "
             "data of all tasks named here together, and differs from `default` in the flags named. "
@@ -117,14 +94,8 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
             "which differ from those of the others.",
             *tables,
         ),
-        figures=measured,
+        figures=found_by_task,
     )
-
-
-def _measured(runs: Sequence[Mapping[str, Any]]) -> dict[str, list[float]]:
-    """Column -> its value of each seed that has one."""
-    values = {name: [column(run) for run in runs] for name, column in _COLUMNS.items()}
-    return {name: [v for v in column if v is not None] for name, column in values.items()}
 
 
 def _shows(task: str, rows: Mapping[str, Mapping[str, Sequence[float]]]) -> list[str]:
@@ -144,10 +115,10 @@ def _shows(task: str, rows: Mapping[str, Mapping[str, Sequence[float]]]) -> list
 
 def _table(task: str, rows: Mapping[str, Mapping[str, Sequence[float]]]) -> Table:
     return Table(
-        title=f"{task} (several seeds: mean and half of the range)",
-        head=("choice", "changed", *_COLUMNS),
+        title=f"{task} ({OVER_SEEDS})",
+        head=("choice", "changed", *COLUMNS),
         rows=tuple(
-            (name, _changed(CHOICES[name]), *(_shown(values) for values in row.values()))
+            (name, _changed(CHOICES[name]), *(over_seeds(values) for values in row.values()))
             for name, row in rows.items()
         ),
     )
@@ -156,13 +127,6 @@ def _table(task: str, rows: Mapping[str, Mapping[str, Sequence[float]]]) -> Tabl
 def _changed(flags: Flags) -> str:
     text = " ".join(f"{name}={value}" for name, value in flags.items())
     return f"`{text}`" if text else ""
-
-
-def _shown(values: Sequence[float]) -> str:
-    if not values:
-        return "-"
-    text = f"{sum(values) / len(values):.3g}"
-    return text if len(values) == 1 else f"{text} ± {(max(values) - min(values)) / 2:.2g}"
 
 
 EXPERIMENT: Final = Experiment(

@@ -21,6 +21,7 @@ from egovcp_experiment.report.document import (
     percent,
     points_range,
 )
+from egovcp_experiment.report.heldout import COLUMNS, OVER_SEEDS, measured, over_seeds
 from egovcp_experiment.store import Record
 
 type Cells = dict[str, dict[str, dict[int, str]]]  # task -> row -> seed -> name of the cell
@@ -45,6 +46,12 @@ MODELS: Final[dict[str, Flags]] = {
     "reward": {"policy.loss.reward": 1},
     "reward_arwm": {"policy.loss.reward": 1, "policy.dynamics": "autoregressive"},
     "reward_td": {"policy.loss.reward": 1, "policy.loss.q_target": "td"},
+}
+#: What the model is called where models are compared, not rows.
+_CALLED: Final = {"reward": "joint embedding", "reward_arwm": "ARWM", "reward_td": "Q by TD"}
+#: Without columns of the latent, whose KL the autoregressive model does not learn.
+_HELDOUT: Final = {
+    name: column for name, column in COLUMNS.items() if name not in ("z active", "KL (nats)")
 }
 #: N -> the paper's rewards of wall, ball and arch.
 _HORIZONS: Final[dict[int, tuple[float, float, float]]] = {
@@ -98,14 +105,18 @@ def _names(config: ExperimentConfig) -> list[str]:
     return [name for name in ROWS if name in chosen]
 
 
-def _plays(config: ExperimentConfig, grid: Grid) -> Cells:
-    """Trains with equal steps, without a limit of time, in which slower models would learn less."""
+def _model(config: ExperimentConfig, name: str) -> Model:
+    """Of equal steps, without a limit of time, in which slower models would learn less."""
     equal = {"steps": config.train.compared_steps, "max_minutes": 0}
+    return Model(name, {**equal, **MODELS[name]})
+
+
+def _plays(config: ExperimentConfig, grid: Grid) -> Cells:
     found: Cells = {}
     for task in config.tasks:
         for name in _names(config):
             row = ROWS[name]
-            variant = Variant(name, Model(row.model, {**equal, **MODELS[row.model]}), row.play)
+            variant = Variant(name, _model(config, row.model), row.play)
             cells = {seed: grid.play(task, seed, variant).name for seed in config.train.seeds}
             found.setdefault(task, {})[name] = cells
     return found
@@ -120,13 +131,19 @@ def _cells(config: ExperimentConfig) -> list[Cell]:
 
 
 def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
-    cells = _plays(config, Grid(config))
+    grid = Grid(config)
+    cells = _plays(config, grid)
     found = _played(cells, records)
+    models = _models(config, grid, records)
     verdicts = _verdicts(cells, records)
     parts: list[str | Table | Plot] = [_training(config)]
     parts += [_summary(found)] if found else []
     parts += [_claims(verdicts)] if verdicts else []
-    figures: dict[str, Any] = {"claims": [verdict.figures() for verdict in verdicts]}
+    parts += [_heldout(models)] if models else []
+    figures: dict[str, Any] = {
+        "claims": [verdict.figures() for verdict in verdicts],
+        "models": models,
+    }
     for task, rows in found.items():
         others = side_by_side(records, f"bounds-{task}", task, BOUNDS)
         named = {ROWS[name].title: played for name, played in rows.items()}
@@ -146,6 +163,39 @@ def _played(cells: Cells, records: Mapping[str, Record]) -> Played:
             if played is not None:
                 found.setdefault(task, {})[name] = played
     return found
+
+
+def _models(
+    config: ExperimentConfig, grid: Grid, records: Mapping[str, Record]
+) -> dict[str, dict[str, dict[str, list[float]]]]:
+    """Task -> what its models are called -> what they do on held-out episodes, seed by seed."""
+    wanted = dict.fromkeys(ROWS[name].model for name in _names(config))
+    found: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for task in config.tasks:
+        for name in wanted:
+            cells = [
+                grid.train(task, seed, _model(config, name)).name for seed in config.train.seeds
+            ]
+            runs = [records[cell]["figures"]["tasks"][task] for cell in cells if cell in records]
+            if runs:
+                found.setdefault(task, {})[_CALLED[name]] = measured(runs, _HELDOUT)
+    return found
+
+
+def _heldout(models: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> Table:
+    return Table(
+        title=(
+            "The models on held-out episodes; (x): times below the error of the last image "
+            "repeated, so many ticks ahead; Q beside Monte Carlo returns, also where it learns by "
+            f"TD ({OVER_SEEDS})"
+        ),
+        head=("task", "model", *_HELDOUT),
+        rows=tuple(
+            (task, name, *(over_seeds(values) for values in row.values()))
+            for task, rows in models.items()
+            for name, row in rows.items()
+        ),
+    )
 
 
 def _training(config: ExperimentConfig) -> str:
