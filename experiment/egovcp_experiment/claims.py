@@ -38,6 +38,8 @@ class Verdict:
     """The same of the success rate."""
     success_interval: Interval
     """95 %, over scenarios."""
+    of_wins: tuple[float, Interval] | None
+    """The same of the reward in episodes in which both succeed; None where there are none."""
     agreeing: int
     """Trainings in which ``above`` has more reward."""
     seeds: int
@@ -74,6 +76,8 @@ class Verdict:
             "reward_gain_ci95": list(self.reward_interval),
             "success_gain": self.success,
             "success_gain_ci95": list(self.success_interval),
+            "reward_gain_of_wins": self.of_wins[0] if self.of_wins else None,
+            "reward_gain_of_wins_ci95": list(self.of_wins[1]) if self.of_wins else None,
             "seeds_in_favour": self.agreeing,
             "seeds": self.seeds,
         }
@@ -110,6 +114,7 @@ def weigh(
         reward_interval,
         success,
         success_interval,
+        of_wins=ours.reward_gain_of_wins(theirs),
         agreeing=int((each > 0).sum()),
         seeds=len(both),
     )

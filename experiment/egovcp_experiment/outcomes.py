@@ -97,6 +97,19 @@ class Outcome:
         )
         return self.reward_per_step - other.reward_per_step, interval
 
+    def reward_gain_of_wins(self, other: Outcome) -> tuple[float, Interval] | None:
+        """The same of episodes in which both succeed, where losses of neither count; None where
+        there are none."""
+        both = self.success * other.success
+        at = both.any(0)  # in these scenarios, with one of the seeds at least
+        if not at.any():
+            return None
+
+        def won(of: Outcome) -> Outcome:
+            return Outcome((of.reward * both)[:, at], (of.steps * both)[:, at], both[:, at])
+
+        return won(self).reward_gain(won(other))
+
     def figures(self) -> dict[str, Any]:
         """For programs."""
         return {

@@ -33,6 +33,19 @@ def test_no_difference_is_zero_and_a_real_one_is_found() -> None:
     assert low > 0.4
 
 
+def test_rewards_of_wins_leave_out_what_either_has_lost() -> None:
+    won = np.array([[1, 1, 0, 1], [1, 0, 0, 1]])
+    lost = np.array([[1, 1, 1, 0], [0, 1, 1, 0]])
+    ours = made(won, np.where(won, 3.0, -50.0))
+    theirs = made(lost, np.where(lost, 1.0, 70.0))
+    found = ours.reward_gain_of_wins(theirs)  # seed 0 both win scenarios 0 and 1, seed 1 none
+    assert found is not None
+    gain, interval = found
+    assert gain == pytest.approx(0.2)
+    assert interval == pytest.approx((0.2, 0.2))
+    assert ours.reward_gain_of_wins(made(1 - won)) is None
+
+
 def test_paired_intervals_cover_about_as_often_as_they_say() -> None:
     rng = np.random.default_rng(2)
     covered = 0

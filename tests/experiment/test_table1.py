@@ -138,6 +138,17 @@ def test_the_opposite_is_contradicted_and_no_difference_is_undecided() -> None:
     assert {word for *_, word in words(same)} == {"undecided"}
 
 
+def test_the_reward_where_both_succeed_is_said_beside() -> None:
+    found = report(as_in_the_paper)
+    (claims,) = [p for p in found.parts if isinstance(p, Table) and p.title.startswith("Differ")]
+    (row,) = [row for row in claims.rows if row[:2] == ("ours, N=4 above ARWM", "ball")]
+    gain = row[claims.head.index("reward/step where both succeed (95 %)")]
+    assert float(gain.split()[0]) == pytest.approx(0.2, abs=0.01)
+    figures = next(c for c in found.figures["claims"] if c["below"] == "arwm")
+    low, high = figures["reward_gain_of_wins_ci95"]
+    assert low < figures["reward_gain_of_wins"] < high
+
+
 def test_what_one_training_alone_does_holds_on_average_only() -> None:
     found = report(lambda task, variant, seed: (0.3, -0.1)[seed] if variant == "ours_n4" else 0.0)
     assert ("ours_n4", "ours_n1", "ball", "holds on average only") in words(found)
@@ -194,7 +205,7 @@ def test_a_claim_is_weighed_by_the_trainings_that_both_have() -> None:
 
 def test_chance_is_said() -> None:
     claim = Claim("a", "b", ("ball",))
-    up = Verdict(claim, "ball", 1.0, (0.5, 1.5), 0.0, (0.0, 0.0), agreeing=1, seeds=1)
+    up = Verdict(claim, "ball", 1.0, (0.5, 1.5), 0.0, (0.0, 0.0), None, agreeing=1, seeds=1)
     even = replace(up, reward_interval=(-0.1, 0.1))
     assert by_chance([up] * 3 + [even] * 17).startswith(
         "of 20 claims, one for each task: 3 holds, 17 undecided (95 % intervals; were no two "

@@ -291,6 +291,7 @@ def _claims(verdicts: Sequence[Verdict]) -> Table:
             f"{v.agreeing} of {v.seeds}",
             f"{100 * v.success:+.1f}",
             points_range(v.success_interval),
+            _of_wins(v),
             f"{_papers(v):+.4f}",
         )
         for v in verdicts
@@ -304,9 +305,17 @@ def _claims(verdicts: Sequence[Verdict]) -> Table:
         "trainings",
         "success (points)",
         "95 %",
+        "reward/step where both succeed (95 %)",
         "the paper's reward",
     )
     return Table("Differences, above - below, on the same scenarios", head, rows)
+
+
+def _of_wins(verdict: Verdict) -> str:
+    if verdict.of_wins is None:
+        return "-"
+    gain, (low, high) = verdict.of_wins
+    return f"{gain:+.5f} ({low:+.5f} to {high:+.5f})"
 
 
 def _papers(verdict: Verdict) -> float:
