@@ -232,9 +232,9 @@ class Run:
 
     def show(self, report: Report) -> None:
         """Record what the last measurement found, and draw it where something takes pictures."""
-        step, found = self.learner.step, self.metrics | scalars(self.tasks)
-        self.recorder.scalars(step, {f"heldout/{k}": v for k, v in found.items()})
-        self.recorder.scalars(step, {f"closed_loop/{k}": v for k, v in self.played.items()})
+        step, heldout = self.learner.step, self.metrics | scalars(self.tasks)
+        found = {f"heldout/{k}": v for k, v in heldout.items()}
+        self.recorder.scalars(step, found | {f"closed_loop/{k}": v for k, v in self.played.items()})
         if len(self.recorder):
             for name, picture in draw(report).items():
                 self.recorder.picture(step, f"heldout/{name}", picture)
