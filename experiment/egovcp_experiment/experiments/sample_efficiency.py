@@ -118,13 +118,15 @@ def _shows(task: str, named: Mapping[str, Outcome]) -> list[str]:
     first, last = named[names[0]], named[names[-1]]
     if len(names) < 2:
         return [f"{task}: {last.success_rate:.1%} success from {names[-1]}"]
-    gain, (low, high) = last.success_gain(first)
+    gain, (low, high) = last.reward_gain(first)
     more = (
         "more data helps" if low > 0 else "more data hurts" if high < 0 else "no clear difference"
     )
+    won, interval = last.success_gain(first)
     return [
         f"{task}: {first.success_rate:.1%} success from {names[0]}, {last.success_rate:.1%} from "
-        f"{names[-1]}: {more} ({100 * gain:+.1f} points, 95 % {points_range((low, high))})"
+        f"{names[-1]}: {more} (reward per step {gain:+.5f}, 95 % {low:+.5f} to {high:+.5f}; "
+        f"success {100 * won:+.1f} points, {points_range(interval)})"
     ]
 
 
