@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -41,6 +42,23 @@ def main(argv):
 """
 
 type MakeCell = Callable[..., Cell]
+
+
+@pytest.fixture
+def trained() -> Callable[[str, float], Mapping[str, Any]]:
+    """Makes the record of a training on a task, whose Q explains so much of the returns."""
+
+    def make(task: str, r2: float) -> Mapping[str, Any]:
+        errors = {str(k): {"model_mm": 1.0, "repeat_mm": 4.0} for k in (4, 8)}
+        found = {
+            "depth": dict.fromkeys(("ball_watched", "near", "valid"), errors),
+            "state": {"joint_position": {"4": {"model": 2.0, "repeat": 3.0}}},
+            "termination": {"5": {"auc": None}},
+            "value": {"r2": r2, "slope": 1.0},
+        }
+        return {"figures": {"tasks": {task: found}}}
+
+    return make
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +10,7 @@ import pytest
 
 from egovcp_experiment.config import DataConfig, ExperimentConfig, PpoConfig
 from egovcp_experiment.experiments import EXPERIMENTS
+from egovcp_experiment.report.document import Table
 
 COUNT = 40
 CONFIG = ExperimentConfig(
@@ -46,3 +47,19 @@ def test_more_data_is_judged_by_reward_and_success_is_said_beside(
     assert line.startswith("wall: 90.0% success from 100k steps, 70.0% from 200k steps: " + words)
     assert f"reward per step {reward - 0.2:+.5f}, 95 % " in line
     assert "success -20.0 points, " in line
+
+
+def test_models_of_each_part_stand_beside_each_other(
+    trained: Callable[[str, float], Mapping[str, Any]],
+) -> None:
+    cells = [cell.name for cell in EXPERIMENTS["sample-efficiency"].cells(CONFIG)]
+    half, whole = [name for name in cells if name.startswith("train-")]
+    records = {name: played(0.2, 0.9) for name in cells if name.startswith("play-")}
+    records |= {half: trained("wall", 0.3), whole: trained("wall", 0.5)}
+    found = EXPERIMENTS["sample-efficiency"].report(CONFIG, records)
+    (table,) = [p for p in found.parts if isinstance(p, Table) and "held-out" in p.title]
+    rows = [dict(zip(table.head, row, strict=True)) for row in table.rows]
+    assert [(row["model"], row["Q R2"]) for row in rows] == [
+        ("100k steps", "0.3"),
+        ("200k steps", "0.5"),
+    ]

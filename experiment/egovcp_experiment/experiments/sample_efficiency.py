@@ -20,6 +20,7 @@ from egovcp_experiment.outcomes import Outcome, outcome, side_by_side
 from egovcp_experiment.report.comparison import comparison
 from egovcp_experiment.report.curves import Curve, transitions_plot
 from egovcp_experiment.report.document import Plot, Report, Table, points_range
+from egovcp_experiment.report.heldout import Models, add, models_table
 from egovcp_experiment.store import Record
 from egovcp_experiment.transitions import per_episode, steps
 
@@ -79,6 +80,7 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
     figures: dict[str, Any] = {}
     curves: dict[str, dict[int, Outcome]] = {}
     ppo: dict[str, dict[int, Outcome]] = {}
+    models: Models = {}
     for task, cells in _plays(config, grid).items():
         found = {p: o for p, c in cells.items() if (o := outcome(records, c, task)) is not None}
         if not found:
@@ -86,6 +88,10 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
         of_each = per_episode(grid, task, records)
         sizes = {p: round(_episodes(config, task, p) * of_each) for p in found}
         curves[task] = {sizes[p]: played for p, played in found.items()}
+        for p in found:
+            model = _model(config, grid, task, p)
+            trained = [grid.train(task, seed, model).name for seed in config.train.seeds]
+            add(models, task, steps(sizes[p]), trained, records)
         free = model_free.curve(grid, task, records)
         ppo[task] = free
         named = {steps(sizes[p]): played for p, played in found.items()}
@@ -100,6 +106,9 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
         figures[task] = {name: o.figures() for name, o in shown.items()}
     if curves:
         parts.insert(1, _plot(curves, ppo))
+    if models:
+        parts.insert(2, models_table(models, "held-out episodes of their own part"))
+        figures["models"] = models
     title = "Sample efficiency: success against the transitions that a model has seen"
     return Report(title, tuple(shows), tuple(parts), figures)
 

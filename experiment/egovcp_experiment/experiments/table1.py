@@ -21,7 +21,7 @@ from egovcp_experiment.report.document import (
     percent,
     points_range,
 )
-from egovcp_experiment.report.heldout import COLUMNS, OVER_SEEDS, measured, over_seeds
+from egovcp_experiment.report.heldout import Models, add, models_table
 from egovcp_experiment.store import Record
 
 type Cells = dict[str, dict[str, dict[int, str]]]  # task -> row -> seed -> name of the cell
@@ -49,10 +49,6 @@ MODELS: Final[dict[str, Flags]] = {
 }
 #: What the model is called where models are compared, not rows.
 _CALLED: Final = {"reward": "joint embedding", "reward_arwm": "ARWM", "reward_td": "Q by TD"}
-#: Without columns of the latent, whose KL the autoregressive model does not learn.
-_HELDOUT: Final = {
-    name: column for name, column in COLUMNS.items() if name not in ("z active", "KL (nats)")
-}
 #: N -> the paper's rewards of wall, ball and arch.
 _HORIZONS: Final[dict[int, tuple[float, float, float]]] = {
     1: (0.0557, -0.0066, -0.0396),
@@ -139,7 +135,7 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
     parts: list[str | Table | Plot] = [_training(config)]
     parts += [_summary(found)] if found else []
     parts += [_claims(verdicts)] if verdicts else []
-    parts += [_heldout(models)] if models else []
+    parts += [models_table(models)] if models else []
     figures: dict[str, Any] = {
         "claims": [verdict.figures() for verdict in verdicts],
         "models": models,
@@ -165,37 +161,14 @@ def _played(cells: Cells, records: Mapping[str, Record]) -> Played:
     return found
 
 
-def _models(
-    config: ExperimentConfig, grid: Grid, records: Mapping[str, Record]
-) -> dict[str, dict[str, dict[str, list[float]]]]:
-    """Task -> what its models are called -> what they do on held-out episodes, seed by seed."""
-    wanted = dict.fromkeys(ROWS[name].model for name in _names(config))
-    found: dict[str, dict[str, dict[str, list[float]]]] = {}
+def _models(config: ExperimentConfig, grid: Grid, records: Mapping[str, Record]) -> Models:
+    found: Models = {}
     for task in config.tasks:
-        for name in wanted:
-            cells = [
-                grid.train(task, seed, _model(config, name)).name for seed in config.train.seeds
-            ]
-            runs = [records[cell]["figures"]["tasks"][task] for cell in cells if cell in records]
-            if runs:
-                found.setdefault(task, {})[_CALLED[name]] = measured(runs, _HELDOUT)
+        for name in dict.fromkeys(ROWS[name].model for name in _names(config)):
+            model = _model(config, name)
+            cells = [grid.train(task, seed, model).name for seed in config.train.seeds]
+            add(found, task, _CALLED[name], cells, records)
     return found
-
-
-def _heldout(models: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> Table:
-    return Table(
-        title=(
-            "The models on held-out episodes; (x): times below the error of the last image "
-            "repeated, so many ticks ahead; Q beside Monte Carlo returns, also where it learns by "
-            f"TD ({OVER_SEEDS})"
-        ),
-        head=("task", "model", *_HELDOUT),
-        rows=tuple(
-            (task, name, *(over_seeds(values) for values in row.values()))
-            for task, rows in models.items()
-            for name, row in rows.items()
-        ),
-    )
 
 
 def _training(config: ExperimentConfig) -> str:

@@ -5,8 +5,11 @@ A run is what `egovcp-train` reports of one task: ``figures.tasks.TASK`` of its 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, Final
+
+from egovcp_experiment.report.document import Table
+from egovcp_experiment.store import Record
 
 #: A column of the table, of one run; none where its episodes do not show it.
 type Column = Callable[[Mapping[str, Any]], float | None]
@@ -37,6 +40,39 @@ COLUMNS: Final[Mapping[str, Column]] = {
     "z active": lambda task: task["latent"]["active"],
     "KL (nats)": lambda task: task["latent"]["kl_nats"],
 }
+
+
+#: Without the latent's, whose KL not every kind of model learns.
+_SHARED: Final = {n: c for n, c in COLUMNS.items() if n not in ("z active", "KL (nats)")}
+
+#: Task -> what a model is called -> column -> its value of each seed.
+type Models = dict[str, dict[str, dict[str, list[float]]]]
+
+
+def add(
+    models: Models, task: str, name: str, cells: Iterable[str], records: Mapping[str, Record]
+) -> None:
+    """Add what the trainings of a model, one for each seed, found, as far as they are there."""
+    runs = [records[cell]["figures"]["tasks"][task] for cell in cells if cell in records]
+    if runs:
+        models.setdefault(task, {})[name] = measured(runs, _SHARED)
+
+
+def models_table(models: Models, where: str = "held-out episodes") -> Table:
+    """All of them beside each other, measured on what ``where`` says."""
+    return Table(
+        title=(
+            f"The models on {where}; (x): times below the error of the last image "
+            "repeated, so many ticks ahead; Q beside Monte Carlo returns, whatever it learns from "
+            f"({OVER_SEEDS})"
+        ),
+        head=("task", "model", *_SHARED),
+        rows=tuple(
+            (task, name, *(over_seeds(values) for values in row.values()))
+            for task, rows in models.items()
+            for name, row in rows.items()
+        ),
+    )
 
 
 def measured(
