@@ -1,6 +1,5 @@
 """egovcp-train from its command line: what it writes, what it refuses."""
 
-import errno
 import os
 import re
 import shutil
@@ -59,22 +58,6 @@ def test_a_run_writes_checkpoints_and_an_artefact_that_plans(
     assert str(output / "checkpoints" / "000006" / "pretrained_model") in printed
 
 
-@pytest.mark.parametrize("broken", ["record", "draw"])
-def test_pictures_that_fail_do_not_take_the_finished_model_with_them(
-    arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, broken: str
-) -> None:
-    whole, output = tmp_path / "whole", tmp_path / "broken"
-    assert main(arguments(whole, tensorboard="true")) == 0
-
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(f"egovcp_train.train.{broken}", full)
-    assert main(arguments(output, tensorboard="true")) == 5
-    kept = [_last(o) / "pretrained_model" / "model.safetensors" for o in (whole, output)]
-    assert kept[0].read_bytes() == kept[1].read_bytes()
-
-
 def test_a_gpu_that_cannot_record_steps_is_said_once(
     arguments: Arguments,
     tmp_path: Path,
@@ -124,18 +107,6 @@ def test_a_preset_is_where_the_policy_options_start(arguments: Arguments, tmp_pa
     assert main(arguments(tmp_path / "run", "--policy.latent=5", "--policy.loss.value=2.5")) == 0
     config = load_artefact(str(_last(tmp_path / "run") / "pretrained_model")).world_model.config
     assert (config.hidden, config.latent, config.loss.value) == (32, 5, 2.5)
-
-
-def test_scalars_and_pictures_go_to_tensorboard(arguments: Arguments, tmp_path: Path) -> None:
-    assert main(arguments(tmp_path / "run", tensorboard="true", eval_freq=2, steps=4)) == 0
-    (events,) = (tmp_path / "run" / "tensorboard").iterdir()
-    content = events.read_bytes()
-    for name in (b"loss/total", b"loss/value", b"heldout/latent/kl", b"grad_norm"):
-        assert name in content
-    for name in (b"depth_valid_h16", b"state_joint_position_repeat_h4", b"latent_active"):
-        assert b"heldout/ball/" + name in content
-    assert b"heldout/open_loop_ball" in content
-    assert b"PNG" in content
 
 
 def test_a_run_under_a_clock_ends_early_and_whole(arguments: Arguments, tmp_path: Path) -> None:
@@ -356,14 +327,6 @@ def test_bfloat16_is_chosen_where_the_device_computes_in_it(
     monkeypatch.delenv("ACCELERATE_MIXED_PRECISION", raising=False)
     assert choose_bf16("auto", torch.device("cpu")) == native
     assert not choose_bf16("no", torch.device("cpu"))
-
-
-def test_the_recording_of_open_loop_prediction_lies_in_the_run(
-    arguments: Arguments, tmp_path: Path
-) -> None:
-    pytest.importorskip("rerun")
-    assert main(arguments(tmp_path / "run", steps=1)) == 0
-    assert (tmp_path / "run" / "open_loop.rrd").read_bytes()[:4] == b"RRF2"
 
 
 def test_the_controller_of_the_data_goes_into_the_artefact(
