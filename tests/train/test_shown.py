@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from egovcp.artefact import load_artefact
 from egovcp_train.train import main
 
 type Arguments = Callable[..., list[str]]
@@ -38,10 +39,30 @@ def test_pictures_that_fail_do_not_take_the_finished_model_with_them(
     whole, output = tmp_path / "whole", tmp_path / "broken"
     assert main(arguments(whole, tensorboard="true")) == 0
 
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(f"egovcp_train.train.{broken}", full)
+    monkeypatch.setattr(f"egovcp_train.train.{broken}", _full)
     assert main(arguments(output, tensorboard="true")) == 5
-    kept = [o / "checkpoints/last/pretrained_model/model.safetensors" for o in (whole, output)]
-    assert kept[0].read_bytes() == kept[1].read_bytes()
+    assert _weights(output) == _weights(whole)
+
+
+def test_pictures_that_fail_in_the_middle_cost_nothing_of_what_was_to_be_saved_there(
+    arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole, output = tmp_path / "whole", tmp_path / "broken"
+    options = {"steps": 6, "save_freq": 3, "eval_freq": 3, "tensorboard": "true"}
+    assert main(arguments(whole, **options)) == 0
+    with monkeypatch.context() as patch:
+        patch.setattr("egovcp_train.train.draw", _full)
+        assert main(arguments(output, **options)) == 5
+    assert (output / "checkpoints" / "last").resolve().name == "000003"
+    kept = load_artefact(str(output / "checkpoints/last/pretrained_model"))
+    assert "value/slope" in kept.manifest["heldout"]
+    assert main([f"--output_dir={output}", "--resume"]) == 0
+    assert _weights(output) == _weights(whole)
+
+
+def _full(*_: object) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def _weights(run: Path) -> bytes:
+    return (run / "checkpoints/last/pretrained_model/model.safetensors").read_bytes()

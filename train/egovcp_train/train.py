@@ -181,8 +181,8 @@ class Run:
                 progress, stop = self.ranks.agreed(progress, bool(stopped))
                 if progress >= 1.0 or stop:
                     return progress >= 1.0
-                if learner.step > start and learner.step % config.save_freq == 0:
-                    self.save(learner.averaged)
+                if learner.step > start:
+                    self._pause()
                 batch = to_tensors(next(self.material.stream), self.device)
                 terms = learner.update(batch, progress)
                 bar.update()
@@ -194,8 +194,16 @@ class Run:
                     if learner.unrecorded and not warned:
                         warned = True
                         bar.write(_UNRECORDED.format(reason=learner.unrecorded))
-                if config.eval_freq and learner.step % config.eval_freq == 0:
-                    self.show(self.measure(learner.averaged))
+
+    def _pause(self) -> None:
+        """Between two steps: measure, save and show, in this order, what is due after the first."""
+        config, learner, report = self.config, self.learner, None
+        if self.ranks.is_first and config.eval_freq and learner.step % config.eval_freq == 0:
+            report = self.measure(learner.averaged)
+        if learner.step % config.save_freq == 0:
+            self.save(learner.averaged)
+        if report is not None:
+            self.show(report)
 
     def finish(self, fit: bool) -> None:
         """Fit Q on the states of the finished model, measure, save what is shipped, and show it.
