@@ -22,13 +22,14 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType
-from typing import Any, Literal, get_args, get_origin
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import draccus
 from draccus.argparsing import ArgumentParser
 from draccus.cfgparsing import load_config
 from draccus.utils import CONFIG_ARG, DecodingError, DraccusException
 
+from egovcp.bounds import Bounds, OutOfBounds, bounded, bounds_of, check_bounds
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError, suggest
 
 
@@ -57,10 +58,10 @@ class SelectedDatasetConfig(DatasetConfig):
 class WeightedDatasetConfig(SelectedDatasetConfig):
     """One of several datasets to mix."""
 
-    weight: float | None = None
+    weight: float | None = bounded(None, least=0)
     """Share of the windows, relative to the other datasets; null, and then for all: in proportion
     to the frames."""
-    return_steps: int | None = None
+    return_steps: int | None = bounded(None, least=1)
     """Horizon K of the returns of its rows, planner ticks; null: --returns.steps."""
 
 
@@ -88,6 +89,14 @@ class _Parser(ArgumentParser[Any]):
                 self.parser._actions.remove(action)
                 del known[flag]
 
+    def tell_bounds(self, config_class: type) -> None:
+        """Say in the help of each flag what numbers it takes."""
+        told = dict(_bounds(config_class, "--"))
+        for action in self.parser._actions:
+            bounds = told.get(action.option_strings[-1])
+            if bounds and action.help:
+                action.help += f" [{bounds}]"
+
     def flag_kinds(self) -> dict[str, Kind]:
         """What each flag takes: "switch", "text" (used as it is written) or "value" (YAML)."""
         actions = [a for a in self.parser._actions if a.option_strings[-1].startswith("--")]
@@ -106,6 +115,17 @@ class _Parser(ArgumentParser[Any]):
         """Flag -> what its value must be, in `_spoken` words; text and groups are left out."""
         actions = [a for a in self.parser._actions if a.type not in (None, str)]
         return {a.option_strings[-1]: _spoken(a.type) for a in actions}
+
+
+def _bounds(config_class: type, prefix: str) -> Iterator[tuple[str, Bounds]]:
+    """Flag -> bounds, of a dataclass and those within it."""
+    kinds = get_type_hints(config_class)
+    for option in dataclasses.fields(config_class):
+        flag, kind = f"{prefix}{option.name}", kinds[option.name]
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            yield from _bounds(kind, f"{flag}.")
+        elif bounds := bounds_of(option):
+            yield flag, bounds
 
 
 def _spoken(kind: object) -> str:
@@ -145,6 +165,7 @@ def parse_config[C](
         exit_on_error=False,
     )
     parser.tidy_groups()
+    parser.tell_bounds(config_class)
     kinds, types = parser.flag_kinds(), parser.flag_types()
     args = [_checked(arg, kinds, prog) for arg in _joined(argv)]
     try:
@@ -155,11 +176,13 @@ def parse_config[C](
             config: C = parser.parse_args(flags)
     except (DraccusException, argparse.ArgumentError, ValueError, TypeError) as error:
         if own := _own_error(error):
-            raise own from None
+            keys = error.key_path if isinstance(error, DecodingError) else ()
+            raise _with_flag(own, keys) from None
         words = _wrong_value(error, args, types) or " ".join(str(error).split())
         raise UsageError(f"{words}; see {prog} --help") from error
     except OSError as error:
         raise UsageError(f"cannot read {error.filename}: {error.strerror}") from error
+    check_bounds(config, "--")
     return config
 
 
@@ -169,6 +192,13 @@ def _own_error(error: BaseException) -> EgovcpError | None:
     while cause is not None and not isinstance(cause, EgovcpError):
         cause = cause.__cause__
     return cause
+
+
+def _with_flag(error: EgovcpError, keys: Sequence[str]) -> EgovcpError:
+    """The error of the config at ``keys``, an option that is out of bounds named as its flag."""
+    if not isinstance(error, OutOfBounds):
+        return error
+    return error.under(f"--{''.join(f'{key}.' for key in keys)}")
 
 
 def _wrong_value(error: Exception, args: Sequence[str], types: Mapping[str, str]) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 
 from egovcp.artefact import Artefact, load_artefact
+from egovcp.bounds import bounded
 from egovcp.errors import UsageError
 from egovcp.plan import PlannerConfig, require_answers
 from egovcp.plan.choices import Ensemble, Latent
@@ -31,23 +32,23 @@ class PolicyOptions:
 class PlannerOptions:
     """Changes to the artefact's own planner; what is not given stays as it is there."""
 
-    samples: int | None = None
+    samples: int | None = bounded(None, least=1)
     """M, candidate plans per iteration."""
-    horizon: int | None = None
+    horizon: int | None = bounded(None, least=1)
     """N, planner ticks of 40 ms."""
     objective: Objective | None = None
     """J of a plan: value (mean of Q), reward (sum of predicted rewards), td (the same and Q at the
     end). The last two need a model trained with loss.reward, and compute step by step."""
-    iterations: int | None = None
+    iterations: int | None = bounded(None, least=1)
     """Rounds of the search."""
-    elites: int | None = None
+    elites: int | None = bounded(None, least=1)
     """Best candidates that the next round is fitted to."""
-    min_std: float | None = None
+    min_std: float | None = bounded(None, least=0)
     """Floor of the deviation that candidates are drawn with, in steps of the action process."""
-    hands_cost: float | None = None
+    hands_cost: float | None = bounded(None, least=0)
     """What hands away from the neutral pose cost a plan: so much return times their mean squared
     action (docs/planner.md)."""
-    step_cost: float | None = None
+    step_cost: float | None = bounded(None, least=0)
     """What moving costs a plan: so much return times its mean squared step."""
     process: Process | None = None
     """What candidates are made of: walk (a step in every tick), or ramp (to a place to rest at, as

@@ -26,6 +26,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from egovcp import spec
+from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.model.depth import nearness
 from egovcp.plan import PolicyStep
@@ -41,19 +42,18 @@ type Layer = tuple[Tensor, Tensor]  # weight, bias
 class ReactiveConfig:
     """Sizes of the networks, and how much of the past they see."""
 
-    frames: int = 3
+    frames: int = bounded(3, least=1)
     """Pictures seen at once, the present one and those of the ticks before: one alone does not show
     where a ball is going."""
-    channels: tuple[int, int, int] = (16, 32, 32)
+    channels: tuple[int, int, int] = bounded((16, 32, 32), least=1)
     """Channels of the three layers of the depth CNN; actor and critic have one each."""
-    hidden: tuple[int, ...] = (256, 128)
+    hidden: tuple[int, ...] = bounded((256, 128), least=1)
     """Hidden layers of actor and critic, after the CNN."""
-    depth_max_m: float = spec.DEPTH_MAX_M
+    depth_max_m: float = bounded(spec.DEPTH_MAX_M, above=0)
     """Depth, in metres, at which nearness is 0."""
 
     def __post_init__(self) -> None:
-        if min(self.frames, *self.channels, *self.hidden) < 1:
-            raise UsageError("frames, channels and hidden layers count from 1")
+        check_bounds(self)
 
 
 class Eyes:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
+from egovcp.bounds import bounded, check_bounds
 from egovcp.data import DatasetConfig
 from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
@@ -17,25 +18,15 @@ ALL_TASKS: Final = "all"
 SHAPING: Final = ("task", "mix", "seed", "eta", "step_ticks", "boundary", "env")
 
 
-_LEAST: Final = {
-    "episodes": 1,
-    "seed": 0,
-    "num_workers": 0,
-    "num_envs": 1,
-    "shard_episodes": 1,
-    "worker_timeout": 1,
-}
-
-
 @dataclass(frozen=True)
 class MixConfig:
     """Share of each task under --task=all, in any unit."""
 
-    ball: float = 1.0
+    ball: float = bounded(1.0, least=0)
     """Weight of ball episodes."""
-    wall: float = 1.0
+    wall: float = bounded(1.0, least=0)
     """Weight of wall episodes."""
-    arch: float = 1.0
+    arch: float = bounded(1.0, least=0)
     """Weight of arch episodes."""
 
 
@@ -49,27 +40,27 @@ class CollectConfig:
     """Task to collect: ball, wall, arch, or all of them in turn."""
     mix: MixConfig = field(default_factory=MixConfig)
     """Shares of the tasks under --task=all."""
-    episodes: int = 200
+    episodes: int = bounded(200, least=1)
     """Number of episodes, those that --resume finds included."""
     resume: bool = False
     """Go on with the collection that is there, if any; with more episodes, extend the dataset."""
-    shard_episodes: int = SHARD_EPISODES
+    shard_episodes: int = bounded(SHARD_EPISODES, least=1)
     """Episodes per data file; the dataset grows by one such shard at a time."""
-    seed: int = 0
+    seed: int = bounded(0, least=0)
     """Episode i is a function of (seed, i) alone, whatever the number of workers."""
     backend: Literal["local", "ray"] = "local"
     """Where the workers run: as processes of this machine, or on a Ray cluster (RAY_ADDRESS; needs
     egovcp-collect[ray])."""
-    num_workers: int = 0
+    num_workers: int = bounded(0, least=0)
     """Processes that simulate; 0: one per processor core, of the cluster under --backend=ray."""
-    worker_timeout: float = 120.0
+    worker_timeout: float = bounded(120.0, least=1)
     """A worker that reports nothing for so long is replaced, s."""
-    num_envs: int = 16
+    num_envs: int = bounded(16, least=1)
     """Robots that each process simulates side by side."""
-    eta: float = ACTION_ETA
+    eta: float = bounded(ACTION_ETA, above=0, most=2)
     """Largest step of the random walk, action box units; what exceeds the rate limit of 0.32 per
     planner tick (40 ms) is sent as a ramp."""
-    step_ticks: tuple[int, int] = (1, 1)
+    step_ticks: tuple[int, int] = bounded((1, 1), least=1)
     """Shortest and longest time from one step of the walk to the next, planner ticks; (1, 1) is
     the paper's walk."""
     boundary: Literal["reflect", "clip"] = "reflect"
@@ -79,15 +70,12 @@ class CollectConfig:
 
     def check(self) -> None:
         """Raise `UsageError` for values that make no sense."""
+        check_bounds(self, "--")
         choices = (*TASKS, ALL_TASKS)
         if self.task not in choices:
             raise UsageError(f"unknown task --task={self.task}{suggest(self.task, choices)}")
-        for name, least in _LEAST.items():
-            value = getattr(self, name)
-            if value < least:
-                raise UsageError(f"--{name}={value}: expected at least {least}")
         least, most = self.step_ticks
-        if not 1 <= least <= most:
+        if least > most:
             raise UsageError(
                 f"--step_ticks={[least, most]}: expected 1 <= shortest <= longest, planner ticks"
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from egovcp.bounds import bounded
 from egovcp.policy_options import PlannerOptions, PolicyOptions
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp_deploy.live.gamepad import GamepadOptions
@@ -44,7 +45,7 @@ class OperatorOptions:
     at this machine, on Linux."""
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """What auto asks for while running: vx, vy (m/s), yaw rate (rad/s)."""
-    duration: float = 0.0
+    duration: float = bounded(0.0, least=0)
     """How long auto runs before it holds and ends, s; 0: until interrupted."""
     gamepad: GamepadOptions = field(default_factory=GamepadOptions)
     """Which gamepad, and which of its buttons does what."""
@@ -75,15 +76,15 @@ class DeployConfig:
     task: str = "ball"
     """Scene of the simulated robot: ball, wall, arch, or sequence (several in one episode,
     --env.sequence.parts). The policy is not told."""
-    episodes: int = 3
+    episodes: int = bounded(3, least=1)
     """Number of rollouts."""
-    seed: int = 0
+    seed: int = bounded(0, least=0)
     """Which held-out scenarios."""
     output_dir: str = ""
     """New folder for recordings and summary."""
     log: LogOptions = field(default_factory=LogOptions)
     """What is recorded, and shown live."""
-    imagine: int = 16
+    imagine: int = bounded(16, least=0)
     """How far ahead the world model imagines depth for the recordings, ticks of 40 ms; 0: not at
     all."""
     env: EnvConfig = field(default_factory=eventful)

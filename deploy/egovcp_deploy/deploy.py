@@ -19,7 +19,6 @@ from egovcp_deploy.options import (
     REFERENCES,
     check_choice,
     check_output_dir,
-    check_positive,
 )
 from egovcp_deploy.robots.replay import open_recordings
 from egovcp_deploy.rollouts import make_robot, play_rollouts, replay
@@ -75,7 +74,6 @@ def _check(config: DeployConfig) -> None:
     check_choice("--task", config.task, PLAYABLE)
     check_choice("--robot.type", config.robot.type, ROBOTS)
     check_choice("--controller", config.controller, DRIVERS)
-    check_positive("--episodes", config.episodes)
     held_out(config.task, config.seed, 0)
     if config.controller == PLANNER:
         config.policy.require("choose a reference that needs none, such as --controller=oracle")

@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
+from egovcp.bounds import bounded, check_bounds
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
@@ -29,7 +30,6 @@ from egovcp_deploy.episodes import Group, Setup, Stage
 from egovcp_deploy.options import (
     check_choice,
     check_output_dir,
-    check_positive,
     make_output_dir,
     versions,
 )
@@ -81,9 +81,9 @@ class EvalConfig:
     task: str = "ball"
     """ball, wall, arch, all (these three), or sequence: several in one episode, by default an arch
     and then a throw (--env.sequence.parts)."""
-    episodes: int = 80
+    episodes: int = bounded(80, least=1)
     """Scenarios per task."""
-    seed: int = 0
+    seed: int = bounded(0, least=0)
     """Which held-out scenarios."""
     controllers: str = ",".join(CONTROLLERS)
     """Who plays, separated by commas: planner, hold (neutral pose), constant (best fixed action),
@@ -94,9 +94,9 @@ class EvalConfig:
     """The baseline `ppo`."""
     output_dir: str = ""
     """New folder for the results."""
-    num_envs: int = 8
+    num_envs: int = bounded(8, least=1)
     """Robots that each process plays side by side."""
-    num_workers: int = 0
+    num_workers: int = bounded(0, least=0)
     """Processes; 0: one per processor core."""
     env: EnvConfig = field(default_factory=eventful)
     """Scenes, sensors, delays and randomisation."""
@@ -117,10 +117,7 @@ class EvalConfig:
         check_choice("--task", self.task, (*PLAYABLE, _ALL))
         for name in self.players:
             check_choice("--controllers", name, (*CONTROLLERS, PPO))
-        for flag in ("episodes", "num_envs"):
-            check_positive(f"--{flag}", getattr(self, flag))
-        if self.num_workers < 0:
-            raise UsageError(f"--num_workers={self.num_workers}: expected 0 or more")
+        check_bounds(self, "--")
         held_out(self.tasks[0], self.seed, 0)
         if "planner" in self.players:
             self.policy.require("leave planner out of --controllers")

@@ -22,12 +22,6 @@ def check_choice(flag: str, value: str, valid: Iterable[str]) -> None:
         raise UsageError(f"unknown value {flag}={value}{suggest(value, choices)}")
 
 
-def check_positive(flag: str, value: int) -> None:
-    """Raise `UsageError` unless ``value`` counts from 1."""
-    if value < 1:
-        raise UsageError(f"{flag}={value}: expected at least 1")
-
-
 def check_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
     """The output folder; one that holds anything is refused. Creates nothing.
 

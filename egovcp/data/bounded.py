@@ -15,6 +15,7 @@ from typing import Any, Final, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.bounds import bounded, check_bounds
 from egovcp.data.digests import Digests, comparing
 from egovcp.data.episode import Episode
 from egovcp.data.index import EpisodeIndex
@@ -37,18 +38,14 @@ _LABELS_KEPT: Final = 20_000  # 60 MB; what is beyond is made again
 class ShuffleConfig:
     """The episodes in memory."""
 
-    episodes: int = 128
+    episodes: int = bounded(128, least=1)
     """Episodes that are in memory at a time, about 1 MB each."""
-    reuse: float = 1.0
+    reuse: float = bounded(1.0, above=0)
     """How often the rows of an episode are used, on average, before the next one is read."""
 
     def check(self) -> None:
         """Raise `UsageError` for values that make no sense."""
-        if self.episodes < 1 or not 0 < self.reuse < float("inf"):
-            raise UsageError(
-                f"a shuffle window of {self.episodes} episodes, each used {self.reuse} times: "
-                "expected at least 1, and more than 0"
-            )
+        check_bounds(self, "shuffle.")
 
 
 class BoundedStream:

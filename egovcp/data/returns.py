@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from egovcp import spec
-from egovcp.errors import UsageError
+from egovcp.bounds import bounded, check_bounds
 
 ReturnScaling = Literal["dataset", "none", "per_task"]
 
@@ -15,9 +15,9 @@ ReturnScaling = Literal["dataset", "none", "per_task"]
 class ReturnConfig:
     """The Monte Carlo target of Q."""
 
-    gamma: float = spec.GAMMA
+    gamma: float = bounded(spec.GAMMA, least=0, most=1)
     """Discount per planner tick."""
-    steps: int = spec.RETURN_STEPS
+    steps: int = bounded(spec.RETURN_STEPS, least=1)
     """Horizon K, planner ticks."""
     keep_truncated: bool = False
     """Train on returns that the time limit cuts short, too (the paper's choice)."""
@@ -27,11 +27,7 @@ class ReturnConfig:
 
     def check(self, flag: str = "--returns") -> None:
         """Raise `UsageError`, which names options of ``flag``, for values that make no sense."""
-        if self.steps < 1 or not 0 <= self.gamma <= 1:
-            raise UsageError(
-                f"{flag}.steps={self.steps} {flag}.gamma={self.gamma}: expected at least 1, and "
-                "from 0 to 1"
-            )
+        check_bounds(self, f"{flag}.")
 
     def steps_of(self, dataset: int) -> int:
         """Horizon K of the rows of one of several datasets, by its number."""
@@ -44,14 +40,8 @@ class MixedReturnConfig(ReturnConfig):
     """The same with a horizon for each dataset: what an action leads to is seen after a second at a
     wall, after three at an arch."""
 
-    steps_each: tuple[int, ...] = ()
+    steps_each: tuple[int, ...] = bounded((), least=1)
     """Horizon K of each dataset, in their order."""
-
-    def check(self, flag: str = "--returns") -> None:
-        """Raise `UsageError`, which names options of ``flag``, for values that make no sense."""
-        super().check(flag)
-        if min(self.steps_each) < 1:
-            raise UsageError(f"return_steps={min(self.steps_each)} of a dataset: at least 1")
 
     def steps_of(self, dataset: int) -> int:
         """Horizon K of the rows of one of several datasets, by its number."""

@@ -20,6 +20,7 @@ from typing import Any
 
 import httpx
 
+from egovcp.bounds import bounded
 from egovcp.errors import EnvironmentFailure
 
 _LOG = logging.getLogger(__name__)
@@ -37,13 +38,13 @@ class HubUnreachable(EnvironmentFailure):
 class Patience:
     """How often and how long the Hub is asked."""
 
-    attempts: int = 5
+    attempts: int = bounded(5, least=1)
     """Tries per request, the first included."""
-    wait_s: float = 1.0
+    wait_s: float = bounded(1.0, least=0)
     """Pause before the second try, s; doubles with each."""
-    longest_wait_s: float = 300.0
+    longest_wait_s: float = bounded(300.0, least=0)
     """Longest pause, s; if the Hub asks for a longer one it is given up."""
-    timeout_s: float = 60.0
+    timeout_s: float = bounded(60.0, above=0)
     """Longest silence within a request, s."""
 
     def pause(self, attempt: int) -> float:

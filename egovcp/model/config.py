@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from egovcp import spec
+from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError
 
 ValueLoss = Literal["mse", "two_hot"]
@@ -22,78 +23,73 @@ AGES = 4  #: of pictures, that are thought possible
 class LossConfig:
     """Weights of the terms of equations 6 to 9, and what each averages over."""
 
-    depth: float = 30.0
+    depth: float = bounded(30.0, least=0)
     """Weight of the depth reconstruction, per pixel mean of 0.5 (x - x_hat)^2."""
-    decode_every: int = 2
+    decode_every: int = bounded(2, least=1)
     """Reconstruct every n-th image of a window, the first one drawn at random: the decoder is
     the dearest part of a step, and neighbouring images teach it the same."""
-    moving: float = 10.0
+    moving: float = bounded(10.0, least=0)
     """Extra weight of pixels that changed since the previous frame; 0: none."""
-    flight: float = 300.0
+    flight: float = bounded(300.0, least=0)
     """Extra weight of the pixels around a thing in flight, where labels tell, if it is not painted
     (`paint_flight`); 0: none."""
-    moving_threshold: float = 0.04
+    moving_threshold: float = bounded(0.04, least=0, most=1)
     """Change of nearness (fraction of the depth range) that counts as moving."""
-    near: float = 10.0
+    near: float = bounded(10.0, least=0)
     """Extra weight of near pixels; 0: none."""
-    near_threshold: float = 0.7
+    near_threshold: float = bounded(0.7, least=0, most=1)
     """Nearness (1 at the camera, 0 at the end of the depth range) beyond which a pixel is near."""
-    motion: float = 10.0
+    motion: float = bounded(10.0, least=0)
     """Weight of the place in the picture of what flies, where labels tell, Huber loss in half
     pictures; 0: none."""
-    passing: float = 3.0
+    passing: float = bounded(3.0, least=0)
     """Weight of where and when something thrown will pass, Huber loss in units of
     `PASSING_UNIT`; 0: none."""
-    state: float = 20.0
+    state: float = bounded(20.0, least=0)
     """Weight of the proprioception reconstruction, mean over the 74 standardised values."""
-    kl_prior: float = 0.1
+    kl_prior: float = bounded(0.1, least=0)
     """Weight of KL(sg q || p), which pulls the prior to the posterior."""
-    kl_posterior: float = 0.01
+    kl_posterior: float = bounded(0.01, least=0)
     """Weight of KL(q || sg p), which pulls the posterior to the prior."""
-    free_nats: float = 1.0
+    free_nats: float = bounded(1.0, least=0)
     """KL below this many nats per step costs nothing."""
     free_nats_per: FreeNatsPer = "step"
     """step: the free nats are for the sum over z, however it is spread; dimension: each dimension
     of z has an equal share of them to itself."""
-    termination: float = 1.0
+    termination: float = bounded(1.0, least=0)
     """Weight of the termination cross entropy."""
-    value: float = 1.0
+    value: float = bounded(1.0, least=0)
     """Weight of (Q - its target)^2, in units of the return's standard deviation (see
     `value_loss`)."""
     q_target: QTarget = "mc"
     """Target of Q. mc: the Monte Carlo return; td: r + gamma Q'(h', z', a') of the next row, with
     the action that the data took there, and 0 in the place of Q' after a failure."""
-    td_decay: float = 0.98
+    td_decay: float = bounded(0.98, least=0, below=1)
     """td: Q' is a copy of Q's heads that follows them with this decay per step; 0: the heads as
     they are, without gradient."""
-    imagined_steps: int = 1
+    imagined_steps: int = bounded(1, least=0)
     """Also regress Q on states imagined this many steps ahead of the posterior; 0: never."""
-    imagined_value: float = 1.0
+    imagined_value: float = bounded(1.0, least=0)
     """Weight of the value loss on imagined states."""
-    foresight_depth: float = 30.0
+    foresight_depth: float = bounded(30.0, least=0)
     """Weight of the pictures of states imagined several ticks ahead; 0: none."""
-    foresight_state: float = 10.0
+    foresight_state: float = bounded(10.0, least=0)
     """Weight of the proprioception of states imagined several ticks ahead; 0: none."""
-    foresight_motion: float = 10.0
+    foresight_motion: float = bounded(10.0, least=0)
     """Weight of the place of what flies in states imagined several ticks ahead; 0: none."""
-    foresight_ahead: tuple[int, ...] = (4, 8, 12)
+    foresight_ahead: tuple[int, ...] = bounded((4, 8, 12), least=1)
     """Ticks ahead at which they are compared with what was recorded."""
-    foresight_every: int = 4
+    foresight_every: int = bounded(4, least=1)
     """Imagine from every n-th row of a window only, the first one drawn at random."""
-    autoregressive_steps: int = 8
+    autoregressive_steps: int = bounded(8, least=1)
     """`dynamics` autoregressive: ticks over which predictions are fed back, all of them compared
     with what was recorded; from the rows that `foresight_every` says."""
-    reward: float = 0.0
+    reward: float = bounded(0.0, least=0)
     """Weight of the reward predicted from (h, z, a), mean squared error in units of the return's
     standard deviation, on the states that Q is trained on; 0: there is no such head."""
 
     def __post_init__(self) -> None:
-        if not 0 <= self.td_decay < 1:
-            raise UsageError(f"loss.td_decay is {self.td_decay}; expected 0 or more, and below 1")
-        if self.autoregressive_steps < 1:
-            raise UsageError(
-                f"loss.autoregressive_steps is {self.autoregressive_steps}; expected at least 1"
-            )
+        check_bounds(self)
 
 
 @dataclass(frozen=True)
@@ -104,7 +100,7 @@ class CameraGeometry:
     """Mount in the torso frame, m (the simulator's default)."""
     pitch: float = math.radians(-2.5)
     """Tilt below the torso's horizontal, rad (the middle of the simulator's range)."""
-    vertical_fov: float = math.radians(58.0)
+    vertical_fov: float = bounded(math.radians(58.0), above=0, below=math.pi)
     """Vertical field of view, rad; pixels are square."""
 
     @property
@@ -121,21 +117,21 @@ class FlightConfig:
     """Q is told the path that the filter follows; else what the state says of it."""
     camera: CameraGeometry = field(default_factory=CameraGeometry)
     """Of the recordings."""
-    plane: float = 0.32
+    plane: float = bounded(0.32, above=0)
     """The plane, before the pelvis, whose crossing is told, m."""
-    picture_ages: Ages = (0.02, 0.04, 0.06, 0.08)
+    picture_ages: Ages = bounded((0.02, 0.04, 0.06, 0.08), least=0)
     """How much older than the state beside it a picture may be, s, at most two ticks; the floor
     says how likely each is (`egovcp.model.picture_age`)."""
-    age_deviation: float = 0.03
+    age_deviation: float = bounded(0.03, above=0)
     """By how much the floor may seem to rise and sink in the pictures that count, m: with a tenth
     of it the stillest floor alone is believed, with ten times as much all ages alike."""
-    age_memory: float = 0.95
+    age_memory: float = bounded(0.95, least=0, most=1)
     """What one picture says of their age counts for so much less with each tick."""
-    radius: float = 0.10
+    radius: float = bounded(0.10, least=0)
     """What is added to the depth of a surface to reach the middle of the thing, m."""
-    search: float = 0.25
+    search: float = bounded(0.25, above=0)
     """Pixels this near the place that the encoder sees, across and in depth, are its own, m."""
-    deviation: float = 0.01
+    deviation: float = bounded(0.01, above=0)
     """Deviation of a sighting, m per m of distance."""
     prior: tuple[AxisPrior, AxisPrior, AxisPrior] = (
         (2.9, -3.5, 7.8, 1.2, 2.4),
@@ -147,13 +143,13 @@ class FlightConfig:
     default task."""
     aim: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.24), (0.45, 0.18))
     """Mean and deviation of y and z where throws cross the plane, m."""
-    doubt: float = 2.0
+    doubt: float = bounded(2.0, above=0)
     """The variance of a crossing is this many times what independent sightings would give."""
-    gate: float = 0.5
+    gate: float = bounded(0.5, above=0)
     """A sighting farther than this from the path of three or more is not its own, m."""
-    painted: float = 0.25
+    painted: float = bounded(0.25, least=0)
     """A path at least so sure says where it is painted (`paint_flight`); else `motion` does."""
-    forget: float = 0.5
+    forget: float = bounded(0.5, least=0)
     """A path whose thing has not been seen for so long is forgotten, s."""
 
 
@@ -161,15 +157,15 @@ class FlightConfig:
 class WorldModelConfig:
     """Sizes of the networks (paper III-C) and the losses they are trained with."""
 
-    hidden: int = 256
+    hidden: int = bounded(256, least=1)
     """Size of the deterministic state h (GRU)."""
-    latent: int = 32
+    latent: int = bounded(32, least=1)
     """Size of the stochastic state z (diagonal Gaussian)."""
-    units: int = 256
+    units: int = bounded(256, least=1)
     """Width of every MLP."""
-    channels: tuple[int, int, int] = (32, 64, 64)
+    channels: tuple[int, int, int] = bounded((32, 64, 64), least=1)
     """Channels of the three layers of the depth CNN; the decoder uses the last."""
-    motion_ahead: tuple[int, ...] = (0, 3, 6, 9)
+    motion_ahead: tuple[int, ...] = bounded((0, 3, 6, 9), least=0)
     """Ticks ahead at which the place of what flies is predicted straight from the state; the first
     is 0, now."""
     paint_flight: bool = True
@@ -179,37 +175,36 @@ class WorldModelConfig:
     """How the dynamics are learned. joint: equation 8, prior and posterior are pulled to each
     other; autoregressive: predictions are fed back for several ticks and compared with the
     recorded observations instead (the baseline ARWM), with no KL at all."""
-    value_state: int = 8
+    value_state: int = bounded(8, least=0)
     """Numbers to which (h, z) is reduced for Q; 0: Q reads all of it."""
     value_of_passing: bool = True
     """Q is told what is on its way (`loss.passing` teaches it) by a head of its own."""
     value_loss: ValueLoss = "mse"
     """mse: Q is a number, fitted by its squared error; two_hot: a distribution over bins of
     symlog returns, fitted by cross entropy, whose mean is the number."""
-    q_heads: int = 1
+    q_heads: int = bounded(1, least=1)
     """Heads of Q that differ in their start. A search finds what one of them is wrong about; where
     the least of them is high, none says otherwise (`planner.ensemble`)."""
-    value_units: int = 0
+    value_units: int = bounded(0, least=0)
     """Width of a head of Q, half of it for the part that is told what is on its way; 0: `units`."""
     flight: FlightConfig = field(default_factory=FlightConfig)
     """Follows what is thrown at the robot; only where `value_of_passing`."""
-    min_std: float = 0.1
+    min_std: float = bounded(0.1, above=0)
     """Floor of the latent standard deviation."""
     update_bias: float = -1.0
     """Bias of the GRU's update gate: memory is kept at the start of training."""
-    depth_max_m: float = spec.DEPTH_MAX_M
+    depth_max_m: float = bounded(spec.DEPTH_MAX_M, above=0)
     """Depth, in metres, at which nearness is 0."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Loss weights."""
 
     def __post_init__(self) -> None:
+        check_bounds(self)
         if self.value_of_passing and self.loss.passing <= 0:
             raise UsageError(
                 "value_of_passing needs loss.passing above 0: nothing else teaches Q what is on "
                 "its way; set --policy.value_of_passing=false, or a weight"
             )
-        if self.q_heads < 1:
-            raise UsageError(f"q_heads is {self.q_heads}; expected at least 1")
         if self.paint_flight and self.loss.motion <= 0:
             raise UsageError(
                 "paint_flight needs loss.motion above 0: nothing else teaches the place of what "

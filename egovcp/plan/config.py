@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from egovcp import spec
+from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError
 from egovcp.plan.choices import Ensemble, Latent
 
@@ -20,26 +21,26 @@ BackendName = Literal["auto", "eager", "float32", "bfloat16", "int8", "compile"]
 class PlannerConfig:
     """The sampling MPC; the defaults are the paper's, 25 Hz."""
 
-    samples: int = 1024
+    samples: int = bounded(1024, least=1)
     """M, candidate plans per iteration."""
-    horizon: int = 4
+    horizon: int = bounded(4, least=1)
     """N, planner ticks."""
     objective: Objective = "value"
     """J of a candidate. value: the mean of Q over its N ticks, the paper's; reward: the sum of the
     N predicted rewards, discounted (Rew-MPC); td: the same and gamma^N Q after them, of one more
     action (TD-MPC). The last two need a model trained with loss.reward."""
-    iterations: int = 3
+    iterations: int = bounded(3, least=1)
     """Rounds of the search; fewer where a deadline comes first."""
-    elites: int = 64
+    elites: int = bounded(64, least=1)
     """Best candidates that the next round is fitted to."""
-    min_std: float = 0.1
+    min_std: float = bounded(0.1, least=0)
     """Floor of the sampling deviation, in units of delta."""
-    eta: float = spec.ACTION_ETA
+    eta: float = bounded(spec.ACTION_ETA, above=0, most=2)
     """Step of the action process, box units per tick."""
-    hands_cost: float = 0.0
+    hands_cost: float = bounded(0.0, least=0)
     """What hands away from the neutral pose cost a candidate, in units of return: times their mean
     squared action. Q knows the price of a pose, but not as exactly as it would have to."""
-    step_cost: float = 0.0
+    step_cost: float = bounded(0.0, least=0)
     """What moving costs a candidate, in units of return: times its mean squared step, of which 1 is
     the largest. Where Q has nothing to say, whoever pays for steps stays where it is."""
     process: Process = "walk"
@@ -61,13 +62,13 @@ class PlannerConfig:
     optimiser: OptimiserName = "cem"
     """How candidates are drawn: cem (fitted to the elites), icem (with coloured noise, elites kept
     and fewer samples each round), mppi (all weighted by their value), shooting (uniform)."""
-    temperature: float = 0.3
+    temperature: float = bounded(0.3, above=0)
     """mppi: a value this many deviations of all values below the best weighs 1/e of it."""
     noise_exponent: float = 2.0
     """icem: power of the noise over frequency, f^-x; 0: white, larger: steadier plans."""
-    kept_elites: float = 0.3
+    kept_elites: float = bounded(0.3, least=0, most=1)
     """icem: share of the elites that are candidates again in the next round."""
-    sample_decay: float = 1.25
+    sample_decay: float = bounded(1.25, least=1)
     """icem: each round draws this many times fewer samples than the one before."""
     backend: BackendName = "auto"
     """Who computes. eager: the world model itself; float32, bfloat16: its networks packed; int8: in
@@ -75,23 +76,9 @@ class PlannerConfig:
     torch.compile, a minute at the start; auto: int8 where it is fast, else float32."""
 
     def __post_init__(self) -> None:
-        if min(self.samples, self.horizon, self.iterations, self.elites) < 1:
-            raise UsageError("samples, horizon, iterations and elites must be at least 1")
+        check_bounds(self)
         if self.elites > self.samples:
             raise UsageError(f"elites ({self.elites}) exceed samples ({self.samples})")
-        if not 0 < self.eta <= 2:
-            raise UsageError(f"eta is {self.eta}; expected more than 0 and at most 2, the box")
-        for name in ("hands_cost", "step_cost"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise UsageError(f"{name} is {getattr(self, name)}; expected at least 0")
-        if not self.min_std >= 0:
-            raise UsageError(f"min_std is {self.min_std}; expected at least 0")
-        if self.temperature <= 0:
-            raise UsageError(f"temperature is {self.temperature}; expected more than 0")
-        if not 0 <= self.kept_elites <= 1:
-            raise UsageError(f"kept_elites is {self.kept_elites}; expected a share, 0 to 1")
-        if self.sample_decay < 1:
-            raise UsageError(f"sample_decay is {self.sample_decay}; expected at least 1")
 
     @property
     def actions(self) -> int:

@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, is_dataclass, replace
 from typing import Literal
 
+from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError, suggest
 from egovcp.spec import TASKS
 
@@ -36,11 +37,11 @@ def _check_ranges(where: str, part: object) -> None:
 class EpisodeConfig:
     """Length of an episode and the time of its event, in planner ticks of 40 ms."""
 
-    ticks: int = 150
+    ticks: int = bounded(150, least=1)
     """Time limit, planner ticks; reaching it truncates the episode."""
-    event_ticks: tuple[int, int] = (20, 60)
+    event_ticks: tuple[int, int] = bounded((20, 60), least=0)
     """First and last tick at which the throw, the push or the arch may start."""
-    empty_probability: float = 0.1
+    empty_probability: float = bounded(0.1, least=0, most=1)
     """Share of episodes in which nothing happens, so that doing nothing is learned too."""
 
 
@@ -50,17 +51,17 @@ class BallConfig:
 
     shape: Literal["sphere", "box"] = "sphere"
     """What is thrown: a ball, or a cube of the same volume that starts at any angle and tumbles."""
-    radius_range: Range = (0.09, 0.12)
+    radius_range: Range = bounded((0.09, 0.12), above=0)
     """Radius of the ball, m."""
-    mass_range: Range = (0.15, 0.35)
+    mass_range: Range = bounded((0.15, 0.35), above=0)
     """Mass of the ball, kg."""
-    distance_range: Range = (2.5, 3.5)
+    distance_range: Range = bounded((2.5, 3.5), above=0)
     """Horizontal distance of the release point from the pelvis, m."""
     bearing_range: Range = (-0.30, 0.30)
     """Direction of the release point seen from the pelvis, rad, 0 is straight ahead."""
-    release_height_range: Range = (0.7, 1.4)
+    release_height_range: Range = bounded((0.7, 1.4), above=0)
     """Height of the release point above ground, m."""
-    flight_range: Range = (0.65, 0.95)
+    flight_range: Range = bounded((0.65, 0.95), above=0)
     """Time from release to the aim point, s."""
     aim_forward: float = 0.10
     """Aim point in front of the pelvis, m, heading frame."""
@@ -68,15 +69,15 @@ class BallConfig:
     """Aim point left of the pelvis, m, heading frame."""
     aim_height_range: Range = (0.10, 0.50)
     """Aim point above the pelvis, m."""
-    grace: float = 0.3
+    grace: float = bounded(0.3, least=0)
     """Contacts within this time after a block do not count, s."""
-    block_reward: float = 1.0
+    block_reward: float = bounded(1.0, least=0)
     """Once, at a first contact with a hand or wrist."""
-    hit_cost: float = 1.0
+    hit_cost: float = bounded(1.0, least=0)
     """Once, when the ball touches torso, head or leg."""
-    pose_cost: float = 0.01
+    pose_cost: float = bounded(0.01, least=0)
     """Per tick, times the mean squared action: the price of leaving the neutral pose."""
-    fall_cost: float = 1.0
+    fall_cost: float = bounded(1.0, least=0)
     """Once, at a fall."""
 
 
@@ -84,43 +85,43 @@ class BallConfig:
 class WallConfig:
     """A wall before the robot, which is pushed towards it; only hands may touch."""
 
-    distance_range: Range = (0.60, 0.70)
+    distance_range: Range = bounded((0.60, 0.70), above=0)
     """Wall surface before the pelvis, m."""
     yaw_range: Range = (-0.10, 0.10)
     """Turn of the wall about the vertical, rad; 0 faces the robot squarely."""
-    friction_range: Range = (0.6, 1.0)
+    friction_range: Range = bounded((0.6, 1.0), least=0)
     """Sliding friction of the wall."""
-    push_speed_range: Range | None = None
+    push_speed_range: Range | None = bounded(None, least=0)
     """Change of base velocity by a push towards the wall, m/s. None: what hands must brace and
     can, for a controller that steps or one that does not (benchmarks/tasks.py)."""
     push_bearing_range: Range = (-0.20, 0.20)
     """Direction of a push towards the wall, rad from straight ahead."""
-    away_probability: float = 0.1
+    away_probability: float = bounded(0.1, least=0, most=1)
     """Share of the pushes that go away from the wall."""
-    away_speed_range: Range = (0.05, 0.15)
+    away_speed_range: Range = bounded((0.05, 0.15), least=0)
     """Change of base velocity by a push away from the wall, m/s; the stance survives it."""
-    push_time: float = 0.02
+    push_time: float = bounded(0.02, above=0)
     """Time over which a push acts, s."""
-    disturbed_time: float | None = None
+    disturbed_time: float | None = bounded(None, least=0)
     """Time after a push in which bracing is rewarded, s. None: 2 s for a controller that steps,
     which stands by itself again then; 6 s, the rest of the episode, for one that does not: it leans
     on the wall and falls against it when its hands let go."""
-    brace_reward: float = 0.03
+    brace_reward: float = bounded(0.03, least=0)
     """Per tick upright with a hand and nothing else on the wall while disturbed."""
-    upright_reward: float = 0.02
+    upright_reward: float = bounded(0.02, least=0)
     """Per tick upright while disturbed."""
-    contact_cost: float = 0.1
+    contact_cost: float = bounded(0.1, least=0)
     """Per tick with anything but a hand on the wall."""
-    impact_cost: float = 0.05
+    impact_cost: float = bounded(0.05, least=0)
     """Per tick, times the peak hand force over ``impact_force``, at most 1 per tick."""
-    impact_force: float = 300.0
+    impact_force: float = bounded(300.0, above=0)
     """Hand force that costs ``impact_cost`` in full, N."""
-    pose_cost: float = 0.03
+    pose_cost: float = bounded(0.03, least=0)
     """Per tick, times the mean squared action."""
-    guard_cost: float = 0.27
+    guard_cost: float = bounded(0.27, least=0)
     """In addition, as long as nothing has pushed: an episode stands for a life in which pushes are
     rarer, and waiting for one with raised hands is paid for all the while."""
-    fall_cost: float = 1.0
+    fall_cost: float = bounded(1.0, least=0)
     """Once, at a fall."""
 
 
@@ -133,35 +134,35 @@ class ArchConfig:
     (--env.controller). `rail`: the robot stands and the arch comes to it at the commanded
     speed, the same relative motion; for controllers that cannot walk. `auto`: whichever the
     controller can."""
-    clearance_range: Range = (1.16, 1.24)
+    clearance_range: Range = bounded((1.16, 1.24), above=0)
     """Lower edge of the lintel above ground, m."""
-    width_range: Range = (1.1, 1.5)
+    width_range: Range = bounded((1.1, 1.5), above=0)
     """Free width between the posts, m."""
-    depth_range: Range = (0.10, 0.20)
+    depth_range: Range = bounded((0.10, 0.20), above=0)
     """Thickness of posts and lintel along the direction of passage, m."""
-    lintel_height: float = 0.35
+    lintel_height: float = bounded(0.35, above=0)
     """Height of the lintel beam, m."""
-    distance_range: Range = (1.6, 2.2)
+    distance_range: Range = bounded((1.6, 2.2), above=0)
     """Centre of the arch before the pelvis when it starts to move, m."""
     lateral_range: Range = (-0.08, 0.08)
     """Centre of the arch left of the pelvis, m."""
-    speed_range: Range = (0.3, 0.5)
+    speed_range: Range = bounded((0.3, 0.5), above=0)
     """Commanded forward velocity, m/s; the arch moves towards the robot as fast."""
-    progress_reward: float = 0.05
+    progress_reward: float = bounded(0.05, least=0)
     """Per metre of progress towards and through the arch."""
-    pass_reward: float = 1.0
+    pass_reward: float = bounded(1.0, least=0)
     """Once, when the arch has been passed without any contact."""
-    head_cost: float = 0.1
+    head_cost: float = bounded(0.1, least=0)
     """Per tick with the head on the arch."""
-    contact_cost: float = 0.05
+    contact_cost: float = bounded(0.05, least=0)
     """Per tick with any other part on the arch."""
-    crouch_cost: float = 0.01
+    crouch_cost: float = bounded(0.01, least=0)
     """Per tick, times the share of the crouch (0 standing, 1 lowest) away from the arch."""
-    near: float = 0.9
+    near: float = bounded(0.9, least=0)
     """Crouching is free while the arch is nearer than this, m."""
-    pose_cost: float = 0.005
+    pose_cost: float = bounded(0.005, least=0)
     """Per tick, times the mean squared action of the hands."""
-    fall_cost: float = 1.0
+    fall_cost: float = bounded(1.0, least=0)
     """Once, at a fall."""
 
 
@@ -172,7 +173,7 @@ class SequenceConfig:
     parts: tuple[str, ...] = ("arch", "ball")
     """Its tasks in their order, each at most once. The wall can only be the last: it would stand in
     the way of what comes next, and the robot leans on it."""
-    pause_ticks: int = 25
+    pause_ticks: int = bounded(25, least=0)
     """Planner ticks from the moment that decides a part (arch passed, ball on the floor) until its
     object is taken away and the next part begins; a part that remains undecided ends after the
     ticks of its own episodes."""
@@ -187,10 +188,6 @@ class SequenceConfig:
                 f"env.sequence.parts={list(self.parts)}: expected at least one task, each at most "
                 "once, and wall only at the end"
             )
-        if self.pause_ticks < 0:
-            raise UsageError(
-                f"env.sequence.pause_ticks={self.pause_ticks}: expected a number of ticks from 0"
-            )
 
 
 @dataclass(frozen=True)
@@ -201,15 +198,15 @@ class CameraConfig:
     """Mount in the torso frame, m."""
     pitch_range: Range = (math.radians(-5.0), 0.0)
     """Tilt below the torso's horizontal, rad, drawn per episode."""
-    vertical_fov: float = math.radians(58.0)
+    vertical_fov: float = bounded(math.radians(58.0), above=0, below=math.pi)
     """Vertical field of view, rad; pixels are square."""
-    noise_per_z2: Range = (0.001, 0.004)
+    noise_per_z2: Range = bounded((0.001, 0.004), least=0)
     """Standard deviation of depth over depth squared, 1/m (stereo noise grows with z^2)."""
-    hole_probability: Range = (0.0, 0.01)
+    hole_probability: Range = bounded((0.0, 0.01), least=0, most=1)
     """Share of pixels lost at random."""
-    edge_probability: Range = (0.0, 0.25)
+    edge_probability: Range = bounded((0.0, 0.25), least=0, most=1)
     """Share of pixels lost beside a depth discontinuity."""
-    edge_ratio: float = 0.12
+    edge_ratio: float = bounded(0.12, above=0)
     """Neighbours whose depths differ by this share of the greater make a discontinuity."""
 
 
@@ -217,13 +214,13 @@ class CameraConfig:
 class SensorConfig:
     """Standard deviations of proprioception, white, per 20 ms measurement."""
 
-    angular_velocity: float = 0.03
+    angular_velocity: float = bounded(0.03, least=0)
     """rad/s."""
-    gravity: float = 0.005
+    gravity: float = bounded(0.005, least=0)
     """Of each component of the projected gravity, which stays a unit vector."""
-    joint_position: float = 0.002
+    joint_position: float = bounded(0.002, least=0)
     """rad."""
-    joint_velocity: float = 0.05
+    joint_velocity: float = bounded(0.05, least=0)
     """rad/s."""
 
 
@@ -231,9 +228,9 @@ class SensorConfig:
 class DelayConfig:
     """Delays, drawn per episode, in whole controller ticks of 20 ms."""
 
-    action_ticks: tuple[int, int] = (0, 2)
+    action_ticks: tuple[int, int] = bounded((0, 2), least=0)
     """Controller ticks from an action to its effect."""
-    image_age: Range = (0.02, 0.08)
+    image_age: Range = bounded((0.02, 0.08), least=0)
     """Age of the picture in an observation, s; rounded to controller ticks."""
 
 
@@ -241,17 +238,17 @@ class DelayConfig:
 class RandomisationConfig:
     """Ranges of the physical parameters, drawn per episode; (1, 1) switches one off."""
 
-    friction: Range = (0.6, 1.0)
+    friction: Range = bounded((0.6, 1.0), least=0)
     """Sliding friction of the feet."""
     payload: Range = (-0.5, 1.5)
     """Mass added to the torso, kg."""
-    mass_scale: Range = (0.97, 1.03)
+    mass_scale: Range = bounded((0.97, 1.03), above=0)
     """Factor on every mass of the robot."""
-    stiffness_scale: Range = (0.95, 1.05)
+    stiffness_scale: Range = bounded((0.95, 1.05), above=0)
     """Factor on the servo stiffness."""
-    damping_scale: Range = (0.9, 1.1)
+    damping_scale: Range = bounded((0.9, 1.1), above=0)
     """Factor on the servo damping."""
-    initial_joint: float = 0.01
+    initial_joint: float = bounded(0.01, least=0)
     """Half width of the uniform offset on the joints of waist and arms at the start, rad."""
 
 
@@ -286,10 +283,11 @@ class EnvConfig:
     """Latency of action and image."""
     randomise: RandomisationConfig = RandomisationConfig()
     """Physical parameters."""
-    threads: int = 1
+    threads: int = bounded(1, least=1)
     """Threads that step physics and cast rays; results do not depend on it."""
 
     def __post_init__(self) -> None:
+        check_bounds(self)
         for name, part in vars(self).items():
             if is_dataclass(part):
                 _check_ranges(name, part)

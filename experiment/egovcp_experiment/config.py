@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError, suggest
 from egovcp.spec import TASKS
 
@@ -15,11 +16,11 @@ Scale = Literal["smoke", "small", "paper"]
 class EpisodesConfig:
     """A number of episodes for each task."""
 
-    ball: int = 1334
+    ball: int = bounded(1334, least=1)
     """Of the ball task, 150 ticks each where no flag says otherwise."""
-    wall: int = 1334
+    wall: int = bounded(1334, least=1)
     """Of the wall task, likewise."""
-    arch: int = 870
+    arch: int = bounded(870, least=1)
     """Of the arch task, 230 ticks each."""
 
 
@@ -29,9 +30,9 @@ class DataConfig:
 
     episodes: EpisodesConfig = field(default_factory=EpisodesConfig)
     """Episodes to collect."""
-    seed: int = 0
+    seed: int = bounded(0, least=0)
     """Seed of the collection."""
-    parts: tuple[float, ...] = (0.125, 0.25, 0.5, 1.0)
+    parts: tuple[float, ...] = bounded((0.125, 0.25, 0.5, 1.0), above=0)
     """Shares of the episodes that models are trained on in sample-efficiency, ascending; above 1,
     more are collected for it."""
     roots: dict[str, str] = field(default_factory=dict)
@@ -46,13 +47,13 @@ class TrainingConfig:
 
     preset: Literal["default", "paper", "debug"] = "default"
     """Starting point of all options of egovcp-train."""
-    steps: int = 20_000
+    steps: int = bounded(20_000, least=1)
     """Gradient steps of a model."""
-    max_minutes: float = 0.0
+    max_minutes: float = bounded(0.0, least=0)
     """Wall-clock limit of a training, minutes; 0: none."""
-    compared_steps: int = 20_000
+    compared_steps: int = bounded(20_000, least=1)
     """Gradient steps, without a limit of time, where choices of training are compared."""
-    seeds: tuple[int, ...] = (0,)
+    seeds: tuple[int, ...] = bounded((0,), least=0)
     """Every model is trained once with each of these."""
     policies: dict[str, str] = field(default_factory=dict)
     """Artefacts that are there already, '{ball: RUN/checkpoints/last/pretrained_model}', in the
@@ -62,7 +63,7 @@ class TrainingConfig:
     task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Flags after those for the models of one task (all: of the multi-task model), '{wall:
     [--sampling.event_fraction=0.7]}'; a task that is not named keeps what the scale says of it."""
-    return_steps: dict[str, int] = field(default_factory=dict)
+    return_steps: dict[str, int] = bounded({}, least=1)
     """Task -> horizon of the returns of its data, ticks, in its own model and in the multi-task
     one, '{arch: 50}'; where a task is not named, --returns.steps."""
 
@@ -78,13 +79,13 @@ class TrainingConfig:
 class PlayConfig:
     """The closed-loop episodes."""
 
-    episodes: int = 100
+    episodes: int = bounded(100, least=1)
     """Scenarios of each task; all variants play the same."""
-    seed: int = 0
+    seed: int = bounded(0, least=0)
     """Which held-out scenarios."""
-    branches: int = 12
+    branches: int = bounded(12, least=2)
     """Random walks from each step of a plan, whose mean return is what the step is worth."""
-    budget_ms: float = 40.0
+    budget_ms: float = bounded(40.0, above=0)
     """Time for a plan, where searches are compared on equal time, ms."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-eval; studies that play take those of the planner, too."""
@@ -98,15 +99,15 @@ class PlayConfig:
 class PpoConfig:
     """The model-free baseline, in ppo and sample-efficiency."""
 
-    steps: int = 200_000
+    steps: int = bounded(200_000, least=0)
     """Transitions of a training, rounded to whole updates between policies; 0: no PPO in
     sample-efficiency."""
-    policies: int = 4
+    policies: int = bounded(4, least=1)
     """Policies along a training that are played, equally far apart; the last is that of its
     end."""
-    robots: int = 32
+    robots: int = bounded(32, least=1)
     """Robots simulated side by side."""
-    ticks: int = 50
+    ticks: int = bounded(50, least=1)
     """Ticks of each robot from one update to the next."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-train-ppo, '[--ppo.entropy_coef=0.01]'."""
@@ -126,11 +127,6 @@ class PpoConfig:
 
     def check(self) -> None:
         """Raise `UsageError` for values that make no sense."""
-        if self.steps < 0 or min(self.policies, self.robots, self.ticks) < 1:
-            raise UsageError(
-                "--ppo.policies, --ppo.robots and --ppo.ticks must be at least 1, --ppo.steps 0 or "
-                "more"
-            )
         own = ("steps", "robots", "ppo.num_steps_per_env", "save_freq", "max_minutes")
         for flag in self.flags:
             if flag.removeprefix("--").split("=", 1)[0] in own:
@@ -144,19 +140,11 @@ class PpoConfig:
 class RayConfig:
     """What a cell is given on a Ray cluster."""
 
-    cpus: float = 1.0
+    cpus: float = bounded(1.0, above=0)
     """Processor cores that are set aside for it. Commands see all cores of their node none the
     less: tell them with '--data.flags=[--num_workers=8]', '--train.flags=[--threads=8]'."""
-    gpus: float = 0.0
+    gpus: float = bounded(0.0, least=0)
     """GPUs that are set aside for a training; other cells get none."""
-
-    def check(self) -> None:
-        """Raise `UsageError` for values that make no sense."""
-        if self.cpus <= 0 or self.gpus < 0:
-            raise UsageError(
-                f"--ray.cpus={self.cpus:g} --ray.gpus={self.gpus:g}: expected more than 0 cores "
-                "and at least 0 GPUs"
-            )
 
 
 @dataclass(frozen=True)
@@ -175,7 +163,7 @@ class ExperimentConfig:
     backend: Literal["local", "ray"] = "local"
     """Where cells run: processes of this machine; or the Ray cluster of RAY_ADDRESS, all of whose
     nodes must have --output_dir under the same path."""
-    jobs: int = 1
+    jobs: int = bounded(1, least=1)
     """Cells that run side by side; here each on its share of the processor cores."""
     ray: RayConfig = field(default_factory=RayConfig)
     """Each cell's share of a Ray cluster."""
@@ -183,7 +171,7 @@ class ExperimentConfig:
     """Tasks to learn and play."""
     only: tuple[str, ...] = ()
     """Names of the variants to run; empty: all."""
-    most: int = 0
+    most: int = bounded(0, least=0)
     """Of all, only so many variants; 0: no limit."""
     scenes: tuple[str, ...] = ()
     """--env.* flags of both collection and play, '[--env.controller=stance]'."""
@@ -200,29 +188,33 @@ class ExperimentConfig:
         """Raise `UsageError` for values that make no sense."""
         if not self.output_dir:
             raise UsageError("--output_dir is missing; name the folder of cells and reports")
-        for task in self.tasks:
-            if task not in TASKS:
-                raise UsageError(f"unknown task --tasks={task}{suggest(task, TASKS)}")
-        known = (*TASKS, "all")
-        for part, given in (("train", self.train.task_flags), ("play", self.play.task_flags)):
+        check_bounds(self, "--")
+        models = (*TASKS, "all")
+        for option, given, known in (
+            ("tasks", self.tasks, TASKS),
+            ("data.roots", self.data.roots, TASKS),
+            ("train.return_steps", self.train.return_steps, TASKS),
+            ("train.policies", self.train.policies, models),
+            ("train.task_flags", self.train.task_flags, models),
+            ("play.task_flags", self.play.task_flags, models),
+        ):
             for task in given:
                 if task not in known:
-                    found = suggest(task, known)
-                    raise UsageError(f"unknown task {task} in --{part}.task_flags{found}")
-        for task in self.train.return_steps:
-            if task not in TASKS:
+                    raise UsageError(f"unknown task {task} in --{option}{suggest(task, known)}")
+        for option, listed in (
+            ("tasks", self.tasks),
+            ("train.seeds", self.train.seeds),
+            ("data.parts", self.data.parts),
+        ):
+            if not listed or len(set(listed)) < len(listed):
                 raise UsageError(
-                    f"unknown task {task} in --train.return_steps{suggest(task, TASKS)}"
+                    f"--{option}=[{', '.join(map(str, listed))}]: expected at least one, and none "
+                    "twice"
                 )
-        if not self.tasks or not self.train.seeds:
-            raise UsageError("--tasks and --train.seeds must name at least one each")
-        if not self.data.parts or min(self.data.parts) <= 0:
-            raise UsageError(f"--data.parts={list(self.data.parts)}: expected shares above 0")
         for flag in self.scenes:
             if not flag.startswith("--env."):
                 raise UsageError(f"--scenes holds {flag}; expected --env.NAME=value")
         self.ppo.check()
-        self.ray.check()
 
     def chosen[T](self, variants: dict[str, T]) -> dict[str, T]:
         """Those of the variants that `only` names, or the first `most`.

@@ -66,7 +66,7 @@ def test_planner_options_change_only_what_they_name() -> None:
     assert PlannerOptions(process="ramp").apply(own) == replace(own, process="ramp")
     with pytest.raises(UsageError):
         PlannerOptions(samples=8).apply(own)  # fewer than the elites
-    with pytest.raises(UsageError, match="min_std is -1"):
+    with pytest.raises(UsageError, match="min_std=-1: expected at least 0"):
         PlannerOptions(min_std=-1).apply(own)
 
 

@@ -106,5 +106,5 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("change", [{"frames": 0}, {"hidden": (0,)}, {"channels": (1, 0, 1)}])
 def test_sizes_count_from_one(change: dict[str, object]) -> None:
-    with pytest.raises(UsageError, match="count from 1"):
+    with pytest.raises(UsageError, match="expected at least 1"):
         ReactiveConfig(**change)  # type: ignore[arg-type]

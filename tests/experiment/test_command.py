@@ -33,6 +33,14 @@ def test_help_lists_every_experiment(capsys: pytest.CaptureFixture[str]) -> None
         (["planners", "--output_dir=x", "--only=[cme]"], "did you mean 'cem'"),
         (["planners", "--output_dir=x", "--jobs=0"], "--jobs=0"),
         (["planners", "--config_path=a.yaml"], "would hide the scale"),
+        (["table1", "--output_dir=x", "--train.seeds=[0,1,0]"], "[0, 1, 0]: expected at least one"),
+        (["table1", "--output_dir=x", "--train.seeds=[]"], "--train.seeds=[]"),
+        (["table1", "--output_dir=x", "--train.seeds=[-1]"], "--train.seeds=[-1]"),
+        (["table1", "--output_dir=x", "--tasks=[ball, ball]"], "none twice"),
+        (["table1", "--output_dir=x", "--data.parts=[0]"], "--data.parts=[0.0]"),
+        (["table1", "--output_dir=x", "--data.roots={bal: y}"], "did you mean 'ball'"),
+        (["table1", "--output_dir=x", "--train.policies={wal: y}"], "did you mean 'wall'"),
+        (["table1", "--output_dir=x", "--train.return_steps={arch: 0}"], "expected at least 1"),
     ],
 )
 def test_misuse_ends_with_2_before_anything_is_written(

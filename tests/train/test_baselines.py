@@ -156,7 +156,10 @@ def test_an_artefact_whose_planner_asks_for_rewards_it_does_not_know_is_refused(
         ({"planner__objective": "reward"}, "train it with --policy.loss.reward=1"),
         ({"planner__objective": "td"}, "train it with --policy.loss.reward=1"),
         ({**TD, "returns__scale": "per_task"}, "no common unit"),
-        ({"policy__loss__td_decay": 1.0}, "td_decay is 1.0"),
+        (
+            {"policy__loss__td_decay": 1.0},
+            "--policy.loss.td_decay=1.0: expected at least 0 and less",
+        ),
         ({"policy__dynamics": "autoregressive"}, "--sampling.length=6"),
         ({**ARWM, "planner__latent": "sample"}, "trains only its mean"),
         ({"policy__dynamics": "autoregresive"}, "autoregresive"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
+from egovcp.bounds import bounded
 from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
 from egovcp.data import MixedReturnConfig, ReturnConfig, ShuffleConfig
 from egovcp.data.source import is_repo_id
@@ -22,15 +23,15 @@ from egovcp_train.wandb_records import WandbConfig
 class OptimizerConfig:
     """AdamW with linear warm-up and cosine decay to a tenth."""
 
-    lr: float = 1e-3
+    lr: float = bounded(1e-3, above=0)
     """Peak learning rate."""
-    weight_decay: float = 1e-3
+    weight_decay: float = bounded(1e-3, least=0)
     """Decoupled weight decay."""
-    warmup_steps: int = 100
+    warmup_steps: int = bounded(100, least=0)
     """Steps of linear warm-up."""
-    grad_clip: float = 10.0
+    grad_clip: float = bounded(10.0, above=0)
     """Largest gradient norm."""
-    ema: float = 0.995
+    ema: float = bounded(0.995, least=0, below=1)
     """Decay of the averaged weights that are evaluated and shipped; 0: no averaging."""
 
 
@@ -38,11 +39,11 @@ class OptimizerConfig:
 class SamplingConfig:
     """Which windows of which episodes make a batch."""
 
-    length: int = 20
+    length: int = bounded(20, least=1)
     """Ticks per window."""
-    burn_in: int = 0
+    burn_in: int = bounded(0, least=0)
     """Leading ticks of a window that only fill the memory and are not trained on."""
-    event_fraction: float = 0.0
+    event_fraction: float = bounded(0.0, least=0, most=1)
     """Share of windows that are placed around events instead of anywhere."""
     mirror: bool = True
     """Left-right mirror half of the windows (the robot is symmetric)."""
@@ -61,7 +62,7 @@ class LoadingConfig:
     takes at most half of the free memory."""
     shuffle: ShuffleConfig = field(default_factory=ShuffleConfig)
     """Shuffle window of mode stream."""
-    sample_files: int = 16
+    sample_files: int = bounded(16, least=1)
     """Files of each task that are fetched before the first step where the data comes from the Hub:
     the episodes in them give the scale of the returns, are evaluated on, and Q is fitted to."""
     network: Patience = field(default_factory=Patience)
@@ -132,28 +133,28 @@ class TrainConfig:
     """Optimiser."""
     value_fit: ValueFitConfig = field(default_factory=ValueFitConfig)
     """Final fit of Q."""
-    steps: int = 20_000
+    steps: int = bounded(20_000, least=1)
     """Gradient steps."""
-    max_minutes: float = 0.0
+    max_minutes: float = bounded(0.0, least=0)
     """Wall-clock limit in minutes after which the run ends early, its learning rate decayed on
     the clock; 0: none. A resumed run has what was left. A run under a limit is not repeatable
     step for step."""
-    batch_size: int = 16
+    batch_size: int = bounded(16, least=1)
     """Windows per gradient step and process; under accelerate launch all processes together make
     one step of batch_size * num_processes windows."""
-    seed: int = 0
+    seed: int = bounded(0, least=0)
     """Seed of initialisation, batches and sampling."""
     resume: bool = False
     """Continue the run in output_dir from its last checkpoint, with its options unless given."""
-    log_freq: int = 50
+    log_freq: int = bounded(50, least=1)
     """Steps between TensorBoard records."""
-    eval_freq: int = 500
+    eval_freq: int = bounded(500, least=0)
     """Steps between evaluations on held-out episodes; 0: only at the end."""
-    eval_closed_loop: int = 0
+    eval_closed_loop: int = bounded(0, least=0)
     """Scenarios of each task that are played in simulation at every evaluation; 0: none."""
-    save_freq: int = 1000
+    save_freq: int = bounded(1000, least=1)
     """Steps between checkpoints; one is always written at the end."""
-    threads: int = 0
+    threads: int = bounded(0, least=0)
     """CPU threads; 0: all cores."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""

@@ -115,8 +115,6 @@ def _prepare(config: TrainConfig, model: WorldModel, ranks: Ranks) -> Material:
     mix, sampling = mix_of(config), stream_config(config)
     sampling.check()
     config.loading.shuffle.check()
-    if config.loading.sample_files < 1:
-        raise UsageError(f"--loading.sample_files={config.loading.sample_files}: at least 1")
     config.targets.check()
     if mirrored(config) == "flights" and not needs_labels(config):
         raise UsageError(

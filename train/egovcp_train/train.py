@@ -293,10 +293,6 @@ class Run:
 
 def _prepare_output(config: TrainConfig, ranks: Ranks) -> Path:
     """Refuse what makes no sense, or cannot be done here, before any work starts."""
-    if min(config.steps, config.batch_size, config.log_freq, config.save_freq) < 1:
-        raise UsageError("--steps, --batch_size, --log_freq and --save_freq must be at least 1")
-    if config.eval_closed_loop < 0:
-        raise UsageError(f"--eval_closed_loop={config.eval_closed_loop}: expected at least 0")
     require_wandb(config.wandb)
     if config.eval_closed_loop:
         require_simulator()

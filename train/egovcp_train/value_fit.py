@@ -18,7 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from tqdm import tqdm
 
-from egovcp.errors import UsageError
+from egovcp.bounds import bounded, check_bounds
 from egovcp.model import Batch, Carry, WorldModel, value
 from egovcp.model.losses import filter_sequence
 from egovcp.model.nets import SplitMlp, ValueHead
@@ -35,22 +35,22 @@ _COMING: Final = 0.01
 class ValueFitConfig:
     """Fit of the value head on fixed states at the end of training."""
 
-    steps: int = 600
+    steps: int = bounded(600, least=0)
     """Least gradient steps of the part of Q that reads the state, and of the reward; 0: no fit."""
-    passes: float = 8.0
+    passes: float = bounded(8.0, least=0)
     """How often all rows are gone over at least: of many, the least steps would see a part only,
     and after two passes another seed is another policy."""
     mirror: Mirrored = "all"
     """Whose mirror images the fit goes over as well, if windows are mirrored (--sampling.mirror).
     flights: those of episodes in which something flies, whose rows are few beside others' where
     tasks are mixed."""
-    imagined_steps: int = 3
+    imagined_steps: int = bounded(3, least=0)
     """States are imagined 0 to this many ticks ahead, as far as the planner looks."""
-    rows: int = 1024
+    rows: int = bounded(1024, least=1)
     """States per step."""
-    lr: float = 1e-3
+    lr: float = bounded(1e-3, above=0)
     """Peak learning rate; one cycle."""
-    told_steps: int = 2500
+    told_steps: int = bounded(2500, least=0)
     """Gradient steps of the part of Q that reads what is told of a flight: few numbers, from which
     there is more to be learned than from the state, which is soon known by heart (docs/log.md).
     0: the part stays silent. Where nothing flies it judges an action by what followed on actions
@@ -59,29 +59,18 @@ class ValueFitConfig:
     """Rows that that part judges. coming: those on which something is on its way, and elsewhere it
     learns to say nothing: where tasks are mixed, what followed on actions like one in all states
     of all tasks misleads the wall."""
-    told_rows: int = 2048
+    told_rows: int = bounded(2048, least=1)
     """States per step of that part."""
-    told_lr: float = 2e-3
+    told_lr: float = bounded(2e-3, above=0)
     """Peak learning rate of that part."""
-    weight_decay: float = 0.1
+    weight_decay: float = bounded(0.1, least=0)
     """Decoupled weight decay."""
-    dropout: float = 0.5
+    dropout: float = bounded(0.5, least=0, below=1)
     """Share of h and z hidden from the head at each step: a few thousand throws are soon known by
     heart."""
 
     def __post_init__(self) -> None:
-        if min(self.rows, self.told_rows) < 1 or min(self.steps, self.told_steps) < 0:
-            raise UsageError(
-                "value_fit.rows and .told_rows must be at least 1, .steps and .told_steps at least "
-                "0"
-            )
-        if not 0 <= self.passes < math.inf:
-            raise UsageError(f"value_fit.passes is {self.passes}; expected a number from 0 on")
-        if self.imagined_steps < 0 or not 0 <= self.dropout < 1:
-            raise UsageError(
-                f"value_fit.imagined_steps is {self.imagined_steps} and .dropout {self.dropout}; "
-                "expected at least 0, and from 0 to below 1"
-            )
+        check_bounds(self)
 
     def steps_over(self, rows: int) -> int:
         """Gradient steps of the part that reads the state, where there are so many rows."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from tqdm import tqdm
 
+from egovcp.bounds import bounded
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import DataError, UsageError
 from egovcp_collect.dataset.again import changed_versions, simulated_again
@@ -24,7 +25,7 @@ class AuditConfig:
     """The dataset: a folder, or an id of the Hub."""
     episodes: list[int] = field(default_factory=list)
     """Which episodes, [0,7,...]; empty: --count of them."""
-    count: int = 5
+    count: int = bounded(5, least=1)
     """How many episodes, spread evenly over the dataset."""
     json: str = ""
     """File for the result: {"ok", "episodes", "different", "versions"}; empty: none."""
@@ -55,8 +56,6 @@ def _chosen(config: AuditConfig, total: int) -> list[int]:
     for index in config.episodes:
         if not 0 <= index < total:
             raise UsageError(f"--episodes: no episode {index}; the dataset has 0 to {total - 1}")
-    if config.count < 1:
-        raise UsageError(f"--count={config.count}: expected at least 1")
     spread = np.linspace(0, total - 1, min(config.count, total)).round().astype(int)
     return sorted(set(config.episodes or spread.tolist()))
 

@@ -11,10 +11,11 @@ from typing import Any
 
 from tqdm import tqdm
 
+from egovcp.bounds import bounded
 from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetConfig, metadata
 from egovcp.data.source import local_root, locate
-from egovcp.errors import DataError, UsageError
+from egovcp.errors import DataError
 from egovcp_collect.dataset.replace import write_report
 
 
@@ -25,7 +26,7 @@ class CheckConfig:
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, for which the network is never asked, or an id of the Hub."""
-    max_problems: int = 20
+    max_problems: int = bounded(20, least=1)
     """Stop after this many problems."""
     json: str = ""
     """File for the result: {"ok", "episodes", "frames", "problems": [{"file", "episode", "frame",
@@ -41,8 +42,6 @@ def run(config: CheckConfig) -> None:
     Raises:
         DataError: something is wrong.
     """
-    if config.max_problems < 1:
-        raise UsageError(f"--max_problems={config.max_problems}: expected at least 1")
     root = local_root(config.dataset) if config.dataset.root else locate(config.dataset).root
     if not root.is_dir():
         raise DataError(f"no dataset at {root}: there is no such folder")

@@ -9,9 +9,12 @@ emergency stop. Without planner or camera the robot can still stand: that is HOL
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
+
+from egovcp.bounds import bounded
 
 
 class State(StrEnum):
@@ -45,23 +48,23 @@ class Request(StrEnum):
 class Limits:
     """When the robot is held or damped."""
 
-    state_hold_s: float = 0.1
+    state_hold_s: float = bounded(0.1, above=0)
     """HOLD when proprioception is older, s."""
-    state_damp_s: float = 0.2
+    state_damp_s: float = bounded(0.2, above=0)
     """DAMP when proprioception is older, s."""
-    picture_hold_s: float = 0.2
+    picture_hold_s: float = bounded(0.2, above=0)
     """HOLD when the picture is older than this, s."""
-    planner_hold_s: float = 0.14
+    planner_hold_s: float = bounded(0.14, above=0)
     """HOLD when the planner has not answered for so long, s."""
-    misses_hold: int = 5
+    misses_hold: int = bounded(5, least=0)
     """HOLD after more than so many ticks in a row without a plan in time."""
-    tilt_damp: float = 1.0
+    tilt_damp: float = bounded(1.0, above=0, most=math.pi / 2)
     """DAMP beyond this angle between pelvis and vertical, rad."""
-    height_damp: float = 0.40
+    height_damp: float = bounded(0.40, least=0)
     """DAMP below this height of the pelvis above the lower foot, m; the lowest stance has 0.5."""
-    recover_s: float = 1.0
+    recover_s: float = bounded(1.0, least=0)
     """HOLD ends by itself when all has been well for so long, s."""
-    stand_s: float = 3.0
+    stand_s: float = bounded(3.0, above=0)
     """Time in which the gains come in, s."""
 
 

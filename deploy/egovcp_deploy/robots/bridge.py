@@ -12,7 +12,8 @@ from typing import Final
 
 import zmq
 
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.bounds import bounded, check_bounds
+from egovcp.errors import EnvironmentFailure
 from egovcp_deploy.robots.body import BodyState, MotorCommand
 from egovcp_deploy.robots.listener import Listener, join, probe
 from egovcp_deploy.robots.publisher import PublisherWatch
@@ -38,20 +39,16 @@ class BridgeConfig:
     host: str = "127.0.0.1"
     """Where LeRobot's bridge runs; a G1 is 192.168.123.164 unless told otherwise, egovcp-fake-g1
     is here."""
-    state_port: int = STATE_PORT
+    state_port: int = bounded(STATE_PORT, least=1, most=65535)
     """Its port for states."""
-    command_port: int = COMMAND_PORT
+    command_port: int = bounded(COMMAND_PORT, least=1, most=65535)
     """Its port for commands."""
     mode: int | None = None
     """Mode machine that the robot must report, which tells its hardware; null: any, as long as it
     stays the same."""
 
     def __post_init__(self) -> None:
-        if not all(0 < port < 65536 for port in (self.state_port, self.command_port)):
-            raise UsageError(
-                f"ports are numbers from 1 to 65535, found {self.state_port} and "
-                f"{self.command_port}"
-            )
+        check_bounds(self)
 
 
 @dataclass

@@ -8,6 +8,7 @@ from typing import Final
 
 import zmq
 
+from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import EnvironmentFailure
 from egovcp.rate import FixedRate, MonotonicClock
@@ -32,7 +33,7 @@ class DepthServerConfig:
     host: str = "127.0.0.1"
     """Interface to listen on; the loopback lets nobody else in, the address of the robot's own
     network its machines."""
-    port: int = CAMERA_PORT
+    port: int = bounded(CAMERA_PORT, least=0, most=65535)
     """Port."""
 
 

@@ -5,6 +5,7 @@ Untested on hardware: the tests run against a camera object that behaves as LeRo
 
 from __future__ import annotations
 
+import math
 import time
 from dataclasses import dataclass
 from typing import Any, Final, Protocol, Self
@@ -12,6 +13,7 @@ from typing import Any, Final, Protocol, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.bounds import bounded
 from egovcp.errors import EnvironmentFailure
 from egovcp.sim.config import CameraConfig
 from egovcp_deploy.robots.body import Picture
@@ -29,13 +31,13 @@ class RealSenseEyeConfig:
     serial: str = ""
     """Serial number, or name if there is only one of it; lerobot-find-cameras realsense lists
     them."""
-    width: int = 848
+    width: int = bounded(848, least=1)
     """Columns of its depth; the stereo of a D435i is best at 848 x 480."""
-    height: int = 480
+    height: int = bounded(480, least=1)
     """Rows of its depth."""
-    fps: int = 60
+    fps: int = bounded(60, least=1)
     """Pictures per second."""
-    vertical_fov: float = CameraConfig.vertical_fov
+    vertical_fov: float = bounded(CameraConfig.vertical_fov, above=0, below=math.pi)
     """Field of view that the policy knows, rad; the camera's own must not be much smaller."""
 
 

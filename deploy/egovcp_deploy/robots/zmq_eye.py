@@ -7,7 +7,8 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.bounds import bounded, check_bounds
+from egovcp.errors import EnvironmentFailure
 from egovcp.sim.config import CameraConfig
 from egovcp_deploy.robots.body import Picture
 from egovcp_deploy.robots.depth_wire import PICTURE_BYTES, decode_picture
@@ -24,14 +25,13 @@ class ZmqEyeConfig:
 
     host: str = "127.0.0.1"
     """Machine of the depth server."""
-    port: int = CAMERA_PORT
+    port: int = bounded(CAMERA_PORT, least=1, most=65535)
     """Its port."""
-    vertical_fov: float = CameraConfig.vertical_fov
+    vertical_fov: float = bounded(CameraConfig.vertical_fov, above=0, below=math.pi)
     """Field of view that the pictures must have, rad: the policy's."""
 
     def __post_init__(self) -> None:
-        if not 0 < self.port < 65536:
-            raise UsageError(f"a port is a number from 1 to 65535, found {self.port}")
+        check_bounds(self)
 
 
 class ZmqEye:

@@ -81,7 +81,7 @@ def test_it_ends_on_an_interrupt() -> None:
     ("flag", "code", "words"),
     [
         ("--task=bal", 2, "did you mean 'ball'"),
-        ("--episode=-1", 2, "expected a number from 0"),
+        ("--episode=-1", 2, "--episode=-1: expected at least 0"),
         ("--json=/nowhere/at/all.json", 5, "no folder"),
     ],
 )

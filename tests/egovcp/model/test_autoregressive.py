@@ -98,7 +98,7 @@ def test_nothing_is_observed_on_the_way() -> None:
 
 
 def test_no_steps_at_all_are_refused() -> None:
-    with pytest.raises(UsageError, match="autoregressive_steps is 0"):
+    with pytest.raises(UsageError, match="autoregressive_steps=0: expected"):
         LossConfig(autoregressive_steps=0)
 
 

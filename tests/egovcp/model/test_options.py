@@ -117,7 +117,7 @@ def test_a_new_q_is_the_mean_return(kind: str) -> None:
 
 
 def test_no_heads_at_all_are_refused() -> None:
-    with pytest.raises(UsageError, match="q_heads is 0"):
+    with pytest.raises(UsageError, match="q_heads=0: expected"):
         WorldModelConfig(q_heads=0)
 
 

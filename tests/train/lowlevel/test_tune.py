@@ -55,5 +55,5 @@ def test_it_leaves_numbers_that_a_gait_can_be_made_of(tmp_path):
 @pytest.mark.parametrize("flag", ["--population=2", "--seconds=0", "--minutes=-1"])
 def test_nonsense_is_refused(flag, tmp_path, capsys):
     assert main([f"--output_dir={tmp_path / 'x'}", flag]) == 2
-    assert "at least 4" in capsys.readouterr().err
+    assert flag.split("=")[0] in capsys.readouterr().err
     assert not (tmp_path / "x").exists()

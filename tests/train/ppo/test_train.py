@@ -61,7 +61,7 @@ def test_another_network_does_not_continue_the_run(
         (["--task=bal"], 2, "did you mean 'ball'"),
         (["--seed=1000000000"], 2, "are for evaluation"),
         (["--initial_std=0"], 2, "--initial_std"),
-        (["--network.frames=0"], 2, "count from 1"),
+        (["--network.frames=0"], 2, "--network.frames=0: expected at least 1"),
         (["--resume"], 4, "no checkpoint to resume from"),
     ],
 )

@@ -12,6 +12,7 @@ from typing import Any, Final
 import torch
 
 from egovcp.artefact import Artefact, load_artefact
+from egovcp.bounds import bounded
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore
 from egovcp.errors import ArtefactError, UsageError
@@ -47,18 +48,18 @@ class HeldoutConfig:
     """Policy to measure."""
     dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
     """Dataset with the episodes."""
-    return_steps: int | None = None
+    return_steps: int | None = bounded(None, least=1)
     """Horizon of the returns that Q is compared with, ticks; null: that of the training, if its
     datasets had but one."""
     split: str = "heldout"
     """heldout, train or all; episodes are held out by a hash, the same ones in each training."""
-    episodes: int = 64
+    episodes: int = bounded(64, least=0)
     """At most this many episodes of each task, evenly spread over the split; 0: all."""
-    stride: int = 4
+    stride: int = bounded(4, least=1)
     """Rows between the starts of open-loop predictions; 1: from each row."""
     pictures: bool = True
     """Write open_loop_TASK.png, value_TASK.png and open_loop.rrd."""
-    threads: int = 0
+    threads: int = bounded(0, least=0)
     """CPU threads; 0: all cores."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""
@@ -94,10 +95,6 @@ def evaluate(config: HeldoutConfig) -> None:
 
 def _check(config: HeldoutConfig) -> Path:
     """Refuse options that make no sense before any work starts."""
-    if config.episodes < 0 or config.stride < 1:
-        raise UsageError(
-            f"--episodes={config.episodes} --stride={config.stride}: expected at least 0 and 1"
-        )
     if not config.policy.path:
         raise UsageError("no policy given: --policy.path=RUN/checkpoints/last/pretrained_model")
     output = Path(config.output_dir)

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from egovcp.bounds import bounded
+
 
 @dataclass(frozen=True)
 class NetworkConfig:
     """Sizes of actor and critic."""
 
-    actor: tuple[int, ...] = (256, 128, 64)
+    actor: tuple[int, ...] = bounded((256, 128, 64), least=1)
     """Hidden layers of the policy."""
-    critic: tuple[int, ...] = (256, 128, 64)
+    critic: tuple[int, ...] = bounded((256, 128, 64), least=1)
     """Hidden layers of the critic, which also sees what only the simulator knows."""
     activation: str = "elu"
     """Activation of both."""
-    initial_std: float = 0.3
+    initial_std: float = bounded(0.3, above=0)
     """Standard deviation of the policy's actions at the start."""
 
 
@@ -23,23 +25,23 @@ class NetworkConfig:
 class PpoConfig:
     """Proximal policy optimisation; the names are rsl-rl's."""
 
-    num_steps_per_env: int = 24
+    num_steps_per_env: int = bounded(24, least=1)
     """Ticks per robot and iteration."""
-    num_learning_epochs: int = 4
+    num_learning_epochs: int = bounded(4, least=1)
     """Passes over the data of an iteration."""
-    num_mini_batches: int = 4
+    num_mini_batches: int = bounded(4, least=1)
     """Mini-batches per pass."""
-    learning_rate: float = 1e-3
+    learning_rate: float = bounded(1e-3, above=0)
     """At the start; then it follows desired_kl."""
-    desired_kl: float = 0.02
+    desired_kl: float = bounded(0.02, above=0)
     """Change of the policy per update that the learning rate aims at."""
-    gamma: float = 0.99
+    gamma: float = bounded(0.99, least=0, most=1)
     """Discount per tick of 20 ms."""
-    lam: float = 0.95
+    lam: float = bounded(0.95, least=0, most=1)
     """Of generalised advantage estimation."""
-    clip_param: float = 0.2
+    clip_param: float = bounded(0.2, above=0)
     """Clipping of the probability ratio."""
-    entropy_coef: float = 0.003
+    entropy_coef: float = bounded(0.003, least=0)
     """Weight of the entropy."""
 
 
@@ -47,11 +49,11 @@ class PpoConfig:
 class CurriculumConfig:
     """When the task becomes harder."""
 
-    step: float = 0.004
+    step: float = bounded(0.004, least=0)
     """Change of the difficulty per iteration."""
-    few_falls: float = 0.02
+    few_falls: float = bounded(0.02, least=0, most=1)
     """Falls per robot and second, below which it becomes harder."""
-    many_falls: float = 0.08
+    many_falls: float = bounded(0.08, least=0, most=1)
     """Above which it becomes easier."""
-    tracking: float = 0.65
+    tracking: float = bounded(0.65, least=0)
     """Mean of the velocity reward (1: perfect) that is also needed to make it harder."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
 from egovcp.intervals import wilson
@@ -51,7 +52,7 @@ class LowLevelEvalConfig:
     """stance, walk (which the package ships), or the walk.safetensors of egovcp-train-lowlevel."""
     skills: str = ",".join(skill.name for skill in SKILLS)
     """Which skills, separated by commas."""
-    episodes: int = 400
+    episodes: int = bounded(400, least=1)
     """Robots per skill."""
     disturbances: DisturbanceConfig = field(default_factory=lambda: DisturbanceConfig(models=400))
     """Ranges of the physical parameters and of the delay."""
@@ -59,9 +60,9 @@ class LowLevelEvalConfig:
     """Noise of proprioception."""
     feet: Literal["stock", "points"] = "stock"
     """Foot collision model."""
-    seed: int = 1000
+    seed: int = bounded(1000, least=0)
     """Seed of robots, commands, pushes and noise."""
-    threads: int = 0
+    threads: int = bounded(0, least=0)
     """CPU threads; 0: all cores."""
 
 
@@ -72,8 +73,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def evaluate(config: LowLevelEvalConfig) -> None:
     """Play, print the table, write the JSON."""
-    if config.episodes < 1:
-        raise UsageError(f"--episodes is {config.episodes}; expected at least 1")
     skills = _chosen(config.skills)
     controller = make_controller(config.controller)
     output = Path(config.output_dir)

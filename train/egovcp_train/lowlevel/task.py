@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError
 
 Range = tuple[float, float]
@@ -28,28 +29,29 @@ def _check_ranges(where: str, config: object) -> None:
 class CommandConfig:
     """The commands of training episodes; a new one every few seconds."""
 
-    interval: Range = (2.0, 6.0)
+    interval: Range = bounded((2.0, 6.0), above=0)
     """s between changes of velocity and of how hands and height move."""
-    standing: float = 0.4
+    standing: float = bounded(0.4, least=0, most=1)
     """Share of commands with zero velocity."""
     forward: tuple[Range, Range] = ((0.1, 0.3), (0.1, 0.6))
     """m/s, easy and hard."""
-    backward: float = 0.1
+    backward: float = bounded(0.1, least=0, most=1)
     """Share of the walking commands that go backwards, at up to half the speed."""
-    sideways: float = 0.15
+    sideways: float = bounded(0.15, least=0)
     """m/s at the hardest, either way, in a third of the walking commands."""
-    turning: float = 0.4
+    turning: float = bounded(0.4, least=0)
     """rad/s at the hardest, either way, in a third of the walking commands."""
-    standing_height: tuple[Range, Range] = ((0.65, 0.75), (0.50, 0.76))
+    standing_height: tuple[Range, Range] = bounded(((0.65, 0.75), (0.50, 0.76)), above=0)
     """m, easy and hard."""
-    walking_height: tuple[Range, Range] = ((0.70, 0.75), (0.55, 0.75))
+    walking_height: tuple[Range, Range] = bounded(((0.70, 0.75), (0.55, 0.75)), above=0)
     """m, easy and hard."""
-    acceleration: float = 0.8
+    acceleration: float = bounded(0.8, above=0)
     """m/s^2 and rad/s^2 at which the commanded velocity changes."""
-    still_hands: float = 0.2
+    still_hands: float = bounded(0.2, least=0, most=1)
     """Share of commands whose hands rest; the others follow the data's random walk."""
 
     def __post_init__(self) -> None:
+        check_bounds(self)
         _check_ranges("commands", self)
 
 
@@ -57,29 +59,28 @@ class CommandConfig:
 class DisturbanceConfig:
     """Pushes, physical parameters, delay and noise."""
 
-    push_interval: Range = (3.0, 8.0)
+    push_interval: Range = bounded((3.0, 8.0), above=0)
     """s between pushes."""
-    push: Range = (0.1, 0.7)
+    push: Range = bounded((0.1, 0.7), least=0)
     """m/s of horizontal velocity at most, easy and hard."""
-    friction: Range = (0.5, 1.1)
+    friction: Range = bounded((0.5, 1.1), least=0)
     """Sliding friction of the feet."""
     payload: Range = (-0.5, 2.0)
     """kg on the torso."""
-    mass_scale: Range = (0.95, 1.05)
+    mass_scale: Range = bounded((0.95, 1.05), above=0)
     """Factor on every mass."""
-    stiffness_scale: Range = (0.8, 1.2)
+    stiffness_scale: Range = bounded((0.8, 1.2), above=0)
     """Factor on the stiffness of every servo."""
-    damping_scale: Range = (0.8, 1.2)
+    damping_scale: Range = bounded((0.8, 1.2), above=0)
     """Factor on the damping of every servo."""
-    delay: Range = (0.0, 0.02)
+    delay: Range = bounded((0.0, 0.02), least=0)
     """s from a measurement to the new targets' effect, in physics steps."""
-    models: int = 64
+    models: int = bounded(64, least=1)
     """Robots of different physical parameters."""
 
     def __post_init__(self) -> None:
+        check_bounds(self)
         _check_ranges("disturbances", self)
-        if self.models < 1:
-            raise UsageError(f"task.disturbances.models is {self.models}; expected at least 1")
 
 
 @dataclass(frozen=True)
@@ -112,5 +113,5 @@ class LowLevelTask:
     """What disturbs."""
     rewards: RewardConfig = field(default_factory=RewardConfig)
     """What is rewarded."""
-    episode: float = 20.0
+    episode: float = bounded(20.0, above=0)
     """s after which an episode is cut."""

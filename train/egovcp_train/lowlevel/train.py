@@ -13,8 +13,9 @@ from typing import Any, Literal
 import draccus
 import torch
 
+from egovcp.bounds import bounded
 from egovcp.cli import run_command, save_config
-from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.errors import ArtefactError, EnvironmentFailure
 from egovcp.robot.walk_onnx import export_onnx
 from egovcp.robot.walking import WalkConfig
 from egovcp.sim.config import SensorConfig
@@ -64,21 +65,21 @@ class LowLevelTrainConfig:
     """Proximal policy optimisation."""
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     """When the task becomes harder."""
-    robots: int = 512
+    robots: int = bounded(512, least=1)
     """Robots simulated side by side."""
     feet: Literal["points", "stock"] = "points"
     """Foot collision model; four points are twice as fast."""
-    steps: int = 50_000_000
+    steps: int = bounded(50_000_000, least=1)
     """Control steps of 20 ms, over all robots."""
-    max_minutes: float = 0.0
+    max_minutes: float = bounded(0.0, least=0)
     """Wall-clock limit in minutes; 0: none."""
-    seed: int = 0
+    seed: int = bounded(0, least=0)
     """Seed of networks, commands, disturbances and noise."""
-    threads: int = 0
+    threads: int = bounded(0, least=0)
     """CPU threads; 0: all cores."""
     resume: bool = False
     """Continue the run in output_dir from its last checkpoint, with its options unless given."""
-    save_freq: int = 50
+    save_freq: int = bounded(50, least=1)
     """Iterations between checkpoints; one is always written at the end."""
     tensorboard: bool = True
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
@@ -95,8 +96,6 @@ def train(config: LowLevelTrainConfig) -> None:
     Raises:
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
-    if min(config.robots, config.steps, config.save_freq) < 1:
-        raise UsageError("--robots, --steps and --save_freq must be at least 1")
     output = prepare_output(config.output_dir, config.resume)
     threads = config.threads or len(os.sched_getaffinity(0))
     torch.set_num_threads(threads)

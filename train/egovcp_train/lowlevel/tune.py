@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from egovcp.bounds import bounded
 from egovcp.cli import run_command
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import EnvironmentFailure
 from egovcp.robot.gait import GaitConfig
 from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
 from egovcp.sim.config import SensorConfig
@@ -56,17 +57,17 @@ class TuneConfig:
     """Where gait.json goes."""
     start: GaitConfig = field(default_factory=GaitConfig)
     """Where to start from."""
-    minutes: float = 15.0
+    minutes: float = bounded(15.0, above=0)
     """Wall-clock limit."""
-    population: int = 28
+    population: int = bounded(28, least=4)
     """Candidates per generation."""
-    seconds: float = 6.0
+    seconds: float = bounded(6.0, above=0)
     """Length of a walk, s."""
-    height: float = 0.72
+    height: float = bounded(0.72, above=0)
     """Pelvis height, m."""
-    seed: int = 0
+    seed: int = bounded(0, least=0)
     """Seed of candidates, physics and noise."""
-    threads: int = 0
+    threads: int = bounded(0, least=0)
     """CPU threads; 0: all cores."""
 
 
@@ -82,8 +83,6 @@ def tune(config: TuneConfig) -> None:
         UsageError: an option makes no sense.
         EnvironmentFailure: the package cma is missing, or the folder cannot be written.
     """
-    if config.population < 4 or config.seconds <= 0 or config.minutes <= 0:
-        raise UsageError("--population must be at least 4, --seconds and --minutes above 0")
     try:
         import cma
     except ImportError as error:

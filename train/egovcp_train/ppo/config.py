@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final
 
+from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError, suggest
 from egovcp.reactive import ReactiveConfig
 from egovcp.sim.config import EnvConfig
@@ -18,23 +19,23 @@ ALL: Final = "all"
 class ContactPpoConfig:
     """Proximal policy optimisation; the names are rsl-rl's."""
 
-    num_steps_per_env: int = 50
+    num_steps_per_env: int = bounded(50, least=1)
     """Ticks per robot and iteration."""
-    num_learning_epochs: int = 4
+    num_learning_epochs: int = bounded(4, least=1)
     """Passes over the data of an iteration."""
-    num_mini_batches: int = 4
+    num_mini_batches: int = bounded(4, least=1)
     """Mini-batches per pass."""
-    learning_rate: float = 1e-3
+    learning_rate: float = bounded(1e-3, above=0)
     """At the start; then it follows desired_kl."""
-    desired_kl: float = 0.01
+    desired_kl: float = bounded(0.01, above=0)
     """Change of the policy per update that the learning rate aims at."""
-    gamma: float = GAMMA
+    gamma: float = bounded(GAMMA, least=0, most=1)
     """Discount per tick of 40 ms; that of the world model's returns."""
-    lam: float = 0.95
+    lam: float = bounded(0.95, least=0, most=1)
     """Of generalised advantage estimation."""
-    clip_param: float = 0.2
+    clip_param: float = bounded(0.2, above=0)
     """Clipping of the probability ratio."""
-    entropy_coef: float = 0.002
+    entropy_coef: float = bounded(0.002, least=0)
     """Weight of the entropy."""
 
 
@@ -56,36 +57,33 @@ class PpoTrainConfig:
     """Scenes, sensors, delays and randomisation; the defaults are those of egovcp-collect."""
     network: ReactiveConfig = field(default_factory=ReactiveConfig)
     """Policy and critic."""
-    initial_std: float = 0.4
+    initial_std: float = bounded(0.4, above=0)
     """Standard deviation of the actions at the start, box units."""
     ppo: ContactPpoConfig = field(default_factory=ContactPpoConfig)
     """Proximal policy optimisation."""
-    robots: int = 32
+    robots: int = bounded(32, least=1)
     """Robots simulated side by side."""
-    steps: int = 1_000_000
+    steps: int = bounded(1_000_000, least=1)
     """Planner ticks of 40 ms, over all robots: transitions."""
-    max_minutes: float = 0.0
+    max_minutes: float = bounded(0.0, least=0)
     """Wall-clock limit in minutes, over all resumes; 0: none."""
-    seed: int = 0
+    seed: int = bounded(0, least=0)
     """Seed of scenarios, networks and actions."""
-    threads: int = 0
+    threads: int = bounded(0, least=0)
     """CPU threads of the networks; 0: all cores. Those of the simulator are --env.threads."""
     resume: bool = False
     """Continue the run in output_dir from its last checkpoint, with its options unless given."""
-    save_freq: int = 20
+    save_freq: int = bounded(20, least=1)
     """Iterations between checkpoints; one is always written at the end."""
     tensorboard: bool = True
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
 
     def __post_init__(self) -> None:
-        if min(self.robots, self.steps, self.save_freq) < 1:
-            raise UsageError("--robots, --steps and --save_freq must be at least 1")
+        check_bounds(self)
         if self.task not in (*TASKS, ALL):
             known = suggest(self.task, (*TASKS, ALL))
             raise UsageError(f"unknown value --task={self.task}{known}")
-        if self.initial_std <= 0:
-            raise UsageError(f"--initial_std={self.initial_std}: expected more than 0")
-        if not 0 <= self.seed < HELD_OUT:
+        if self.seed >= HELD_OUT:
             raise UsageError(
                 f"--seed={self.seed}: expected a number from 0 to {HELD_OUT - 1}; the scenarios "
                 "beyond are for evaluation"

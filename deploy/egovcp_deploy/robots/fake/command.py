@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.rate import NS_PER_S, Clock, MonotonicClock
@@ -44,18 +45,18 @@ class FakeConfig:
 
     task: str = "ball"
     """Scene: ball, wall, arch, or sequence (several in one episode, --env.sequence.parts)."""
-    seed: int = 0
+    seed: int = bounded(0, least=0)
     """Which held-out scenarios, the same that egovcp-eval plays."""
-    episode: int = 0
+    episode: int = bounded(0, least=0)
     """Number of the first."""
-    episodes: int = 0
+    episodes: int = bounded(0, least=0)
     """How many; 0: until interrupted."""
-    gantry: float | None = 3.0
+    gantry: float | None = bounded(3.0, least=0)
     """How long the motors must have been told to hold something, without a break, before the crane
     that holds the pelvis lets go, s; 0: at the first command; null: only on the word release."""
-    settle: float = 2.0
+    settle: float = bounded(2.0, least=0)
     """From there to the beginning of the task, s."""
-    pause: float = 2.0
+    pause: float = bounded(2.0, least=0)
     """From the end of an episode to the next, which begins on the crane, s; at least 1.5."""
     ports: Ports = field(default_factory=Ports)
     """Where to listen."""
@@ -102,9 +103,6 @@ def run(config: FakeConfig, opened: Callable[[Ports], None] = lambda ports: None
 
 def _check(config: FakeConfig) -> None:
     held_out(config.task, config.seed, 0)
-    for name in ("episode", "episodes"):
-        if getattr(config, name) < 0:
-            raise UsageError(f"--{name}={getattr(config, name)}: expected a number from 0")
     folder = Path(config.json).parent
     if config.json and not folder.is_dir():
         raise EnvironmentFailure(f"--json={config.json}: there is no folder {folder}")

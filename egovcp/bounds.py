@@ -1,0 +1,142 @@
+"""What numbers an option may be, said beside its default and checked before any work starts.
+
+    @dataclass(frozen=True)
+    class OptimizerConfig:
+        lr: float = bounded(1e-3, above=0)
+
+`egovcp.cli` checks what it has parsed, and ``--help`` tells the bounds. A config that is made
+elsewhere too checks itself in its ``__post_init__``, beside what its options must be together.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterator, Mapping
+from copy import copy
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Final
+
+from egovcp.errors import UsageError
+
+_KEY: Final = "bounds"
+_FINITE: Final = "a finite number"
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """An interval, open where it is ``above`` or ``below`` something."""
+
+    least: float | None = None
+    most: float | None = None
+    above: float | None = None
+    below: float | None = None
+
+    def hold(self, value: float) -> bool:
+        """Whether a number lies within."""
+        return (
+            math.isfinite(value)
+            and (self.least is None or value >= self.least)
+            and (self.most is None or value <= self.most)
+            and (self.above is None or value > self.above)
+            and (self.below is None or value < self.below)
+        )
+
+    def __str__(self) -> str:
+        """In words, as after "expected"."""
+        words = {
+            "at least": self.least,
+            "more than": self.above,
+            "at most": self.most,
+            "less than": self.below,
+        }
+        said = [f"{word} {value:g}" for word, value in words.items() if value is not None]
+        return " and ".join(said) or _FINITE
+
+
+_ANY: Final = Bounds()
+
+
+def bounded[T](
+    default: T,
+    *,
+    least: float | None = None,
+    most: float | None = None,
+    above: float | None = None,
+    below: float | None = None,
+) -> T:
+    """A dataclass field with this default whose value, or each number in it, has bounds; None,
+    where the type allows it, stands for no number."""
+    metadata = {_KEY: Bounds(least, most, above, below)}
+    if isinstance(default, dict):
+        return field(default_factory=partial(copy, default), metadata=metadata)
+    return field(default=default, metadata=metadata)
+
+
+def bounds_of(option: dataclasses.Field[Any]) -> Bounds | None:
+    """Those that were declared."""
+    found: Bounds | None = option.metadata.get(_KEY)
+    return found
+
+
+class OutOfBounds(UsageError):
+    """A number that an option may not be."""
+
+    def __init__(self, option: str, value: object, expected: str) -> None:
+        super().__init__(f"{option}={_written(value)}: expected {expected}")
+        self._facts = option, value, expected
+
+    def under(self, prefix: str) -> OutOfBounds:
+        """The same, of an option of the config that has this name."""
+        option, value, expected = self._facts
+        return OutOfBounds(f"{prefix}{option}", value, expected)
+
+
+def check_bounds(config: Any, prefix: str = "") -> None:
+    """Hold every number in a dataclass, and in those within it, against its bounds; without any it
+    has to be finite.
+
+    Args:
+        prefix: What stands before the name of an option, ``--policy.``.
+
+    Raises:
+        OutOfBounds: one is not within.
+    """
+    for option in dataclasses.fields(config):
+        name, value = f"{prefix}{option.name}", getattr(config, option.name)
+        if dataclasses.is_dataclass(value):
+            check_bounds(value, f"{name}.")
+            continue
+        bounds = bounds_of(option) or _ANY
+        for number in _numbers(value, name):
+            if not bounds.hold(number):
+                expected = str(bounds) if math.isfinite(number) else _FINITE
+                raise OutOfBounds(name, value, expected)
+
+
+def _numbers(value: object, name: str) -> Iterator[float]:
+    """All numbers in a value; dataclasses in a list of them are checked one by one."""
+    match value:
+        case bool() | str():
+            return
+        case int() | float():
+            yield value
+        case Mapping():
+            for inner in value.values():
+                yield from _numbers(inner, name)
+        case tuple() | list():
+            for index, inner in enumerate(value):
+                if dataclasses.is_dataclass(inner):
+                    check_bounds(inner, f"{name}[{index}].")
+                else:
+                    yield from _numbers(inner, name)
+
+
+def _written(value: object) -> str:
+    """As on a command line."""
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{k}: {_written(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, tuple | list):
+        return "[" + ", ".join(map(_written, value)) + "]"
+    return str(value)
