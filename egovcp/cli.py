@@ -174,6 +174,8 @@ def parse_config[C](
         with _defaults_file(_merged(beneath, given)) as path:
             parser.config_path = path
             config: C = parser.parse_args(flags)
+    except EgovcpError as error:
+        raise _with_flag(error, ()) from None
     except (DraccusException, argparse.ArgumentError, ValueError, TypeError) as error:
         if own := _own_error(error):
             keys = error.key_path if isinstance(error, DecodingError) else ()

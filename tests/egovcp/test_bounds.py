@@ -107,6 +107,11 @@ def test_a_config_that_checks_itself_needs_no_command_line() -> None:
         Keel(depth=0)
 
 
+def test_a_command_whose_whole_config_checks_itself_names_the_flag_too() -> None:
+    with pytest.raises(UsageError, match=r"^--depth=-1\.0: expected more than 0$"):
+        parse_config(Keel, ["--depth=-1"], "egovcp-test")
+
+
 def test_help_tells_the_bounds(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         _parse("--help")

@@ -48,11 +48,11 @@ def test_a_run_on_two_datasets_is_resumed_exactly(mixed: Arguments, tmp_path: Pa
     ("weights", "flags", "message"),
     [
         (("1", "null"), [], "every dataset a weight, or none"),
-        (("1", "-1"), [], "a weight of -1.0"),
+        (("1", "-1"), [], "--datasets[1].weight=-1.0: expected at least 0"),
         (("1", "1"), ["--sampling.tasks={bal: 2}"], "did you mean 'ball'"),
         (("1", "1"), ["--dataset.root=x"], "--dataset and --datasets"),
         (("1", "1"), ["--returns.steps=0"], "--returns.steps=0"),
-        (("1, return_steps: 0", "1"), [], "return_steps=0"),
+        (("1, return_steps: 0", "1"), [], "--datasets[0].return_steps=0"),
     ],
 )
 def test_a_mixture_that_makes_no_sense_is_refused_before_anything_is_written(
