@@ -76,7 +76,8 @@ class Lane:
         self._controller_tick = 0
         self.state = np.zeros(STATE_DIM)
         self._sensors.measure(self.robot.data, self.state)
-        self._pictures = deque([self._take_picture()] * 4, maxlen=4)
+        kept = 1 + self.image_age // CONTROLLER_TICKS_PER_PLAN
+        self._pictures = deque([self._take_picture()] * kept, maxlen=kept)
 
     def _robot(self, task: str) -> SimulatedRobot:
         if task not in self._robots:
