@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 
-from egovcp.bounds import bounded
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.rollouts import POSE, run_info, ticks_of
@@ -29,7 +28,7 @@ class VizConfig:
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, or an id of the Hub."""
-    episode: int = bounded(0, least=0)
+    episode: int = 0
     """Which episode, counted from 0."""
     output: str = ""
     """Recording to create; empty: NAME-episode-N.rrd in the present folder."""
