@@ -179,6 +179,7 @@ class SequenceConfig:
     ticks of its own episodes."""
 
     def __post_init__(self) -> None:
+        check_bounds(self)
         for name in self.parts:
             if name not in TASKS:
                 known = suggest(name, TASKS)

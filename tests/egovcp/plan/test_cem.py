@@ -116,7 +116,7 @@ def test_who_pays_for_steps_still_goes_where_it_is_worth_the_way() -> None:
 @pytest.mark.parametrize("name", ["hands_cost", "step_cost"])
 @pytest.mark.parametrize("cost", [-0.1, math.inf, math.nan])
 def test_a_price_is_a_number_from_zero_up(name: str, cost: float) -> None:
-    with pytest.raises(UsageError, match=f"{name} is {cost}"):
+    with pytest.raises(UsageError, match=f"{name}={cost}: expected"):
         PlannerConfig(**{name: cost})
 
 

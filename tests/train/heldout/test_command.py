@@ -107,7 +107,7 @@ def test_few_episodes_are_enough(policy: Path, dataset_root: Path, tmp_path: Pat
         ("--policy.path=/nowhere", 4, "no policy artefact"),
         ("--dataset.root=/nowhere", 3, "/nowhere"),
         ("--device=tpu9", 2, "unknown --device"),
-        ("--return_steps=0", 2, "--returns.steps=0"),
+        ("--return_steps=0", 2, "--return_steps=0"),
     ],
 )
 def test_refusals(
