@@ -20,11 +20,13 @@ from typing import Any, Final
 import draccus
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
-from egovcp.artefact import MANIFEST, WEIGHTS, Artefact, load_artefact
+from egovcp.artefact import WEIGHTS, Artefact, load_artefact
+from egovcp.atomic import write_bytes
 from egovcp.cli import run_command
 from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.manifest import MANIFEST
 from egovcp.policy_options import PolicyOptions
 from egovcp_train.onnx_networks import (
     NETWORKS,
@@ -107,7 +109,7 @@ def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:
     golden = {f"inputs/{name}": tensor for name, tensor in inputs.items()}
     for name, outputs in reference(model, inputs, ensemble).items():
         golden |= {f"outputs/{name}/{key}": tensor for key, tensor in outputs.items()}
-    save_file({name: t.contiguous() for name, t in golden.items()}, folder / GOLDEN)
+    write_bytes(folder / GOLDEN, save({name: t.contiguous() for name, t in golden.items()}))
     errors = verify(folder)
     report = _report(artefact, folder, golden) | {"largest_error": errors}
     text = json.dumps(report, indent=2, allow_nan=False) + "\n"

@@ -6,10 +6,10 @@ import shlex
 from pathlib import Path
 from typing import Final
 
-from egovcp.artefact import Artefact, load_artefact
+from egovcp.artefact import FILES, Artefact, load_artefact
 from egovcp.errors import EgovcpError, EnvironmentFailure
 from egovcp.hub import Content, Patience, Publication, Published, publish, reserve
-from egovcp_train.card import ASSETS, CARD, card_text
+from egovcp_train.card import ASSETS, CARD, CURVES, card_text
 from egovcp_train.config import PolicyConfig
 
 PATIENCE: Final = Patience()
@@ -32,8 +32,8 @@ def publication(
 ) -> Publication:
     """The artefact with a card of its own, as one commit; nothing else that lies beside it."""
     folder = artefact.path
-    data = [*folder.glob("*.json"), *folder.glob("*.safetensors"), *folder.glob(f"{ASSETS}/*.png")]
-    contents = {path.relative_to(folder).as_posix(): Content(path) for path in data}
+    names = [name for name in (*FILES, CURVES) if (folder / name).is_file()]
+    contents = {name: Content(folder / name) for name in names}
     contents[CARD] = Content(card_text(artefact, repo_id).encode())
     return Publication(
         repo_id=repo_id,

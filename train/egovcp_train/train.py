@@ -18,6 +18,7 @@ from egovcp.cli import run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.data.ahead import Ahead
 from egovcp.errors import ArtefactError, UsageError
+from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
@@ -259,7 +260,7 @@ class Run:
             return
         partial = begin_checkpoint(self.output, self.learner.step)
         found = {"heldout": self.metrics, "heldout_tasks": self.tasks, "closed_loop": self.played}
-        provenance = self.provenance | {"step": self.learner.step, **found}
+        provenance = self.provenance | {"step": self.learner.step, **finite_or_null(found)}
         save_artefact(partial / "pretrained_model", model, self.config.planner, provenance)
         spent = {"seconds": self.budget.spent}
         state = {"learner": self.learner.state_dict(), "streams": streams, **spent}

@@ -9,8 +9,9 @@ from typing import Any
 
 import pytest
 
-from egovcp.artefact import CONFIG, MANIFEST, WEIGHTS, save_artefact, sealed
+from egovcp.artefact import CONFIG, WEIGHTS, save_artefact
 from egovcp.hub import Patience
+from egovcp.manifest import MANIFEST, sealed
 from egovcp.plan import PlannerConfig
 from egovcp.processors import PROCESSORS
 from egovcp.testing import toy_model
