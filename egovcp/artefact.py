@@ -141,7 +141,7 @@ def write_artefact(
         "schema_version": SCHEMA_VERSION,
         "egovcp_version": version("egovcp"),
         "features": feature_spec(),
-        "files": {name: _sha256(folder / name) for name in (CONFIG, WEIGHTS, *processors)},
+        "files": {name: sha256(folder / name) for name in (CONFIG, WEIGHTS, *processors)},
         **provenance,
     }
     write_manifest(folder, manifest)
@@ -188,7 +188,7 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
     manifest = read_manifest(folder)
     digests = manifest["files"]
     for name in (CONFIG, *(name for name in PROCESSORS if name in digests)):
-        _require_digest(folder / name, _sha256(folder / name), digests.get(name))
+        _require_digest(folder / name, _json_digest(folder / name), digests.get(name))
     _check_processors(folder)
     config, planner = read_options(folder)
     model = _load_weights(folder, config, digests.get(WEIGHTS))
@@ -303,8 +303,8 @@ def _require_digest(path: Path, found: str, expected: object) -> None:
         )
 
 
-def _sha256(path: Path) -> str:
-    """Of a JSON file."""
+def _json_digest(path: Path) -> str:
+    """SHA-256 of a JSON file."""
     try:
         return sha256(path, JSON_LIMIT_BYTES)
     except OSError as error:

@@ -51,9 +51,10 @@ def require_affordable(model: WorldModelConfig, planner: PlannerConfig) -> None:
     if cost.seconds > MAX_SECONDS or cost.memory_bytes > MAX_BYTES:
         raise UsageError(
             f"planner.samples={planner.samples}, planner.horizon={planner.horizon} and "
-            f"planner.iterations={planner.iterations} take about {cost.seconds:.2g} s on one core "
-            f"and {cost.memory_bytes / 1e6:.2g} MB for each plan of one robot; expected at most "
-            f"{MAX_SECONDS:.0f} s and {MAX_BYTES / 1e6:.0f} MB: lower them"
+            f"planner.iterations={planner.iterations} take about {cost.seconds:,.1f} s on one core "
+            f"and {cost.memory_bytes / 1e6:,.0f} MB for each plan of one robot with these "
+            f"networks; expected at most {MAX_SECONDS:.0f} s and {MAX_BYTES / 1e6:.0f} MB: lower "
+            "them"
         )
 
 

@@ -13,6 +13,7 @@ from egovcp.hub import Patience, is_repo_id
 from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_answers
+from egovcp.plan.cost import require_affordable
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.value_fit import ValueFitConfig
 from egovcp_train.wandb_records import WandbConfig
@@ -176,6 +177,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         require_answers(self.policy, self.planner)
+        require_affordable(self.policy, self.planner)
         loss = self.policy.loss
         if loss.q_target == "td" and self.returns.scale == "per_task":
             raise UsageError(

@@ -20,6 +20,7 @@ from egovcp.data.ahead import Ahead
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
+from egovcp.model.weights import tensor_shapes
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
 from egovcp_train.card import versions, write_card
@@ -292,9 +293,18 @@ class Run:
         )
 
 
+def _require_loadable(config: TrainConfig) -> None:
+    """Raise `UsageError` for networks so large that their artefact would be refused."""
+    try:
+        tensor_shapes(config.policy.world_model())
+    except ValueError as error:
+        raise UsageError(f"--policy: {error}; make the networks smaller") from error
+
+
 def _prepare_output(config: TrainConfig, ranks: Ranks) -> Path:
     """Refuse what makes no sense, or cannot be done here, before any work starts."""
     require_wandb(config.wandb)
+    _require_loadable(config)
     if config.eval_closed_loop:
         require_simulator()
     output = Path(config.output_dir)
