@@ -65,7 +65,7 @@ def collect(config: CollectConfig, command: str = "") -> None:
     root = local_root(config.dataset)
     with committing(root, provenance, config.shard_episodes, agree) as committer:
         missing = _missing(config, committer)
-        require_room(root.parent, missing, config.env, config.shard_episodes)
+        require_room(committer.root.parent, missing, config.env, config.shard_episodes)
         already = committer.committed + committer.sealed
         with Progress(config.episodes, already, lambda: _disk_bytes(committer)) as progress:
             try:

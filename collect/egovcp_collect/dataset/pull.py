@@ -7,11 +7,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader, schema
-from egovcp.data.files import rename, sync, sync_tree
+from egovcp.data.destination import require_new, require_replaceable, resolve_root
+from egovcp.data.files import sync_tree
 from egovcp.data.hashes import verify_hashes
 from egovcp.data.lock import only_writer
 from egovcp.data.source import Source, record, recorded
-from egovcp.data.writer import require_new
+from egovcp.data.version import publish
 from egovcp.errors import DataError, UsageError
 from egovcp.hub import Patience, fetch, is_repo_id, resolve
 from egovcp_collect.dataset.replace import write_report
@@ -44,19 +45,21 @@ def run(config: PullConfig) -> None:
     Raises:
         UsageError: no id, or the folder is taken.
         DataError: the Hub has no such dataset, or what it has is damaged.
-        EnvironmentFailure: the Hub cannot be reached, or refuses.
+        EnvironmentFailure: the Hub cannot be reached, or refuses; the folder is a mount point.
     """
     repo_id = config.dataset.repo_id
     if config.dataset.root or not is_repo_id(repo_id):
         raise UsageError("pull takes the id of a dataset on the Hub, user/name")
     if not config.output_dir:
         raise UsageError("--output_dir is missing: the new folder for the dataset")
-    root = Path(config.output_dir).expanduser().absolute()
+    root = resolve_root(config.output_dir)
+    if not (root / schema.SOURCE_PATH).is_file():
+        _require_free(root)
     commit = resolve(repo_id, config.dataset.revision, config.network)
     if _is_there(root, repo_id, commit):
         print(f"{root} is {repo_id}@{commit} already")
     else:
-        require_new(root)
+        _require_free(root)
         _bring(Source(root, repo_id, commit), config.network)
     _report(config, DatasetReader.open(DatasetConfig(root=str(root))))
 
@@ -66,6 +69,11 @@ def _is_there(root: Path, repo_id: str, commit: str) -> bool:
         return False
     verify_hashes(root)
     return True
+
+
+def _require_free(root: Path) -> None:
+    require_new(root)
+    require_replaceable(root)
 
 
 def _bring(source: Source, patience: Patience) -> None:
@@ -84,9 +92,7 @@ def _bring(source: Source, patience: Patience) -> None:
             raise
         record(Source(files, source.repo_id, source.commit))
         sync_tree(files)
-        require_new(source.root)
-        rename(files, source.root)
-        sync(source.root.parent)
+        publish(files, source.root)
     shutil.rmtree(aside, ignore_errors=True)
 
 
