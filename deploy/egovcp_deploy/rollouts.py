@@ -88,9 +88,12 @@ def _play(
     config: DeployConfig, artefact: Artefact | None, robot: Robot, policy: RolloutPolicy
 ) -> None:
     """Record one rollout after the other and, whatever ends them, sum up the complete ones."""
+    thinker = Thinker(policy, config.imagine)
+    if artefact is not None:
+        thinker.warm_up()
     folder = make_output_dir(config.output_dir)
     clock = LockstepClock()
-    desk = InlineDesk(Thinker(policy, config.imagine), clock)
+    desk = InlineDesk(thinker, clock)
     backend = backend_of(policy)
     runner = Runner(desk, robot, FixedRate(PLANNER_HZ, clock), limits=config.robot.limits)
     summaries: list[RolloutSummary] = []
@@ -160,6 +163,7 @@ def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
         "success": summary.success,
         "terminated": summary.terminated,
         "rejected_plans": summary.rejected,
+        "skipped_observations": summary.skipped,
         "held_ticks": summary.held,
         "damped": summary.damped,
         "overruns": summary.overruns,
@@ -177,5 +181,6 @@ def _print(summaries: Sequence[RolloutSummary], folder: Path) -> None:
             f"rollout {i}: {verdict}, {summary.steps} ticks, "
             f"mean reward {summary.reward / summary.steps:+.4f}, "
             f"plan {np.median(summary.plan_ms):.0f} ms"
+            + (f", {summary.skipped} observations skipped" if summary.skipped else "")
         )
     print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")

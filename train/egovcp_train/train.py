@@ -21,6 +21,7 @@ from egovcp.errors import ArtefactError, UsageError
 from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
 from egovcp.model.weights import tensor_shapes
+from egovcp.plan.backends import judge_of_model
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
 from egovcp_train.card import versions, write_card
@@ -100,7 +101,7 @@ def train(config: TrainConfig) -> None:
     spent = _restore(output, learner, material.stream) if config.resume else 0.0
     provenance = _provenance(material)
     if ranks.is_first:
-        simulation = _simulation(config, provenance)
+        simulation = _simulation(config, provenance, learner.model)
         reserve_policy(config.policy)
         output.mkdir(parents=True, exist_ok=True)
         save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
@@ -311,9 +312,12 @@ def _prepare_output(config: TrainConfig, ranks: Ranks) -> Path:
     return prepare_output(config.output_dir, config.resume) if ranks.is_first else output
 
 
-def _simulation(config: TrainConfig, provenance: dict[str, Any]) -> ClosedLoop | None:
+def _simulation(
+    config: TrainConfig, provenance: dict[str, Any], model: WorldModel
+) -> ClosedLoop | None:
     if not config.eval_closed_loop:
         return None
+    judge_of_model(model, config.planner)  # refuse a backend that cannot be used here before work
     tasks, controller = provenance["tasks"], provenance["controller_id"]
     return ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
 

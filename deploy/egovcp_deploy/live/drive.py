@@ -173,6 +173,7 @@ def _report(
         "ticks_held": summary.held,
         "plans": summary.planned,
         "plans_late": summary.late,
+        "skipped_observations": summary.skipped,
         **_percentiles("plan_ms", summary.plan_ms),
         **_percentiles("latency_ms", summary.latency_ms),
         "iterations_mean": float(np.mean(summary.iterations or [0])),
@@ -199,6 +200,7 @@ def _print(summary: LiveSummary, backend: str, folder: Path) -> None:
         f"{summary.ticks} ticks, {summary.running} running, {summary.held} held; observation to "
         f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late; plans "
         f"computed by {backend}"
+        + (f"; {summary.skipped} observations skipped" if summary.skipped else "")
     )
     print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
 
