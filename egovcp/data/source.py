@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +11,9 @@ from egovcp.cli import DatasetConfig
 from egovcp.data import schema
 from egovcp.data.files import write_json
 from egovcp.errors import DataError, UsageError
-from egovcp.hub import Patience, Shelf, snapshot
+from egovcp.hub import Patience, Shelf, is_repo_id, snapshot
 
 _PATIENCE = Patience()
-_REPO_ID = re.compile(r"\w[\w.-]*/\w[\w.-]*", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -116,11 +114,6 @@ def recorded(root: Path, repo_id: str = "") -> Source:
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} is damaged; remove it, or pull the dataset again") from error
     return found if repo_id in ("", found.repo_id) else Source(root, repo_id)
-
-
-def is_repo_id(text: str) -> bool:
-    """Whether ``text`` has the form of an id on the Hub, ``user/name``."""
-    return bool(_REPO_ID.fullmatch(text)) and ".." not in text
 
 
 def _require_repo_id(repo_id: str) -> None:

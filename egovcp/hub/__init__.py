@@ -10,6 +10,7 @@ from egovcp.hub.fetch import fetch, resolve, snapshot
 from egovcp.hub.options import PublishConfig
 from egovcp.hub.patience import HubUnreachable, Patience, patient
 from egovcp.hub.publish import Content, Publication, Published, publish, reserve
+from egovcp.hub.repo_id import is_local_path, is_repo_id
 from egovcp.hub.shelf import Shelf
 
 __all__ = [
@@ -24,6 +25,8 @@ __all__ = [
     "Shelf",
     "explained",
     "fetch",
+    "is_local_path",
+    "is_repo_id",
     "patient",
     "publish",
     "reserve",

@@ -8,9 +8,8 @@ from typing import Any, Literal
 from egovcp.bounds import bounded
 from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
 from egovcp.data import MixedReturnConfig, ReturnConfig, ShuffleConfig
-from egovcp.data.source import is_repo_id
 from egovcp.errors import UsageError
-from egovcp.hub import Patience
+from egovcp.hub import Patience, is_repo_id
 from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_answers

@@ -21,8 +21,8 @@ from types import MappingProxyType
 from typing import Any, Final, get_type_hints
 
 from egovcp.cli import run_command
-from egovcp.data.source import is_repo_id
 from egovcp.errors import UsageError, suggest
+from egovcp.hub import is_repo_id
 
 PROG: Final = "egovcp-dataset"
 

@@ -10,10 +10,10 @@ from egovcp.data import DatasetConfig, DatasetReader, schema
 from egovcp.data.files import rename, sync, sync_tree
 from egovcp.data.hashes import verify_hashes
 from egovcp.data.lock import only_writer
-from egovcp.data.source import Source, is_repo_id, record, recorded
+from egovcp.data.source import Source, record, recorded
 from egovcp.data.writer import require_new
 from egovcp.errors import DataError, UsageError
-from egovcp.hub import Patience, fetch, resolve
+from egovcp.hub import Patience, fetch, is_repo_id, resolve
 from egovcp_collect.dataset.replace import write_report
 
 

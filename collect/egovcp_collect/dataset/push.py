@@ -13,9 +13,8 @@ from tqdm import tqdm
 from egovcp.checks import check_dataset
 from egovcp.data import DatasetConfig, DatasetReader, schema
 from egovcp.data.committer import work_folder
-from egovcp.data.source import is_repo_id
 from egovcp.errors import DataError, UsageError
-from egovcp.hub import Content, Publication, PublishConfig, Published, publish
+from egovcp.hub import Content, Publication, PublishConfig, Published, is_repo_id, publish
 from egovcp_collect.dataset.card import ASSETS, CARD, card_text
 from egovcp_collect.dataset.replace import write_report
 
