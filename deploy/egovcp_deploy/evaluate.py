@@ -24,6 +24,7 @@ from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.env import decided
 from egovcp.sim.scenario import PLAYABLE, Scenario
 from egovcp.spec import TASKS
+from egovcp.terminal import echo
 from egovcp_deploy.constant_search import Action, BestConstant, load_constants, search_constant
 from egovcp_deploy.controllers import CONTROLLERS, PPO
 from egovcp_deploy.episodes import Group, Setup, Stage
@@ -160,10 +161,10 @@ def evaluate(config: EvalConfig) -> None:
     record = _record(config, artefact, ppo, constants, scores)
     write_json(folder / "eval_run.json", {"backend": backend, **record})
     write_json(folder / "eval.json", figures)
-    print(table(figures))
+    echo(table(figures))
     if backend:
-        print(f"plans computed by {backend}")
-    print(f"figures: {folder / 'eval.json'}")
+        echo(f"plans computed by {backend}")
+    echo(f"figures: {folder / 'eval.json'}")
 
 
 def _load_policy(config: EvalConfig) -> Artefact | None:

@@ -16,6 +16,7 @@ from egovcp.log.live import LiveRerun
 from egovcp.log.mcap import McapSink
 from egovcp.log.rerun import RerunSink
 from egovcp.log.sink import Fanout, Sink
+from egovcp.terminal import echo
 from egovcp_deploy.options import versions
 
 
@@ -82,7 +83,7 @@ def _viewers(options: LogOptions, stack: ExitStack) -> Iterator[BackgroundSink]:
     if options.live:
         live = stack.enter_context(LiveRerun.of(options.live))
         if live.page:
-            print(f"look at it: {live.page}")
+            echo(f"look at it: {live.page}")
         yield BackgroundSink(RerunSink(live.viewer), "Rerun")
 
 

@@ -18,6 +18,7 @@ from egovcp.log.info import RunInfo
 from egovcp.log.tick import Tick
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import PLANNER_HZ
+from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.options import make_output_dir, versions
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
@@ -173,9 +174,9 @@ def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
 def _print(summaries: Sequence[RolloutSummary], folder: Path) -> None:
     for i, summary in enumerate(summaries):
         verdict = "success" if summary.success else "fell" if summary.terminated else "failure"
-        print(
+        echo(
             f"rollout {i}: {verdict}, {summary.steps} ticks, "
             f"mean reward {summary.reward / summary.steps:+.4f}, "
             f"plan {np.median(summary.plan_ms):.0f} ms"
         )
-    print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
+    echo(f"look at it:  rerun {folder / 'rollout-0.rrd'}")

@@ -26,6 +26,7 @@ from egovcp.artefact import MANIFEST, WEIGHTS, Artefact, load_artefact
 from egovcp.cli import run_command
 from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
 from egovcp.policy_options import PolicyOptions
+from egovcp.terminal import echo
 from egovcp_train.onnx_networks import (
     NETWORKS,
     OPSET,
@@ -88,8 +89,8 @@ def export(config: ExportConfig) -> None:
     finally:
         shutil.rmtree(work, ignore_errors=True)
     for name, error in errors.items():
-        print(f"{output / name}.onnx: at most {error:.1e} from the original")
-    print(f"golden vectors: {output / GOLDEN}; description: {output / REPORT}")
+        echo(f"{output / name}.onnx: at most {error:.1e} from the original")
+    echo(f"golden vectors: {output / GOLDEN}; description: {output / REPORT}")
 
 
 def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:

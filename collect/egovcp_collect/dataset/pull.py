@@ -14,6 +14,7 @@ from egovcp.data.source import Source, record, recorded
 from egovcp.data.writer import require_new
 from egovcp.errors import DataError, UsageError
 from egovcp.hub import Patience, fetch, is_repo_id, resolve
+from egovcp.terminal import echo
 from egovcp_collect.dataset.replace import write_report
 
 
@@ -54,7 +55,7 @@ def run(config: PullConfig) -> None:
     root = Path(config.output_dir).expanduser().absolute()
     commit = resolve(repo_id, config.dataset.revision, config.network)
     if _is_there(root, repo_id, commit):
-        print(f"{root} is {repo_id}@{commit} already")
+        echo(f"{root} is {repo_id}@{commit} already")
     else:
         require_new(root)
         _bring(Source(root, repo_id, commit), config.network)
@@ -92,9 +93,9 @@ def _bring(source: Source, patience: Patience) -> None:
 
 def _report(config: PullConfig, reader: DatasetReader) -> None:
     source = reader.source
-    print(f"{source.root}: {source.repo_id}@{source.commit}")
-    print(f"{len(reader)} episodes, {reader.num_frames} steps")
-    print(f"egovcp-train --dataset.root={source.root}")
+    echo(f"{source.root}: {source.repo_id}@{source.commit}")
+    echo(f"{len(reader)} episodes, {reader.num_frames} steps")
+    echo(f"egovcp-train --dataset.root={source.root}")
     facts = {
         "repo_id": source.repo_id,
         "commit": source.commit,

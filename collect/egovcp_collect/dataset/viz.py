@@ -16,6 +16,7 @@ from pathlib import Path
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.rollouts import POSE, run_info, ticks_of
+from egovcp.terminal import echo
 
 
 @dataclass(frozen=True)
@@ -62,11 +63,11 @@ def run(config: VizConfig) -> None:
         name = f"{reader.source.repo_id.partition('/')[2]}-episode-{config.episode}.rrd"
     output = Path(config.output or name)
     write_recording(reader, config.episode, output)
-    print(f"wrote {output}; {POSE}")
+    echo(f"wrote {output}; {POSE}")
     if config.spawn:
         open_viewer(output)
     else:
-        print(f"open it with: rerun {output}")
+        echo(f"open it with: rerun {output}")
 
 
 def write_recording(reader: DatasetReader, index: int, output: Path, meshes: bool = True) -> None:

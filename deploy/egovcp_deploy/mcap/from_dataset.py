@@ -9,6 +9,7 @@ from pathlib import Path
 from egovcp.cli import DatasetConfig
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.log.mcap import McapSink
+from egovcp.terminal import echo
 
 
 @dataclass(frozen=True)
@@ -57,4 +58,4 @@ def run(config: FromDatasetConfig) -> None:
             sink.write(tick)
     finally:
         sink.close()
-    print(f"{config.output}: {len(episode)} ticks of {episode.task}")
+    echo(f"{config.output}: {len(episode)} ticks of {episode.task}")

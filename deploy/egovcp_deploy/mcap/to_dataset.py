@@ -15,6 +15,7 @@ from egovcp.errors import DataError, EnvironmentFailure, UsageError
 from egovcp.log.info import RunInfo
 from egovcp.log.mcap_reader import ROW_TOPICS, RecordingReader
 from egovcp.log.tick import Tick
+from egovcp.terminal import echo
 from egovcp_deploy.pilot.states import State
 
 if TYPE_CHECKING:
@@ -67,8 +68,8 @@ def run(config: ToDatasetConfig) -> None:
         for path in paths:
             episode, cut = read_episode(path, config.gaps)
             writer.add(episode)
-            print(f"{path}: {len(episode)} ticks{cut}")
-    print(f"{writer.root}: {writer.num_episodes} episodes, {writer.num_frames} frames")
+            echo(f"{path}: {len(episode)} ticks{cut}")
+    echo(f"{writer.root}: {writer.num_episodes} episodes, {writer.num_frames} frames")
 
 
 def provenance(paths: Sequence[Path]) -> Provenance:

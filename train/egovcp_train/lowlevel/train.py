@@ -19,6 +19,7 @@ from egovcp.errors import ArtefactError, EnvironmentFailure
 from egovcp.robot.walk_onnx import export_onnx
 from egovcp.robot.walking import WalkConfig
 from egovcp.sim.config import SensorConfig
+from egovcp.terminal import echo
 from egovcp_train.checkpoint import (
     begin_checkpoint,
     checkpoint_dir,
@@ -161,9 +162,9 @@ class _Run:
         )
         final = checkpoint_dir(self.output, learner.iteration) / "pretrained_model" / POLICY_FILE
         state = "done" if finished else "stopped early"
-        print(f"{PROG}: {state} after {learner.steps} steps, difficulty {self._difficulty:.2f}")
-        print(f"controller: {final}")
-        print(f"next: egovcp-eval-lowlevel --controller={final} --output_dir=...")
+        echo(f"{PROG}: {state} after {learner.steps} steps, difficulty {self._difficulty:.2f}")
+        echo(f"controller: {final}")
+        echo(f"next: egovcp-eval-lowlevel --controller={final} --output_dir=...")
         if not finished:
             raise KeyboardInterrupt
 

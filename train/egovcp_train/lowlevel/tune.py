@@ -28,6 +28,7 @@ from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.sensors import noise_std
 from egovcp.spec import ACTION_BOX, CONTROLLER_HZ
+from egovcp.terminal import echo
 from egovcp_train.lowlevel import events, rewards
 from egovcp_train.lowlevel.physics import Physics
 from egovcp_train.lowlevel.sensing import measure
@@ -110,7 +111,7 @@ def tune(config: TuneConfig) -> None:
             most = config.seconds * _MOST
             bar.set_postfix_str(f"best {scores.max() / most:.0%}, mean {scores.mean() / most:.0%}")
             bar.update(1)
-    print(f"gait: {output / RESULT}")
+    echo(f"gait: {output / RESULT}")
 
 
 def flat(gait: GaitConfig) -> Array:

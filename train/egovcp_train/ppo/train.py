@@ -14,6 +14,7 @@ import torch
 
 from egovcp.cli import run_command, save_config
 from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp.terminal import echo
 from egovcp_train.checkpoint import (
     begin_checkpoint,
     checkpoint_dir,
@@ -94,9 +95,9 @@ def _run(config: PpoTrainConfig, output: Path, learner: Any, spent: float) -> No
     recorder = Recorder(output, enabled=config.tensorboard)
     finished = run_iterations(learner, budget, recorder, save, config.save_freq, _summary)
     final = checkpoint_dir(output, learner.iteration) / "pretrained_model" / POLICY_FILE
-    print(f"{PROG}: {'done' if finished else 'stopped early'} after {learner.steps} steps")
-    print(f"policy: {final}")
-    print(f"next: egovcp-eval --controllers=ppo --ppo.path={final} --task=... --output_dir=...")
+    echo(f"{PROG}: {'done' if finished else 'stopped early'} after {learner.steps} steps")
+    echo(f"policy: {final}")
+    echo(f"next: egovcp-eval --controllers=ppo --ppo.path={final} --task=... --output_dir=...")
     if not finished:
         raise KeyboardInterrupt
 
