@@ -33,6 +33,7 @@ from egovcp.bounds import Bounds, OutOfBounds, bounded, bounds_of, check_bounds
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError, suggest
 from egovcp.interrupts import EXIT_CODE as INTERRUPTED
 from egovcp.interrupts import raise_on_sigint
+from egovcp.packages import missing_package
 from egovcp.terminal import echo, one_line
 
 
@@ -344,6 +345,11 @@ def run_command[C](
         return INTERRUPTED
     except EgovcpError as error:
         return report_error(prog, error, debug)
+    except ModuleNotFoundError as error:
+        missing = missing_package(error, config_class.__module__, prog)
+        if missing is None:
+            raise
+        return report_error(prog, missing, debug)
     except BrokenPipeError:
         raise  # the reader of the output has gone: `EntryPoint` ends the process
     except (OSError, UnicodeEncodeError) as error:

@@ -13,9 +13,9 @@ from tqdm import tqdm
 
 from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
-from egovcp.errors import EnvironmentFailure
 from egovcp.log.info import RunInfo
 from egovcp.log.tick import Tick
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import PLANNER_HZ
 from egovcp.terminal import echo
@@ -75,13 +75,9 @@ def make_robot(config: DeployConfig) -> SimRobot:
     Raises:
         EnvironmentFailure: the simulator is not installed.
     """
-    try:
-        from egovcp_deploy.robots.sim import SimRobot
-    except ModuleNotFoundError as error:
-        raise EnvironmentFailure(
-            f"--robot.type=sim needs the simulator, but {error.name} is not installed; "
-            "install it: pip install 'egovcp-deploy[sim]'"
-        ) from error
+    require_packages("egovcp-deploy", "--robot.type=sim", *SIMULATOR_MODULES)
+    from egovcp_deploy.robots.sim import SimRobot
+
     return SimRobot(config.env, config.task, config.seed)
 
 

@@ -17,7 +17,8 @@ import draccus
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp.errors import ArtefactError
+from egovcp.packages import require_packages
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.robot.stance_table import standing_pose
 from egovcp.robot.walk_policy import OBSERVATION_CLIP, WalkPolicy
@@ -47,10 +48,9 @@ def export_onnx(policy: WalkPolicy, path: Path) -> None:
     Raises:
         EnvironmentFailure: the package onnx is missing.
     """
-    try:
-        import onnx
-    except ImportError as error:
-        raise _missing("onnx") from error
+    require_packages("egovcp", "exporting a controller", "onnx")
+    import onnx
+
     model = onnx.helper.make_model(
         _graph(policy), opset_imports=[onnx.helper.make_opsetid("", _OPSET)], ir_version=9
     )
@@ -122,10 +122,9 @@ class OnnxPolicy:
             ArtefactError: missing, damaged, or not of this observation and action.
             EnvironmentFailure: the package onnxruntime is missing.
         """
-        try:
-            import onnxruntime
-        except ImportError as error:
-            raise _missing("onnxruntime") from error
+        require_packages("egovcp", "a controller in ONNX", "onnxruntime")
+        import onnxruntime
+
         if not path.is_file():
             raise ArtefactError(f"{path}: no such controller; expected an exported .onnx file")
         options = onnxruntime.SessionOptions()
@@ -170,9 +169,3 @@ class OnnxPolicy:
         """(B, 95) -> actions (B, 15)."""
         out: NDArray[np.float32] = self._session.run([_OUTPUT], {_INPUT: observation})[0]
         return out
-
-
-def _missing(package: str) -> EnvironmentFailure:
-    return EnvironmentFailure(
-        f"this needs the package {package}, which is not installed here: pip install 'egovcp[onnx]'"
-    )

@@ -13,7 +13,6 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,7 +23,8 @@ from safetensors.torch import load_file, save_file
 
 from egovcp.artefact import MANIFEST, WEIGHTS, Artefact, load_artefact
 from egovcp.cli import run_command
-from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.errors import ArtefactError, UsageError
+from egovcp.packages import require_packages
 from egovcp.policy_options import PolicyOptions
 from egovcp.terminal import echo
 from egovcp_train.onnx_networks import (
@@ -218,8 +218,4 @@ def _sha256(path: Path) -> str:
 
 
 def _require_packages() -> None:
-    missing = [name for name in ("onnx", "onnxruntime") if find_spec(name) is None]
-    if missing:
-        raise EnvironmentFailure(
-            f"this needs {' and '.join(missing)}, not installed here: pip install 'egovcp[onnx]'"
-        )
+    require_packages("egovcp-train", PROG, "onnx", "onnxruntime")

@@ -10,11 +10,11 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import UsageError
+from egovcp.packages import require_packages
 from egovcp.rollouts import POSE, run_info, ticks_of
 from egovcp.terminal import echo
 
@@ -48,11 +48,7 @@ def run(config: VizConfig) -> None:
         DataError: the dataset is damaged.
         EnvironmentFailure: Rerun is not installed, or the recording exists already.
     """
-    if find_spec("rerun") is None:
-        raise EnvironmentFailure(
-            "the recording needs rerun-sdk, which is not installed: pip install "
-            "'egovcp-collect[viz]'"
-        )
+    require_packages("egovcp-collect", "the recording", "rerun")
     reader = DatasetReader.open(config.dataset)
     if not 0 <= config.episode < len(reader):
         raise UsageError(

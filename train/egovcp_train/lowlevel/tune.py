@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from egovcp.bounds import bounded
 from egovcp.cli import run_command
-from egovcp.errors import EnvironmentFailure
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.gait import GaitConfig
 from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
 from egovcp.sim.config import SensorConfig
@@ -84,13 +84,9 @@ def tune(config: TuneConfig) -> None:
         UsageError: an option makes no sense.
         EnvironmentFailure: the package cma is missing, or the folder cannot be written.
     """
-    try:
-        import cma
-    except ImportError as error:
-        raise EnvironmentFailure(
-            f"{PROG} needs the package cma, which is not installed here: "
-            "pip install 'egovcp-train[lowlevel]'"
-        ) from error
+    require_packages("egovcp-train", PROG, "cma", *SIMULATOR_MODULES)
+    import cma
+
     output = Path(config.output_dir)
     require_writable(output)
     output.mkdir(parents=True, exist_ok=True)

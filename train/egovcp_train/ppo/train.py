@@ -13,7 +13,8 @@ import draccus
 import torch
 
 from egovcp.cli import run_command, save_config
-from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp.errors import ArtefactError
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import (
     begin_checkpoint,
@@ -59,13 +60,9 @@ def train(config: PpoTrainConfig) -> None:
 
 def _build(config: PpoTrainConfig, first: int) -> Any:
     """The simulator and PPO; imported here, so that --help needs neither."""
-    try:
-        from egovcp_train.ppo.learn import ContactLearner
-    except ImportError as error:
-        raise EnvironmentFailure(
-            f"{PROG} needs the package {error.name}, which is not installed here: "
-            "pip install 'egovcp-train[lowlevel]'"
-        ) from error
+    require_packages("egovcp-train", PROG, "rsl_rl", "tensordict", *SIMULATOR_MODULES)
+    from egovcp_train.ppo.learn import ContactLearner
+
     return ContactLearner(config, first)
 
 
