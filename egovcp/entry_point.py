@@ -26,16 +26,14 @@ BROKEN_PIPE: Final = 141  # 128 + SIGPIPE, as a shell reports a program which th
 class EntryPoint:
     """A command whose module is imported when it is called."""
 
-    def __init__(self, prog: str, module: str, install: str = "") -> None:
+    def __init__(self, prog: str, module: str) -> None:
         """Describe a command; nothing is imported.
 
         Args:
             prog: its name.
             module: the module with its function ``main(argv) -> int``.
-            install: what to install if a package is missing, such as ``egovcp-deploy[sim]``; empty:
-                the distribution of the module.
         """
-        self.prog, self.module, self.install = prog, module, install
+        self.prog, self.module = prog, module
 
     def __call__(self, argv: Sequence[str] | None = None) -> int:
         """Run the command on ``argv``, or on ``sys.argv``, and return its exit code."""
@@ -67,26 +65,26 @@ class EntryPoint:
     def _run(self, argv: Sequence[str] | None) -> int:
         from importlib import import_module
 
-        from egovcp.errors import EnvironmentFailure
-        from egovcp.terminal import echo
-
         try:
             main: Callable[[Sequence[str] | None], int] = import_module(self.module).main
-        except ModuleNotFoundError as error:
-            package = self.install or self.module.partition(".")[0].replace("_", "-")
-            echo(
-                f"{self.prog}: error: {error.name} is not installed here; install it: "
-                f"pip install '{package}'",
-                error=True,
-            )
-            return EnvironmentFailure.exit_code
-        try:
             code = main(argv)
+        except ModuleNotFoundError as error:
+            return self._missing(error)
         except SystemExit as end:  # argparse, after --help
             code = end.code if isinstance(end.code, int) else 0
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         return code
+
+    def _missing(self, error: ModuleNotFoundError) -> int:
+        from egovcp.packages import missing_package
+        from egovcp.terminal import echo
+
+        missing = missing_package(error, self.module, self.prog)
+        if missing is None:
+            raise error
+        echo(f"{self.prog}: error: {missing}", error=True)
+        return missing.exit_code
 
 
 def prepare_process() -> None:

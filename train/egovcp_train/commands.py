@@ -10,13 +10,7 @@ train: Final = EntryPoint("egovcp-train", "egovcp_train.train")
 push: Final = EntryPoint("egovcp-push", "egovcp_train.push")
 export: Final = EntryPoint("egovcp-export", "egovcp_train.export")
 eval_model: Final = EntryPoint("egovcp-eval-model", "egovcp_train.heldout.command")
-train_lowlevel: Final = EntryPoint(
-    "egovcp-train-lowlevel", "egovcp_train.lowlevel.train", "egovcp-train[lowlevel]"
-)
-eval_lowlevel: Final = EntryPoint(
-    "egovcp-eval-lowlevel", "egovcp_train.lowlevel.evaluate", "egovcp-train[lowlevel]"
-)
+train_lowlevel: Final = EntryPoint("egovcp-train-lowlevel", "egovcp_train.lowlevel.train")
+eval_lowlevel: Final = EntryPoint("egovcp-eval-lowlevel", "egovcp_train.lowlevel.evaluate")
 train_ppo: Final = EntryPoint("egovcp-train-ppo", "egovcp_train.ppo.train")
-tune_gait: Final = EntryPoint(
-    "egovcp-tune-gait", "egovcp_train.lowlevel.tune", "egovcp-train[lowlevel]"
-)
+tune_gait: Final = EntryPoint("egovcp-tune-gait", "egovcp_train.lowlevel.tune")
