@@ -12,15 +12,17 @@ gone (``| head -1``), 1 with a traceback for a bug.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import sys
-from collections.abc import Callable, Sequence
-from typing import Any, Final
 
 from egovcp import interrupts
 
-BROKEN_PIPE: Final = 141  # 128 + SIGPIPE, as a shell reports a program which that signal ended
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # these take as long as all the rest that is imported before SIGINT is handled
+    from collections.abc import Callable, Sequence
+    from typing import Any
+
+BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell reports a program which that signal ended
 
 
 class EntryPoint:
@@ -39,7 +41,8 @@ class EntryPoint:
         """Run the command on ``argv``, or on ``sys.argv``, and return its exit code."""
         interrupts.exit_on_sigint(self.prog)
         prepare_process()
-        from egovcp.terminal import discard_output, echo, reader_is_gone
+        from egovcp.errors import EnvironmentFailure
+        from egovcp.terminal import discard_output, reader_is_gone
 
         try:
             return self._run(argv)
@@ -53,10 +56,8 @@ class EntryPoint:
         except OSError as error:
             if error.filename is not None:
                 return _report_bug()
-            with contextlib.suppress(OSError):
-                echo(f"{self.prog}: error: cannot write the output: {error}", error=True)
-            discard_output()
-            return 5
+            _print_last(f"{self.prog}: error: cannot write the output: {error}\n")
+            return EnvironmentFailure.exit_code
         except Exception:  # noqa: BLE001 - a bug: as Python itself does, but with text escaped
             return _report_bug()
         finally:
@@ -71,7 +72,7 @@ class EntryPoint:
         except ModuleNotFoundError as error:
             return self._missing(error)
         except SystemExit as end:  # argparse, after --help
-            code = end.code if isinstance(end.code, int) else 0
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         return code
@@ -142,9 +143,15 @@ def _escape_log_messages() -> None:
 def _report_bug() -> int:
     import traceback
 
+    _print_last(traceback.format_exc())
+    return 1
+
+
+def _print_last(text: str) -> None:
     from egovcp.terminal import discard_output, echo
 
-    with contextlib.suppress(OSError):
-        echo(traceback.format_exc(), error=True, end="")
+    try:
+        echo(text, error=True, end="")
+    except OSError:
+        pass  # stderr cannot be written either
     discard_output()
-    return 1

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import os
 import signal
-import threading
-from types import FrameType
-from typing import Final
 
-EXIT_CODE: Final = 130  # 128 + SIGINT, as a shell reports a program which that signal ended
-_RETRY_S: Final = 0.05
-_IMPORT_MACHINERY: Final = "<frozen importlib._bootstrap>"
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # `typing` and `types` are not imported before SIGINT is handled
+    from types import FrameType
+
+EXIT_CODE = 130  # 128 + SIGINT, as a shell reports a program which that signal ended
+_RETRY_S = 0.05
+_IMPORT_MACHINERY = "<frozen importlib._bootstrap>"
 
 
 def exit_on_sigint(prog: str) -> None:
@@ -40,19 +41,19 @@ def raise_on_sigint() -> None:
     Replaces only the handler of `exit_on_sigint`, so that code which is called from elsewhere keeps
     its own.
     """
-    current = signal.getsignal(signal.SIGINT)
-    if getattr(current, "__module__", "") == __name__:
-        signal.signal(signal.SIGINT, _raise_outside_imports)
+    import threading  # not before SIGINT is handled
 
-
-def _raise_outside_imports(number: int, frame: FrameType | None) -> None:
-    if not _is_importing(frame):
-        raise KeyboardInterrupt
     main = threading.main_thread().ident
-    assert main is not None
-    retry = threading.Timer(_RETRY_S, signal.pthread_kill, [main, signal.SIGINT])
-    retry.daemon = True
-    retry.start()
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if not _is_importing(frame):
+            raise KeyboardInterrupt
+        retry = threading.Timer(_RETRY_S, signal.pthread_kill, [main, signal.SIGINT])
+        retry.daemon = True
+        retry.start()
+
+    if getattr(signal.getsignal(signal.SIGINT), "__module__", "") == __name__:
+        signal.signal(signal.SIGINT, interrupt)
 
 
 def _is_importing(frame: FrameType | None) -> bool:

@@ -1,9 +1,5 @@
-"""Entry points of the console commands. This module imports no other one of the package."""
-
-from __future__ import annotations
-
-from typing import Final
+"""Entry points of the console commands. Nothing else is imported here: see `EntryPoint`."""
 
 from egovcp.entry_point import EntryPoint
 
-experiment: Final = EntryPoint("egovcp-experiment", "egovcp_experiment.command")
+experiment = EntryPoint("egovcp-experiment", "egovcp_experiment.command")
