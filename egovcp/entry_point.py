@@ -148,10 +148,10 @@ def _report_bug() -> int:
 
 
 def _print_last(text: str) -> None:
+    from contextlib import suppress
+
     from egovcp.terminal import discard_output, echo
 
-    try:
+    with suppress(OSError):  # stderr may be closed as well
         echo(text, error=True, end="")
-    except OSError:
-        pass  # stderr cannot be written either
     discard_output()
