@@ -24,6 +24,7 @@ from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.env import decided
 from egovcp.sim.scenario import PLAYABLE, Scenario
 from egovcp.spec import TASKS
+from egovcp.terminal import echo
 from egovcp_deploy.constant_search import Action, BestConstant, load_constants, search_constant
 from egovcp_deploy.controllers import CONTROLLERS, PPO
 from egovcp_deploy.episodes import Group, Setup, Stage
@@ -161,12 +162,12 @@ def evaluate(config: EvalConfig) -> None:
     record = _record(config, artefact, ppo, constants, scores)
     write_json(folder / "eval_run.json", {"backend": backend, **record})
     write_json(folder / "eval.json", figures)
-    print(table(figures))
+    echo(table(figures))
     if backend:
-        print(f"plans computed by {backend}")
+        echo(f"plans computed by {backend}")
     if skipped := sum(s.skipped for row in scores.values() for each in row.values() for s in each):
-        print(f"{skipped} observations were not finite and were skipped; see eval_run.json")
-    print(f"figures: {folder / 'eval.json'}")
+        echo(f"{skipped} observations were not finite and were skipped; see eval_run.json")
+    echo(f"figures: {folder / 'eval.json'}")
 
 
 def _load_policy(config: EvalConfig) -> Artefact | None:

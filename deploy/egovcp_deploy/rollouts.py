@@ -13,11 +13,12 @@ from tqdm import tqdm
 
 from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
-from egovcp.errors import EnvironmentFailure
 from egovcp.log.info import RunInfo
 from egovcp.log.tick import Tick
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import PLANNER_HZ
+from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.options import make_output_dir, versions
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
@@ -74,13 +75,9 @@ def make_robot(config: DeployConfig) -> SimRobot:
     Raises:
         EnvironmentFailure: the simulator is not installed.
     """
-    try:
-        from egovcp_deploy.robots.sim import SimRobot
-    except ModuleNotFoundError as error:
-        raise EnvironmentFailure(
-            f"--robot.type=sim needs the simulator, but {error.name} is not installed; "
-            "install it: pip install 'egovcp-deploy[sim]'"
-        ) from error
+    require_packages("egovcp-deploy", "--robot.type=sim", *SIMULATOR_MODULES)
+    from egovcp_deploy.robots.sim import SimRobot
+
     return SimRobot(config.env, config.task, config.seed)
 
 
@@ -177,10 +174,10 @@ def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
 def _print(summaries: Sequence[RolloutSummary], folder: Path) -> None:
     for i, summary in enumerate(summaries):
         verdict = "success" if summary.success else "fell" if summary.terminated else "failure"
-        print(
+        echo(
             f"rollout {i}: {verdict}, {summary.steps} ticks, "
             f"mean reward {summary.reward / summary.steps:+.4f}, "
             f"plan {np.median(summary.plan_ms):.0f} ms"
             + (f", {summary.skipped} observations skipped" if summary.skipped else "")
         )
-    print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
+    echo(f"look at it:  rerun {folder / 'rollout-0.rrd'}")

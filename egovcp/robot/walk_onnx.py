@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 
 from egovcp.bounds import check_bounds
 from egovcp.decode import decode, require_type, shown
-from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp.errors import ArtefactError
+from egovcp.packages import require_packages
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.robot.stance_table import standing_pose
 from egovcp.robot.walk_policy import OBSERVATION_CLIP, WalkPolicy
@@ -55,10 +56,9 @@ def export_onnx(policy: WalkPolicy, path: Path) -> None:
     Raises:
         EnvironmentFailure: the package onnx is missing.
     """
-    try:
-        import onnx
-    except ImportError as error:
-        raise _missing("onnx") from error
+    require_packages("egovcp", "exporting a controller", "onnx")
+    import onnx
+
     model = onnx.helper.make_model(
         _graph(policy), opset_imports=[onnx.helper.make_opsetid("", _OPSET)], ir_version=9
     )
@@ -130,11 +130,9 @@ class OnnxPolicy:
             ArtefactError: missing, damaged, or not of this observation and action.
             EnvironmentFailure: the package onnxruntime is missing.
         """
-        try:
-            import onnx  # noqa: F401
-            import onnxruntime
-        except ImportError as error:
-            raise _missing(error.name or "onnx") from error
+        require_packages("egovcp", "a controller in ONNX", "onnx", "onnxruntime")
+        import onnxruntime
+
         if not os.path.lexists(path):
             raise ArtefactError(f"{path}: no such controller; expected an exported .onnx file")
         options = onnxruntime.SessionOptions()
@@ -206,9 +204,3 @@ def _check_graph(content: bytes) -> None:
             raise ValueError("expected weights of type float32")
         if not np.isfinite(onnx.numpy_helper.to_array(tensor)).all():
             raise ValueError("expected finite weights")
-
-
-def _missing(package: str) -> EnvironmentFailure:
-    return EnvironmentFailure(
-        f"this needs the package {package}, which is not installed here: pip install 'egovcp[onnx]'"
-    )

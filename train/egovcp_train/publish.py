@@ -9,6 +9,7 @@ from typing import Final
 from egovcp.artefact import FILES, Artefact, load_artefact
 from egovcp.errors import EgovcpError, EnvironmentFailure
 from egovcp.hub import Content, Patience, Publication, Published, publish, reserve
+from egovcp.terminal import echo
 from egovcp_train.card import ASSETS, CARD, CURVES, card_text
 from egovcp_train.config import PolicyConfig
 
@@ -66,7 +67,5 @@ def publish_trained(folder: Path, policy: PolicyConfig) -> None:
 def report(target: Publication, published: Published) -> None:
     """Say where the policy is and how to use it."""
     name, commit = target.repo_id, published.commit
-    print(f"{name}@{target.branch} {'is now' if published.new else 'was already'} {commit}")
-    print(
-        f"egovcp-eval --policy.path={name} --policy.revision={commit} --task=... --output_dir=..."
-    )
+    echo(f"{name}@{target.branch} {'is now' if published.new else 'was already'} {commit}")
+    echo(f"egovcp-eval --policy.path={name} --policy.revision={commit} --task=... --output_dir=...")

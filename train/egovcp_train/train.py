@@ -22,6 +22,7 @@ from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
 from egovcp.model.weights import tensor_shapes
 from egovcp.plan.backends import judge_of_model
+from egovcp.terminal import echo, one_line
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
 from egovcp_train.card import versions, write_card
@@ -156,7 +157,7 @@ class Run:
     def _conclude(self, final: Path, finished: bool) -> None:
         """Say where everything is, and publish what is finished."""
         artefact = final / "pretrained_model"
-        print(self._last_words(final, stopped=not finished))
+        echo(self._last_words(final, stopped=not finished))
         write_card(artefact, self.output, self.config.policy.repo_id)
         if finished:
             self.recorder.artefact(self.learner.step, artefact)
@@ -196,7 +197,7 @@ class Run:
                     bar.set_postfix(self._summary(terms, bar, frames))
                     if learner.unrecorded and not warned:
                         warned = True
-                        bar.write(_UNRECORDED.format(reason=learner.unrecorded))
+                        bar.write(one_line(_UNRECORDED.format(reason=learner.unrecorded)))
 
     def _pause(self) -> None:
         """Between two steps: measure, save and show, in this order, what is due after the first."""

@@ -15,6 +15,7 @@ from egovcp.data.source import Source, record, recorded
 from egovcp.data.version import publish
 from egovcp.errors import DataError, UsageError
 from egovcp.hub import Patience, fetch, is_repo_id, resolve
+from egovcp.terminal import echo
 from egovcp_collect.dataset.replace import write_report
 
 
@@ -57,7 +58,7 @@ def run(config: PullConfig) -> None:
         _require_free(root)
     commit = resolve(repo_id, config.dataset.revision, config.network)
     if _is_there(root, repo_id, commit):
-        print(f"{root} is {repo_id}@{commit} already")
+        echo(f"{root} is {repo_id}@{commit} already")
     else:
         _require_free(root)
         _bring(Source(root, repo_id, commit), config.network)
@@ -98,9 +99,9 @@ def _bring(source: Source, patience: Patience) -> None:
 
 def _report(config: PullConfig, reader: DatasetReader) -> None:
     source = reader.source
-    print(f"{source.root}: {source.repo_id}@{source.commit}")
-    print(f"{len(reader)} episodes, {reader.num_frames} steps")
-    print(f"egovcp-train --dataset.root={source.root}")
+    echo(f"{source.root}: {source.repo_id}@{source.commit}")
+    echo(f"{len(reader)} episodes, {reader.num_frames} steps")
+    echo(f"egovcp-train --dataset.root={source.root}")
     facts = {
         "repo_id": source.repo_id,
         "commit": source.commit,

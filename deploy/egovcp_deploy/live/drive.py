@@ -19,6 +19,7 @@ from egovcp.errors import EgovcpError, EnvironmentFailure, SafetyStop, UsageErro
 from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.tick import Tick
 from egovcp.robot.controllers import make_controller
+from egovcp.terminal import echo, one_line
 from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import CAMERAS, HardwareOptions, open_eye
@@ -156,7 +157,7 @@ def _leave_a_core() -> None:
 
 def _show(bar: Any, tick: Tick) -> None:
     for event in tick.events:
-        bar.write(f"{tick.time_ns / 1e9:8.2f} s  {event}")
+        bar.write(one_line(f"{tick.time_ns / 1e9:8.2f} s  {event}"))
     plan = f", plan {tick.timing_ms['plan']:.0f} ms" if "plan" in tick.timing_ms else ""
     bar.set_postfix_str(f"{tick.mode}{plan}", refresh=False)
     bar.update(1)
@@ -196,13 +197,13 @@ def _percentiles(name: str, values: list[float]) -> dict[str, float]:
 
 def _print(summary: LiveSummary, backend: str, folder: Path) -> None:
     latency = _percentiles("ms", summary.latency_ms)
-    print(
+    echo(
         f"{summary.ticks} ticks, {summary.running} running, {summary.held} held; observation to "
         f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late; plans "
         f"computed by {backend}"
         + (f"; {summary.skipped} observations skipped" if summary.skipped else "")
     )
-    print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
+    echo(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
 
 
 def examine_hardware(config: DeployConfig, artefact: Artefact | None) -> Iterator[dry_run.Finding]:

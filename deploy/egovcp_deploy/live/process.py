@@ -17,6 +17,7 @@ from egovcp.errors import EgovcpError
 from egovcp.rate import FixedRate, MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.spec import CONTROLLER_HZ
+from egovcp.terminal import echo, one_line
 from egovcp_deploy.live import motors
 from egovcp_deploy.live.buttons import Buttons
 from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
@@ -55,7 +56,8 @@ def control_process(setup: ControlSetup) -> None:
     try:
         hardware = open_hardware(setup.hardware)
     except EgovcpError as error:
-        print(f"\negovcp-deploy: error: {error}", file=sys.stderr)  # a progress bar is above
+        # a progress bar is above
+        echo("\n" + one_line(f"egovcp-deploy: error: {error}"), error=True)
         sys.exit(error.exit_code)
     link = Link(setup.address, serve=False)
     try:
@@ -126,11 +128,10 @@ class ControlProcess:
 
 def _say_who_is_left() -> None:
     with suppress(OSError):  # the terminal may be gone as well
-        print(
+        echo(
             "egovcp-deploy: the planner's process is gone; the robot is held, and stands until it "
             f"is ended: kill {os.getpid()} damps it, as does L1 + B on its remote control",
-            file=sys.stderr,
-            flush=True,
+            error=True,
         )
 
 

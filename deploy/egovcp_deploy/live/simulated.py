@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.lifeline import die_with_parent
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions
@@ -37,14 +38,10 @@ def simulated(config: DeployConfig, outcomes: Path) -> Iterator[HardwareOptions]
     Raises:
         EnvironmentFailure: the simulator is not installed, or does not come up.
     """
-    try:
-        from egovcp_deploy.robots.fake.bridge import Ports
-        from egovcp_deploy.robots.fake.command import FakeConfig
-    except ModuleNotFoundError as error:
-        raise EnvironmentFailure(
-            f"--realtime needs the simulator, but {error.name} is not installed; "
-            "install it: pip install 'egovcp-deploy[sim]'"
-        ) from error
+    require_packages("egovcp-deploy", "--realtime", *SIMULATOR_MODULES)
+    from egovcp_deploy.robots.fake.bridge import Ports
+    from egovcp_deploy.robots.fake.command import FakeConfig
+
     fake = FakeConfig(
         task=config.task,
         seed=config.seed,

@@ -13,6 +13,7 @@ from egovcp.log.info import RunInfo
 from egovcp.log.mcap_reader import Moment, RecordingReader
 from egovcp.log.messages import Topic
 from egovcp.rate import NS_PER_S
+from egovcp.terminal import echo, echo_lines
 
 
 @dataclass(frozen=True)
@@ -104,11 +105,11 @@ def run(config: InfoConfig) -> None:
     summary = summarise(Path(config.file))
     report = json.dumps(summary.to_json(), indent=2)
     if config.json == "-":
-        print(report)
+        echo(report)
         return
     if config.json:
         Path(config.json).write_text(report + "\n", encoding="utf-8")
-    print(text(summary))
+    echo_lines(text(summary))
 
 
 def summarise(path: Path) -> Summary:
@@ -140,8 +141,8 @@ def _gap(before: Moment, moment: Moment, period_ns: int) -> Gap | None:
     return Gap(before.index, missing, passed / NS_PER_S) if missing or late else None
 
 
-def text(summary: Summary) -> str:
-    """For reading."""
+def text(summary: Summary) -> list[str]:
+    """Lines for reading."""
     info = summary.info
     lines = [
         f"{summary.file}: {'complete' if summary.complete else 'TORN'}, "
@@ -163,7 +164,7 @@ def text(summary: Summary) -> str:
     ]
     if not summary.complete:
         lines.append(f"save its ticks: egovcp-mcap recover {summary.file} OUT.mcap")
-    return "\n".join(lines)
+    return lines
 
 
 _SHOWN_GAPS = 10

@@ -8,6 +8,7 @@ from pathlib import Path
 from egovcp.errors import UsageError
 from egovcp.log.mcap import McapFile
 from egovcp.log.mcap_reader import RecordingReader
+from egovcp.terminal import echo
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ def run(config: RecoverConfig) -> None:
         raise UsageError("from where, and where to? egovcp-mcap recover TORN OUT")
     ticks, complete = recover(Path(config.file), Path(config.output))
     was = "was complete already" if complete else "was torn"
-    print(f"{config.output}: {ticks} ticks; {config.file} {was}")
+    echo(f"{config.output}: {ticks} ticks; {config.file} {was}")
 
 
 def recover(torn: Path, output: Path) -> tuple[int, bool]:

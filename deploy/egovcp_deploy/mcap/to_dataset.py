@@ -6,15 +6,16 @@ import shlex
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from egovcp.cli import DatasetConfig
-from egovcp.errors import DataError, EnvironmentFailure, UsageError
+from egovcp.errors import DataError, UsageError
 from egovcp.log.info import RunInfo
 from egovcp.log.mcap_reader import ROW_TOPICS, RecordingReader
 from egovcp.log.tick import Tick
+from egovcp.packages import DATA_MODULES, require_packages
+from egovcp.terminal import echo
 from egovcp_deploy.pilot.states import State
 
 if TYPE_CHECKING:
@@ -55,10 +56,7 @@ def run(config: ToDatasetConfig) -> None:
         raise UsageError("which recordings? egovcp-mcap to-dataset FILE... --dataset.root=ROOT")
     if config.dataset.revision:
         raise UsageError("--dataset.revision has no meaning for a new dataset; drop it")
-    if find_spec("pyarrow") is None:
-        raise EnvironmentFailure(
-            "datasets are written with pyarrow, which is not installed: pip install 'egovcp[data]'"
-        )
+    require_packages("egovcp-deploy", "writing a dataset", *DATA_MODULES)
     from egovcp.data import DatasetWriter
     from egovcp.data.source import local_root
 
@@ -67,8 +65,8 @@ def run(config: ToDatasetConfig) -> None:
         for path in paths:
             episode, cut = read_episode(path, config.gaps)
             writer.add(episode)
-            print(f"{path}: {len(episode)} ticks{cut}")
-    print(f"{writer.root}: {writer.num_episodes} episodes, {writer.num_frames} frames")
+            echo(f"{path}: {len(episode)} ticks{cut}")
+    echo(f"{writer.root}: {writer.num_episodes} episodes, {writer.num_frames} frames")
 
 
 def provenance(paths: Sequence[Path]) -> Provenance:

@@ -9,7 +9,6 @@ import os
 import platform
 import shutil
 import subprocess
-import sys
 import tempfile
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,6 +18,7 @@ from threading import Lock
 from typing import Final, NamedTuple
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.terminal import echo
 from egovcp.trusted_cache import TrustedCache, load_library, user_cache_folder
 
 SOURCE: Final = Path(__file__).parent / "kernel" / "kernel.c"
@@ -270,7 +270,7 @@ def warn_float32(reason: str) -> None:
 
 def _warn(text: str) -> None:
     if multiprocessing.parent_process() is None:  # else every worker would repeat it
-        print(f"egovcp: warning: {text}", file=sys.stderr, flush=True)
+        echo(f"egovcp: warning: {text}", error=True)
 
 
 def _cached(name: str, flags: Sequence[str]) -> bytes:

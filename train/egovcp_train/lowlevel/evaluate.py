@@ -20,6 +20,7 @@ from egovcp.errors import UsageError, suggest
 from egovcp.intervals import wilson
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
+from egovcp.terminal import echo
 from egovcp_train.lowlevel.skills import SKILLS, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
 from egovcp_train.output import require_writable
@@ -82,11 +83,11 @@ def evaluate(config: LowLevelEvalConfig) -> None:
         for skill in skills:
             bar.set_postfix_str(skill.name)
             figures[skill.name] = _figures(skill, _play(config, skill, bar))
-    print(table(figures))
+    echo(table(figures))
     output.mkdir(parents=True, exist_ok=True)
     run = {"controller": controller.id, "command": [PROG, *sys.argv[1:]], "seed": config.seed}
     (output / RESULT).write_text(json.dumps(figures | {"_run": run}, indent=2))
-    print(f"figures: {output / RESULT}")
+    echo(f"figures: {output / RESULT}")
 
 
 def _chosen(names: str) -> list[Skill]:
