@@ -53,6 +53,8 @@ def run(config: FromDatasetConfig) -> None:
     try:
         for tick in ticks_of(episode):
             sink.write(tick)
-    finally:
         sink.close()
+    except BaseException:
+        sink.discard()
+        raise
     echo(f"{config.output}: {len(episode)} ticks of {episode.task}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import shlex
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -49,7 +50,8 @@ def run(config: ToDatasetConfig) -> None:
 
     Raises:
         UsageError: no file is given, or the dataset exists.
-        DataError: a file is no recording of ours, has gaps, or another controller.
+        DataError: a file is no recording of ours, is damaged, has gaps, another controller, or
+            repeats another file.
         EnvironmentFailure: what writes datasets is not installed.
     """
     if not config.files:
@@ -59,9 +61,14 @@ def run(config: ToDatasetConfig) -> None:
     require_packages("egovcp-deploy", "writing a dataset", *DATA_MODULES)
     from egovcp.data import DatasetWriter
     from egovcp.data.source import local_root
+    from egovcp.data.writer import require_new
 
     paths = [Path(file).expanduser() for file in config.files]
-    with DatasetWriter(local_root(config.dataset), provenance(paths)) as writer:
+    root = local_root(config.dataset)
+    require_new(root.absolute())
+    known = provenance(paths)
+    require_different(paths, config.gaps)
+    with DatasetWriter(root, known) as writer:
         for path in paths:
             episode, cut = read_episode(path, config.gaps)
             writer.add(episode)
@@ -104,11 +111,41 @@ def _config(info: RunInfo) -> dict[str, object]:
     return {name: value for name, value in info.config.items() if name not in own}
 
 
+def require_different(paths: Sequence[Path], gaps: str = "refuse") -> None:
+    """Check that each recording holds another run, before anything is written.
+
+    A copy of a recording is recognised by its rows. The copy may end earlier: a torn or damaged
+    recording that was recovered begins with the same rows.
+
+    Raises:
+        DataError: two recordings have the same rows, or one cannot be converted.
+    """
+    seen: dict[bytes, list[tuple[Path, list[bytes]]]] = {}
+    for path in paths:
+        rows = _row_digests(read_episode(path, gaps)[0])
+        for other, other_rows in seen.setdefault(rows[0], []):
+            shared = min(len(rows), len(other_rows))
+            if rows[:shared] == other_rows[:shared]:
+                raise DataError(
+                    f"{path} repeats {other}: its first {shared} rows are the same; give each "
+                    "rollout once, as its longest recording"
+                )
+        seen[rows[0]].append((path, rows))
+
+
+def _row_digests(episode: Episode) -> list[bytes]:
+    """A digest of each row: what was observed, sent and earned."""
+    columns = (episode.depth, episode.state, episode.action, episode.reward)
+    rows = (b"".join(column[t].tobytes() for column in columns) for t in range(len(episode)))
+    return [hashlib.blake2b(row, digest_size=16).digest() for row in rows]
+
+
 def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
     """A recording as an episode, and words on what was left out.
 
     Raises:
-        DataError: not a recording of ours, ticks are missing, or a value is out of its range.
+        DataError: not a recording of ours, it is damaged, ticks are missing, or a value is out of
+            its range.
     """
     from egovcp.rollouts import episode_of
 
@@ -116,7 +153,8 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
     try:
         moments = reader.moments()
         ticks = _until_over(_driven(moment.tick(ROW_TOPICS) for moment in moments))
-        deque(moments, maxlen=0)  # on to the end: is the file whole?
+        deque(moments, maxlen=0)  # read on to the end: damage may follow the episode
+        reader.require_undamaged()
         whole, why = _before_gap(ticks)
         if why and gaps == "refuse":
             raise DataError(
@@ -126,7 +164,8 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
         episode = episode_of(reader.info, whole)
         episode.validate()
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        place = "" if str(error).startswith(str(path)) else f"{path}: "
+        raise DataError(f"{place}{error}") from error
     cut = f", cut: {why}" if why else ""
     return episode, cut if reader.complete else f"{cut}; the file is torn there"
 

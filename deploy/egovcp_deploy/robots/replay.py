@@ -145,14 +145,14 @@ def _number(path: Path) -> tuple[int, str]:
 
 
 def recorded_run(path: Path) -> Recorded:
-    """The run in an MCAP file of ours, also if it was cut short.
+    """The run in an MCAP file of ours, also if its end is missing.
 
     One on the wall clock begins where the planner took over: its recurrence started there.
 
     Raises:
-        DataError: it is none, or holds no ticks.
+        DataError: it is none, is damaged, or holds no ticks.
     """
-    recording = read_recording(path)
+    recording = read_recording(path, damaged_ok=False)
     ticks = recording.ticks[_take_over(recording.ticks) :]
     return Recorded(
         name=str(path),
