@@ -48,6 +48,8 @@ class ControlLoop:
         pilot: the state machine and the way to the planner.
         velocity: bounds on what the operator may ask for.
         refusal: why the robot must not be armed; asked at every tick, empty: nothing.
+        fault: why the motors must be damped, likewise.
+        skipped: what was wrong with the readings since the newest that was used, likewise.
     """
 
     def __init__(
@@ -58,12 +60,14 @@ class ControlLoop:
         pilot: Pilot,
         velocity: VelocityCommand | None = None,
         refusal: Callable[[], str] = lambda: "",
+        fault: Callable[[], str] = lambda: "",
+        skipped: Callable[[], str] = lambda: "",
     ) -> None:
         self._body, self._eye = body, eye
         self._controller = controller
         self.pilot = pilot
         self._velocity = velocity or VelocityCommand()
-        self._refusal = refusal
+        self._refusal, self._fault, self._skipped = refusal, fault, skipped
         self._count = 0
         self._open = False  # o_t is out, a_t is not decided
         self._reading: BodyState | None = None
@@ -83,9 +87,17 @@ class ControlLoop:
         sent = np.concatenate([self._moving, ACTION_BOX.to_metric(self.pilot.sent)])
         state = None if reading is None else proprioception(reading, sent)
         depth = None if picture is None else picture.depth
-        self.pilot.sense(now_ns, state, depth)
+        state_ns = None if reading is None else reading.time_ns
+        depth_ns = None if picture is None else picture.time_ns
+        self.pilot.sense(now_ns, state, depth, state_ns, depth_ns)
         before = self.state
-        self.pilot.judge(now_ns, wishes.request, refusal=self._refusal())
+        self.pilot.judge(
+            now_ns,
+            wishes.request,
+            refusal=self._refusal(),
+            damp=self._fault(),
+            skipped=self._skipped(),
+        )
         if state is not None and self._count % CONTROLLER_TICKS_PER_PLAN == 0:
             seen = _BLIND if depth is None else depth
             events = self.pilot.events()

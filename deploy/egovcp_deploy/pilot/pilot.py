@@ -11,6 +11,7 @@ simulation all of it happens at once. Nothing here blocks, sleeps or does I/O of
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -67,11 +68,21 @@ class Pilot:
         now_ns: int,
         state: NDArray[np.floating] | None,
         depth: NDArray[np.uint16] | None,
+        state_ns: int | None = None,
+        depth_ns: int | None = None,
     ) -> None:
-        """Take the newest readings, state (74,) and depth (48, 64); None: there are none."""
+        """Take the newest readings.
+
+        Args:
+            now_ns: now.
+            state: (74,) proprioception; None: there is none.
+            depth: (48, 64); None: there is none.
+            state_ns: when the state arrived, on the clock of ``now_ns``; None: now.
+            depth_ns: likewise.
+        """
         measured = None if state is None else np.delete(np.asarray(state), COMMAND_SLICE)
-        self._proprioception.update(now_ns, measured)
-        self._eye.update(now_ns, depth)
+        self._proprioception.update(now_ns if state_ns is None else state_ns, measured)
+        self._eye.update(now_ns if depth_ns is None else depth_ns, depth)
         if measured is not None and np.isfinite(measured).all():
             self._posture = posture(np.asarray(state))
 
@@ -81,17 +92,26 @@ class Pilot:
         request: Request | None = None,
         controller_ok: bool = True,
         refusal: str = "",
+        hold: str = "",
+        damp: str = "",
+        skipped: str = "",
     ) -> State:
-        """Move the state machine on; where it is now."""
+        """Move the state machine on; where it is now. Reasons: see `Facts`."""
         before = self.supervisor.state
-        facts = self._facts(now_ns, controller_ok, refusal)
+        facts = replace(
+            self._facts(now_ns, controller_ok),
+            refusal=refusal,
+            hold=hold,
+            damp=damp,
+            skipped=skipped,
+        )
         self._events += self.supervisor.update(facts, request)
         if before is State.ARMED and self.supervisor.state is State.RUN:
             self._first = True
             self._book.reset()
         return self.supervisor.state
 
-    def _facts(self, now_ns: int, controller_ok: bool, refusal: str) -> Facts:
+    def _facts(self, now_ns: int, controller_ok: bool) -> Facts:
         silence = (now_ns - self._unanswered[0].time_ns) / 1e9 if self._unanswered else 0.0
         return Facts(
             time_ns=now_ns,
@@ -103,7 +123,6 @@ class Pilot:
             height=self._posture.height,
             controller_ok=controller_ok,
             planner_alive=self._desk.alive,
-            refusal=refusal,
         )
 
     # --- at every planner tick -----------------------------------------------------------
