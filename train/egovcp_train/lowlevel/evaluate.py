@@ -20,6 +20,7 @@ from egovcp.errors import UsageError, suggest
 from egovcp.intervals import wilson
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
+from egovcp.spec import JOINT_NAMES
 from egovcp.terminal import echo
 from egovcp_train.lowlevel.skills import SKILLS, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
@@ -45,6 +46,9 @@ class LowLevelEvalConfig:
     Every skill is played by --episodes robots of different mass, friction and gains, with
     delay and sensor noise. A fall is a tilt of more than 1 rad or a pelvis below 0.35 m.
     Errors, and the share of the time in which it steps, are means over the time before a fall.
+    The column torque is the RMS torque of the most loaded joint, relative to its motor's peak
+    torque; lowlevel.json has all joints. The skill rest also compares the torques of the
+    undisturbed robot with what gravity needs at its pose.
     """
 
     output_dir: str
@@ -84,9 +88,10 @@ def evaluate(config: LowLevelEvalConfig) -> None:
             bar.set_postfix_str(skill.name)
             figures[skill.name] = _figures(skill, _play(config, skill, bar))
     echo(table(figures))
+    loads = _standing_load(config) if "rest" in figures else {}
     output.mkdir(parents=True, exist_ok=True)
     run = {"controller": controller.id, "command": [PROG, *sys.argv[1:]], "seed": config.seed}
-    (output / RESULT).write_text(json.dumps(figures | {"_run": run}, indent=2))
+    (output / RESULT).write_text(json.dumps(figures | loads | {"_run": run}, indent=2))
     echo(f"figures: {output / RESULT}")
 
 
@@ -118,7 +123,7 @@ def _play(config: LowLevelEvalConfig, skill: Skill, bar: Any) -> dict[str, NDArr
             )
         )
         bar.update(robots)
-    names = ("survived", *_FIGURES.values())
+    names = ("survived", "torque_rms", *_FIGURES.values())
     return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
 
 
@@ -134,13 +139,38 @@ def _figures(skill: Skill, outcome: dict[str, NDArray[Any]]) -> dict[str, Any]:
     for key, name in _FIGURES.items():
         known = outcome[name][np.isfinite(outcome[name])]
         out[key] = float(known.mean()) if len(known) else None
+    torque = outcome["torque_rms"]
+    torque = torque[np.isfinite(torque).all(axis=1)]
+    out["torque_rms_relative"] = (
+        dict(zip(JOINT_NAMES, torque.mean(axis=0).tolist(), strict=True)) if len(torque) else None
+    )
     return out
+
+
+def _standing_load(config: LowLevelEvalConfig) -> dict[str, Any]:
+    """Torques at rest against what gravity needs; prints the worst joint."""
+    from egovcp_train.lowlevel.heat import describe, standing_load
+
+    load = standing_load(make_controller(config.controller), config.feet)
+    print(describe(load))
+    joints = {
+        name: {"mean_nm": mean, "needed_nm": needed, "excess_relative": excess}
+        for name, mean, needed, excess in zip(
+            JOINT_NAMES,
+            load.mean.tolist(),
+            load.needed.tolist(),
+            load.excess.tolist(),
+            strict=True,
+        )
+    }
+    within = bool((load.excess <= 0.0).all())
+    return {"_standing_load": {"within_bar": within, "joints": joints}}
 
 
 def table(figures: dict[str, dict[str, Any]]) -> str:
     """One line per skill."""
     head = f"{'skill':<8}{'survival':>9}  {'95 %':<18}{'hand':>8}{'lag':>8}{'height':>9}"
-    lines = [head + f"{'velocity':>11}{'head top':>10}{'stepping':>10}"]
+    lines = [head + f"{'velocity':>11}{'head top':>10}{'stepping':>10}  torque"]
     for name, f in figures.items():
         low, high = f["survival_ci95"]
         lines.append(
@@ -149,8 +179,17 @@ def table(figures: dict[str, dict[str, Any]]) -> str:
             f"{_cell(f['height_error_m'], 100, 'cm'):>9}"
             f"{_cell(f['velocity_error_mps'], 1, 'm/s', 2):>11}"
             f"{_cell(f['head_top_m'], 1, 'm', 2):>10}{_cell(f['stepping'], 100, '%', 0):>10}"
+            f"  {_hottest(f['torque_rms_relative'])}"
         )
     return "\n".join(lines)
+
+
+def _hottest(torques: dict[str, float] | None) -> str:
+    """The most loaded joint, such as ``9.7 % left_knee``."""
+    if torques is None:
+        return ""
+    joint = max(torques, key=lambda name: torques[name])
+    return f"{torques[joint]:.1%} {joint.removesuffix('_joint')}"
 
 
 def _cell(value: float | None, scale: float, unit: str, digits: int = 1) -> str:

@@ -53,7 +53,7 @@ class Physics:
     def __init__(
         self, robots: int, feet: FootModel, config: DisturbanceConfig, threads: int, seed: int
     ) -> None:
-        base = _compile(feet)
+        base = compile_model(feet)
         rng = np.random.default_rng(seed)
         pool = [_randomised(base, config, rng) for _ in range(min(robots, config.models))]
         self._models = [pool[i % len(pool)] for i in range(robots)]
@@ -133,7 +133,8 @@ class Physics:
         self._rollout.close()
 
 
-def _compile(feet: FootModel) -> mujoco.MjModel:
+def compile_model(feet: FootModel) -> mujoco.MjModel:
+    """The robot on a floor, with the sensors that `Physics` reads."""
     spec = robot_spec(feet)
     strip_visuals(spec)
     for sensor in list(spec.sensors):

@@ -109,4 +109,5 @@ SKILLS: Final = (
     ),
     Skill("low", "10 s at 0.2 to 0.4 m/s, 0.55 m", 10.0, walking((0.2, 0.4), (0.55, 0.55))),
     Skill("push", "an impulse of 0.5 m/s while standing", 6.0, neutral, push=0.5),
+    Skill("rest", "60 s at the neutral pose", 60.0, neutral),
 )

@@ -18,6 +18,7 @@ from egovcp.sim.sensors import noise_std
 from egovcp.spec import CONTROLLER_HZ
 from egovcp_train.lowlevel import events
 from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
+from egovcp_train.lowlevel.heat import relative_rms
 from egovcp_train.lowlevel.physics import Physics, Snapshot
 from egovcp_train.lowlevel.sensing import measure
 from egovcp_train.lowlevel.skills import HOLD, SETTLED, Skill
@@ -43,6 +44,7 @@ class Outcome:
     velocity_error: Array  # m/s, mean over strides
     head_top: Array  # m, highest in walking
     stepping: Array  # share of the ticks in which the robot steps
+    torque_rms: Array  # (N, 29) RMS torque of each joint, relative to the motor's peak
 
 
 class _Record:
@@ -55,6 +57,7 @@ class _Record:
         self.velocity: list[Array] = []
         self.head: list[Array] = []
         self.stepping: list[NDArray[np.bool_]] = []
+        self.torque: list[Array] = []
 
     def add(self, x: Snapshot, command: Array, stepping: NDArray[np.bool_]) -> None:
         turn = rotation(x.quaternion)
@@ -69,6 +72,7 @@ class _Record:
         self.velocity.append(in_heading(x.velocity, forward))
         self.head.append(x.head_top.copy())
         self.stepping.append(stepping)
+        self.torque.append(x.torque.copy())
 
 
 def play(
@@ -140,6 +144,7 @@ def _judge(skill: Skill, commands: Array, record: _Record, alive: NDArray[np.boo
         else _nothing(alive),
         head_top=_highest(np.array(record.head), counted) if moves else _nothing(alive),
         stepping=_mean(np.array(record.stepping), alive),
+        torque_rms=relative_rms(np.array(record.torque), alive),
     )
 
 
