@@ -152,7 +152,7 @@ def _standing_load(config: LowLevelEvalConfig) -> dict[str, Any]:
     from egovcp_train.lowlevel.heat import describe, standing_load
 
     load = standing_load(make_controller(config.controller), config.feet)
-    print(describe(load))
+    echo(describe(load))
     joints = {
         name: {"mean_nm": mean, "needed_nm": needed, "excess_relative": excess}
         for name, mean, needed, excess in zip(
