@@ -28,7 +28,7 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.errors import ArtefactError, UsageError
-from egovcp.hub import Patience, snapshot
+from egovcp.hub import RetryPolicy, snapshot
 from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.plan import PlannerConfig, Policy, require_answers
 from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
@@ -40,7 +40,7 @@ _BEFORE: Final[Mapping[str, Any]] = {"flight": {"enabled": False}}
 SEAL = "manifest_sha256"
 CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
 _PATTERNS = ("*.json", "*.safetensors")
-_PATIENCE = Patience()
+_RETRY_POLICY = RetryPolicy()
 
 
 @dataclass(frozen=True)
@@ -174,7 +174,7 @@ def _replace(path: Path, new: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE) -> Artefact:
+def load_artefact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POLICY) -> Artefact:
     """Load and validate a policy from a folder or, failing that, a Hub model id.
 
     If the Hub cannot be reached, an earlier download of that revision serves.
@@ -183,14 +183,14 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
         path: the folder, or `user/name`.
         revision: branch, tag or commit SHA on the Hub; empty: the latest. The name of
             `Artefact.path` is the commit's SHA then.
-        patience: how often and how long the Hub is asked.
+        retry: how often and how long the Hub is asked.
 
     Raises:
         ArtefactError: missing, tampered with, or made for another feature spec.
         UsageError: a revision is asked of a folder.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
-    folder = _locate(path, revision, patience)
+    folder = _locate(path, revision, retry)
     manifest = _read_json(folder / MANIFEST)
     _check_manifest(folder, manifest)
     config, planner = read_options(folder)
@@ -245,7 +245,7 @@ def _decode[C](
     return decoded
 
 
-def _locate(path: str, revision: str, patience: Patience) -> Path:
+def _locate(path: str, revision: str, retry: RetryPolicy) -> Path:
     folder = Path(path)
     if folder.is_dir() and not revision:
         return folder
@@ -259,7 +259,7 @@ def _locate(path: str, revision: str, patience: Patience) -> Path:
             f"no policy artefact at {path!r}: expected a folder with {CONFIG}, {WEIGHTS} and "
             f"{MANIFEST} (a run's checkpoints/last/pretrained_model) or a Hub id 'user/name'"
         )
-    return snapshot(path, revision, patience, "model", patterns=_PATTERNS)
+    return snapshot(path, revision, retry, "model", patterns=_PATTERNS)
 
 
 def _is_hub_id(text: str) -> bool:
