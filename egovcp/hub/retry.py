@@ -4,10 +4,10 @@ The library repeats some requests and not others, waits as long as a server tell
 time limit on most. Within `retrying`, every request has a time limit, what may be repeated is
 repeated after growing pauses, and then one clear error is raised.
 
-Both majors of the library are supported: version 1 sends with `httpx`, version 2 with `httpx2`. Only
-public names are used: the shared client of `huggingface_hub.get_session` gets another ``send`` for
-the time of the block. So a client that a user made with `set_client_factory`, with a proxy or
-certificates, stays in use, and its connections stay open between blocks.
+Both majors of the library are supported: version 1 sends with `httpx`, version 2 with `httpx2`.
+Only public names are used: the client of `huggingface_hub.get_session` gets another ``send`` within
+the block. So a client that a user made with `set_client_factory`, with a proxy or certificates,
+stays in use, and its connections stay open between blocks.
 """
 
 from __future__ import annotations
@@ -34,9 +34,7 @@ if TYPE_CHECKING:
 _LOG = logging.getLogger(__name__)
 _TRANSIENT: Final = {408, 429, 500, 502, 503, 504}
 _OPTIONAL_S: Final = 5.0  # the library does without the answer to a request with a shorter limit
-_PROGRESS_BYTES: Final = (
-    1 << 20
-)  # a download that broke after this much does not count as a failure
+_PROGRESS_BYTES: Final = 1 << 20  # a download that breaks after this much is no failure
 
 
 class HubUnreachable(EnvironmentFailure):
@@ -149,7 +147,7 @@ _state = _State()
 
 
 def _reset_after_fork() -> None:
-    """Another thread of the parent may have been in a block; the library's client is new as well."""
+    """The library's client is a new one, and other threads, which may be in blocks, are gone."""
     global _state
     _state = _State()
 
@@ -209,7 +207,7 @@ class _RetryingSend:
             response = self._send(request, **options)
         except self._http.TransportError as error:
             self._count(request, _describe(error), error)
-            # The library repeats after this error, too; after a ConnectError it would first drop the
+            # The library repeats after this error, too; after a ConnectError it would first drop its
             # client, and with it this object.
             raise self._http.RemoteProtocolError(_describe(error)) from error
         if response.status_code in _TRANSIENT:
