@@ -207,8 +207,8 @@ class _RetryingSend:
             response = self._send(request, **options)
         except self._http.TransportError as error:
             self._count(request, _describe(error), error)
-            # The library repeats after this error, too; after a ConnectError it would first drop its
-            # client, and with it this object.
+            # The library repeats after this error, too; after a ConnectError it would first drop
+            # its client, and with it this object.
             raise self._http.RemoteProtocolError(_describe(error)) from error
         if response.status_code in _TRANSIENT:
             self._requested_pause(request, response)
