@@ -27,7 +27,7 @@ from torch import Tensor
 from egovcp.atomic import write_bytes
 from egovcp.decode import DecodeError, decode, require_type, shown
 from egovcp.errors import ArtefactError, UsageError
-from egovcp.hub import HubUnreachable, Patience, is_local_path, is_repo_id, snapshot
+from egovcp.hub import HubUnreachable, RetryPolicy, is_local_path, is_repo_id, snapshot
 from egovcp.manifest import (
     MANIFEST,
     SCHEMA_VERSION,
@@ -51,7 +51,7 @@ CONFIG, WEIGHTS = "config.json", "model.safetensors"
 FILES: Final = (CONFIG, WEIGHTS, MANIFEST, *PROCESSORS)
 #: Where a training run keeps its latest policy.
 _IN_RUN: Final = "checkpoints/last/pretrained_model"
-_PATIENCE = Patience()
+_RETRY_POLICY = RetryPolicy()
 
 
 @dataclass(frozen=True)
@@ -167,7 +167,7 @@ def _replace(path: Path, new: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE) -> Artefact:
+def load_artefact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POLICY) -> Artefact:
     """Load and validate a policy from a folder or, failing that, a Hub model id.
 
     If the Hub cannot be reached, an earlier download of that revision serves.
@@ -176,7 +176,7 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
         path: the folder, or `user/name`.
         revision: branch, tag or commit SHA on the Hub; empty: the latest. The name of
             `Artefact.path` is the commit's SHA then.
-        patience: how often and how long the Hub is asked.
+        retry: how often and how long the Hub is asked.
 
     Raises:
         ArtefactError: missing, tampered with, made for another feature spec, or with weights or
@@ -184,7 +184,7 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
         UsageError: a revision is asked of a folder.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
-    folder = _locate(path, revision, patience)
+    folder = _locate(path, revision, retry)
     manifest = read_manifest(folder)
     digests = manifest["files"]
     for name in (CONFIG, *(name for name in PROCESSORS if name in digests)):
@@ -239,7 +239,7 @@ def _load_weights(folder: Path, config: WorldModelConfig, digest: object) -> Wor
         ) from error
 
 
-def _locate(path: str, revision: str, patience: Patience) -> Path:
+def _locate(path: str, revision: str, retry: RetryPolicy) -> Path:
     folder = Path(os.path.expanduser(path))  # `Path.expanduser` raises for unknown users
     is_folder = os.path.isdir(folder)
     if is_folder and revision:
@@ -257,7 +257,7 @@ def _locate(path: str, revision: str, patience: Patience) -> Path:
             f"{MANIFEST} (a run's {_IN_RUN}) or a Hub id 'user/name'"
         )
     try:
-        return snapshot(path, revision, patience, "model", patterns=FILES)
+        return snapshot(path, revision, retry, "model", patterns=FILES)
     except HubUnreachable as error:
         raise HubUnreachable(f"there is no folder {path!r}, and {error}") from error
 

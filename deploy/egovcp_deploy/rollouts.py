@@ -15,7 +15,6 @@ from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
 from egovcp.log.info import RunInfo
 from egovcp.log.tick import Tick
-from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import PLANNER_HZ
 from egovcp.terminal import echo
@@ -70,12 +69,7 @@ def _make_policy(config: DeployConfig, artefact: Artefact | None, robot: SimRobo
 
 
 def make_robot(config: DeployConfig) -> SimRobot:
-    """The robot of ``--robot.type``.
-
-    Raises:
-        EnvironmentFailure: the simulator is not installed.
-    """
-    require_packages("egovcp-deploy", "--robot.type=sim", *SIMULATOR_MODULES)
+    """The robot of ``--robot.type=sim``; importing it needs the simulator."""
     from egovcp_deploy.robots.sim import SimRobot
 
     return SimRobot(config.env, config.task, config.seed)

@@ -9,7 +9,7 @@ from egovcp.bounds import bounded
 from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
 from egovcp.data import MixedReturnConfig, ReturnConfig, ShuffleConfig
 from egovcp.errors import UsageError
-from egovcp.hub import Patience, is_repo_id
+from egovcp.hub import RetryPolicy, is_repo_id
 from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_answers
@@ -65,7 +65,7 @@ class LoadingConfig:
     sample_files: int = bounded(16, least=1)
     """Files of each task that are fetched before the first step where the data comes from the Hub:
     the episodes in them give the scale of the returns, are evaluated on, and Q is fitted to."""
-    network: Patience = field(default_factory=Patience)
+    network: RetryPolicy = field(default_factory=RetryPolicy)
     """How long the Hub is asked for a file before the run ends; its checkpoints remain."""
 
 

@@ -8,12 +8,12 @@ from typing import Final
 
 from egovcp.artefact import FILES, Artefact, load_artefact
 from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.hub import Content, Patience, Publication, Published, publish, reserve
+from egovcp.hub import Content, Publication, Published, RetryPolicy, publish, reserve
 from egovcp.terminal import echo
 from egovcp_train.card import ASSETS, CARD, CURVES, card_text
 from egovcp_train.config import PolicyConfig
 
-PATIENCE: Final = Patience()
+RETRY_POLICY: Final = RetryPolicy()
 
 
 def reserve_policy(policy: PolicyConfig) -> None:
@@ -25,7 +25,7 @@ def reserve_policy(policy: PolicyConfig) -> None:
     """
     if policy.push_to_hub:
         target = Publication(policy.repo_id, {}, "", private=policy.private, repo_type="model")
-        reserve(target, PATIENCE)
+        reserve(target, RETRY_POLICY)
 
 
 def publication(
@@ -54,7 +54,7 @@ def publish_trained(folder: Path, policy: PolicyConfig) -> None:
     """
     try:
         target = publication(load_artefact(str(folder)), policy.repo_id, policy.private)
-        report(target, publish(target, PATIENCE))
+        report(target, publish(target, RETRY_POLICY))
     except (EgovcpError, OSError) as error:
         private = ["--private"] if policy.private else []
         again = ["egovcp-push", f"--policy.path={folder}", f"--repo_id={policy.repo_id}", *private]

@@ -14,7 +14,7 @@ from egovcp.data.lock import only_writer
 from egovcp.data.source import Source, record, recorded
 from egovcp.data.version import publish
 from egovcp.errors import DataError, UsageError
-from egovcp.hub import Patience, fetch, is_repo_id, resolve
+from egovcp.hub import RetryPolicy, fetch, is_repo_id, resolve
 from egovcp.terminal import echo
 from egovcp_collect.dataset.replace import write_report
 
@@ -31,7 +31,7 @@ class PullConfig:
     """The dataset: its id on the Hub, and the revision; empty: the latest."""
     output_dir: str = ""
     """The new folder."""
-    network: Patience = field(default_factory=Patience)
+    network: RetryPolicy = field(default_factory=RetryPolicy)
     """How long to try."""
     json: str = ""
     """File for {"repo_id", "commit", "root", "episodes", "frames"}; empty: none."""
@@ -77,13 +77,13 @@ def _require_free(root: Path) -> None:
     require_replaceable(root)
 
 
-def _bring(source: Source, patience: Patience) -> None:
+def _bring(source: Source, retry: RetryPolicy) -> None:
     """Everything into a folder aside, then that folder to its place."""
     aside = source.root.with_name(f".{source.root.name}.pull")
     files = aside / "files"
     files.mkdir(parents=True, exist_ok=True)
     with only_writer(source.root, aside):
-        fetch(source.repo_id, source.commit, files, patience)
+        fetch(source.repo_id, source.commit, files, retry)
         try:
             (files / schema.SOURCE_PATH).unlink(missing_ok=True)
             verify_hashes(files)

@@ -22,7 +22,7 @@ from egovcp.robot.controllers import make_controller
 from egovcp.terminal import echo, one_line
 from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.hardware import CAMERAS, HardwareOptions, open_eye
+from egovcp_deploy.live.hardware import CAMERAS, REALSENSE, HardwareOptions, open_eye
 from egovcp_deploy.live.operators import OPERATORS, operator
 from egovcp_deploy.live.planner import LiveSummary, failure_words
 from egovcp_deploy.live.run import LiveSetup, run_live
@@ -33,14 +33,22 @@ from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.policy import backend_of
 from egovcp_deploy.recording import missing_ticks, recording, run_info
 from egovcp_deploy.robots.bridge import BridgeBody
+from egovcp_deploy.robots.realsense_eye import require_realsense
 
 SIMULATED_S: Final = 15.0  # in RUN: the crane lets go, the robot settles, the episode
 
 
 def check_live(config: DeployConfig) -> None:
-    """Raise `UsageError` for options that make no sense on the wall clock."""
+    """Refuse options that make no sense on the wall clock.
+
+    Raises:
+        UsageError: names the option.
+        MissingPackage: the driver of the camera is not installed.
+    """
     check_choice("--operator.type", config.operator.type, OPERATORS)
     check_choice("--robot.camera.type", config.robot.camera.type, CAMERAS)
+    if config.robot.camera.type == REALSENSE:
+        require_realsense()
     if not np.isfinite(config.operator.velocity).all():
         raise UsageError(f"--operator.velocity={config.operator.velocity}: expected numbers")
     if not config.operator.duration >= 0:

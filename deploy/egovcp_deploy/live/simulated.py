@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Final
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.lifeline import die_with_parent
-from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions
@@ -38,7 +37,6 @@ def simulated(config: DeployConfig, outcomes: Path) -> Iterator[HardwareOptions]
     Raises:
         EnvironmentFailure: the simulator is not installed, or does not come up.
     """
-    require_packages("egovcp-deploy", "--realtime", *SIMULATOR_MODULES)
     from egovcp_deploy.robots.fake.bridge import Ports
     from egovcp_deploy.robots.fake.command import FakeConfig
 

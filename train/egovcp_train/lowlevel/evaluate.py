@@ -18,6 +18,7 @@ from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
 from egovcp.intervals import wilson
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import JOINT_NAMES
@@ -79,6 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def evaluate(config: LowLevelEvalConfig) -> None:
     """Play, print the table, write the JSON."""
     skills = _chosen(config.skills)
+    require_packages("egovcp-train", PROG, *SIMULATOR_MODULES)
     controller = make_controller(config.controller)
     output = Path(config.output_dir)
     require_writable(output)
