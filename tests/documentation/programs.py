@@ -1,0 +1,188 @@
+"""Parse a command line with the real parser of its program, and go no further."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import re
+import runpy
+import sys
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache
+from importlib import import_module, metadata
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import egovcp.cli
+from egovcp.entry_point import EntryPoint
+
+ROOT = Path(__file__).resolve().parents[2]
+#: LeRobot's commands that read their options into a dataclass -> that class.
+_LEROBOT_CONFIGS = {
+    "lerobot-eval": "lerobot.configs.eval:EvalPipelineConfig",
+    "lerobot-train": "lerobot.configs.train:TrainPipelineConfig",
+}
+#: Packages of others that are installed by name.
+_PACKAGES = {"uv", "wandb"}
+
+
+class WrongCommand(Exception):
+    """A program would refuse the command line."""
+
+
+class _Parsed(BaseException):
+    """Ends a program after its options have been parsed."""
+
+
+def check(argv: Sequence[str]) -> None:
+    """Raise `WrongCommand` if the program of this command line would refuse it."""
+    program, *args = argv
+    if program == "make":
+        _require(args[0] in _makefile_targets(), f"make has no target {args[0]}")
+    elif program == "pip":
+        _check_packages(args[1:])
+    elif program == "python":
+        _check_script(args)
+    elif program in _LEROBOT_CONFIGS:
+        _check_lerobot(program, args)
+    elif program != "rerun":
+        _check_parser(program, args, lambda: main_of(program)(args))
+
+
+def main_of(program: str) -> Callable[..., int]:
+    """The function behind a console script, called with the arguments."""
+    points = metadata.entry_points(group="console_scripts", name=program)
+    _require(bool(points), f"there is no program {program}")
+    found: Any = next(iter(points)).load()
+    if isinstance(found, EntryPoint):
+        return import_module(found.module).main  # type: ignore[no-any-return]
+    return lambda args: found()
+
+
+@cache
+def own_flags() -> frozenset[str]:
+    """Every flag of every command of ours, as their help names it."""
+    found: set[str] = set()
+    for point in metadata.entry_points(group="console_scripts"):
+        if point.name.startswith("egovcp-"):
+            for subcommand in _subcommands(point.name):
+                found |= set(re.findall(r"--[\w.-]+", _help(point.name, *subcommand)))
+    return frozenset(found)
+
+
+def _subcommands(program: str) -> list[list[str]]:
+    if program == "egovcp-experiment":
+        return [["ablations"]]  # all have the same options
+    text = _help(program)
+    names = re.findall(r"^  ([a-z-]+)  ?", text, re.M) if "SUBCOMMAND" in text else []
+    return [[name] for name in names] or [[]]
+
+
+@cache
+def _help(program: str, *subcommand: str) -> str:
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
+        main_of(program)([*subcommand, "--help"])
+    return printed.getvalue()
+
+
+@cache
+def _makefile_targets() -> frozenset[str]:
+    text = (ROOT / "Makefile").read_text(encoding="utf-8")
+    return frozenset(re.findall(r"^([a-z]+):", text, re.M))
+
+
+def _check_parser(program: str, args: Sequence[str], start: Callable[[], object]) -> None:
+    """Start a program whose parsers have been changed so that they end it."""
+
+    def ending(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            function(*args, **kwargs)
+            raise _Parsed
+
+        return call
+
+    argparser, errors = argparse.ArgumentParser, io.StringIO()
+    with (
+        mock.patch.object(egovcp.cli, "parse_config", ending(egovcp.cli.parse_config)),
+        mock.patch.object(argparser, "parse_args", ending(argparser.parse_args)),
+        mock.patch.object(sys, "argv", [program, *args]),
+        contextlib.redirect_stdout(io.StringIO()),
+        contextlib.redirect_stderr(errors),
+    ):
+        try:
+            code = start()
+        except _Parsed:
+            return
+        except SystemExit as end:
+            code = end.code
+    _require(not code, errors.getvalue().strip())
+
+
+def _check_script(args: Sequence[str]) -> None:
+    """``python -m MODULE ...`` or ``python FILE ...``."""
+    module = args[0] == "-m"
+    name, rest = (args[1], args[2:]) if module else (args[0], args[1:])
+    exists = find_spec(name) is not None if module else (ROOT / name).is_file()
+    _require(exists, f"there is no {name}")
+    if not rest:
+        return
+
+    def start() -> object:
+        if module:
+            found = import_module(name)
+            if hasattr(found, "main"):
+                return found.main(rest)
+            return runpy.run_module(name, run_name="__main__")
+        path = ROOT / name
+        with mock.patch.object(sys, "path", [str(path.parent), *sys.path]):
+            return runpy.run_path(str(path), run_name="__main__")
+
+    _check_parser(name, rest, start)
+
+
+def _check_lerobot(program: str, args: Sequence[str]) -> None:
+    from lerobot.configs import parser
+
+    for plugin in ("policy", "env", "robot"):
+        import_module(f"lerobot_{plugin}_egovcp")
+    module, name = _LEROBOT_CONFIGS[program].split(":")
+
+    def parsed(cfg: Any) -> None:
+        """Do nothing."""
+
+    parsed.__annotations__["cfg"] = getattr(import_module(module), name)
+    errors = io.StringIO()
+    with mock.patch.object(sys, "argv", [program, *args]), contextlib.redirect_stderr(errors):
+        try:
+            parser.wrap()(parsed)()
+        except SystemExit as end:
+            raise WrongCommand(errors.getvalue().strip()) from end
+
+
+def _check_packages(targets: Sequence[str]) -> None:
+    """Each is a package that we use, with extras that it has."""
+    extras: dict[str, set[str]] = {name: set() for name in _PACKAGES}
+    for file in _project_files():
+        project = tomllib.loads(file.read_text(encoding="utf-8"))["project"]
+        extras[project["name"]] = set(project.get("optional-dependencies", {}))
+    for target in targets:
+        name, _, wanted = target.rstrip("]").partition("[")
+        _require(name in extras, f"there is no package {name}")
+        missing = {extra for extra in wanted.split(",") if extra} - extras[name]
+        _require(not missing, f"{name} has no extra {', '.join(sorted(missing))}")
+
+
+def _project_files() -> Iterator[Path]:
+    yield ROOT / "pyproject.toml"
+    for pattern in ("*/pyproject.toml", "plugins/*/pyproject.toml"):
+        yield from ROOT.glob(pattern)
+
+
+def _require(holds: bool, message: str) -> None:
+    if not holds:
+        raise WrongCommand(message)
