@@ -22,6 +22,7 @@ from egovcp.errors import UsageError
 
 _KEY: Final = "bounds"
 _FINITE: Final = "a finite number"
+_LONGEST_WRITTEN: Final = 40  # characters of a number in a message
 
 
 @dataclass(frozen=True)
@@ -151,4 +152,5 @@ def _written(value: object) -> str:
         return "{" + ", ".join(f"{k}: {_written(v)}" for k, v in value.items()) + "}"
     if isinstance(value, tuple | list):
         return "[" + ", ".join(map(_written, value)) + "]"
-    return str(value)
+    text = str(value)
+    return text if len(text) <= _LONGEST_WRITTEN else f"{text[:_LONGEST_WRITTEN]}..."
