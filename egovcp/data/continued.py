@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
-import pyarrow.parquet as pq
 
 from egovcp.data import metadata, schema, stats
 from egovcp.data.encoded import EncodedEpisode
 from egovcp.data.hashes import load_hashes, verify_hashes
 from egovcp.data.origin import SOURCES
+from egovcp.data.parquet import damaged, open_parquet
 from egovcp.data.provenance import Provenance, parse_provenance
 from egovcp.data.shard import shard_paths
 from egovcp.data.version import Contents
@@ -98,8 +98,8 @@ def _next_number(root: Path, provenance: Provenance, records: list[dict[str, Any
 
 def _episodes_table(root: Path, number: int) -> pa.Table:
     path = root / shard_paths(number)[1]
-    with metadata.damaged(path):
-        return pq.ParquetFile(path).read()
+    with damaged(path):
+        return open_parquet(path).read()
 
 
 def _tasks(records: list[dict[str, Any]], names: dict[int, str]) -> dict[str, int]:
@@ -113,8 +113,8 @@ def _tail(
 ) -> list[EncodedEpisode]:
     path = root / shard_paths(number)[0]
     ordered = schema.episode_schema()
-    with metadata.damaged(path):
-        file = pq.ParquetFile(path)
+    with damaged(path):
+        file = open_parquet(path)
         tables = [
             file.read_row_group(i, columns=ordered.names).select(ordered.names).cast(ordered)
             for i in range(len(records))

@@ -21,6 +21,7 @@ from egovcp.data.columns import EPISODE_FEATURES, Columns, open_data_file, to_nu
 from egovcp.data.digests import Digests
 from egovcp.data.episode import Episode
 from egovcp.data.origin import ScenarioKey, ScenarioKeys
+from egovcp.data.parquet import damaged
 from egovcp.data.paths import require_file
 from egovcp.data.provenance import parse_provenance
 from egovcp.data.selection import select_episodes
@@ -167,6 +168,10 @@ class DatasetReader:
         """Statistics of every feature, as in ``meta/stats.json``."""
         return metadata.load_stats(self.root)
 
+    def first_frame(self, index: int) -> int:
+        """Index, in the dataset, of the first frame of an episode."""
+        return int(self._table.start[index])
+
     def task(self, index: int) -> str:
         """Task of an episode."""
         return str(self._collection["episodes"][index]["task"])
@@ -284,7 +289,7 @@ class DatasetReader:
             raise IndexError(f"episode {index} of {len(self)}")
         path = self.data_path(index)
         try:
-            with metadata.damaged(path):
+            with damaged(path):
                 table = self._rows(path, index, names)
                 if table.num_rows != self._table.length[index]:
                     raise DataError("ends before the end of the episode")
