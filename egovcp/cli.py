@@ -15,12 +15,14 @@ import argparse
 import contextlib
 import dataclasses
 import errno
+import io
 import json
 import sys
 import tempfile
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import NoneType
 from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
@@ -29,6 +31,7 @@ from draccus.argparsing import ArgumentParser
 from draccus.cfgparsing import load_config
 from draccus.utils import CONFIG_ARG, DecodingError, DraccusException
 
+from egovcp.atomic import write_text
 from egovcp.bounds import Bounds, OutOfBounds, bounded, bounds_of, check_bounds
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError, suggest
 from egovcp.interrupts import EXIT_CODE as INTERRUPTED
@@ -407,5 +410,6 @@ def _without_token(text: str) -> str:
 
 def save_config(config: Any, path: str) -> None:
     """Write the resolved config as YAML, so that a run can be repeated with ``--config_path``."""
-    with open(path, "w", encoding="utf-8") as file:
-        draccus.dump(config, file)
+    text = io.StringIO()
+    draccus.dump(config, text)
+    write_text(Path(path), text.getvalue())
