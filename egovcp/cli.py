@@ -12,14 +12,17 @@ after an interrupt. A traceback is printed only with ``--debug``.
 from __future__ import annotations
 
 import errno
+import io
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import draccus
 
+from egovcp.atomic import write_text
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
 from egovcp.flags import HELP, flag_values, flags_of, merged, split_flags
@@ -179,5 +182,6 @@ def _without_token(text: str) -> str:
 
 def save_config(config: Any, path: str) -> None:
     """Write the resolved config as YAML, so that a run can be repeated with ``--config_path``."""
-    with open(path, "w", encoding="utf-8") as file:
-        draccus.dump(config, file)
+    text = io.StringIO()
+    draccus.dump(config, text)
+    write_text(Path(path), text.getvalue())

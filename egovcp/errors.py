@@ -53,6 +53,10 @@ class DataError(EgovcpError):
         return error
 
 
+class SimulationDiverged(DataError):
+    """The physics of an episode left the range of real robots; the episode is not valid data."""
+
+
 class ArtefactError(EgovcpError):
     """A policy artefact is missing, tampered with, or of another spec."""
 

@@ -53,7 +53,7 @@ def collect(config: CollectConfig, command: str = "") -> None:
 
     Raises:
         UsageError: an option makes no sense, or something is there already.
-        DataError: what is there is damaged, or simulation went wrong.
+        DataError: what is there is damaged, or the simulation diverged.
         EnvironmentFailure: another process writes the dataset; there is not enough room for it;
             workers cannot be kept alive.
         OSError: the disk is full.

@@ -19,6 +19,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 
+from egovcp.atomic import removed_on_error
 from egovcp.data import files, metadata, schema
 from egovcp.data.continued import read_version
 from egovcp.data.destination import is_vacant, make_parent, require_replaceable, resolve_root
@@ -151,10 +152,10 @@ class Committer:
         self.spool.sweep()
         self.spool.drop_before(self.next_number)
         self._sealed = self.spool.numbers()
-        partial = run.with_suffix(".partial")
-        partial.unlink(missing_ok=True)
-        files.write_json(partial, asdict(self.provenance))
-        files.rename(partial, run)
+        with removed_on_error(run.with_suffix(".partial")) as partial:
+            partial.unlink(missing_ok=True)
+            files.write_json(partial, asdict(self.provenance))
+            files.rename(partial, run)
 
 
 @contextmanager

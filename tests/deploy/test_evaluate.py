@@ -10,6 +10,7 @@ import pytest
 
 from egovcp.plan.backends import library
 from egovcp.robot.stance import StanceController
+from egovcp.sim import robot
 from egovcp.spec import ACTION_DIM
 from egovcp.testing import toy_reactive
 from egovcp_deploy.deploy import main as deploy
@@ -223,6 +224,19 @@ def test_an_artefact_of_another_controller_is_not_evaluated(
     assert run(out, f"--policy.path={foreign_artefact_dir}", "--controllers=planner") == 4
     assert "another-controller" in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_diverging_simulation_is_an_error_that_names_the_episode(
+    tmp_path: Path,
+    short: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(robot, "MAX_SPEED", 2.0)  # m/s; a ball is faster
+    assert run(tmp_path / "out", "--controllers=hold", "--episodes=1", *short) == 3
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "the simulation diverged in task ball, seed " in message
+    assert "velocity of ball is" in message
 
 
 @pytest.mark.parametrize("command", ["evaluate", "deploy"])
