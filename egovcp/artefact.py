@@ -211,12 +211,15 @@ def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
         model = decode(WorldModelConfig, world_model, "world_model")
         planner = decode(PlannerConfig, config.get("planner"), "planner")
         require_answers(model, planner)
-        require_affordable(model, planner)
     except (DecodeError, UsageError) as error:
         raise ArtefactError(
             f"{folder / CONFIG}: {error}; a policy of another version of egovcp has to be trained "
             "again with this one"
         ) from error
+    try:
+        require_affordable(model, planner)
+    except UsageError as error:
+        raise ArtefactError(f"{folder / CONFIG}: {error}") from error
     return model, planner
 
 

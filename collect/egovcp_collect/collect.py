@@ -93,7 +93,8 @@ def _commit_after(error: BaseException, committer: Committer) -> None:
 def _missing(config: CollectConfig, committer: Committer) -> list[Scenario]:
     """The episodes that are neither committed nor sealed."""
     numbers = set(committer.missing(config.episodes))
-    return [scenario for scenario in config.scenarios() if scenario.episode in numbers]
+    through = replace(config, episodes=max(numbers, default=0) + 1)
+    return [scenario for scenario in through.scenarios() if scenario.episode in numbers]
 
 
 def _collect(

@@ -42,8 +42,10 @@ def dataset_problems(root: Path, progress: Progress | None = None) -> Iterator[D
 
     First the files (recorded hashes, none too many, none that lie elsewhere), then the `meta`
     folder, then each episode (schema, counts, times, values, recorded digest, and that the
-    commands in its states line up with its actions), at last the statistics.
+    commands in its states line up with its actions, and that it is there once), at last the
+    statistics.
     """
+    from egovcp.checks.duplicates import DuplicateEpisodes
     from egovcp.checks.layout import file_problems, table_problems
     from egovcp.checks.statistics import Totals
     from egovcp.data.hashes import hash_problems
@@ -54,7 +56,7 @@ def dataset_problems(root: Path, progress: Progress | None = None) -> Iterator[D
         return
     yield from file_problems(reader)
     yield from _raised(table_problems(reader))
-    totals = Totals()
+    totals, duplicates = Totals(), DuplicateEpisodes(reader)
     for index in range(len(reader)):
         episode, problems = reader.inspect(index)
         yield from problems
@@ -62,6 +64,7 @@ def dataset_problems(root: Path, progress: Progress | None = None) -> Iterator[D
             for frame, problem in command_problems(episode):
                 yield DataError.at(reader.data_path(index), problem, index, frame)
             totals.add(episode)
+            yield from duplicates.problems(index, reader.digest(index) or episode.digest())
         if progress is not None:
             progress(index + 1, len(reader))
     yield from _raised(totals.problems(reader))

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from egovcp import spec
 from egovcp.data import schema
 from egovcp.data.paths import check_template, require_file
+from egovcp.data.provenance import parse_provenance
 from egovcp.data.records import record_problems
 from egovcp.errors import DataError
 
@@ -232,11 +233,7 @@ def load_collection(root: Path, lengths: NDArray[np.int64]) -> dict[str, Any]:
     if collection.get("spec_version") != spec.SPEC_VERSION:
         found = collection.get("spec_version")
         raise DataError.at(path, f"specification {found}, expected {spec.SPEC_VERSION}")
-    if not collection.get("controller_id") or not isinstance(collection["controller_id"], str):
-        raise DataError.at(path, "names no low-level controller")
-    for name in ("config", "versions"):
-        if not isinstance(collection.get(name, {}), dict):
-            raise DataError.at(path, f"its {name} is no object")
+    parse_provenance(collection, path)
     for episode, problem in record_problems(collection.get("episodes"), lengths):
         raise DataError.at(path, problem, episode)
     return collection
