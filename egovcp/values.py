@@ -238,7 +238,8 @@ def _options_of(config_class: Any, value: Any, name: str) -> str:
     meant = [key for key in _MAIN_OPTIONS if key in names and isinstance(value, str)]
     if meant:
         return f"; did you mean {name}.{meant[0]}={shown(value)}?"
-    listed = ", ".join(f"{name}.{key}" for key in names[:_SHOWN_OPTIONS])
+    prefix = "" if name.endswith("]") else f"{name}."  # of an item in a list: no flag
+    listed = ", ".join(f"{prefix}{key}" for key in names[:_SHOWN_OPTIONS])
     return f"; its options are {listed}{', ...' if len(names) > _SHOWN_OPTIONS else ''}"
 
 
