@@ -24,7 +24,7 @@ import draccus
 from safetensors.torch import save
 from torch import Tensor
 
-from egovcp.atomic import write_bytes
+from egovcp.atomic import removed_on_error, write_bytes
 from egovcp.decode import DecodeError, decode, require_type, shown
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.hub import HubUnreachable, RetryPolicy, is_local_path, is_repo_id, snapshot
@@ -100,9 +100,6 @@ def save_artefact(
         ArtefactError: the provenance names no controller, or a number in it is not finite.
     """
     _require_controller_id(path, provenance)
-    work = path.with_name(path.name + ".partial")
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
     config = {
         "type": "egovcp",
         "world_model": draccus.encode(model.config),
@@ -110,8 +107,11 @@ def save_artefact(
         "input_features": INPUT_FEATURES,
         "output_features": OUTPUT_FEATURES,
     }
-    write_artefact(work, config, model.state_dict(), provenance, PROCESSORS)
-    _replace(path, work)
+    with removed_on_error(path.with_name(path.name + ".partial")) as work:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
+        write_artefact(work, config, model.state_dict(), provenance, PROCESSORS)
+        _replace(path, work)
 
 
 def write_artefact(
@@ -211,12 +211,15 @@ def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
         model = decode(WorldModelConfig, world_model, "world_model")
         planner = decode(PlannerConfig, config.get("planner"), "planner")
         require_answers(model, planner)
-        require_affordable(model, planner)
     except (DecodeError, UsageError) as error:
         raise ArtefactError(
             f"{folder / CONFIG}: {error}; a policy of another version of egovcp has to be trained "
             "again with this one"
         ) from error
+    try:
+        require_affordable(model, planner)
+    except UsageError as error:
+        raise ArtefactError(f"{folder / CONFIG}: {error}") from error
     return model, planner
 
 

@@ -1,24 +1,51 @@
-"""Files that are complete or not there at all, also after a crash."""
+"""Files and folders that are complete or not there at all, also after a crash."""
 
 from __future__ import annotations
 
 import json
 import os
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 
-def write_bytes(path: Path, content: bytes) -> None:
+@contextmanager
+def removed_on_error(path: Path) -> Iterator[Path]:
+    """Remove a temporary file or folder if the block raises anything, Ctrl-C included.
+
+    Args:
+        path: need not exist; yielded.
+    """
+    try:
+        yield path
+    except BaseException:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        raise
+
+
+def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
     """Write a file, or replace it; its mode follows the umask.
 
     `tempfile` and `safetensors.save_file` would create it for its owner only.
+
+    Args:
+        path: the file; if anything fails it is as before, and nothing lies beside it.
+        content: all of it.
+        durable: wait until the disk has it.
     """
-    temporary = path.with_name(f".{path.name}.partial")
-    with temporary.open("wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.replace(path)
+    with removed_on_error(path.with_name(f".{path.name}.partial")) as temporary:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            if durable:
+                os.fsync(file.fileno())
+        temporary.replace(path)
 
 
 def write_text(path: Path, text: str) -> None:

@@ -22,6 +22,8 @@ from egovcp.errors import UsageError
 
 _KEY: Final = "bounds"
 _FINITE: Final = "a finite number"
+_SHOWN_LENGTH: Final = 200
+_LARGE: Final = 10**100
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class OutOfBounds(UsageError):
     """A number that an option may not be."""
 
     def __init__(self, option: str, value: object, expected: str) -> None:
-        super().__init__(f"{option}={_written(value)}: expected {expected}")
+        super().__init__(f"{option}={shown(value)}: expected {expected}")
         self._facts = option, value, expected
 
     def under(self, prefix: str) -> OutOfBounds:
@@ -145,10 +147,22 @@ def _numbers(value: object, name: str) -> Iterator[float]:
                     yield from _numbers(inner, name)
 
 
-def _written(value: object) -> str:
-    """As on a command line."""
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{k}: {_written(v)}" for k, v in value.items()) + "}"
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(map(_written, value)) + "]"
+def shown(value: object) -> str:
+    """A value as it is written on a command line, shortened if it is long."""
+    text = _yaml(value)
+    if len(text) <= _SHOWN_LENGTH:
+        return text
+    return f"{text[: _SHOWN_LENGTH // 2]}... ({len(text)} characters)"
+
+
+def _yaml(value: object) -> str:
+    match value:
+        case None | bool():
+            return {None: "null", True: "true", False: "false"}[value]
+        case int():
+            return f"{value:d}" if abs(value) < _LARGE else f"{value:#x}"  # decimal is limited
+        case Mapping():
+            return "{" + ", ".join(f"{_yaml(k)}: {_yaml(v)}" for k, v in value.items()) + "}"
+        case tuple() | list():
+            return "[" + ", ".join(map(_yaml, value)) + "]"
     return str(value)

@@ -47,9 +47,14 @@ class DataError(EgovcpError):
         """``"FILE, episode 3, frame 7: problem"``, with the place kept for reports."""
         numbers = {"episode": episode, "frame": frame}
         place = [f"{name} {number}" for name, number in numbers.items() if number is not None]
-        error = cls(f"{', '.join([str(file), *place])}: {problem}")
+        shown = os.fsencode(file).decode("utf-8", "backslashreplace")  # a name is bytes
+        error = cls(f"{', '.join([shown, *place])}: {problem}")
         error.problem, error.file, error.episode, error.frame = problem, str(file), episode, frame
         return error
+
+
+class SimulationDiverged(DataError):
+    """The physics of an episode left the range of real robots; the episode is not valid data."""
 
 
 class ArtefactError(EgovcpError):

@@ -175,6 +175,7 @@ REWARD_KEY: Final = "next.reward"
 DONE_KEY: Final = "next.done"
 SUCCESS_KEY: Final = "next.success"
 TRUNCATED_KEY: Final = "next.truncated"
+CONTROLLER_ID_KEY: Final = "controller_id"  # of the low-level controller, in LeRobot's `info`
 
 #: LeRobot feature descriptions of the columns egovcp adds to the standard ones.
 FEATURES: Final[dict[str, dict[str, object]]] = {

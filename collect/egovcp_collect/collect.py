@@ -53,7 +53,7 @@ def collect(config: CollectConfig, command: str = "") -> None:
 
     Raises:
         UsageError: an option makes no sense, or something is there already.
-        DataError: what is there is damaged, or simulation went wrong.
+        DataError: what is there is damaged, or the simulation diverged.
         EnvironmentFailure: another process writes the dataset; there is not enough room for it;
             workers cannot be kept alive.
         OSError: the disk is full.
@@ -93,7 +93,8 @@ def _commit_after(error: BaseException, committer: Committer) -> None:
 def _missing(config: CollectConfig, committer: Committer) -> list[Scenario]:
     """The episodes that are neither committed nor sealed."""
     numbers = set(committer.missing(config.episodes))
-    return [scenario for scenario in config.scenarios() if scenario.episode in numbers]
+    through = replace(config, episodes=max(numbers, default=0) + 1)
+    return [scenario for scenario in through.scenarios() if scenario.episode in numbers]
 
 
 def _collect(

@@ -42,10 +42,12 @@ def dataset_problems(root: Path, progress: Progress | None = None) -> Iterator[D
 
     First the files (recorded hashes, none too many, none that lie elsewhere), then the `meta`
     folder, then each episode (schema, counts, times, values, recorded digest, and that the
-    commands in its states line up with its actions), at last the statistics.
+    commands in its states line up with its actions, and that it is there once), at last the
+    statistics.
     """
+    from egovcp.checks.duplicates import DuplicateEpisodes
     from egovcp.checks.layout import file_problems, table_problems
-    from egovcp.checks.statistics import Totals
+    from egovcp.checks.statistics import EpisodeStatistics, StatisticsCheck
     from egovcp.data.hashes import hash_problems
 
     yield from _raised(hash_problems(root))
@@ -54,17 +56,21 @@ def dataset_problems(root: Path, progress: Progress | None = None) -> Iterator[D
         return
     yield from file_problems(reader)
     yield from _raised(table_problems(reader))
-    totals = Totals()
+    duplicates = DuplicateEpisodes(reader)
+    total, table = StatisticsCheck(reader), EpisodeStatistics(reader)
     for index in range(len(reader)):
         episode, problems = reader.inspect(index)
         yield from problems
+        matrix = None
         if episode is not None and not problems:
             for frame, problem in command_problems(episode):
                 yield DataError.at(reader.data_path(index), problem, index, frame)
-            totals.add(episode)
+            matrix = total.add(index, episode)
+            yield from duplicates.problems(index, reader.digest(index) or episode.digest())
+        yield from _raised(table.problems(index, matrix))
         if progress is not None:
             progress(index + 1, len(reader))
-    yield from _raised(totals.problems(reader))
+    yield from _raised(total.problems())
 
 
 def _open(root: Path) -> Generator[DataError, None, DatasetReader | None]:

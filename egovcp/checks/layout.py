@@ -7,13 +7,12 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pyarrow.parquet as pq
-
 from egovcp.data import DatasetReader, metadata, schema
+from egovcp.data.parquet import damaged, open_parquet
 from egovcp.data.paths import files_below, require_file
 from egovcp.errors import DataError
 
-_RANGE = re.compile(r"(\d+):(\d+)")
+_RANGE = re.compile(r"(\d{1,18}):(\d{1,18})", re.ASCII)
 
 
 def file_problems(reader: DatasetReader) -> Iterator[DataError]:
@@ -28,18 +27,18 @@ def file_problems(reader: DatasetReader) -> Iterator[DataError]:
         except DataError as error:
             yield error if error.file else DataError.at(path, str(error))
     for path in files_below(reader.root / "data"):
-        if path not in expected and not path.name.startswith("."):
+        if path not in expected:
             problem = "listed in no table, yet LeRobot and `datasets` would read it; remove it"
             yield DataError.at(path, problem)
 
 
 def _content_problems(reader: DatasetReader, path: Path, frames: int) -> Iterator[DataError]:
     require_file(reader.root, path)
-    with metadata.damaged(path):
-        file = pq.read_metadata(path)
-        columns = set(file.schema.to_arrow_schema().names)
-    if file.num_rows != frames:
-        yield DataError.at(path, f"holds {file.num_rows} frames, but meta/episodes lists {frames}")
+    with damaged(path):
+        file = open_parquet(path)
+        rows, columns = file.metadata.num_rows, set(file.schema_arrow.names)
+    if rows != frames:
+        yield DataError.at(path, f"holds {rows} frames, but meta/episodes lists {frames}")
     unknown = sorted(columns - set(reader.info["features"]))
     if unknown:
         problem = f"columns that {schema.INFO_PATH} does not know: {', '.join(unknown)}"
@@ -54,9 +53,9 @@ def table_problems(reader: DatasetReader) -> Iterator[DataError]:
         yield DataError.at(path, f"{found}, but {schema.TASKS_PATH} lists {len(reader.task_names)}")
     yield from (DataError.at(path, text) for text in _split_problems(info, len(reader)))
     index = 0
-    for file in sorted((reader.root / "meta" / "episodes").glob("*/*.parquet")):
-        with metadata.damaged(file):
-            listed = pq.ParquetFile(file).read(columns=["tasks"])["tasks"].to_pylist()
+    for file in metadata.episode_files(reader.root):
+        with damaged(file):
+            listed = open_parquet(file).read(columns=["tasks"])["tasks"].to_pylist()
         for tasks in listed:
             if tasks != [reader.task(index)]:
                 problem = f"its tasks are {tasks}, expected {reader.task(index)}"

@@ -2,90 +2,148 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.data import DatasetReader, Episode, schema
+from egovcp import spec
+from egovcp.data import DatasetReader, Episode, metadata, schema, stats
 from egovcp.data.columns import EPISODE_FEATURES
+from egovcp.data.parquet import damaged, open_parquet
 from egovcp.errors import DataError
 
 _RELATIVE = 1e-4  # of the column's range: statistics may have been gathered in float32
 _LEAST = 1e-6
 
-type Moments = dict[str, NDArray[np.float64]]
 
+class StatisticsCheck:
+    """Compares the statistics of each episode and of all with those of the frames."""
 
-class Totals:
-    """Count, minimum, maximum, mean and standard deviation over episodes, one by one."""
+    def __init__(self, reader: DatasetReader) -> None:
+        self._reader = reader
+        self._frames = 0
+        self._total: stats.Matrix | None = None
 
-    def __init__(self) -> None:
-        self.frames = 0
-        self._parts: dict[str, list[tuple[int, Moments]]] = {name: [] for name in EPISODE_FEATURES}
+    def add(self, index: int, episode: Episode) -> stats.Matrix:
+        """Take in a valid episode; the statistics (R, D) of its frames."""
+        matrix = _statistics(self._reader, index, episode)
+        parts = [matrix] if self._total is None else [self._total, matrix]
+        counts = [len(episode)] if self._total is None else [self._frames, len(episode)]
+        self._total = stats.aggregate(parts, counts)
+        self._frames += len(episode)
+        return matrix
 
-    def add(self, episode: Episode) -> None:
-        """Take in an episode."""
-        self.frames += len(episode)
-        for name, parts in self._parts.items():
-            parts.append((len(episode), _moments(getattr(episode, name), name)))
-
-    def problems(self, reader: DatasetReader) -> Iterator[DataError]:
+    def problems(self) -> Iterator[DataError]:
         """What differs from ``meta/stats.json``, if every frame of the dataset was added.
 
         Raises:
             DataError: the file is missing or damaged.
         """
-        path, found = reader.root / schema.STATS_PATH, reader.stats
+        path = self._reader.root / schema.STATS_PATH
+        found = self._reader.stats
         for key in schema.FEATURES:
             if not isinstance(found.get(key), dict):
                 yield DataError.at(path, f"has no statistics of {key}")
-        if self.frames != reader.num_frames:
+        if self._total is None or self._frames != self._reader.num_frames:
             return
-        for name, key in EPISODE_FEATURES.items():
+        for key in schema.FEATURES:
             if isinstance(found.get(key), dict):
-                true = _joined(self._parts[name])
-                for problem in _differences(found[key], true, self.frames):
+                for problem in _differences(found[key], self._total, key, self._frames):
                     yield DataError.at(path, f"{key}: {problem}")
 
 
-def _moments(values: NDArray[np.generic], name: str) -> Moments:
-    """Each (D,), or (1,) for depth, over all frames (and pixels) of an episode."""
-    rows = values.reshape(-1, 1) if name == "depth" else values.reshape(len(values), -1)
-    if rows.dtype == np.bool_:
-        rows = rows.astype(np.uint8)
-    mean = rows.mean(0, dtype=np.float64)
-    return {
-        "min": rows.min(0).astype(np.float64),
-        "max": rows.max(0).astype(np.float64),
-        "mean": mean,
-        "square": rows.var(0, dtype=np.float64) + mean**2,
+class EpisodeStatistics:
+    """The statistics of each episode in ``meta/episodes``, read file by file."""
+
+    def __init__(self, reader: DatasetReader) -> None:
+        self._reader = reader
+        self._rows = self._all_rows()
+
+    def problems(self, index: int, matrix: stats.Matrix | None) -> Iterator[DataError]:
+        """What differs from the table's row of an episode; call it for every episode in order.
+
+        Args:
+            index: the episode.
+            matrix: statistics (R, D) of its frames; None: unknown.
+
+        Raises:
+            DataError: the table cannot be read.
+        """
+        found_row = next(self._rows, None)
+        if found_row is None or matrix is None:
+            return
+        path, row = found_row
+        for key in schema.FEATURES:
+            prefix = f"stats/{key}/"
+            found = {k.removeprefix(prefix): v for k, v in row.items() if k.startswith(prefix)}
+            length = int(self._reader.lengths[index])
+            for problem in _differences(found, matrix, key, length):
+                yield DataError.at(path, f"statistics of {key}: {problem}", index)
+
+    def _all_rows(self) -> Iterator[tuple[Any, Mapping[str, Any]]]:
+        for path in metadata.episode_files(self._reader.root):
+            with damaged(path):
+                file = open_parquet(path)
+                names = [n for n in file.schema_arrow.names if n.startswith("stats/")]
+                for group in range(file.num_row_groups):
+                    for row in file.read_row_group(group, columns=names).to_pylist():
+                        yield path, row
+
+
+def _statistics(reader: DatasetReader, index: int, episode: Episode) -> stats.Matrix:
+    """(R, D) of an episode at its place in a dataset."""
+    columns = {key: getattr(episode, name) for name, key in EPISODE_FEATURES.items()}
+    depth = columns.pop(spec.DEPTH_KEY)
+    frames = np.arange(len(episode), dtype=np.int64)
+    numbers = {name: number for number, name in reader.task_names.items()}
+    places: dict[str, NDArray[np.generic]] = {
+        "timestamp": (frames / reader.fps).astype(np.float32),
+        "frame_index": frames,
+        "episode_index": np.full_like(frames, index),
+        "index": frames + reader.first_frame(index),
+        "task_index": np.full_like(frames, numbers[episode.task]),
     }
+    return np.concatenate([stats.data_stats(depth, columns), stats.index_stats(places)], axis=1)
 
 
-def _joined(parts: list[tuple[int, Moments]]) -> Moments:
-    weight = np.array([frames for frames, _ in parts], dtype=np.float64)
-    stacked = {name: np.stack([moments[name] for _, moments in parts]) for name in parts[0][1]}
-    mean, square = (np.average(stacked[n], axis=0, weights=weight) for n in ("mean", "square"))
-    return {
-        "min": stacked["min"].min(0),
-        "max": stacked["max"].max(0),
-        "mean": mean,
-        "std": np.sqrt(np.maximum(square - mean**2, 0.0)),
-    }
-
-
-def _differences(found: dict[str, object], true: Moments, frames: int) -> Iterator[str]:
-    slack = _RELATIVE * (true["max"] - true["min"] + np.abs(true["mean"])) + _LEAST
-    for name, expected in true.items():
-        try:
-            values = np.asarray(found.get(name), dtype=np.float64).reshape(-1)
-        except (TypeError, ValueError):
-            values = np.empty(0)
-        if values.shape != expected.shape:
-            yield f"{name} is missing or has not {len(expected)} values"
+def _differences(
+    found: Mapping[str, object], matrix: stats.Matrix, key: str, frames: int
+) -> Iterator[str]:
+    part = matrix[:, stats.LAYOUT[key]]
+    least, most, mean = part[0], part[1], part[2]
+    slack = _RELATIVE * (most - least + np.abs(mean)) + _LEAST
+    for name, expected in zip(stats.ROWS, part, strict=True):
+        values = _numbers(found.get(name))
+        if values is None or values.shape != expected.shape:
+            yield f"{name} is missing or has not {len(expected)} numbers"
         elif not (np.abs(values - expected) <= slack).all():
             at = int(np.argmax(~(np.abs(values - expected) <= slack)))
             yield f"{name} of value {at} is {values[at]:.6g}, its frames have {expected[at]:.6g}"
-    if found.get("count") != [frames]:
-        yield f"count is {found.get('count')}, expected [{frames}]"
+    count = found.get("count")
+    if count != [frames] or not isinstance(count, list) or isinstance(count[0], bool):
+        yield f"count is {count!r:.80}, expected [{frames}]"
+
+
+def _numbers(value: object) -> NDArray[np.float64] | None:
+    """Nested lists of numbers as a flat array; None if there is something else in them."""
+    flat: list[float] = []
+    waiting = [value]
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, list):
+            waiting += reversed(item)
+        elif isinstance(item, int | float) and not isinstance(item, bool):
+            flat.append(_as_float(item))
+        else:
+            return None
+    return np.array(flat, dtype=np.float64)
+
+
+def _as_float(number: float) -> float:
+    try:
+        return float(number)
+    except OverflowError:  # an integer beyond 1.8e308
+        return math.inf

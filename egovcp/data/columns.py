@@ -12,7 +12,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from egovcp import spec
-from egovcp.data import metadata, schema, tiff
+from egovcp.data import schema, tiff
+from egovcp.data.parquet import damaged, open_parquet
 from egovcp.data.paths import require_file
 from egovcp.errors import DataError
 
@@ -20,20 +21,17 @@ type Columns = dict[str, NDArray[Any]]
 
 
 def open_data_file(root: Path, path: Path) -> pq.ParquetFile:
-    """A data file of the dataset at ``root``, read into memory piece by piece.
-
-    Not mapped: pages of a map count as this process's memory as long as the file is open, and a
-    file that somebody cuts short would end it.
+    """A data file of the dataset at ``root``.
 
     Raises:
         DataError: it is missing, damaged, lies elsewhere, or has columns of other types.
     """
     require_file(root, path)
-    with metadata.damaged(path):
-        file = pq.ParquetFile(path)
+    file = open_parquet(path)
+    with damaged(path):
         for problem in schema.type_problems(file.schema_arrow):
             raise DataError.at(path, problem)
-        return file
+    return file
 
 
 def to_numpy(column: pa.ChunkedArray, name: str) -> NDArray[Any]:

@@ -1,7 +1,8 @@
 """Turns sealed episodes into a dataset, shard by shard, and never into anything less.
 
 At every moment ``root`` either does not exist or is a complete dataset of episodes 0..n-1 of the
-run. What is sealed but not committed, and the lock, lie in a hidden folder beside it::
+run (after a removal of episodes: without those). What is sealed but not committed, and the lock,
+lie in a hidden folder beside it::
 
     .NAME.collect/
         lock           held while a collector runs
@@ -18,12 +19,13 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 
+from egovcp.atomic import removed_on_error
 from egovcp.data import files, metadata, schema
-from egovcp.data.continued import read_provenance, read_version
+from egovcp.data.continued import read_version
 from egovcp.data.destination import is_vacant, make_parent, require_replaceable, resolve_root
 from egovcp.data.encoded import EncodedEpisode
 from egovcp.data.lock import only_writer
-from egovcp.data.provenance import Provenance
+from egovcp.data.provenance import Provenance, parse_provenance
 from egovcp.data.spool import Spool
 from egovcp.data.version import Contents, Version, publish, recover
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
@@ -49,6 +51,9 @@ class Committer:
         """Episodes in the dataset."""
         self.frames = 0
         """Frames in the dataset."""
+        self.next_number = 0
+        """Number, in the run, of the next episode to commit. It is `committed`, unless episodes
+        were removed from the dataset: those are not collected again."""
         self._contents = Contents(shard_episodes)
         self._tail: list[EncodedEpisode] = []
         self._sealed: set[int] = set()
@@ -59,8 +64,9 @@ class Committer:
         return len(self._sealed)
 
     def missing(self, episodes: int) -> list[int]:
-        """Numbers below ``episodes`` that are neither committed nor sealed."""
-        return [n for n in range(self.committed, episodes) if n not in self._sealed]
+        """Numbers that are not sealed yet of a dataset of so many episodes in all."""
+        last = self.next_number + episodes - self.committed
+        return [n for n in range(self.next_number, last) if n not in self._sealed]
 
     def note(self, number: int) -> None:
         """An episode has been put into the spool."""
@@ -69,7 +75,7 @@ class Committer:
     def ready(self) -> int:
         """How many sealed episodes follow the committed ones without a gap."""
         count = 0
-        while self.committed + count in self._sealed:
+        while self.next_number + count in self._sealed:
             count += 1
         return count
 
@@ -89,12 +95,13 @@ class Committer:
             OSError: the disk is full or broken.
             DataError: the dataset is not the one that was committed.
         """
-        numbers = list(range(self.committed, self.committed + self.ready()))
+        numbers = list(range(self.next_number, self.next_number + self.ready()))
         episodes = self._take(numbers)
         if episodes:
             self._publish(episodes)
+            self.next_number += len(episodes)
             self._sealed.difference_update(numbers)
-            self.spool.drop_before(self.committed)
+            self.spool.drop_before(self.next_number)
         return numbers[: len(episodes)]
 
     def _take(self, numbers: list[int]) -> list[EncodedEpisode]:
@@ -133,20 +140,22 @@ class Committer:
         shutil.rmtree(self._next, ignore_errors=True)
         run = work_folder(self.root) / "run.json"
         if not is_vacant(self.root):
-            self._contents, self._tail, provenance = read_version(self.root)
-            agree(provenance)
+            existing = read_version(self.root)
+            agree(existing.provenance)
+            self._contents, self._tail = existing.contents, existing.tail
+            self.next_number = existing.next_number
         elif run.is_file():
-            agree(read_provenance(metadata.load_object(run)))
+            agree(parse_provenance(metadata.load_object(run), run))
         self.committed = len(self._contents.records) + len(self._tail)
         self.frames = self._contents.frames + sum(map(len, self._tail))
         self.spool.folder.mkdir(exist_ok=True)
         self.spool.sweep()
-        self.spool.drop_before(self.committed)
+        self.spool.drop_before(self.next_number)
         self._sealed = self.spool.numbers()
-        partial = run.with_suffix(".partial")
-        partial.unlink(missing_ok=True)
-        files.write_json(partial, asdict(self.provenance))
-        files.rename(partial, run)
+        with removed_on_error(run.with_suffix(".partial")) as partial:
+            partial.unlink(missing_ok=True)
+            files.write_json(partial, asdict(self.provenance))
+            files.rename(partial, run)
 
 
 @contextmanager

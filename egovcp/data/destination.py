@@ -42,7 +42,7 @@ def is_vacant(root: Path) -> bool:
 
 def require_new(root: Path) -> None:
     """Raise `UsageError` if there is something at ``root``; nothing is ever overwritten."""
-    if not is_vacant(root):
+    if not is_vacant(resolve_root(root)):
         raise UsageError(
             f"output folder {root} exists already and is not empty; choose another or remove it"
         )

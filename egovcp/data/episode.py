@@ -15,6 +15,9 @@ from egovcp.errors import DataError, suggest
 
 _ACTION_SLACK = 1e-6  # float32 rounding of an action on the wall of its box
 
+#: Longest episode, which is read as a whole: more than an hour.
+EPISODE_FRAMES: Final = 50_000
+
 #: The arrays of an episode, in the order in which its digest takes them.
 ARRAYS: Final = ("depth", "state", "action", "reward", "done", "success", "truncated")
 
@@ -85,6 +88,8 @@ def _layout_problems(episode: Episode) -> Iterator[tuple[int | None, str]]:
     length = len(episode.reward)
     if length == 0:
         yield None, "no frames, expected at least one"
+    if length > EPISODE_FRAMES:
+        yield None, f"{length} frames, expected at most {EPISODE_FRAMES}"
     layout: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
         "depth": ((length, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16),
         "state": ((length, spec.STATE_DIM), np.float32),

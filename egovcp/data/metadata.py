@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.data import schema
-from egovcp.data.paths import check_template, require_file
+from egovcp.data.episode import EPISODE_FRAMES
+from egovcp.data.parquet import damaged, open_parquet
+from egovcp.data.paths import check_template, files_below, require_file
+from egovcp.data.provenance import parse_provenance
 from egovcp.data.records import record_problems
 from egovcp.errors import DataError
+from egovcp.safe_files import JSON_LIMIT_BYTES, read_json
 
 _EPISODE_COLUMNS = (
     "episode_index",
@@ -30,6 +31,11 @@ _EPISODE_COLUMNS = (
 )
 
 
+_EPISODES: Final = 10_000_000
+_TASKS: Final = 10_000
+_RECORD_BYTES: Final = 32_768  # 20 times the record of an episode
+
+
 @dataclass(frozen=True)
 class EpisodeTable:
     """Where each of the E episodes lies; all arrays are (E,) int64."""
@@ -39,26 +45,6 @@ class EpisodeTable:
     file_index: NDArray[np.int64]
     start: NDArray[np.int64]
     """First global frame index."""
-
-
-@contextmanager
-def damaged(path: Path) -> Iterator[None]:
-    """Turn what pyarrow and json say of a damaged file into a `DataError` that names it."""
-    try:
-        yield
-    except FileNotFoundError as error:
-        raise DataError.at(path, "missing; the dataset is incomplete") from error
-    except OSError as error:
-        if error.errno is not None:
-            raise
-        raise _damage(path, error) from error
-    except (pa.ArrowException, ValueError, TypeError, LookupError, RecursionError) as error:
-        raise _damage(path, error) from error
-
-
-def _damage(path: Path, error: Exception) -> DataError:
-    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-    return DataError.at(path, f"damaged: {reason}")
 
 
 def load_info(root: Path) -> dict[str, Any]:
@@ -86,12 +72,14 @@ def load_info(root: Path) -> dict[str, Any]:
     return info
 
 
-def load_object(path: Path, root: Path | None = None) -> dict[str, Any]:
+def load_object(
+    path: Path, root: Path | None = None, limit_bytes: int = JSON_LIMIT_BYTES
+) -> dict[str, Any]:
     """A JSON file that holds an object; with ``root``, one that lies inside this folder."""
     if root is not None:
         require_file(root, path)
     with damaged(path):
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, limit_bytes)
     if not isinstance(content, dict):
         raise DataError.at(path, f"holds a {type(content).__name__}, expected an object")
     return content
@@ -119,10 +107,7 @@ def _plain(value: object) -> object:
 
 def load_episode_table(root: Path, info: Mapping[str, Any]) -> EpisodeTable:
     """``meta/episodes``, checked for consistency with itself and with ``info.json``."""
-    folder = root / "meta" / "episodes"
-    paths = sorted(folder.glob("*/*.parquet"))
-    if not paths:
-        raise DataError.at(folder, "holds no parquet file; the dataset is incomplete")
+    paths = episode_files(root)
     parts = [_episode_columns(root, path) for path in paths]
     column = {name: np.concatenate([part[name] for part in parts]) for name in _EPISODE_COLUMNS}
     rows = np.cumsum([len(part["length"]) for part in parts])
@@ -135,10 +120,23 @@ def load_episode_table(root: Path, info: Mapping[str, Any]) -> EpisodeTable:
     )
 
 
+def episode_files(root: Path) -> list[Path]:
+    """The files of the table of episodes, in order.
+
+    Raises:
+        DataError: there is none.
+    """
+    folder = root / "meta" / "episodes"
+    paths = [path for path in files_below(folder) if path.suffix == ".parquet"]
+    if not paths:
+        raise DataError.at(folder, "holds no parquet file; the dataset is incomplete")
+    return paths
+
+
 def _episode_columns(root: Path, path: Path) -> dict[str, NDArray[np.int64]]:
     require_file(root, path)
     with damaged(path):
-        table = pq.ParquetFile(path).read(columns=list(_EPISODE_COLUMNS))
+        table = open_parquet(path, _EPISODES).read(columns=list(_EPISODE_COLUMNS))
         for name in _EPISODE_COLUMNS:
             column = table[name]
             if column.null_count or not pa.types.is_integer(column.type):
@@ -163,14 +161,18 @@ def _check_episodes(
     consistent = (
         (column["episode_index"] == np.arange(count))
         & (column["length"] > 0)
+        & (column["length"] <= EPISODE_FRAMES)
         & (column["dataset_to_index"] == ends)
         & (column["dataset_from_index"] == ends - column["length"])
     )
     if not consistent.all():
         bad = int(np.argmin(consistent))
-        problem = "its index, length or frame range does not follow from the episodes before it"
+        problem = (
+            "its index, length or frame range does not follow from the episodes before it, or it "
+            f"has more than {EPISODE_FRAMES} frames"
+        )
         raise DataError.at(file_of(bad), problem, bad)
-    if ends[-1] != info.get("total_frames"):
+    if int(ends[-1]) != info.get("total_frames"):
         raise DataError.at(
             path,
             f"total_frames is {info.get('total_frames')}, but meta/episodes adds to {ends[-1]}",
@@ -187,9 +189,9 @@ def load_episode_stats(
     """
     folder = root / "meta" / "episodes"
     names = [f"stats/{feature}/{statistic}" for statistic in ("mean", "std")]
+    paths = episode_files(root)
     with damaged(folder):
-        paths = sorted(folder.glob("*/*.parquet"))
-        tables = [pq.ParquetFile(path).read(columns=names) for path in paths]
+        tables = [open_parquet(path, _EPISODES).read(columns=names) for path in paths]
         table = pa.concat_tables(tables)
         mean, std = (np.array(table[name].to_pylist(), dtype=np.float64) for name in names)
     if len(mean) != count or not (np.isfinite(mean).all() and np.isfinite(std).all()):
@@ -202,8 +204,12 @@ def load_tasks(root: Path) -> dict[int, str]:
     path = root / schema.TASKS_PATH
     require_file(root, path)
     with damaged(path):
-        table = pq.ParquetFile(path).read(columns=["task_index", "task"])
+        table = open_parquet(path, _TASKS).read(columns=["task_index", "task"])
         numbers, names = table["task_index"].to_pylist(), table["task"].to_pylist()
+    if not all(type(number) is int for number in numbers):
+        raise DataError.at(path, f"column task_index is {table['task_index'].type}, expected int64")
+    if not all(isinstance(name, str) for name in names):
+        raise DataError.at(path, f"column task is {table['task'].type}, expected strings")
     if len(set(numbers)) != len(numbers) or len(set(names)) != len(names):
         raise DataError.at(path, f"lists a task twice: {names}, {numbers}")
     return dict(zip(numbers, names, strict=True))
@@ -228,15 +234,11 @@ def load_collection(root: Path, lengths: NDArray[np.int64]) -> dict[str, Any]:
             "If LeRobot's tools made this dataset out of others, take the facts from those: "
             f"egovcp-dataset repair {root} --records=ORIGINAL --output_dir=NEW",
         )
-    collection = load_object(path, root)
+    collection = load_object(path, root, JSON_LIMIT_BYTES + _RECORD_BYTES * len(lengths))
     if collection.get("spec_version") != spec.SPEC_VERSION:
         found = collection.get("spec_version")
         raise DataError.at(path, f"specification {found}, expected {spec.SPEC_VERSION}")
-    if not collection.get("controller_id") or not isinstance(collection["controller_id"], str):
-        raise DataError.at(path, "names no low-level controller")
-    for name in ("config", "versions"):
-        if not isinstance(collection.get(name, {}), dict):
-            raise DataError.at(path, f"its {name} is no object")
+    parse_provenance(collection, path)
     for episode, problem in record_problems(collection.get("episodes"), lengths):
         raise DataError.at(path, problem, episode)
     return collection

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
 
 from egovcp.errors import DataError
@@ -21,6 +20,8 @@ def check_template(template: object, path: Path) -> None:
     parts = PurePosixPath(template)
     if parts.is_absolute() or ".." in parts.parts:
         raise DataError.at(path, f"data_path {template!r} leads outside of the dataset")
+    if any(part.startswith(".") for part in parts.parts):
+        raise DataError.at(path, f"data_path {template!r} names hidden files")
     plain = _FIELD.sub("", template)
     if not template.startswith("data/") or re.search(r"[^\w./-]", plain, re.ASCII):
         raise DataError.at(
@@ -40,8 +41,10 @@ def require_file(root: Path, path: Path) -> None:
         target = path.resolve(strict=True)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise DataError.at(path, "missing; the dataset is incomplete") from error
-    except (OSError, RuntimeError) as error:
-        raise DataError.at(path, "a link that leads nowhere") from error
+    except RuntimeError as error:
+        raise DataError.at(path, "a loop of symbolic links") from error
+    except OSError as error:
+        raise DataError.at(path, f"cannot be opened: {error.strerror}") from error
     if not any(target.is_relative_to(home) for home in _homes(root)):
         raise DataError.at(path, f"a link that leads outside of the dataset, to {target}")
     if not target.is_file():
@@ -56,8 +59,24 @@ def _homes(root: Path) -> list[Path]:
     return homes
 
 
-def files_below(folder: Path) -> Iterator[Path]:
-    """Everything in ``folder``, at any depth, that is no folder; links are not followed."""
+def files_below(folder: Path) -> list[Path]:
+    """Everything in ``folder``, at any depth, that is no folder, sorted; links are not followed.
+
+    Hidden files and folders are ignored, as `datasets` does: macOS writes ``._NAME`` beside each
+    file on a foreign disk, and ``.DS_Store``.
+    """
+    if folder.is_symlink():
+        return [folder]
+    found: list[Path] = []
     for parent, folders, files in folder.walk():
+        folders[:] = [name for name in folders if not name.startswith(".")]
         linked = [name for name in folders if (parent / name).is_symlink()]
-        yield from (parent / name for name in sorted([*files, *linked]))
+        found += [parent / name for name in [*files, *linked] if not name.startswith(".")]
+    return sorted(found)
+
+
+def hidden_files(folder: Path) -> int:
+    """Number of hidden files and folders in ``folder``, at any depth."""
+    return sum(
+        name.startswith(".") for _, folders, files in folder.walk() for name in (*folders, *files)
+    )

@@ -20,7 +20,10 @@ from egovcp.data import metadata, schema
 from egovcp.data.columns import EPISODE_FEATURES, Columns, open_data_file, to_numpy
 from egovcp.data.digests import Digests
 from egovcp.data.episode import Episode
+from egovcp.data.origin import ScenarioKey, ScenarioKeys
+from egovcp.data.parquet import damaged
 from egovcp.data.paths import require_file
+from egovcp.data.provenance import parse_provenance
 from egovcp.data.selection import select_episodes
 from egovcp.data.source import Source, is_local, locate, shelve
 from egovcp.errors import DataError, suggest
@@ -50,6 +53,9 @@ class DatasetReader:
         self._info = metadata.load_info(source.root)
         self._table = metadata.load_episode_table(source.root, self._info)
         self._collection = metadata.load_collection(source.root, self.lengths)
+        self.origin = parse_provenance(self._collection, source.root / schema.COLLECTION_PATH)
+        """How the dataset was collected."""
+        self._scenarios = ScenarioKeys(self.origin)
         self._task_names = metadata.load_tasks(source.root)
         self._file_start = _file_starts(self._table)
         self._shelf, self._episodes = shelf, episodes
@@ -154,13 +160,17 @@ class DatasetReader:
 
     @property
     def provenance(self) -> Mapping[str, Any]:
-        """How the dataset was collected: command, seed, versions, configuration."""
+        """`origin` as it is in ``meta/collection.json``, with entries that others added."""
         return {key: value for key, value in self._collection.items() if key != "episodes"}
 
     @property
     def stats(self) -> dict[str, Any]:
         """Statistics of every feature, as in ``meta/stats.json``."""
         return metadata.load_stats(self.root)
+
+    def first_frame(self, index: int) -> int:
+        """Index, in the dataset, of the first frame of an episode."""
+        return int(self._table.start[index])
 
     def task(self, index: int) -> str:
         """Task of an episode."""
@@ -184,6 +194,19 @@ class DatasetReader:
         facts = self.metadata(index)
         seed, number = facts.get("seed", self._collection.get("seed")), facts.get("episode", index)
         return f"{self.task(index)}/{seed}/{number}"
+
+    def scenario(self, index: int) -> ScenarioKey | None:
+        """What an episode simulates, whatever dataset holds it; None if that is not recorded.
+
+        Unlike `identity` it tells collections of different configurations apart.
+
+        Raises:
+            DataError: it names a collection that is not recorded.
+        """
+        try:
+            return self._scenarios.key(self.task(index), self.metadata(index))
+        except DataError as error:
+            raise DataError.at(self.root / schema.COLLECTION_PATH, error.problem, index) from error
 
     def read(self, index: int, digests: Digests | None = None) -> Episode:
         """Read one episode, validate it and compare it with its recorded digest.
@@ -266,7 +289,7 @@ class DatasetReader:
             raise IndexError(f"episode {index} of {len(self)}")
         path = self.data_path(index)
         try:
-            with metadata.damaged(path):
+            with damaged(path):
                 table = self._rows(path, index, names)
                 if table.num_rows != self._table.length[index]:
                     raise DataError("ends before the end of the episode")

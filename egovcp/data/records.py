@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp import spec
 
-_DIGEST = re.compile(r"[0-9a-f]{64}")
+_LARGEST_LIMIT: Final = 2**31 - 1
+_DIGEST: Final = re.compile(r"[0-9a-f]{64}")
 
 
 def record_problems(
@@ -46,8 +47,8 @@ def shape_problems(record: Mapping[Any, Any]) -> Iterator[str]:
     task, limit, digest = record.get("task"), record.get("time_limit"), record.get("sha256", "")
     if task not in spec.TASKS:
         yield f"its task is {task!r}, expected one of {', '.join(spec.TASKS)}"
-    if not isinstance(limit, int) or isinstance(limit, bool):
-        yield f"its time_limit is {limit!r}, expected a number of ticks"
+    if not isinstance(limit, int) or isinstance(limit, bool) or not 0 < limit <= _LARGEST_LIMIT:
+        yield f"its time_limit is {limit!r}, expected 1 to {_LARGEST_LIMIT} ticks"
     if not isinstance(digest, str) or (digest and not _DIGEST.fullmatch(digest)):
         yield f"its sha256 is {digest!r}, expected 64 hexadecimal digits"
     if not isinstance(record.get("metadata", {}), Mapping):

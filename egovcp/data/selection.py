@@ -7,12 +7,15 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.bounds import shown
 from egovcp.errors import UsageError
 
-_PART = re.compile(r"(\d+)|(\d*):(\d*)", re.ASCII)
+_PART = re.compile(r"(\d{1,18})|(\d{0,18}):(\d{0,18})", re.ASCII)
 
 
-def select_episodes(text: str, count: int) -> NDArray[np.int64]:
+def select_episodes(
+    text: str, count: int, flag: str = "--dataset.episodes"
+) -> NDArray[np.int64]:
     """The numbers that ``text`` names, in ascending order, each once; all of them if it is empty.
 
     A lone number needs its brackets: YAML reads the range ``1:30`` as the number 90 where it is not
@@ -20,47 +23,49 @@ def select_episodes(text: str, count: int) -> NDArray[np.int64]:
 
     Args:
         text: numbers and ranges ``first:end`` without the end, separated by commas; either end of
-            a range may be left out.
+            a range may be left out. May be in brackets or parentheses.
         count: episodes of the dataset.
+        flag: names the option in messages.
 
     Raises:
         UsageError: it is not of this form, names nothing, or an episode that is not there.
     """
     if not text.strip():
         return np.arange(count)
+    given = f"{flag}={shown(text)}"
     wanted: NDArray[np.int64] = np.unique(
-        np.concatenate([_part(part, text, count) for part in _parts(text)])
+        np.concatenate([_part(part, given, count) for part in _parts(text, given)])
     )
     if len(wanted) == 0:
-        raise UsageError(f"--dataset.episodes={text} names no episode; there are {count}")
-    if wanted[-1] >= count:
-        raise UsageError(
-            f"--dataset.episodes={text} names episode {wanted[-1]}, but the dataset has {count} "
-            f"episodes, 0 to {count - 1}"
-        )
+        raise UsageError(f"{given} names no episode; there are {count}")
     return wanted
 
 
-def _parts(text: str) -> list[str]:
+def _parts(text: str, given: str) -> list[str]:
     inner = text.strip()
-    if inner.startswith("[") and inner.endswith("]"):
+    if inner[0] + inner[-1] in ("[]", "()"):
         inner = inner[1:-1]
     elif inner.isdigit():
         raise UsageError(
-            f"--dataset.episodes={text}: for a single episode write [{inner}], for the first ones "
-            f"0:{inner}; in YAML, quote a range: '0:{inner}'"
+            f"{given}: for a single episode write [{shown(inner)}], for the first ones "
+            f"0:{shown(inner)}; in YAML, quote a range: '0:{shown(inner)}'"
         )
     return [part.strip() for part in inner.split(",")]
 
 
-def _part(part: str, text: str, count: int) -> NDArray[np.int64]:
+def _part(part: str, given: str, count: int) -> NDArray[np.int64]:
     found = _PART.fullmatch(part)
     if found is None:
         raise UsageError(
-            f"--dataset.episodes={text}: {part!r} is no episode; expected numbers, [0, 5, 7], a "
+            f"{given}: {shown(part)!r} is no episode; expected numbers, [0, 5, 7], a "
             "range without its end, 0:1334, or both, [0:100, 250]"
         )
     number, first, end = found.groups()
-    if number:
-        return np.array([int(number)])
-    return np.arange(int(first or 0), int(end or count))
+    start = int(number or first or 0)
+    stop = start + 1 if number else int(end or count)
+    if start < stop and stop > count:
+        raise UsageError(
+            f"{given} names episode {stop - 1}, but the dataset has {count} episodes, "
+            f"0 to {count - 1}"
+        )
+    return np.arange(start, stop)

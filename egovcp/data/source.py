@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +11,7 @@ from egovcp.data import schema
 from egovcp.data.files import write_json
 from egovcp.errors import DataError, UsageError
 from egovcp.hub import RetryPolicy, Shelf, is_repo_id, snapshot
+from egovcp.safe_files import read_json
 
 _RETRY_POLICY = RetryPolicy()
 
@@ -109,7 +109,7 @@ def recorded(root: Path, repo_id: str = "") -> Source:
     if not path.is_file():
         return Source(root, repo_id)
     try:
-        note = json.loads(path.read_text(encoding="utf-8"))
+        note = read_json(path)
         found = Source(root, str(note["repo_id"]), str(note["commit"]))
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} is damaged; remove it, or pull the dataset again") from error

@@ -12,12 +12,16 @@ import io
 import struct
 import warnings
 from functools import cache
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from egovcp.errors import DataError
+
+if TYPE_CHECKING:
+    from PIL import Image
 
 _SHORT, _LONG = 3, 4
 _ENTRY_BYTES = 12
@@ -90,17 +94,25 @@ def _fixed_size_bytes(blobs: pa.BinaryArray, size: int) -> NDArray[np.uint8] | N
 
 
 def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uint16]:
-    from PIL import Image  # only for layouts that are not ours
+    from PIL import Image, UnidentifiedImageError  # only for layouts that are not ours
 
     try:
-        with warnings.catch_warnings(action="ignore"), Image.open(io.BytesIO(blob)) as image:
+        with warnings.catch_warnings(action="ignore"), _open(blob) as image:
             mode, size = image.mode, image.size
             if mode.startswith("I;16") and size == (cols, rows):
                 return np.asarray(image).astype(np.uint16)
+    except UnidentifiedImageError as error:
+        raise _at(frame, "is no TIFF") from error
     except (*_PILLOW_ERRORS, Image.DecompressionBombError) as error:
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise _at(frame, f"is not a readable TIFF: {reason}") from error
     raise _at(frame, f"is {mode} {size[1]}x{size[0]}, expected uint16 {rows}x{cols}")
+
+
+def _open(blob: bytes) -> Image.Image:
+    from PIL import Image
+
+    return Image.open(io.BytesIO(blob), formats=("TIFF",))
 
 
 #: What Pillow raises on a damaged TIFF: its parser trusts what it reads.
@@ -109,7 +121,7 @@ _PILLOW_ERRORS = (
     AttributeError,
     EOFError,
     LookupError,
-    OSError,  # UnidentifiedImageError among them
+    OSError,
     RuntimeError,
     SyntaxError,
     TypeError,

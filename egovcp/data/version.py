@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp import spec
+from egovcp.atomic import removed_on_error
 from egovcp.data import files, schema, stats
 from egovcp.data.destination import is_vacant
 from egovcp.data.encoded import EncodedEpisode
@@ -96,7 +97,8 @@ class Version:
         self._shard: Shard | None = None
         folder.mkdir(parents=True)
         if previous is not None:
-            self._take_over(previous)
+            with removed_on_error(folder):
+                self._take_over(previous)
 
     def _take_over(self, previous: Path) -> None:
         """The files of the shards, and what others put beside ``data`` and ``meta``: a card."""

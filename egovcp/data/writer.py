@@ -24,7 +24,8 @@ from egovcp.errors import UsageError
 class DatasetWriter:
     """Adds episodes one by one; ``finalize`` makes the dataset appear at ``root``.
 
-    As a context manager it finalizes on success and discards everything on an error.
+    As a context manager it finalizes on success and discards everything on an error, one of
+    ``finalize`` included.
     """
 
     def __init__(
@@ -70,11 +71,14 @@ class DatasetWriter:
         Raises:
             UsageError: no episode was added, or ``root`` has appeared meanwhile.
         """
-        if self.num_episodes == 0:
+        try:
+            if self.num_episodes == 0:
+                raise UsageError(f"no episode was written to {self.root}; nothing to keep")
+            self._version.close()
+            publish(self._version.folder, self.root)
+        except BaseException:
             self.discard()
-            raise UsageError(f"no episode was written to {self.root}; nothing to keep")
-        self._version.close()
-        publish(self._version.folder, self.root)
+            raise
         return self.root
 
     def discard(self) -> None:

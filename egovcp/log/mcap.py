@@ -91,15 +91,22 @@ class McapFile:
             raise EnvironmentFailure(f"{self._path} would lie in a folder that is not there") from (
                 error
             )
+        try:
+            self._begin(self._file, with_checksum(metadata))
+        except BaseException:
+            self.discard()
+            raise
+
+    def _begin(self, file: AppendFile, metadata: dict[str, str]) -> None:
         self._writer = Writer(
-            cast(IO[bytes], self._file),
+            cast(IO[bytes], file),
             chunk_size=_CHUNK_BYTES,
             compression=CompressionType.ZSTD,
             enable_data_crcs=True,
         )
         self._writer.start(profile=Profile.ROS2, library="egovcp")
-        self._metadata = with_checksum(metadata)
-        self._writer.add_metadata(METADATA_NAME, self._metadata)
+        self._metadata = metadata
+        self._writer.add_metadata(METADATA_NAME, metadata)
         self.flush()
 
     def add(self, line: Line, index: int, time_ns: int, data: bytes) -> None:

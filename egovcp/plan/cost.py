@@ -50,12 +50,17 @@ def require_affordable(model: WorldModelConfig, planner: PlannerConfig) -> None:
     cost = plan_cost(model, planner)
     if cost.seconds > MAX_SECONDS or cost.memory_bytes > MAX_BYTES:
         raise UsageError(
-            f"planner.samples={planner.samples}, planner.horizon={planner.horizon} and "
-            f"planner.iterations={planner.iterations} take about {cost.seconds:,.1f} s on one core "
-            f"and {cost.memory_bytes / 1e6:,.0f} MB for each plan of one robot with these "
+            f"planner.samples={_short(planner.samples)}, "
+            f"planner.horizon={_short(planner.horizon)} and "
+            f"planner.iterations={_short(planner.iterations)} take about {cost.seconds:,.1f} s on "
+            f"one core and {cost.memory_bytes / 1e6:,.0f} MB for each plan of one robot with these "
             f"networks; expected at most {MAX_SECONDS:.0f} s and {MAX_BYTES / 1e6:.0f} MB: lower "
             "them"
         )
+
+
+def _short(number: int) -> str:
+    return str(number) if number <= _LARGEST else f"{number:.3g}"
 
 
 def _products_per_step(c: WorldModelConfig) -> int:

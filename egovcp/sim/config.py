@@ -1,19 +1,24 @@
 """Every scene, sensor and randomisation parameter of the simulated robot.
 
-Frozen data only. Ranges are (low, high) and drawn uniformly once per episode.
+Frozen data only. Ranges are (low, high) and drawn uniformly once per episode. The bounds are what
+the physics can simulate, which is far more than what makes sense to train on.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, is_dataclass, replace
-from typing import Literal
+from typing import Final, Literal
 
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError, suggest
 from egovcp.spec import TASKS
 
 Range = tuple[float, float]
+#: Longest episode, planner ticks of 40 ms.
+MAX_TICKS: Final = 10_000
+#: Greatest coefficient of a reward term; larger ones lose the others in float32.
+MAX_REWARD: Final = 1000
 #: m/s towards the wall, calibrated with ``benchmarks/tasks.py`` for controllers that do not step
 #: (``stance``) and that do (``walk``).
 STANDING_PUSHES: Range = (0.40, 0.60)
@@ -37,9 +42,9 @@ def _check_ranges(where: str, part: object) -> None:
 class EpisodeConfig:
     """Length of an episode and the time of its event, in planner ticks of 40 ms."""
 
-    ticks: int = bounded(150, least=1)
+    ticks: int = bounded(150, least=1, most=MAX_TICKS)
     """Time limit, planner ticks; reaching it truncates the episode."""
-    event_ticks: tuple[int, int] = bounded((20, 60), least=0)
+    event_ticks: tuple[int, int] = bounded((20, 60), least=0, most=MAX_TICKS)
     """First and last tick at which the throw, the push or the arch may start."""
     empty_probability: float = bounded(0.1, least=0, most=1)
     """Share of episodes in which nothing happens, so that doing nothing is learned too."""
@@ -51,33 +56,33 @@ class BallConfig:
 
     shape: Literal["sphere", "box"] = "sphere"
     """What is thrown: a ball, or a cube of the same volume that starts at any angle and tumbles."""
-    radius_range: Range = bounded((0.09, 0.12), above=0)
+    radius_range: Range = bounded((0.09, 0.12), least=0.01, most=0.3)
     """Radius of the ball, m."""
-    mass_range: Range = bounded((0.15, 0.35), above=0)
+    mass_range: Range = bounded((0.15, 0.35), least=0.001, most=10)
     """Mass of the ball, kg."""
-    distance_range: Range = bounded((2.5, 3.5), above=0)
+    distance_range: Range = bounded((2.5, 3.5), least=0.6, most=10)
     """Horizontal distance of the release point from the pelvis, m."""
-    bearing_range: Range = (-0.30, 0.30)
+    bearing_range: Range = bounded((-0.30, 0.30), least=-math.pi, most=math.pi)
     """Direction of the release point seen from the pelvis, rad, 0 is straight ahead."""
-    release_height_range: Range = bounded((0.7, 1.4), above=0)
+    release_height_range: Range = bounded((0.7, 1.4), least=0.1, most=5)
     """Height of the release point above ground, m."""
-    flight_range: Range = bounded((0.65, 0.95), above=0)
+    flight_range: Range = bounded((0.65, 0.95), least=0.2, most=5)
     """Time from release to the aim point, s."""
-    aim_forward: float = 0.10
+    aim_forward: float = bounded(0.10, least=-1, most=1)
     """Aim point in front of the pelvis, m, heading frame."""
-    aim_lateral_range: Range = (-0.40, 0.40)
+    aim_lateral_range: Range = bounded((-0.40, 0.40), least=-2, most=2)
     """Aim point left of the pelvis, m, heading frame."""
-    aim_height_range: Range = (0.10, 0.50)
+    aim_height_range: Range = bounded((0.10, 0.50), least=-1, most=2)
     """Aim point above the pelvis, m."""
-    grace: float = bounded(0.3, least=0)
+    grace: float = bounded(0.3, least=0, most=60)
     """Contacts within this time after a block do not count, s."""
-    block_reward: float = bounded(1.0, least=0)
+    block_reward: float = bounded(1.0, least=0, most=MAX_REWARD)
     """Once, at a first contact with a hand or wrist."""
-    hit_cost: float = bounded(1.0, least=0)
+    hit_cost: float = bounded(1.0, least=0, most=MAX_REWARD)
     """Once, when the ball touches torso, head or leg."""
-    pose_cost: float = bounded(0.01, least=0)
+    pose_cost: float = bounded(0.01, least=0, most=MAX_REWARD)
     """Per tick, times the mean squared action: the price of leaving the neutral pose."""
-    fall_cost: float = bounded(1.0, least=0)
+    fall_cost: float = bounded(1.0, least=0, most=MAX_REWARD)
     """Once, at a fall."""
 
 
@@ -85,43 +90,43 @@ class BallConfig:
 class WallConfig:
     """A wall before the robot, which is pushed towards it; only hands may touch."""
 
-    distance_range: Range = bounded((0.60, 0.70), above=0)
+    distance_range: Range = bounded((0.60, 0.70), least=0.3, most=10)
     """Wall surface before the pelvis, m."""
-    yaw_range: Range = (-0.10, 0.10)
+    yaw_range: Range = bounded((-0.10, 0.10), least=-1, most=1)
     """Turn of the wall about the vertical, rad; 0 faces the robot squarely."""
-    friction_range: Range = bounded((0.6, 1.0), least=0)
+    friction_range: Range = bounded((0.6, 1.0), least=0, most=5)
     """Sliding friction of the wall."""
-    push_speed_range: Range | None = bounded(None, least=0)
+    push_speed_range: Range | None = bounded(None, least=0, most=5)
     """Change of base velocity by a push towards the wall, m/s. None: what hands must brace and
     can, for a controller that steps or one that does not (benchmarks/tasks.py)."""
-    push_bearing_range: Range = (-0.20, 0.20)
+    push_bearing_range: Range = bounded((-0.20, 0.20), least=-math.pi, most=math.pi)
     """Direction of a push towards the wall, rad from straight ahead."""
     away_probability: float = bounded(0.1, least=0, most=1)
     """Share of the pushes that go away from the wall."""
-    away_speed_range: Range = bounded((0.05, 0.15), least=0)
+    away_speed_range: Range = bounded((0.05, 0.15), least=0, most=5)
     """Change of base velocity by a push away from the wall, m/s; the stance survives it."""
-    push_time: float = bounded(0.02, above=0)
+    push_time: float = bounded(0.02, least=0.005, most=1)
     """Time over which a push acts, s."""
-    disturbed_time: float | None = bounded(None, least=0)
+    disturbed_time: float | None = bounded(None, least=0, most=3600)
     """Time after a push in which bracing is rewarded, s. None: 2 s for a controller that steps,
     which stands by itself again then; 6 s, the rest of the episode, for one that does not: it leans
     on the wall and falls against it when its hands let go."""
-    brace_reward: float = bounded(0.03, least=0)
+    brace_reward: float = bounded(0.03, least=0, most=MAX_REWARD)
     """Per tick upright with a hand and nothing else on the wall while disturbed."""
-    upright_reward: float = bounded(0.02, least=0)
+    upright_reward: float = bounded(0.02, least=0, most=MAX_REWARD)
     """Per tick upright while disturbed."""
-    contact_cost: float = bounded(0.1, least=0)
+    contact_cost: float = bounded(0.1, least=0, most=MAX_REWARD)
     """Per tick with anything but a hand on the wall."""
-    impact_cost: float = bounded(0.05, least=0)
+    impact_cost: float = bounded(0.05, least=0, most=MAX_REWARD)
     """Per tick, times the peak hand force over ``impact_force``, at most 1 per tick."""
-    impact_force: float = bounded(300.0, above=0)
+    impact_force: float = bounded(300.0, least=1, most=1e5)
     """Hand force that costs ``impact_cost`` in full, N."""
-    pose_cost: float = bounded(0.03, least=0)
+    pose_cost: float = bounded(0.03, least=0, most=MAX_REWARD)
     """Per tick, times the mean squared action."""
-    guard_cost: float = bounded(0.27, least=0)
+    guard_cost: float = bounded(0.27, least=0, most=MAX_REWARD)
     """In addition, as long as nothing has pushed: an episode stands for a life in which pushes are
     rarer, and waiting for one with raised hands is paid for all the while."""
-    fall_cost: float = bounded(1.0, least=0)
+    fall_cost: float = bounded(1.0, least=0, most=MAX_REWARD)
     """Once, at a fall."""
 
 
@@ -134,35 +139,35 @@ class ArchConfig:
     (--env.controller). `rail`: the robot stands and the arch comes to it at the commanded
     speed, the same relative motion; for controllers that cannot walk. `auto`: whichever the
     controller can."""
-    clearance_range: Range = bounded((1.16, 1.24), above=0)
+    clearance_range: Range = bounded((1.16, 1.24), least=0.5, most=3)
     """Lower edge of the lintel above ground, m."""
-    width_range: Range = bounded((1.1, 1.5), above=0)
+    width_range: Range = bounded((1.1, 1.5), least=0.4, most=10)
     """Free width between the posts, m."""
-    depth_range: Range = bounded((0.10, 0.20), above=0)
+    depth_range: Range = bounded((0.10, 0.20), least=0.01, most=5)
     """Thickness of posts and lintel along the direction of passage, m."""
-    lintel_height: float = bounded(0.35, above=0)
+    lintel_height: float = bounded(0.35, least=0.01, most=5)
     """Height of the lintel beam, m."""
-    distance_range: Range = bounded((1.6, 2.2), above=0)
+    distance_range: Range = bounded((1.6, 2.2), least=0.4, most=20)
     """Centre of the arch before the pelvis when it starts to move, m."""
-    lateral_range: Range = (-0.08, 0.08)
+    lateral_range: Range = bounded((-0.08, 0.08), least=-5, most=5)
     """Centre of the arch left of the pelvis, m."""
-    speed_range: Range = bounded((0.3, 0.5), above=0)
+    speed_range: Range = bounded((0.3, 0.5), least=0.01, most=2)
     """Commanded forward velocity, m/s; the arch moves towards the robot as fast."""
-    progress_reward: float = bounded(0.05, least=0)
+    progress_reward: float = bounded(0.05, least=0, most=MAX_REWARD)
     """Per metre of progress towards and through the arch."""
-    pass_reward: float = bounded(1.0, least=0)
+    pass_reward: float = bounded(1.0, least=0, most=MAX_REWARD)
     """Once, when the arch has been passed without any contact."""
-    head_cost: float = bounded(0.1, least=0)
+    head_cost: float = bounded(0.1, least=0, most=MAX_REWARD)
     """Per tick with the head on the arch."""
-    contact_cost: float = bounded(0.05, least=0)
+    contact_cost: float = bounded(0.05, least=0, most=MAX_REWARD)
     """Per tick with any other part on the arch."""
-    crouch_cost: float = bounded(0.01, least=0)
+    crouch_cost: float = bounded(0.01, least=0, most=MAX_REWARD)
     """Per tick, times the share of the crouch (0 standing, 1 lowest) away from the arch."""
-    near: float = bounded(0.9, least=0)
+    near: float = bounded(0.9, least=0, most=20)
     """Crouching is free while the arch is nearer than this, m."""
-    pose_cost: float = bounded(0.005, least=0)
+    pose_cost: float = bounded(0.005, least=0, most=MAX_REWARD)
     """Per tick, times the mean squared action of the hands."""
-    fall_cost: float = bounded(1.0, least=0)
+    fall_cost: float = bounded(1.0, least=0, most=MAX_REWARD)
     """Once, at a fall."""
 
 
@@ -173,7 +178,7 @@ class SequenceConfig:
     parts: tuple[str, ...] = ("arch", "ball")
     """Its tasks in their order, each at most once. The wall can only be the last: it would stand in
     the way of what comes next, and the robot leans on it."""
-    pause_ticks: int = bounded(25, least=0)
+    pause_ticks: int = bounded(25, least=0, most=MAX_TICKS)
     """Planner ticks from the moment that decides a part (arch passed, ball on the floor) until its
     object is taken away and the next part begins; a part that remains undecided ends after the
     ticks of its own episodes."""
@@ -195,19 +200,19 @@ class SequenceConfig:
 class CameraConfig:
     """Depth camera on the head, and the noise of its pictures."""
 
-    position: tuple[float, float, float] = (0.058, 0.0, 0.42)
+    position: tuple[float, float, float] = bounded((0.058, 0.0, 0.42), least=-1, most=1)
     """Mount in the torso frame, m."""
-    pitch_range: Range = (math.radians(-5.0), 0.0)
+    pitch_range: Range = bounded((math.radians(-5.0), 0.0), least=-math.pi / 2, most=math.pi / 2)
     """Tilt below the torso's horizontal, rad, drawn per episode."""
-    vertical_fov: float = bounded(math.radians(58.0), above=0, below=math.pi)
+    vertical_fov: float = bounded(math.radians(58.0), least=0.1, most=3)
     """Vertical field of view, rad; pixels are square."""
-    noise_per_z2: Range = bounded((0.001, 0.004), least=0)
+    noise_per_z2: Range = bounded((0.001, 0.004), least=0, most=1)
     """Standard deviation of depth over depth squared, 1/m (stereo noise grows with z^2)."""
     hole_probability: Range = bounded((0.0, 0.01), least=0, most=1)
     """Share of pixels lost at random."""
     edge_probability: Range = bounded((0.0, 0.25), least=0, most=1)
     """Share of pixels lost beside a depth discontinuity."""
-    edge_ratio: float = bounded(0.12, above=0)
+    edge_ratio: float = bounded(0.12, above=0, most=1)
     """Neighbours whose depths differ by this share of the greater make a discontinuity."""
 
 
@@ -215,13 +220,13 @@ class CameraConfig:
 class SensorConfig:
     """Standard deviations of proprioception, white, per 20 ms measurement."""
 
-    angular_velocity: float = bounded(0.03, least=0)
+    angular_velocity: float = bounded(0.03, least=0, most=10)
     """rad/s."""
-    gravity: float = bounded(0.005, least=0)
+    gravity: float = bounded(0.005, least=0, most=1)
     """Of each component of the projected gravity, which stays a unit vector."""
-    joint_position: float = bounded(0.002, least=0)
+    joint_position: float = bounded(0.002, least=0, most=1)
     """rad."""
-    joint_velocity: float = bounded(0.05, least=0)
+    joint_velocity: float = bounded(0.05, least=0, most=10)
     """rad/s."""
 
 
@@ -229,9 +234,9 @@ class SensorConfig:
 class DelayConfig:
     """Delays, drawn per episode, in whole controller ticks of 20 ms."""
 
-    action_ticks: tuple[int, int] = bounded((0, 2), least=0)
+    action_ticks: tuple[int, int] = bounded((0, 2), least=0, most=50)
     """Controller ticks from an action to its effect."""
-    image_age: Range = bounded((0.02, 0.08), least=0)
+    image_age: Range = bounded((0.02, 0.08), least=0, most=1)
     """Age of the picture in an observation, s; rounded to controller ticks."""
 
 
@@ -239,17 +244,17 @@ class DelayConfig:
 class RandomisationConfig:
     """Ranges of the physical parameters, drawn per episode; (1, 1) switches one off."""
 
-    friction: Range = bounded((0.6, 1.0), least=0)
-    """Sliding friction of the feet."""
-    payload: Range = (-0.5, 1.5)
+    friction: Range = bounded((0.6, 1.0), least=0.01, most=5)
+    """Sliding friction of the feet; the simulation diverges without any."""
+    payload: Range = bounded((-0.5, 1.5), least=-2, most=30)
     """Mass added to the torso, kg."""
-    mass_scale: Range = bounded((0.97, 1.03), above=0)
+    mass_scale: Range = bounded((0.97, 1.03), least=0.5, most=2)
     """Factor on every mass of the robot."""
-    stiffness_scale: Range = bounded((0.95, 1.05), above=0)
+    stiffness_scale: Range = bounded((0.95, 1.05), least=0.1, most=5)
     """Factor on the servo stiffness."""
-    damping_scale: Range = bounded((0.9, 1.1), above=0)
+    damping_scale: Range = bounded((0.9, 1.1), least=0.1, most=5)
     """Factor on the servo damping."""
-    initial_joint: float = bounded(0.01, least=0)
+    initial_joint: float = bounded(0.01, least=0, most=1)
     """Half width of the uniform offset on the joints of waist and arms at the start, rad."""
 
 
@@ -284,7 +289,7 @@ class EnvConfig:
     """Latency of action and image."""
     randomise: RandomisationConfig = RandomisationConfig()
     """Physical parameters."""
-    threads: int = bounded(1, least=1)
+    threads: int = bounded(1, least=1, most=1024)
     """Threads that step physics and cast rays; results do not depend on it."""
 
     def __post_init__(self) -> None:

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.errors import SimulationDiverged
 from egovcp.sim.camera import DepthCamera, DepthNoise
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.randomise import apply_physics, draw_physics, initial_offset
@@ -137,14 +138,36 @@ class Lane:
             self.step()
 
     def step(self) -> None:
-        """One physics step under what the motors were told; the sensors after every fourth."""
+        """One physics step under what the motors were told; the sensors after every fourth.
+
+        Raises:
+            SimulationDiverged: see `require_valid_physics`.
+        """
         if self.task.physics_steps % PHYSICS_STEPS_PER_TICK == 0:
             self.task.begin_tick()
         self.task.step()
         if self.task.physics_steps % PHYSICS_STEPS_PER_CONTROLLER_TICK == 0:
             self._controller_tick += 1
-            if not self.robot.broken:
-                self._sense()
+            self.require_valid_physics()
+            self._sense()
+
+    def require_valid_physics(self) -> None:
+        """Check the simulation.
+
+        Raises:
+            SimulationDiverged: its numbers are not those of a real robot any more.
+        """
+        if not self.robot.diverged:
+            return
+        scenario = self.scenario
+        drawn = ", ".join(f"{name}={value:.3g}" for name, value in self._drawn.items())
+        error = SimulationDiverged(
+            f"the simulation diverged in task {scenario.task}, seed {scenario.seed}, episode "
+            f"{scenario.episode}, after {self.task.time:.2f} s: {self.robot.divergence}; the scene "
+            f"is {drawn}; choose narrower ranges of --env.{self.task.present} or --env.randomise"
+        )
+        error.episode = scenario.episode
+        raise error
 
     def _sense(self) -> None:
         self.robot.refresh_poses()

@@ -208,6 +208,8 @@ class LiveRobot:
 
     def _step_physics(self) -> None:
         self.robot.step()
+        if self.phase is not Phase.OVER:
+            self.lane.require_valid_physics()
         if self.phase is Phase.HELD:
             data = self.robot.data
             data.qpos[:7] = self._standing.pelvis

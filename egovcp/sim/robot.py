@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import mujoco
 import numpy as np
@@ -15,14 +16,20 @@ from egovcp.sim.sensors import base_rotation
 
 Array = NDArray[np.float64]
 
-_BAD_STATE = np.array(
-    [
-        mujoco.mjtWarning.mjWARN_BADQPOS,
-        mujoco.mjtWarning.mjWARN_BADQVEL,
-        mujoco.mjtWarning.mjWARN_BADQACC,
-    ],
-    dtype=np.intp,
-)
+#: MuJoCo warnings after which the physics is wrong: for the first three, MuJoCo has also reset the
+#: state.
+_WARNINGS: Final = {
+    mujoco.mjtWarning.mjWARN_BADQACC: "acceleration of {dof} is not finite or huge",
+    mujoco.mjtWarning.mjWARN_BADQVEL: "velocity of {dof} is not finite or huge",
+    mujoco.mjtWarning.mjWARN_BADQPOS: "a position is not finite or huge",
+    mujoco.mjtWarning.mjWARN_BADCTRL: "a joint target is not finite",
+    mujoco.mjtWarning.mjWARN_INERTIA: "the inertia matrix is singular",
+    mujoco.mjtWarning.mjWARN_CONTACTFULL: "there are too many contacts",
+    mujoco.mjtWarning.mjWARN_CNSTRFULL: "there are too many constraints",
+}
+_WARNING_NUMBERS: Final = np.array([int(kind) for kind in _WARNINGS], dtype=np.intp)
+MAX_SPEED: Final = 1000.0
+"""Faster joints and bodies count as diverged, rad/s or m/s; the joints of the G1 reach 37 rad/s."""
 
 _LYING_HEIGHT = 0.5  # m, pelvis; above it no part of the trunk reaches the floor
 
@@ -108,14 +115,31 @@ class SimulatedRobot:
         return found
 
     @property
-    def broken(self) -> bool:
+    def diverged(self) -> bool:
         """Whether the physics has diverged since the last reset."""
-        return bool(self.data.warning.number.take(_BAD_STATE).any()) or not self.finite
+        data = self.data
+        if data.warning.number.take(_WARNING_NUMBERS).any():
+            return True
+        return not (np.abs(data.qvel).max() <= MAX_SPEED and math.isfinite(data.qpos.sum()))
 
     @property
-    def finite(self) -> bool:
-        """Whether positions and velocities hold numbers only."""
-        return math.isfinite(self.data.qpos.sum() + self.data.qvel.sum())
+    def divergence(self) -> str:
+        """What diverged; empty if nothing has."""
+        for kind, words in _WARNINGS.items():
+            warning = self.data.warning[kind]
+            if warning.number:
+                named = "{dof}" in words
+                dof = self._dof_name(int(warning.lastinfo)) if named else ""
+                return f"{words.format(dof=dof)} ({kind.name})"
+        for dof in np.flatnonzero(~(np.abs(self.data.qvel) <= MAX_SPEED)):
+            return f"velocity of {self._dof_name(int(dof))} is {self.data.qvel[dof]:.3g} per second"
+        return "" if math.isfinite(self.data.qpos.sum()) else "a position is not finite"
+
+    def _dof_name(self, dof: int) -> str:
+        """The joint of a degree of freedom, or the body if the joint has no name."""
+        joint = int(self.model.dof_jntid[dof])
+        name = self.model.joint(joint).name
+        return str(name or self.model.body(int(self.model.jnt_bodyid[joint])).name)
 
     @property
     def pelvis_height(self) -> float:

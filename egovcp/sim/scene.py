@@ -10,6 +10,7 @@ Geom groups: 0 floor and objects, 3 robot. Robot geoms meet the geoms with conty
 from __future__ import annotations
 
 import copy
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -22,6 +23,13 @@ from numpy.typing import NDArray
 from egovcp.robot.mjcf import FootModel, robot_spec
 from egovcp.sim.scenario import SEQUENCE
 from egovcp.spec import JOINT_NAMES
+
+_LOG = logging.getLogger(__name__)
+
+# MuJoCo would print its warnings and append them to MUJOCO_LOG.TXT in the working directory. Here
+# the counters in `MjData.warning` are checked.
+if mujoco.get_mju_user_warning() is None:
+    mujoco.set_mju_user_warning(_LOG.debug)
 
 FLOOR: Final = "floor"
 BALL: Final = "ball"

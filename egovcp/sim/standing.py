@@ -73,7 +73,7 @@ def settle(scene: Scene, controller: LowLevelController) -> Standing:
         for _ in range(PHYSICS_STEPS_PER_CONTROLLER_TICK):
             robot.step()
         sensors.measure(robot.data, state[0])
-    if robot.broken or robot.pelvis_height < 0.6:
+    if robot.diverged or robot.pelvis_height < 0.6:
         raise EnvironmentFailure(
             f"the controller {controller.id} does not stand: pelvis at "
             f"{robot.pelvis_height:.2f} m after 2 s, expected {ACTION_BOX.neutral[-1]} m; "

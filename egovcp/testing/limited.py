@@ -34,6 +34,7 @@ class LimitedResult:
     output: str
     """stdout and stderr together, undecodable bytes as backslash escapes."""
     seconds: float
+    """Wall time, less the time in which the child waited for a processor that others used."""
     memory_bytes: int
     """Growth of the peak resident memory over what the parent had at the fork."""
     timed_out: bool
@@ -54,7 +55,8 @@ def run_limited(
 
     Args:
         function: what to run, such as ``lambda: main(["check", str(root)])``.
-        seconds: the child is killed after this time.
+        seconds: the child is killed after this time, not counting time in which it was ready to
+            run but other processes used the processors.
         memory_bytes: private writable memory that it may allocate beyond what it inherits.
         network: without it, opening a connection raises in the child, and the result has exit
             code 70 and a traceback.
@@ -65,11 +67,10 @@ def run_limited(
         pid = os.fork()
         if pid == 0:
             _run_child(function, log.fileno(), memory_bytes, network)
-        timed_out = not _wait(pid, seconds)
+        elapsed, timed_out = _wait(pid, started, seconds)
         if timed_out:
             os.kill(pid, signal.SIGKILL)
         _, status, usage = os.wait4(pid, 0)
-        elapsed = time.monotonic() - started
         log.seek(0)
         output = log.read().decode("utf-8", errors="backslashreplace")
     return LimitedResult(
@@ -81,13 +82,29 @@ def run_limited(
     )
 
 
-def _wait(pid: int, seconds: float) -> bool:
-    """Whether the child ends within this time."""
+def _wait(pid: int, started: float, limit: float) -> tuple[float, bool]:
+    """Wait for a child; its time in seconds, and whether that exceeded the limit."""
     descriptor = os.pidfd_open(pid)
     try:
-        return bool(select.select([descriptor], [], [], seconds)[0])
+        while True:
+            elapsed = time.monotonic() - started - _queued_seconds(pid)
+            remaining = max(limit - elapsed, 0.0)
+            if select.select([descriptor], [], [], remaining)[0]:
+                return time.monotonic() - started - _queued_seconds(pid), False
+            if remaining == 0.0:
+                return elapsed, True
     finally:
         os.close(descriptor)
+
+
+def _queued_seconds(pid: int) -> float:
+    """How long the main thread of a process, which may have ended, waited for a processor; 0 where
+    the kernel does not count it."""
+    try:
+        _, queued_ns, _ = Path(f"/proc/{pid}/schedstat").read_text(encoding="utf-8").split()
+    except FileNotFoundError:
+        return 0.0
+    return int(queued_ns) / 1e9
 
 
 def _run_child(function: Callable[[], int], log: int, memory_bytes: int, network: bool) -> NoReturn:

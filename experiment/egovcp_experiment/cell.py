@@ -62,6 +62,8 @@ class Tool:
     """Flags that go on with what an interrupted run left in its folder; None: start anew."""
     prog: str = ""
     """Name of the command in reports; empty: ``python -m MODULE``."""
+    packages: tuple[str, ...] = ()
+    """Modules of optional packages that it imports."""
     learns: bool = False
     """Whether it trains networks, which a GPU is for."""
     alone: bool = False

@@ -14,8 +14,9 @@ import draccus
 
 from egovcp.cli import report_error, run_command
 from egovcp.errors import UsageError, suggest
+from egovcp.packages import require_packages
 from egovcp.terminal import echo
-from egovcp_experiment.cell import in_order
+from egovcp_experiment.cell import Cell, in_order
 from egovcp_experiment.cluster import RayRunner
 from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.experiments import EXPERIMENTS
@@ -70,7 +71,7 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
 
     Raises:
         UsageError: an option makes no sense, or results of other settings are there.
-        EnvironmentFailure: cells failed, or the folder cannot be used.
+        EnvironmentFailure: a package is missing, cells failed, or the folder cannot be used.
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     config.check()
@@ -80,6 +81,9 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
     say = echo
     with store.locked(), closing(_runner(config, say)) as runner:
         schedule = Schedule(cells, store, config.jobs, say, runner)
+        if config.backend == "local":
+            missing_cells = [cell for cell in cells if cell.name not in schedule.records]
+            _require_packages(missing_cells)
         echo(f"{PROG} {name}: {len(cells)} cells, {len(schedule.records)} complete")
         try:
             schedule.run()
@@ -94,6 +98,12 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
     for line in report.shows:
         echo(f"- {line}")
     echo(f"report: {store.folder / name}.html, .md, .json")
+
+
+def _require_packages(cells: Sequence[Cell]) -> None:
+    """Refuse cells whose commands would end for a missing package, hours later perhaps."""
+    for tool in dict.fromkeys(cell.tool for cell in cells):
+        require_packages("egovcp-experiment", tool.prog or tool.module, *tool.packages)
 
 
 def _runner(config: ExperimentConfig, say: Callable[[str], None]) -> Runner:

@@ -117,6 +117,7 @@ TRAIN_PPO: Final = Tool(
     digest=_policies_digest,
     continued=_resumed,
     prog="egovcp-train-ppo",
+    packages=("rsl_rl", "tensordict"),
     learns=True,
 )
 PLAY: Final = Tool(

@@ -141,6 +141,35 @@ def test_an_error_is_not_hidden_by_the_commit_that_follows_it(
     assert "No space left" in warning
 
 
+def test_episodes_of_a_diverging_simulation_are_not_stored(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    heavy = [
+        "--env.controller=stance",
+        "--env.ball.radius_range=[0.01,0.01]",
+        "--env.ball.mass_range=[10,10]",
+        "--env.ball.flight_range=[0.2,0.2]",
+        "--env.ball_episode.ticks=46",
+        "--env.ball_episode.empty_probability=0",
+    ]
+    root = tmp_path / "new"
+    code = _collect(root, *heavy, "--episodes=4", "--num_envs=4", "--num_workers=1")
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert code == 3, message
+    assert "the simulation diverged in task ball, seed 0, episode" in message
+    assert "radius=0.01, mass=10" in message
+    with pytest.raises(DataError):
+        DatasetReader.open(DatasetConfig(root=str(root)))
+
+
+def test_ranges_that_cannot_be_simulated_are_refused_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert _collect(tmp_path / "new", "--env.ball.radius_range=[0.1,100]") == 2
+    assert "at least 0.01 and at most 0.3" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_no_destination_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--episodes=1"]) == 2
     assert "--dataset.repo_id" in capsys.readouterr().err

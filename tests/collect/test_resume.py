@@ -48,3 +48,27 @@ def test_a_ball_of_before_goes_on_though_walls_have_changed() -> None:
     older: dict[str, Any] = copy.deepcopy(dict(now.config))
     del older["env"]["wall"]["guard_cost"]
     require_same(now, replace(now, config=older))
+
+
+def test_only_options_of_the_collected_task_are_listed() -> None:
+    before, other = made("ball"), copy.deepcopy(dict(made("ball").config))
+    other["env"]["wall"]["push_speed_range"] = [0.1, 0.2]
+    other["env"]["ball"]["shape"] = "box"
+    with pytest.raises(UsageError) as caught:
+        require_same(replace(before, config=other), before)
+    assert "--env.ball.shape was sphere, is box" in str(caught.value)
+    assert "wall" not in str(caught.value)
+
+
+def test_options_of_another_task_are_listed_if_nothing_else_differs() -> None:
+    before, other = made("ball"), copy.deepcopy(dict(made("ball").config))
+    other["env"]["wall"]["push_speed_range"] = [0.1, 0.2]
+    with pytest.raises(UsageError, match=r"--env\.wall\.push_speed_range was"):
+        require_same(replace(before, config=other), before)
+
+
+def test_a_merged_or_converted_dataset_is_refused_without_listing_options() -> None:
+    before = replace(made(), seed=None, config={"sources": []})
+    with pytest.raises(UsageError, match="was merged or converted") as caught:
+        require_same(made(), before)
+    assert "--env" not in str(caught.value)

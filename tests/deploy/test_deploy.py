@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from egovcp.log.mcap_reader import read_recording
+from egovcp.sim import robot
 from egovcp.sim.config import STANDING_PUSHES
 from egovcp.spec import ACTION_RATE_LIMIT, COMMAND_SLICE
 from egovcp_deploy.deploy import main
@@ -261,3 +262,16 @@ def test_an_unknown_driver_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     assert run("--controller=orcale", f"--output_dir={tmp_path / 'x'}") == 2
     assert "oracle" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()
+
+
+def test_a_diverging_simulation_is_an_error_that_names_the_episode(
+    tmp_path: Path,
+    short: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(robot, "MAX_SPEED", 2.0)  # m/s; a ball is faster
+    out = tmp_path / "out"
+    assert run("--controller=hold", "--episodes=1", f"--output_dir={out}", *short) == 3
+    assert "the simulation diverged in task ball" in capsys.readouterr().err
+    assert not (out / "deploy.json").exists()

@@ -8,9 +8,12 @@ from typing import Any
 
 import pytest
 
+from egovcp.plan.backends import library
 from egovcp.robot.stance import StanceController
+from egovcp.sim import robot
 from egovcp.spec import ACTION_DIM
 from egovcp.testing import toy_reactive
+from egovcp_deploy.deploy import main as deploy
 from egovcp_deploy.evaluate import EvalConfig, main
 
 KEYS = {
@@ -220,4 +223,41 @@ def test_an_artefact_of_another_controller_is_not_evaluated(
     out = tmp_path / "out"
     assert run(out, f"--policy.path={foreign_artefact_dir}", "--controllers=planner") == 4
     assert "another-controller" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_a_diverging_simulation_is_an_error_that_names_the_episode(
+    tmp_path: Path,
+    short: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(robot, "MAX_SPEED", 2.0)  # m/s; a ball is faster
+    assert run(tmp_path / "out", "--controllers=hold", "--episodes=1", *short) == 3
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "the simulation diverged in task ball, seed " in message
+    assert "velocity of ball is" in message
+
+
+@pytest.mark.parametrize("command", ["evaluate", "deploy"])
+def test_int8_is_refused_before_any_work_where_it_cannot_be_used(
+    command: str,
+    tmp_path: Path,
+    artefact_dir: Path,
+    short: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(library, "compiler", lambda: None)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    library.library.cache_clear()
+    out = tmp_path / "out"
+    flags = [f"--policy.path={artefact_dir}", f"--output_dir={out}", "--planner.backend=int8"]
+    try:
+        assert {"evaluate": main, "deploy": deploy}[command]([*flags, *short]) == 5
+    finally:
+        library.library.cache_clear()
+    told = capsys.readouterr().err
+    assert "there is no C compiler" in told
+    assert "plan with --planner.backend=float32" in told
     assert not out.exists()

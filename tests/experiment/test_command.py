@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from egovcp import packages
 from egovcp.cli import parse_config
 from egovcp_experiment.command import main, scale_of
 from egovcp_experiment.config import ExperimentConfig
@@ -54,6 +55,17 @@ def test_misuse_ends_with_2_before_anything_is_written(
     assert main(argv) == 2
     assert message in capsys.readouterr().err
     assert not list(tmp_path.glob("x/cells/*.json"))
+
+
+def test_a_missing_package_is_named_before_any_cell_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(packages, "is_installed", lambda name: name != "rsl_rl")
+    assert main(["ppo", f"--output_dir={tmp_path / 'out'}", "--scale=smoke"]) == 5
+    message = capsys.readouterr().err
+    assert "egovcp-train-ppo needs rsl-rl-lib, which is not installed" in message
+    assert "egovcp-train[lowlevel]" in message
+    assert not (tmp_path / "out" / "logs").exists()
 
 
 def test_a_flag_takes_from_one_task_what_the_scale_gives_it() -> None:

@@ -8,11 +8,12 @@ from lerobot.datasets import LeRobotDatasetMetadata
 from egovcp.data import DatasetWriter, Provenance, ReturnConfig
 from egovcp.model import LossConfig, WorldModelConfig
 from egovcp.plan import PlannerConfig
+from egovcp.robot.stance import StanceController
 from egovcp.testing import random_episode
 from egovcp_train.train import main as egovcp_train
 from lerobot_policy_egovcp import EgovcpConfig
 
-CONTROLLER = "stance-test"
+CONTROLLER = StanceController().id
 REPO_ID = "me/ball"
 RETURNS = ReturnConfig(steps=4)
 

@@ -143,7 +143,7 @@ def test_data_of_another_controller_is_refused(artefact: Path, tmp_path: Path) -
     with DatasetWriter(tmp_path / "walking", Provenance("walker-7")) as writer:
         writer.add(random_episode(0))
     meta = LeRobotDatasetMetadata("me/walking", root=tmp_path / "walking")
-    with pytest.raises(ArtefactError, match=r"stance-test.*walker-7"):
+    with pytest.raises(ArtefactError, match=r"stance.*walker-7"):
         EgovcpPolicy.from_pretrained(artefact, dataset_meta=meta)
 
 

@@ -14,6 +14,7 @@ import pytest
 from egovcp.artefact import load_artefact
 from egovcp.checks import check_artefact
 from egovcp.processors import PROCESSORS
+from egovcp.robot.stance import StanceController
 from egovcp.testing.hub import FakeHub, environment, in_this_process
 from lerobot_policy_egovcp import EgovcpPolicy
 
@@ -99,7 +100,7 @@ def test_it_trains_a_policy_that_egovcp_and_lerobot_load(run: tuple[Path, str]) 
     output, log = run
     assert re.search(r"step:2 .*kl_prior:", log)
     artefact = check_artefact(str(_checkpoint(output, 2)))
-    assert artefact.controller_id == "stance-test"
+    assert artefact.controller_id == StanceController().id
     assert "--policy.type=egovcp" in artefact.manifest["command"]
     policy = EgovcpPolicy.from_pretrained(_checkpoint(output, 2))
     assert policy.config.planner == artefact.planner

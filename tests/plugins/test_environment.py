@@ -1,6 +1,7 @@
 """The simulation as a LeRobot environment: the same episode, under LeRobot's names."""
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from lerobot.scripts.lerobot_eval import rollout
 
 from egovcp import spec
 from egovcp.artefact import load_artefact
-from egovcp.errors import UsageError
+from egovcp.errors import ArtefactError, UsageError
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.gym import EgovcpEnv
 from lerobot_env_egovcp import EgovcpEnvConfig, LeRobotView
@@ -114,6 +115,30 @@ def test_a_rollout_of_lerobot_takes_the_actions_of_the_artefact(
             assert float(played["reward"][row, tick]) == pytest.approx(reward, abs=1e-4)
     assert played["done"][:, -1].all()
     assert not played["done"][:, -2].any()
+
+
+def test_a_rollout_of_lerobot_with_another_controller_is_refused_before_its_first_step(
+    artefact: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = EgovcpEnvConfig(task="ball", simulation=replace(SIMULATION, controller="walk"))
+    policy_config = PreTrainedConfig.from_pretrained(artefact)
+    policy_config.pretrained_path, policy_config.device = artefact, "cpu"
+    policy = make_policy(policy_config, env_cfg=config)
+    envs = make_env(config, n_envs=2)
+    steps: list[object] = []
+    monkeypatch.setattr(EgovcpEnv, "step", lambda *_: steps.append(1))
+    try:
+        with pytest.raises(ArtefactError, match=r"'g1-stance.*'g1-walk.*simulation\.controller"):
+            rollout(
+                envs["egovcp"][0],
+                policy,
+                *make_env_pre_post_processors(config, policy_config),
+                *make_pre_post_processors(policy_config, str(artefact)),
+                seeds=[5, 6],
+            )
+    finally:
+        close_envs(envs)
+    assert not steps
 
 
 def test_processes_of_their_own_are_possible() -> None:

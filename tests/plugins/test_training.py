@@ -19,6 +19,7 @@ from egovcp.data.stream import gather
 from egovcp.data.windows import mirror_rows
 from egovcp.errors import ArtefactError, DataError, UsageError
 from egovcp.model import Batch
+from egovcp.robot.stance import StanceController
 from egovcp_train.batches import set_normalisation
 from lerobot_policy_egovcp import (
     EgovcpConfig,
@@ -153,7 +154,7 @@ def test_what_is_saved_is_an_artefact(
     (tmp_path / "notes.md").write_text("mine")
     policy.save_pretrained(tmp_path)
     loaded = load_artefact(str(tmp_path))
-    assert loaded.controller_id == "stance-test"
+    assert loaded.controller_id == StanceController().id
     assert loaded.manifest["datasets"] == [{"repo_id": "me/ball", "revision": ""}]
     assert loaded.planner == policy.config.planner
     for name, value in policy.world_model.state_dict().items():

@@ -14,7 +14,7 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from egovcp import spec
+from egovcp import packages, spec
 from egovcp.artefact import load_artefact, save_artefact
 from egovcp.errors import ArtefactError
 from egovcp.model import PRESETS, Carry, WorldModel
@@ -225,9 +225,10 @@ def test_without_the_packages_it_says_what_to_install(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(module, "find_spec", lambda name: None if name == "onnx" else object())
+    monkeypatch.setattr(packages, "is_installed", lambda name: name != "onnx")
     assert main([f"--policy.path={artefact}", f"--output_dir={tmp_path / 'onnx'}"]) == 5
-    assert "this needs onnx, not installed here" in capsys.readouterr().err
+    assert "egovcp-export needs onnx, which is not installed" in capsys.readouterr().err
+    assert not list(tmp_path.glob("*onnx*"))
 
 
 # --- options ----------------------------------------------------------------------------

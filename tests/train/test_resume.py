@@ -17,7 +17,7 @@ from egovcp.artefact import load_artefact
 from egovcp.errors import ArtefactError
 from egovcp.model import Batch
 from egovcp_train import checkpoint
-from egovcp_train.checkpoint import begin_checkpoint, finish_checkpoint, load_training_state
+from egovcp_train.checkpoint import load_training_state, new_checkpoint
 from egovcp_train.config import TrainConfig
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.train import main
@@ -257,10 +257,8 @@ def _killed_at(call: int, monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]
 
 
 def _write(output: Path, step: int) -> None:
-    partial = begin_checkpoint(output, step)
-    (partial / "pretrained_model").mkdir()
-    (partial / "pretrained_model" / "config.json").write_text(str(step))
-    finish_checkpoint(partial, {"step": step})
+    with new_checkpoint(output, step, {"step": step}) as folder:
+        (folder / "config.json").write_text(str(step))
 
 
 def _complete(output: Path) -> int:
@@ -294,6 +292,20 @@ def test_killed_at_any_moment_the_last_checkpoint_is_whole(
     assert outcomes[-1] == 2
     assert outcomes == sorted(outcomes)
     assert {"mkdir", "save", "fsync", "rename", "symlink_to", "replace"} <= set(made)
+
+
+def test_a_failing_checkpoint_leaves_the_one_before_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    _write(tmp_path, 1)
+    monkeypatch.setattr(torch, "save", fail)
+    with pytest.raises(OSError, match="No space left"):
+        _write(tmp_path, 2)
+    assert _complete(tmp_path) == 1
+    assert {path.name for path in (tmp_path / "checkpoints").iterdir()} == {"000001", "last"}
 
 
 def test_a_checkpoint_left_over_by_a_killed_run_is_written_again(tmp_path: Path) -> None:

@@ -9,11 +9,14 @@ from __future__ import annotations
 
 import pickle
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from egovcp.atomic import removed_on_error
 from egovcp.data.files import sync, sync_tree
 from egovcp.errors import ArtefactError
 
@@ -24,8 +27,29 @@ def checkpoint_dir(output_dir: Path, step: int) -> Path:
     return output_dir / "checkpoints" / f"{step:06d}"
 
 
-def finish_checkpoint(partial: Path, state: dict[str, Any]) -> Path:
-    """Add the training state to ``partial`` (NNNNNN.partial), publish it, point ``last`` at it."""
+@contextmanager
+def new_checkpoint(output_dir: Path, step: int, state: dict[str, Any]) -> Iterator[Path]:
+    """Write a checkpoint: the block fills ``pretrained_model``, an empty folder.
+
+    Then the training state is added, and the checkpoint appears under its name. If anything fails
+    nothing is left, and ``last`` is the checkpoint before.
+
+    Args:
+        output_dir: folder of the run.
+        step: names the checkpoint.
+        state: what `load_training_state` will return.
+    """
+    with removed_on_error(checkpoint_dir(output_dir, step).with_suffix(".partial")) as partial:
+        for leftover in partial.parent.glob("*.partial"):  # of a killed run
+            shutil.rmtree(leftover, ignore_errors=True)
+        model = partial / "pretrained_model"
+        model.mkdir(parents=True)
+        yield model
+        _finish(partial, state)
+
+
+def _finish(partial: Path, state: dict[str, Any]) -> None:
+    """Add the training state to NNNNNN.partial, publish it, point ``last`` at it."""
     folder = partial / "training_state"
     folder.mkdir(parents=True)
     with (folder / STATE_FILE).open("wb") as file:
@@ -39,16 +63,6 @@ def finish_checkpoint(partial: Path, state: dict[str, Any]) -> Path:
     link.symlink_to(final.name)
     link.replace(final.parent / "last")
     sync(final.parent)
-    return final
-
-
-def begin_checkpoint(output_dir: Path, step: int) -> Path:
-    """An empty NNNNNN.partial folder to fill; leftovers of a killed run are removed."""
-    partial = checkpoint_dir(output_dir, step).with_suffix(".partial")
-    for leftover in partial.parent.glob("*.partial"):
-        shutil.rmtree(leftover, ignore_errors=True)
-    partial.mkdir(parents=True)
-    return partial
 
 
 def load_training_state(output_dir: Path) -> dict[str, Any]:

@@ -22,7 +22,7 @@ import torch
 from safetensors.torch import load_file, save
 
 from egovcp.artefact import WEIGHTS, Artefact, load_artefact
-from egovcp.atomic import write_bytes
+from egovcp.atomic import removed_on_error, write_bytes
 from egovcp.cli import run_command
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.manifest import MANIFEST
@@ -82,14 +82,11 @@ def export(config: ExportConfig) -> None:
     _require_packages()
     output = prepare_output(config.output_dir, resume=False)
     artefact = load_artefact(config.policy.path, config.policy.revision)
-    work = output.with_name(output.name + ".partial")
-    shutil.rmtree(work, ignore_errors=True)
-    work.mkdir(parents=True)
-    try:
+    with removed_on_error(output.with_name(output.name + ".partial")) as work:
+        shutil.rmtree(work, ignore_errors=True)
+        work.mkdir(parents=True)
         errors = write_export(artefact, work)
         os.replace(work, output)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
     for name, error in errors.items():
         echo(f"{output / name}.onnx: at most {error:.1e} from the original")
     echo(f"golden vectors: {output / GOLDEN}; description: {output / REPORT}")

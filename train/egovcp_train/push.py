@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from egovcp.artefact import load_artefact
+from egovcp.atomic import write_text
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.hub import PublishConfig, is_repo_id, publish
@@ -66,4 +67,4 @@ def push(config: PushConfig) -> None:
     if config.json:
         facts = {"repo_id": config.repo_id, "branch": config.branch, "tag": config.tag}
         text = json.dumps({**facts, **asdict(published)}, indent=1) + "\n"
-        Path(config.json).expanduser().write_text(text, encoding="utf-8")
+        write_text(Path(config.json).expanduser(), text)

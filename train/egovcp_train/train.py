@@ -26,12 +26,7 @@ from egovcp.terminal import echo, one_line
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
 from egovcp_train.card import versions, write_card
-from egovcp_train.checkpoint import (
-    begin_checkpoint,
-    checkpoint_dir,
-    finish_checkpoint,
-    load_training_state,
-)
+from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
 from egovcp_train.closed_loop import ClosedLoop, require_simulator
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
 from egovcp_train.datasets import EVALUATION_EPISODES, Material, prepare
@@ -261,13 +256,12 @@ class Run:
         self.learner.require_finite()
         if not self.ranks.is_first:
             return
-        partial = begin_checkpoint(self.output, self.learner.step)
         found = {"heldout": self.metrics, "heldout_tasks": self.tasks, "closed_loop": self.played}
         provenance = self.provenance | {"step": self.learner.step, **finite_or_null(found)}
-        save_artefact(partial / "pretrained_model", model, self.config.planner, provenance)
         spent = {"seconds": self.budget.spent}
         state = {"learner": self.learner.state_dict(), "streams": streams, **spent}
-        finish_checkpoint(partial, state)
+        with new_checkpoint(self.output, self.learner.step, state) as folder:
+            save_artefact(folder, model, self.config.planner, provenance)
 
     def _summary(self, terms: dict[str, Any], bar: Any, frames: int) -> dict[str, str]:
         summary = {"loss": f"{float(terms['loss/total']):.3f}"}

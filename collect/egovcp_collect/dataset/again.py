@@ -9,12 +9,11 @@ import draccus
 from draccus.utils import DraccusException
 
 from egovcp.data import DatasetReader, Episode, schema
-from egovcp.data.continued import read_provenance
+from egovcp.data.origin import origin_of, parts_of, source_of
 from egovcp.errors import DataError
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.scenario import Scenario
 from egovcp_collect.config import SHAPING, CollectConfig
-from egovcp_collect.dataset.origin import origin_of, source_of
 from egovcp_collect.older import completed
 from egovcp_collect.simulation import Simulation, Watch
 from egovcp_collect.versions import installed_versions
@@ -40,10 +39,10 @@ def simulated_again(
     Raises:
         DataError: it is not recorded how an episode came to be, or this version cannot follow it.
     """
-    origin = read_provenance(dict(reader.provenance))
+    sources = len(parts_of(reader.origin))
     groups: dict[tuple[int, int], list[int]] = {}
     for index in chosen:
-        source = source_of(origin, reader.metadata(index))
+        source = source_of(sources, reader.metadata(index))
         groups.setdefault((source, _number(reader, index, "seed")), []).append(index)
     for indices in groups.values():
         simulation = Simulation(_collection(reader, indices[0]), watch, pictures)
@@ -97,7 +96,7 @@ def _collection(reader: DatasetReader, index: int) -> CollectConfig:
         DataError: there is none, or this version cannot follow it.
     """
     path = reader.root / schema.COLLECTION_PATH
-    origin = origin_of(read_provenance(dict(reader.provenance)), reader.metadata(index))
+    origin = origin_of(reader.origin, reader.metadata(index))
     settings = {name: origin.config[name] for name in SHAPING if name in origin.config}
     if "env" not in settings:
         raise DataError.at(path, "records no configuration of the simulator to repeat", index)
@@ -116,4 +115,4 @@ def _collection(reader: DatasetReader, index: int) -> CollectConfig:
 
 def _recorded_versions(reader: DatasetReader, chosen: Sequence[int]) -> Iterator[Mapping[str, Any]]:
     for index in chosen:
-        yield origin_of(read_provenance(dict(reader.provenance)), reader.metadata(index)).versions
+        yield origin_of(reader.origin, reader.metadata(index)).versions

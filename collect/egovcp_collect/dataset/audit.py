@@ -11,7 +11,8 @@ from tqdm import tqdm
 
 from egovcp.bounds import bounded
 from egovcp.data import DatasetConfig, DatasetReader
-from egovcp.errors import DataError, UsageError
+from egovcp.data.selection import select_episodes
+from egovcp.errors import DataError
 from egovcp.terminal import echo
 from egovcp_collect.dataset.again import changed_versions, simulated_again
 from egovcp_collect.dataset.replace import write_report
@@ -24,8 +25,9 @@ class AuditConfig:
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, or an id of the Hub."""
-    episodes: list[int] = field(default_factory=list)
-    """Which episodes, [0,7,...]; empty: --count of them."""
+    episodes: str = ""
+    """Which episodes: numbers, `[0, 7]`, a range whose end is excluded, `0:100`, or both; empty:
+    --count of them."""
     count: int = bounded(5, least=1)
     """How many episodes, spread evenly over the dataset."""
     json: str = ""
@@ -54,11 +56,10 @@ def run(config: AuditConfig) -> None:
 
 
 def _chosen(config: AuditConfig, total: int) -> list[int]:
-    for index in config.episodes:
-        if not 0 <= index < total:
-            raise UsageError(f"--episodes: no episode {index}; the dataset has 0 to {total - 1}")
+    if config.episodes:
+        return select_episodes(config.episodes, total, "--episodes").tolist()
     spread = np.linspace(0, total - 1, min(config.count, total)).round().astype(int)
-    return sorted(set(config.episodes or spread.tolist()))
+    return sorted(set(spread.tolist()))
 
 
 def _different(reader: DatasetReader, chosen: Sequence[int]) -> list[int]:

@@ -9,7 +9,7 @@ from typing import Any
 
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, Provenance, metadata, schema
-from egovcp.data.continued import read_provenance
+from egovcp.data.provenance import parse_provenance
 from egovcp.data.records import shape_problems
 from egovcp.errors import DataError
 from egovcp_collect.dataset.origin import joint, moved, require_one_controller
@@ -80,14 +80,10 @@ def _own_volume(root: Path, required: bool) -> Volume | None:
 
 
 def _origin(content: dict[str, Any], path: Path) -> Provenance:
-    with metadata.damaged(path):
-        origin = read_provenance(content)
     if content.get("spec_version") != spec.SPEC_VERSION:
         found = content.get("spec_version")
         raise DataError.at(path, f"specification {found}, expected {spec.SPEC_VERSION}")
-    if not isinstance(origin.controller_id, str) or not origin.controller_id:
-        raise DataError.at(path, "names no low-level controller")
-    return origin
+    return parse_provenance(content, path)
 
 
 def _sound(record: object) -> Mapping[str, Any]:
@@ -108,4 +104,4 @@ def _original_volume(root: Path) -> Volume:
         }
         for i in range(len(reader))
     ]
-    return Volume(reader.root, read_provenance(dict(reader.provenance)), records)
+    return Volume(reader.root, reader.origin, records)

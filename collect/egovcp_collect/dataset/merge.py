@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 from tqdm import tqdm
 
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter
-from egovcp.data.continued import read_provenance
+from egovcp.data.duplicates import Duplicate, DuplicateFinder
 from egovcp.errors import DataError, UsageError
 from egovcp.terminal import echo
 from egovcp_collect.dataset.origin import joint, moved, require_one_controller
@@ -33,7 +33,7 @@ class MergeConfig:
     output_dir: str = ""
     """Folder of the new dataset."""
     duplicates: Literal["refuse", "drop"] = "refuse"
-    """What to do about an episode (task, seed and number) that came before."""
+    """What to do about an episode whose content equals that of an earlier one."""
     json: str = ""
     """File for the result: {"episodes", "frames", "dropped"}; empty: none."""
 
@@ -64,24 +64,44 @@ def run(config: MergeConfig) -> None:
 
 
 def _chosen(readers: Sequence[DatasetReader], duplicates: str) -> tuple[list[tuple[int, int]], int]:
-    """(dataset, episode) of each episode to write, and how many came before."""
-    first: dict[str, tuple[int, int]] = {}
+    """(dataset, episode) of each episode to write, and how many repeat an earlier one.
+
+    Raises:
+        DataError: an episode repeats an earlier one and must not, or has its seed and number but
+            other content.
+    """
+    finder = DuplicateFinder[tuple[int, int]]()
     episodes = [(number, index) for number, r in enumerate(readers) for index in range(len(r))]
+    chosen = []
     for number, index in episodes:
-        identity = readers[number].identity(index)
-        known, before = first.setdefault(identity, (number, index))
-        if (known, before) != (number, index) and duplicates == "refuse":
-            raise DataError(
-                f"{readers[number].root}, episode {index} is {identity} (task/seed/number), and so "
-                f"is {readers[known].root}, episode {before}; --duplicates=drop keeps the first"
-            )
-    return list(first.values()), len(episodes) - len(first)
+        reader = readers[number]
+        digest = reader.digest(index) or reader.read(index).digest()
+        found = finder.add((number, index), digest, reader.scenario(index))
+        if found is None:
+            chosen.append((number, index))
+        elif not found.equal or duplicates == "refuse":
+            raise _refusal(readers, (number, index), found)
+    return chosen, len(episodes) - len(chosen)
+
+
+def _refusal(
+    readers: Sequence[DatasetReader], place: tuple[int, int], found: Duplicate[tuple[int, int]]
+) -> DataError:
+    (number, index), (earlier, before) = place, found.place
+    this = f"{readers[number].root}, episode {index}"
+    other = f"{readers[earlier].root}, episode {before}"
+    if found.equal:
+        return DataError(f"{this} equals {other}; --duplicates=drop keeps the first")
+    return DataError(
+        f"{this} is {readers[number].scenario(index)}, and so is {other}, but their content "
+        "differs: one was altered, or simulated on another machine; leave out one of the datasets"
+    )
 
 
 def _write(
     readers: Sequence[DatasetReader], chosen: Sequence[tuple[int, int]], output: Path, command: str
 ) -> int:
-    origins = [read_provenance(dict(reader.provenance)) for reader in readers]
+    origins = [reader.origin for reader in readers]
     with DatasetWriter(output, joint(origins, command)) as writer:
         for number, index in tqdm(chosen, unit="ep", delay=1):
             episode = readers[number].read(index)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
-from egovcp.data import Provenance, schema
+from egovcp.data import Provenance
+from egovcp.data.origin import SOURCE, SOURCES, parts_of, source_of, without_command
 from egovcp.errors import DataError
-
-#: Where a joint provenance keeps those it was made of, and an episode says which is its own.
-SOURCES: Final = "sources"
-SOURCE: Final = "source"
 
 
 def require_one_controller(controllers: Mapping[Path, str]) -> None:
@@ -32,7 +29,7 @@ def joint(origins: Sequence[Provenance], command: str) -> Provenance:
     If all agree on what shapes an episode, they are one already.
     """
     first = origins[0]
-    if all(_shape(origin) == _shape(first) for origin in origins):
+    if all(without_command(origin) == without_command(first) for origin in origins):
         return first
     parts = [part for origin in origins for part in parts_of(origin)]
     return Provenance(
@@ -44,50 +41,12 @@ def joint(origins: Sequence[Provenance], command: str) -> Provenance:
     )
 
 
-def parts_of(origin: Provenance) -> list[Provenance]:
-    """The provenances that a joint one was made of, or itself.
-
-    Raises:
-        DataError: they are damaged.
-    """
-    parts = origin.config.get(SOURCES, [])
-    try:
-        return [Provenance(**part) for part in parts] or [origin]
-    except TypeError as error:
-        raise DataError(f"{schema.COLLECTION_PATH}: config.{SOURCES} is damaged") from error
-
-
-def origin_of(origin: Provenance, facts: Mapping[str, Any]) -> Provenance:
-    """The provenance of an episode with these ``metadata``."""
-    return parts_of(origin)[source_of(origin, facts)]
-
-
-def source_of(origin: Provenance, facts: Mapping[str, Any]) -> int:
-    """Which of `parts_of` an episode with these ``metadata`` comes from.
-
-    Raises:
-        DataError: none of them.
-    """
-    source, count = facts.get(SOURCE, 0), len(parts_of(origin))
-    if not isinstance(source, int) or not 0 <= source < count:
-        raise DataError(
-            f"{schema.COLLECTION_PATH}: an episode's {SOURCE} is {source!r}, expected 0 to "
-            f"{count - 1}"
-        )
-    return source
-
-
 def moved(facts: Mapping[str, Any], origins: Sequence[Provenance], index: int) -> dict[str, Any]:
     """An episode's ``metadata`` in the `joint` of ``origins``, of which its own is ``index``."""
-    if all(_shape(origin) == _shape(origins[0]) for origin in origins):
+    if all(without_command(origin) == without_command(origins[0]) for origin in origins):
         return dict(facts)
     before = sum(len(parts_of(origin)) for origin in origins[:index])
-    return {**facts, SOURCE: before + source_of(origins[index], facts)}
-
-
-def _shape(origin: Provenance) -> Provenance:
-    """What an episode depends on; the command that asked for it is not among it."""
-    return replace(origin, command="")
+    return {**facts, SOURCE: before + source_of(len(parts_of(origins[index])), facts)}
 
 
 def _agreed(origins: Sequence[Provenance], name: str, version: str) -> bool:

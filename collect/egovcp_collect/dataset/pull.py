@@ -83,7 +83,12 @@ def _bring(source: Source, retry: RetryPolicy) -> None:
     files = aside / "files"
     files.mkdir(parents=True, exist_ok=True)
     with only_writer(source.root, aside):
-        fetch(source.repo_id, source.commit, files, retry)
+        try:
+            fetch(source.repo_id, source.commit, files, retry)
+        except BaseException:
+            if not _has_arrived(files):
+                shutil.rmtree(aside, ignore_errors=True)
+            raise
         try:
             (files / schema.SOURCE_PATH).unlink(missing_ok=True)
             verify_hashes(files)
@@ -95,6 +100,16 @@ def _bring(source: Source, retry: RetryPolicy) -> None:
         sync_tree(files)
         publish(files, source.root)
     shutil.rmtree(aside, ignore_errors=True)
+
+
+def _has_arrived(files: Path) -> bool:
+    """Whether there is anything that the next attempt can use."""
+    found = (path for path in files.rglob("*") if path.is_file() and path.stat().st_size)
+    # in .cache huggingface_hub keeps locks and notes beside the parts of files
+    return any(
+        path.suffix == ".incomplete" or path.relative_to(files).parts[0] != ".cache"
+        for path in found
+    )
 
 
 def _report(config: PullConfig, reader: DatasetReader) -> None:

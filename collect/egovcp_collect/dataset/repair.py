@@ -12,6 +12,8 @@ from tqdm import tqdm
 
 from egovcp.checks.dataset import command_problems
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode
+from egovcp.data.duplicates import Duplicate, DuplicateFinder
+from egovcp.data.origin import ScenarioKey, ScenarioKeys
 from egovcp.data.source import Source, local_root
 from egovcp.errors import DataError
 from egovcp.terminal import echo, one_line
@@ -97,7 +99,7 @@ def _rebuild(
 def _sound_episodes(root: Path, book: Book, dropped: list[DataError]) -> Iterator[Episode]:
     """Each episode once; why others are left behind goes to ``dropped``."""
     seen: set[int] = set()
-    digests: dict[str, int] = {}
+    finder, scenarios = DuplicateFinder[int](), ScenarioKeys(book.provenance)
     for found in salvage(root):
         if isinstance(found, DataError):
             dropped.append(found)
@@ -107,9 +109,9 @@ def _sound_episodes(root: Path, book: Book, dropped: list[DataError]) -> Iterato
         digest = found.digest()
         record = book.find(digest, found.number)
         problems = list(_problems(found, record))
-        if digest in digests:
-            problems = [(None, f"the same as episode {digests[digest]}")]
-        digests.setdefault(digest, found.number)
+        if not problems and record is not None:
+            scenario = scenarios.key(record["task"], record.get("metadata", {}))
+            problems = list(_repetition(finder.add(found.number, digest, scenario), scenario))
         if problems or record is None:
             frame, problem = problems[0]
             dropped.append(DataError.at(found.file, problem, found.number, frame))
@@ -117,6 +119,15 @@ def _sound_episodes(root: Path, book: Book, dropped: list[DataError]) -> Iterato
             yield found.episode(dict(record))
     for number in sorted(set(range(book.own)) - seen):
         dropped.append(DataError.at(_place(root, number), "cannot be read", number))
+
+
+def _repetition(
+    found: Duplicate[int] | None, scenario: ScenarioKey | None
+) -> Iterator[tuple[int | None, str]]:
+    if found is not None and found.equal:
+        yield None, f"the same as episode {found.place}"
+    elif found is not None:
+        yield None, f"is {scenario}, and so is episode {found.place}, of other content"
 
 
 def _place(root: Path, number: int) -> Path:

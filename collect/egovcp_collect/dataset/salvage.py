@@ -14,8 +14,9 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from egovcp import spec
-from egovcp.data import Episode, metadata, schema
+from egovcp.data import Episode, schema
 from egovcp.data.columns import EPISODE_FEATURES, open_data_file, to_numpy
+from egovcp.data.parquet import damaged
 from egovcp.data.paths import files_below
 from egovcp.errors import DataError
 
@@ -48,7 +49,7 @@ class Found:
 def salvage(root: Path) -> Iterator[Found | DataError]:
     """The episodes of all data files in order, and what could not be read."""
     for path in files_below(root / "data"):
-        if path.suffix != ".parquet" or path.name.startswith("."):
+        if path.suffix != ".parquet":
             continue
         try:
             file = open_data_file(root, path)
@@ -63,7 +64,7 @@ def _episodes(file: pq.ParquetFile, path: Path) -> Iterator[Found | DataError]:
     number, parts = -1, list[pa.Table]()
     for group in range(file.num_row_groups):
         try:
-            with metadata.damaged(path):
+            with damaged(path):
                 table = file.read_row_group(group, columns=[*schema.FEATURES], use_threads=False)
                 runs = list(_runs(table))
         except DataError as error:
@@ -104,7 +105,7 @@ def _numbers(file: pq.ParquetFile, group: int) -> list[int]:
 
 def _assembled(path: Path, number: int, parts: list[pa.Table]) -> Found | DataError:
     try:
-        with metadata.damaged(path):
+        with damaged(path):
             table = pa.concat_tables(parts)
             columns = {name: to_numpy(table[name], name) for name in schema.FEATURES}
     except DataError as error:

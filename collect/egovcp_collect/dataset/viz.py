@@ -12,6 +12,7 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from egovcp.atomic import removed_on_error
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import UsageError
 from egovcp.packages import require_packages
@@ -78,9 +79,10 @@ def write_recording(reader: DatasetReader, index: int, output: Path, meshes: boo
     output.parent.mkdir(parents=True, exist_ok=True)
     sink = RerunSink(output, imagined=(), meshes=meshes, signals=True)
     sink.open(run_info(reader, index, episode))
-    for tick in ticks_of(episode):
-        sink.write(tick)
-    sink.close()
+    with removed_on_error(output):
+        for tick in ticks_of(episode):
+            sink.write(tick)
+        sink.close()
 
 
 def open_viewer(recording: Path) -> None:

@@ -56,6 +56,7 @@ def control_process(setup: ControlSetup) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the planner's process to judge
     quitting = Flag()
     signal.signal(signal.SIGTERM, lambda number, frame: quitting.set())
+    _prefer_punctuality()
     try:
         hardware = open_hardware(setup.hardware)
     except EgovcpError as error:
@@ -65,7 +66,7 @@ def control_process(setup: ControlSetup) -> None:
     link = Link(setup.address, serve=False)
     try:
         control = ControlProcess(setup, hardware, link)
-        _prefer_punctuality()
+        gc.freeze()  # what the imports brought is not searched for garbage again
         control.run(quitting)
     finally:
         last_words(hardware.body)
@@ -74,9 +75,9 @@ def control_process(setup: ControlSetup) -> None:
 
 
 def _prefer_punctuality() -> None:
-    """Do what this process may so that its ticks are on time."""
+    """Do what this process may so that its ticks are on time; before it has threads, which inherit
+    the priority: one that holds the interpreter's lock must not be put aside either."""
     sys.setswitchinterval(_SWITCH_S)
-    gc.freeze()  # what the imports brought is not searched for garbage again
     with suppress(OSError):  # needs a privilege
         os.setpriority(os.PRIO_PROCESS, 0, _PRIORITY)
 

@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+from egovcp.atomic import write_text
 from egovcp.errors import UsageError
 from egovcp.log.info import RunInfo
 from egovcp.log.mcap_reader import Moment, RecordingReader
@@ -112,7 +113,7 @@ def run(config: InfoConfig) -> None:
     summary = _summarise(Path(config.file), reader)
     report = json.dumps(summary.to_json(), indent=2)
     if config.json and config.json != "-":
-        Path(config.json).write_text(report + "\n", encoding="utf-8")
+        write_text(Path(config.json), report + "\n")
     if config.json == "-":
         echo(report)
     else:

@@ -124,10 +124,8 @@ class Task(ABC):
         return terms
 
     def has_fallen(self) -> bool:
-        """Whether the robot lies or is past saving, or its physics has diverged."""
+        """Whether the robot lies or is past saving."""
         robot = self.robot
-        if robot.broken:
-            return True
         return robot.pelvis_height < FALL_HEIGHT or robot.tilt > FALL_TILT or robot.on_floor
 
     @property

@@ -56,7 +56,7 @@ def write_json(folder: Path, name: str, text: str | bytes) -> None:
 
 
 def edit_tensors(folder: Path, change: Callable[[dict[str, torch.Tensor]], object]) -> str:
-    tensors = load((folder / WEIGHTS).read_bytes())
+    tensors = dict(sorted(load((folder / WEIGHTS).read_bytes()).items()))  # in a fixed order
     change(tensors)
     (folder / WEIGHTS).write_bytes(save(tensors))
     renew_digests(folder)

@@ -131,7 +131,7 @@ def _link_to_the_files(folder: Path, rng: Random) -> None:
 
 def _reorder_tensors(folder: Path, rng: Random) -> None:
     tensors = load((folder / WEIGHTS).read_bytes())
-    names = [str(name) for name in rng.permutation(list(tensors))]
+    names = [str(name) for name in rng.permutation(sorted(tensors))]
     content = {name: tensors[name] for name in names}
     (folder / WEIGHTS).write_bytes(save(content, {"format": "pt", "note": "reordered"}))
     renew_digests(folder)

@@ -9,11 +9,14 @@ from typing import Any
 import gymnasium
 from lerobot.configs import FeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
+from lerobot.processor import PolicyProcessorPipeline
 
 from egovcp import spec
 from egovcp.errors import UsageError, suggest
+from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig as SimulationConfig
 from lerobot_env_egovcp.environment_egovcp import LeRobotView
+from lerobot_env_egovcp.processor_egovcp import ControllerIdProcessorStep
 
 
 def _features() -> dict[str, PolicyFeature]:
@@ -74,3 +77,12 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
             else gymnasium.vector.SyncVectorEnv(make, autoreset_mode=mode)
         )
         return {self.type: {0: envs}}
+
+    def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
+        """What LeRobot applies to observations and to actions of these environments.
+
+        Raises:
+            UsageError, ArtefactError: as `make_controller`, for ``simulation.controller``.
+        """
+        step = ControllerIdProcessorStep(make_controller(self.simulation.controller).id)
+        return PolicyProcessorPipeline(steps=[step]), PolicyProcessorPipeline(steps=[])

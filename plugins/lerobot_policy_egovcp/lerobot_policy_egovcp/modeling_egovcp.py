@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import draccus
 import numpy as np
@@ -25,16 +26,12 @@ from egovcp.model import WorldModel, world_model_loss
 from egovcp.model.statistics import set_statistics
 from egovcp.plan import Policy
 from lerobot_policy_egovcp.configuration_egovcp import EgovcpConfig
-from lerobot_policy_egovcp.training_rows import (
-    Targets,
-    mirrored,
-    open_reader,
-    to_batch,
-    to_millimetres,
-)
+from lerobot_policy_egovcp.observations import read_observation
+from lerobot_policy_egovcp.training_rows import Targets, mirrored, open_reader, to_batch
 
 type Stats = Mapping[str, Mapping[str, Any]]
 
+_LOG: Final = logging.getLogger(__name__)
 _PREFIX = "world_model."
 _OWN_KEYS = ("schema_version", "egovcp_version", "features", "files", SEAL)  # of the manifest
 
@@ -135,29 +132,54 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         self._planner = None
 
     @torch.no_grad()
-    def select_action(self, batch: dict[str, Tensor]) -> Tensor:
+    def select_action(self, batch: dict[str, Any]) -> Tensor:
         """Filter one observation of E robots and plan: the action (E, 7) in [-1, 1] to execute.
 
-        The memory advances with this action, as if it were sent unchanged.
+        The memory advances with this action, as if it were sent unchanged. See
+        `predict_action_chunk` for the arguments and the errors.
         """
         return self.predict_action_chunk(batch)[:, 0]
 
     @torch.no_grad()
-    def predict_action_chunk(self, batch: dict[str, Tensor]) -> Tensor:
-        """The same, but the whole plan (E, N, 7). One call is one tick of 40 ms.
+    def predict_action_chunk(self, batch: dict[str, Any]) -> Tensor:
+        """The same, but the whole plan (E, N, 7). One call is one planner step of 40 ms.
+
+        An observation whose state is not finite is skipped with a warning, see
+        `egovcp.plan.Policy`.
 
         Args:
-            batch: ``observation.images.ego_depth`` (E, 1, 48, 64) float mm, 0 = invalid, and
-                ``observation.state`` (E, 74).
+            batch: the observation, see `read_observation`. ``info`` may hold the
+                ``controller_id`` of the robot's low-level controller, as the processors of
+                ``--env.type=egovcp`` write it.
 
         Raises:
+            DataError: a part of the observation is missing, or of another type, shape or unit.
             UsageError: E changed without a `reset`.
+            ArtefactError: the policy was trained for another low-level controller.
         """
-        depth, state = to_millimetres(batch[spec.DEPTH_KEY]), batch[spec.STATE_KEY]
+        self._require_controller(batch.get("info"))
+        depth, state = read_observation(batch)
         planner = self._planner_for(len(state))
-        step = planner.act(depth.cpu().numpy().astype(np.uint16), state.float().cpu().numpy())
+        before = planner.skipped
+        step = planner.act(depth, state)
         planner.advance(step.action)
-        return torch.from_numpy(step.plan).to(state.device)
+        if (robots := (step.skipped & ~before).nonzero()[0]).size:
+            _LOG.warning(
+                "skipped the observation of robot %s: %s is not finite, or impossible",
+                ", ".join(map(str, robots)),
+                spec.STATE_KEY,
+            )
+        return torch.from_numpy(step.plan).to(batch[spec.STATE_KEY].device)
+
+    def _require_controller(self, info: object) -> None:
+        found = info.get(spec.CONTROLLER_ID_KEY) if isinstance(info, Mapping) else None
+        expected = self._provenance.get("controller_id")
+        if None not in (found, expected) and found != expected:
+            raise ArtefactError(
+                f"the policy was trained on data of low-level controller {expected!r}, but the "
+                f"environment runs {found!r}; choose the data's with --env.simulation.controller, "
+                "or train on data of this one"
+            )
 
     def _planner_for(self, robots: int) -> Policy:
         if self._planner is None:

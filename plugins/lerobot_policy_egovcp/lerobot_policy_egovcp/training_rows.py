@@ -17,6 +17,7 @@ from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_
 from egovcp.data.source import recorded
 from egovcp.errors import DataError
 from egovcp.model import Batch
+from lerobot_policy_egovcp.observations import to_millimetres
 
 _COLUMNS = (spec.REWARD_KEY, spec.DONE_KEY, spec.TRUNCATED_KEY)
 
@@ -137,24 +138,3 @@ def mirrored(rows: Batch, which: Tensor) -> Batch:
         action=swap(rows.action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),
         prev_action=swap(rows.prev_action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),
     )
-
-
-def to_millimetres(depth: Tensor) -> Tensor:
-    """LeRobot's depth (..., 1, 48, 64), float millimetres -> (..., 48, 64) whole ones, int32.
-
-    Raises:
-        DataError: another shape; or no millimetres.
-    """
-    expected = (1, spec.DEPTH_ROWS, spec.DEPTH_COLS)
-    if tuple(depth.shape[-3:]) != expected:
-        raise DataError(
-            f"{spec.DEPTH_KEY} has shape {tuple(depth.shape)}, expected (..., "
-            f"{', '.join(map(str, expected))})"
-        )
-    whole = depth.squeeze(-3).nan_to_num(0.0, 0.0, 0.0).round()
-    if depth.is_floating_point() and 0 < float(whole.max()) < spec.DEPTH_MIN_M * 1e3:
-        raise DataError(
-            f"{spec.DEPTH_KEY} is at most {float(depth.max()):g}, less than the camera's nearest "
-            f"{spec.DEPTH_MIN_M * 1e3:g} mm: the policy reads millimetres, not metres"
-        )
-    return whole.clamp(0, torch.iinfo(torch.uint16).max).to(torch.int32)

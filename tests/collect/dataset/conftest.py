@@ -14,6 +14,7 @@ from egovcp.testing import CountingEnv
 
 type MakeEpisode = Callable[..., Episode]
 
+COLLECTED = Provenance("stance-1", seed=5, command="collect", config={"eta": 0.3})
 LENGTHS = (12, 7, 12, 5, 9, 12)
 
 
@@ -43,8 +44,7 @@ def walk(number: int, length: int, time_limit: int = 12, task: str = "ball") -> 
 
 def write(root: Path, numbers: list[int], provenance: Provenance | None = None) -> Path:
     """A dataset of the walks with these numbers, tasks in turn, three episodes per file."""
-    known = provenance or Provenance("stance-1", seed=5, command="collect", config={"eta": 0.3})
-    with DatasetWriter(root, known, shard_episodes=3) as writer:
+    with DatasetWriter(root, provenance or COLLECTED, shard_episodes=3) as writer:
         for n in numbers:
             writer.add(walk(n, LENGTHS[n % 6], task="wall" if n % 2 else "ball"))
     return root

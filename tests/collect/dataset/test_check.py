@@ -1,13 +1,16 @@
 """The report of the check: all problems up to a limit, each with its place."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from egovcp.data import DatasetWriter, Episode, Provenance
 from egovcp_collect.dataset.cli import main
 
 from . import damage as d
+from .conftest import COLLECTED, walk, write
 
 pytestmark = pytest.mark.usefixtures("no_network")
 
@@ -70,3 +73,58 @@ def test_a_missing_folder_is_told_without_asking_the_hub(
 ) -> None:
     assert main(["check", str(tmp_path / "none")]) == 3
     assert "there is no such folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("second", "file", "words"),
+    [
+        (walk(0, 12), d.DATA, "repeats episode 0"),
+        (
+            replace(walk(7, 12), metadata={"seed": 5, "episode": 0}),
+            d.COLLECTION,
+            r"is ball/5/0 (task/seed/number), and so is episode 0, of other content",
+        ),
+        (replace(walk(0, 12), metadata={"seed": 5, "episode": 3}), d.DATA, "repeats episode 0"),
+    ],
+)
+@pytest.mark.parametrize("hashed", [True, False])
+def test_an_episode_that_is_there_twice_is_found(
+    second: Episode, file: str, words: str, hashed: bool, tmp_path: Path
+) -> None:
+    root, report = tmp_path / "twice", tmp_path / "report.json"
+    with DatasetWriter(root, COLLECTED) as writer:
+        for episode in (walk(0, 12), walk(1, 7), second):
+            writer.add(episode)
+    if not hashed:
+        (root / d.HASHES).unlink()
+        d.edit(d.COLLECTION, lambda c: [r.pop("sha256") for r in c["episodes"]])(root)
+    assert main(["check", str(root), f"--json={report}"]) == 3
+    problems = json.loads(report.read_text())["problems"]
+    assert [(p["file"], p["episode"], p["problem"]) for p in problems] == [(file, 2, words)]
+    new = tmp_path / "new"
+    assert main(["repair", str(root), f"--output_dir={new}"]) == 0
+    assert main(["check", str(new)]) == 0
+
+
+def test_recorded_rollouts_of_one_scenario_are_different_episodes(tmp_path: Path) -> None:
+    root = tmp_path / "rollouts"
+    with DatasetWriter(root, COLLECTED) as writer:
+        for number in range(2):
+            facts = {"rollout": {"seed": 5, "episode": 0}}
+            writer.add(replace(walk(number, 12), metadata=facts))
+    assert main(["check", str(root)]) == 0
+
+
+@pytest.mark.parametrize("source", [2, -1, True, "x", None])
+def test_an_episode_of_no_recorded_collection_is_found(
+    source: object, sound: Path, tmp_path: Path
+) -> None:
+    other = write(tmp_path / "other", [6], Provenance("stance-1", 6, config={"eta": 0.1}))
+    merged, report = tmp_path / "merged", tmp_path / "report.json"
+    assert main(["merge", str(sound), str(other), f"--output_dir={merged}"]) == 0
+    (merged / d.HASHES).unlink()
+    change = d.edit(d.COLLECTION, lambda c: c["episodes"][6]["metadata"].update({"source": source}))
+    change(merged)
+    assert main(["check", str(merged), f"--json={report}"]) == 3
+    (problem,) = json.loads(report.read_text())["problems"]
+    assert (problem["file"], problem["episode"]) == (d.COLLECTION, 6)

@@ -39,7 +39,8 @@ def test_every_subcommand_explains_its_options(
         (["check", "{sound}", "--max_problem=3"], "did you mean '--max_problems'"),
         (["check", "{sound}", "--max_problems=0"], "expected at least 1"),
         (["info", "{sound}", "--json={sound}"], "cannot be a file"),
-        (["audit", "{sound}", "--episodes=[0,6]"], "no episode 6"),
+        (["audit", "{sound}", "--episodes=[0,6]"], "names episode 6, but the dataset has"),
+        (["audit", "{sound}", "--episodes=1000"], "--episodes=1000: for a single episode write"),
     ],
 )
 def test_what_cannot_be_meant_is_a_usage_error_in_one_line(

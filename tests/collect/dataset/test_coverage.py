@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from egovcp_collect.dataset import figures
+from egovcp import packages
 from egovcp_collect.dataset.cli import main
 
 from .scenes import scene, three_balls, write_scenes
@@ -62,7 +62,7 @@ def test_pictures_of_a_dataset_without_returns_or_events(sound: Path, tmp_path: 
 def test_a_missing_matplotlib_is_said_before_anything_is_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(figures, "find_spec", lambda name: None)
+    monkeypatch.setattr(packages, "is_installed", lambda name: name != "matplotlib")
     nowhere = tmp_path / "nowhere"
     assert main(["coverage", str(nowhere), f"--output_dir={tmp_path / 'pictures'}"]) == 5
     assert "egovcp-collect[pictures]" in capsys.readouterr().err

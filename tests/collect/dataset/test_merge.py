@@ -1,15 +1,16 @@
 """One dataset out of several: every episode as it was, with its own facts."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from egovcp.data import DatasetConfig, DatasetReader, Provenance
+from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Provenance
 from egovcp_collect.dataset.cli import main
 
 from . import damage
-from .conftest import write
+from .conftest import COLLECTED, walk, write
 
 
 def _reader(root: Path) -> DatasetReader:
@@ -42,18 +43,47 @@ def test_unequal_collections_keep_what_each_was(sound: Path, tmp_path: Path) -> 
     assert [source["seed"] for source in used] == [5] * 6 + [6] * 2 + [7]
 
 
-def test_episodes_that_came_before_are_refused_or_dropped(
+def test_episodes_with_the_content_of_an_earlier_one_are_refused_or_dropped(
     sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     again, new = write(tmp_path / "again", [6, 4]), tmp_path / "new"
     flags = ["merge", str(sound), str(again), f"--output_dir={new}"]
     assert main(flags) == 3
-    assert f"{again}, episode 1 is ball/5/4" in capsys.readouterr().err
+    assert f"{again}, episode 1 equals {sound}, episode 4" in capsys.readouterr().err
     assert not new.exists()
     report = tmp_path / "report.json"
     assert main([*flags, "--duplicates=drop", f"--json={report}"]) == 0
     assert _digests(new) == [*_digests(sound), _digests(again)[0]]
     assert json.loads(report.read_text())["dropped"] == 1
+
+
+@pytest.mark.parametrize("duplicates", ["refuse", "drop"])
+def test_equal_seed_and_number_of_another_configuration_are_another_episode(
+    sound: Path, tmp_path: Path, duplicates: str
+) -> None:
+    other, new = tmp_path / "other", tmp_path / "new"
+    with DatasetWriter(other, Provenance("stance-1", seed=5, config={"eta": 0.1})) as writer:
+        for n in (0, 1):
+            writer.add(replace(walk(n + 10, 12), metadata={"seed": 5, "episode": n}))
+    flags = [f"--output_dir={new}", f"--duplicates={duplicates}"]
+    assert main(["merge", str(sound), str(other), *flags]) == 0
+    assert _digests(new) == _digests(sound, other)
+    assert main(["check", str(new)]) == 0
+
+
+def test_equal_scenarios_of_other_content_are_refused(
+    sound: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    other, new = tmp_path / "other", tmp_path / "new"
+    with DatasetWriter(other, COLLECTED) as writer:
+        writer.add(replace(walk(10, 12), metadata={"seed": 5, "episode": 0}))
+    for duplicates in ("refuse", "drop"):
+        flags = [f"--output_dir={new}", f"--duplicates={duplicates}"]
+        assert main(["merge", str(sound), str(other), *flags]) == 3
+        message = capsys.readouterr().err
+        assert f"{other}, episode 0 is ball/5/0" in message
+        assert f"{sound}, episode 0" in message
+    assert not new.exists()
 
 
 def test_controllers_do_not_mix(

@@ -158,6 +158,15 @@ def test_a_pull_that_failed_goes_on_where_it_was(hub: FakeHub, root: Path, tmp_p
     assert hashes(tmp_path / "copy") == hashes(root)
 
 
+def test_a_pull_that_brought_nothing_leaves_nothing(
+    hub: FakeHub, root: Path, tmp_path: Path
+) -> None:
+    assert push(root) == 0
+    hub.fail("resolve", 403)
+    assert pull(tmp_path / "copy") == 5
+    assert not list(tmp_path.glob("*copy*"))
+
+
 def test_a_folder_is_not_overwritten_but_recognised(
     hub: FakeHub, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from rerun.experimental import RrdReader
 
-from egovcp import spec
+from egovcp import packages, spec
 from egovcp.data import DatasetReader
 from egovcp.log import paths
 from egovcp.robot.kinematics import LINK_NAMES
@@ -136,6 +136,6 @@ def test_spawn_opens_a_viewer_that_only_this_machine_can_reach(
 def test_a_missing_rerun_is_an_environment_failure(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(viz, "find_spec", lambda name: None)
+    monkeypatch.setattr(packages, "is_installed", lambda name: name != "rerun")
     assert main(["viz", "--dataset.root=anything"]) == 5
     assert "egovcp-collect[viz]" in capsys.readouterr().err

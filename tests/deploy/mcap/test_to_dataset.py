@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from egovcp import packages
 from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetReader, open_dataset
 from egovcp.log.mcap_reader import read_recording
@@ -136,6 +137,20 @@ def test_it_trains(record: Record, tmp_path: Path) -> None:
     flags += ["--returns.steps=4", "--sampling.length=6"]
     assert train([f"--dataset.root={tmp_path / 'new'}", *flags]) == 0
     assert (tmp_path / "run/checkpoints/last/pretrained_model/model.safetensors").is_file()
+
+
+def test_a_missing_package_is_named_before_anything_is_written(
+    record: Record,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    file = record()
+    monkeypatch.setattr(packages, "is_installed", lambda name: name != "pandas")
+    assert main(["to-dataset", str(file), f"--dataset.root={tmp_path / 'new'}"]) == 5
+    message = "writing a dataset needs pandas, which is not installed"
+    assert message in capsys.readouterr().err
+    assert [path for path in tmp_path.iterdir() if "new" in path.name] == []
 
 
 def live(tick: Tick) -> Tick:

@@ -34,6 +34,7 @@ def _load_and_compare(folder: Path) -> int:
 def test_mutated_policies_are_refused_within_limits(
     original: Path, tmp_path: Path, part: int
 ) -> None:
+    load_artefact(str(original))  # each child inherits what is initialised on first use
     count = POLICIES // 10
     for seed in range(part * count, (part + 1) * count):
         folder = Path(shutil.copytree(original, tmp_path / str(seed)))

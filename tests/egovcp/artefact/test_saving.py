@@ -127,6 +127,7 @@ def test_a_failure_while_writing_leaves_the_old_artefact(
         with pytest.raises(OSError, match="No space left"):
             save_artefact(folder, toy_model(seed=1), PLANNER, PROVENANCE)
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
     save_artefact(folder, toy_model(seed=1), PLANNER, PROVENANCE)  # leftovers do no harm
     load_artefact(str(folder))
 

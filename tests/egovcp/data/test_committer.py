@@ -6,11 +6,13 @@ import sys
 import time
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, Provenance, files
 from egovcp.data.committer import Committer, committing, work_folder
 from egovcp.data.encoded import encode
@@ -345,3 +347,86 @@ def test_killed_at_random_moments(tmp_path: Path) -> None:
 @pytest.mark.timeout(3600)
 def test_killed_at_two_hundred_random_moments(tmp_path: Path) -> None:
     _kill_at_random_moments(tmp_path, 200)
+
+
+def _without(root: Path, episodes: Sequence[Episode], numbers: Sequence[int]) -> None:
+    """A dataset of these episodes of a run, as `egovcp-dataset repair` writes it."""
+    with DatasetWriter(root, _RUN, _SHARD) as writer:
+        for number in numbers:
+            writer.add(episodes[number])
+
+
+@pytest.mark.parametrize(
+    ("left", "added"),
+    [([0, 2, 3], [4, 5]), ([0, 1, 3], [4, 5]), ([2], [3, 4, 5]), ([3, 0], [4, 5])],
+)
+@pytest.mark.parametrize("at_once", [True, False])
+def test_resume_continues_after_the_highest_number(
+    tmp_path: Path, episodes: list[Episode], left: list[int], added: list[int], at_once: bool
+) -> None:
+    root, expected = tmp_path / "d", tmp_path / "expected"
+    _without(root, episodes, left)
+    steps = [added] if at_once else [[number] for number in added]
+    for numbers in steps:
+        with committing(root, _RUN, _SHARD, _agree) as committer:
+            count = committer.committed + len(numbers)
+            assert committer.missing(count) == numbers
+            _seal(committer, episodes, numbers)
+            assert committer.missing(count) == []
+            assert committer.commit() == numbers
+            assert committer.committed == count
+    _without(expected, episodes, [*left, *added])
+    assert _tree(root) == _tree(expected)
+    assert not list(dataset_problems(root))
+
+
+def test_what_was_sealed_before_a_removal_is_still_taken_up(
+    tmp_path: Path, episodes: list[Episode]
+) -> None:
+    root = tmp_path / "d"
+    _without(root, episodes, [0, 2])
+    with committing(root, _RUN, _SHARD, _agree) as committer:
+        _seal(committer, episodes, [4])
+    with committing(root, _RUN, _SHARD, _agree) as committer:
+        assert (committer.committed, committer.sealed) == (2, 1)
+        assert committer.missing(4) == [3]
+        _seal(committer, episodes, [3])
+        assert committer.commit() == [3, 4]
+
+
+@pytest.mark.parametrize(
+    ("facts", "error", "words"),
+    [
+        ({"seed": 0, "episode": 0}, DataError, "is number 0 of the collection, and so is"),
+        ({"seed": 1, "episode": 1}, UsageError, "several collections and cannot be extended"),
+        ({"seed": 0, "episode": "1"}, DataError, "its number is '1', expected an integer"),
+        ({"seed": 0, "episode": True}, DataError, "its number is True, expected an integer"),
+    ],
+)
+def test_resume_refuses_episodes_that_it_cannot_continue(
+    tmp_path: Path,
+    episodes: list[Episode],
+    facts: dict[str, Any],
+    error: type[Exception],
+    words: str,
+) -> None:
+    root = tmp_path / "d"
+    with DatasetWriter(root, _RUN, _SHARD) as writer:
+        writer.add(episodes[0])
+        writer.add(replace(episodes[1], metadata=facts))
+    before = _tree(root)
+    with pytest.raises(error, match=words), committing(root, _RUN, _SHARD, _agree):
+        pass
+    assert _tree(root) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["d"]
+
+
+def test_resume_refuses_a_merged_dataset(tmp_path: Path, episodes: list[Episode]) -> None:
+    sources = [{"controller_id": "stance-1", "seed": seed} for seed in range(2)]
+    with DatasetWriter(tmp_path / "d", replace(_RUN, config={"sources": sources})) as writer:
+        writer.add(episodes[0])
+    with (
+        pytest.raises(UsageError, match="several collections and cannot be extended"),
+        committing(tmp_path / "d", _RUN, _SHARD, _agree),
+    ):
+        pass

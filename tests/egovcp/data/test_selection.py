@@ -22,19 +22,20 @@ from egovcp.errors import UsageError
         (":2", [0, 1]),
         ("8:", [8, 9]),
         ("[0:2, 9, 4:6]", [0, 1, 4, 5, 9]),
+        ("(0:2, 9)", [0, 1, 9]),
     ],
 )
 def test_numbers_and_ranges(text: str, numbers: list[int]) -> None:
     np.testing.assert_array_equal(select_episodes(text, 10), numbers)
 
 
-@pytest.mark.parametrize("text", ["0:11", "[3, 10]", "20:30"])
+@pytest.mark.parametrize("text", ["0:11", "[3, 10]", "20:30", "0:999999999999"])
 def test_what_is_not_there_is_refused_with_the_number_there_is(text: str) -> None:
     with pytest.raises(UsageError, match=r"the dataset has 10 episodes, 0 to 9"):
         select_episodes(text, 10)
 
 
-@pytest.mark.parametrize("text", ["a", "[1, x]", "-1", "[]", "1:2:3", "1.5"])
+@pytest.mark.parametrize("text", ["a", "[1, x]", "-1", "[]", "1:2:3", "1.5", f"[{'9' * 5000}]"])
 def test_what_is_no_episode_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match=r"is no episode; expected numbers, \[0, 5, 7\]"):
         select_episodes(text, 10)

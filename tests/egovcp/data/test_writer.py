@@ -6,6 +6,7 @@ import pytest
 
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, Provenance
+from egovcp.data.version import Version
 from egovcp.errors import DataError, UsageError
 
 _ARRAYS = ("depth", "state", "action", "reward", "done", "success", "truncated")
@@ -84,6 +85,19 @@ def _fail_after(root: Path, episode: Episode) -> None:
 def test_a_failed_run_leaves_nothing(tmp_path: Path, episodes: list[Episode]) -> None:
     with pytest.raises(RuntimeError, match="stop"):
         _fail_after(tmp_path / "new", episodes[0])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("error", [ModuleNotFoundError("No module named 'pandas'"), OSError(28)])
+def test_a_failure_to_complete_the_files_leaves_nothing(
+    tmp_path: Path, episodes: list[Episode], monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    def fail(self: Version) -> None:
+        raise error
+
+    monkeypatch.setattr(Version, "_write_tasks", fail)
+    with pytest.raises(type(error)), DatasetWriter(tmp_path / "new", Provenance("s")) as writer:
+        writer.add(episodes[0])
     assert list(tmp_path.iterdir()) == []
 
 

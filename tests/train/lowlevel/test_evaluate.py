@@ -9,7 +9,7 @@ import pytest
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import ACTION_BOX, ACTION_ETA
-from egovcp_train.lowlevel import skills
+from egovcp_train.lowlevel import skills, trial
 from egovcp_train.lowlevel.evaluate import main
 from egovcp_train.lowlevel.skills import SKILLS, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
@@ -108,11 +108,23 @@ def test_it_writes_a_line_per_skill(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "squat" in capsys.readouterr().out
 
 
+def test_a_diverging_simulation_is_an_error_and_writes_no_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    monkeypatch.setattr(trial, "MAX_SPEED", 1e-3)
+    flags = [f"--output_dir={tmp_path}", "--skills=squat", "--episodes=2", "--threads=1"]
+    assert main(flags) == 3
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert "the simulation diverged in skill squat, seed 1000, tick 0, robot 0" in message
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("flag", "code", "message"),
     [
         ("--skills=squad", 2, "did you mean 'squat'"),
         ("--episodes=0", 2, "--episodes"),
+        ("--disturbances.mass_scale=[0.9,100]", 2, "at least 0.5 and at most 2"),
         ("--controller=stans", 2, "expected stance"),
         ("--controller=none.safetensors", 4, "no such controller"),
     ],

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from egovcp import packages
 from egovcp.robot.walk_policy import WalkPolicy
 from egovcp.robot.walking import OBSERVATION_DIM, WalkConfig, WalkingController
 from egovcp.sim.config import SensorConfig
@@ -55,6 +56,13 @@ def test_it_goes_on_where_it_stopped(run: Path, capsys: pytest.CaptureFixture[st
 def test_bad_options_are_refused(tmp_path, capsys, flags, code, message):
     assert main([f"--output_dir={tmp_path / 'new'}", *flags]) == code
     assert message in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_missing_package_is_named_before_any_work(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(packages, "is_installed", lambda name: name != "onnx")
+    assert main([f"--output_dir={tmp_path / 'new'}", *SMALL]) == 5
+    assert "egovcp-train-lowlevel needs onnx" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 

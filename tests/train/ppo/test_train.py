@@ -6,6 +6,7 @@ import pytest
 
 from egovcp.reactive import ReactiveNetwork
 from egovcp.robot.stance import StanceController
+from egovcp.sim import robot
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.ppo.train import main
 
@@ -54,6 +55,14 @@ def test_another_network_does_not_continue_the_run(
     assert "does not fit" in capsys.readouterr().err
 
 
+def test_a_diverging_simulation_is_an_error_that_names_the_episode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(robot, "MAX_SPEED", 2.0)  # m/s; a ball is faster
+    assert main([f"--output_dir={tmp_path}", "--steps=24", *SMALL]) == 3
+    assert "the simulation diverged in task ball, seed 0" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("flags", "code", "message"),
     [
@@ -62,6 +71,7 @@ def test_another_network_does_not_continue_the_run(
         (["--seed=1000000000"], 2, "are for evaluation"),
         (["--initial_std=0"], 2, "--initial_std"),
         (["--network.frames=0"], 2, "--network.frames=0: expected at least 1"),
+        (["--env.ball.mass_range=[1,1e6]"], 2, "at least 0.001 and at most 10"),
         (["--resume"], 4, "no checkpoint to resume from"),
     ],
 )

@@ -12,6 +12,7 @@ from typing import Any, Final
 import torch
 
 from egovcp.artefact import Artefact, load_artefact
+from egovcp.atomic import write_text
 from egovcp.bounds import bounded
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore
@@ -147,7 +148,7 @@ def _run(config: HeldoutConfig, artefact: Artefact, reader: DatasetReader) -> di
 def _write(output: Path, report: Report, run: dict[str, Any]) -> None:
     output.mkdir(parents=True, exist_ok=True)
     content = {"tasks": report.tasks, "all_tasks": report.metrics, "_run": run}
-    (output / RESULT).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_text(output / RESULT, json.dumps(content, indent=2) + "\n")
 
 
 def _show(output: Path, report: Report, depth_max_m: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from egovcp.atomic import write_json
 from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
@@ -93,7 +93,7 @@ def evaluate(config: LowLevelEvalConfig) -> None:
     loads = _standing_load(config) if "rest" in figures else {}
     output.mkdir(parents=True, exist_ok=True)
     run = {"controller": controller.id, "command": [PROG, *sys.argv[1:]], "seed": config.seed}
-    (output / RESULT).write_text(json.dumps(figures | loads | {"_run": run}, indent=2))
+    write_json(output / RESULT, figures | loads | {"_run": run})
     echo(f"figures: {output / RESULT}")
 
 

@@ -29,23 +29,23 @@ def _check_ranges(where: str, config: object) -> None:
 class CommandConfig:
     """The commands of training episodes; a new one every few seconds."""
 
-    interval: Range = bounded((2.0, 6.0), above=0)
+    interval: Range = bounded((2.0, 6.0), least=0.02, most=3600)
     """s between changes of velocity and of how hands and height move."""
     standing: float = bounded(0.4, least=0, most=1)
     """Share of commands with zero velocity."""
-    forward: tuple[Range, Range] = ((0.1, 0.3), (0.1, 0.6))
+    forward: tuple[Range, Range] = bounded(((0.1, 0.3), (0.1, 0.6)), least=-3, most=3)
     """m/s, easy and hard."""
     backward: float = bounded(0.1, least=0, most=1)
     """Share of the walking commands that go backwards, at up to half the speed."""
-    sideways: float = bounded(0.15, least=0)
+    sideways: float = bounded(0.15, least=0, most=3)
     """m/s at the hardest, either way, in a third of the walking commands."""
-    turning: float = bounded(0.4, least=0)
+    turning: float = bounded(0.4, least=0, most=5)
     """rad/s at the hardest, either way, in a third of the walking commands."""
-    standing_height: tuple[Range, Range] = bounded(((0.65, 0.75), (0.50, 0.76)), above=0)
+    standing_height: tuple[Range, Range] = bounded(((0.65, 0.75), (0.50, 0.76)), least=0.3, most=1)
     """m, easy and hard."""
-    walking_height: tuple[Range, Range] = bounded(((0.70, 0.75), (0.55, 0.75)), above=0)
+    walking_height: tuple[Range, Range] = bounded(((0.70, 0.75), (0.55, 0.75)), least=0.3, most=1)
     """m, easy and hard."""
-    acceleration: float = bounded(0.8, above=0)
+    acceleration: float = bounded(0.8, least=0.01, most=100)
     """m/s^2 and rad/s^2 at which the commanded velocity changes."""
     still_hands: float = bounded(0.2, least=0, most=1)
     """Share of commands whose hands rest; the others follow the data's random walk."""
@@ -59,23 +59,23 @@ class CommandConfig:
 class DisturbanceConfig:
     """Pushes, physical parameters, delay and noise."""
 
-    push_interval: Range = bounded((3.0, 8.0), above=0)
+    push_interval: Range = bounded((3.0, 8.0), least=0.02, most=3600)
     """s between pushes."""
-    push: Range = bounded((0.1, 0.7), least=0)
+    push: Range = bounded((0.1, 0.7), least=0, most=5)
     """m/s of horizontal velocity at most, easy and hard."""
-    friction: Range = bounded((0.5, 1.1), least=0)
-    """Sliding friction of the feet."""
-    payload: Range = (-0.5, 2.0)
+    friction: Range = bounded((0.5, 1.1), least=0.01, most=5)
+    """Sliding friction of the feet; the simulation diverges without any."""
+    payload: Range = bounded((-0.5, 2.0), least=-2, most=30)
     """kg on the torso."""
-    mass_scale: Range = bounded((0.95, 1.05), above=0)
+    mass_scale: Range = bounded((0.95, 1.05), least=0.5, most=2)
     """Factor on every mass."""
-    stiffness_scale: Range = bounded((0.8, 1.2), above=0)
+    stiffness_scale: Range = bounded((0.8, 1.2), least=0.1, most=5)
     """Factor on the stiffness of every servo."""
-    damping_scale: Range = bounded((0.8, 1.2), above=0)
+    damping_scale: Range = bounded((0.8, 1.2), least=0.1, most=5)
     """Factor on the damping of every servo."""
-    delay: Range = bounded((0.0, 0.02), least=0)
+    delay: Range = bounded((0.0, 0.02), least=0, most=0.02)
     """s from a measurement to the new targets' effect, in physics steps."""
-    models: int = bounded(64, least=1)
+    models: int = bounded(64, least=1, most=4096)
     """Robots of different physical parameters."""
 
     def __post_init__(self) -> None:

@@ -21,12 +21,7 @@ from egovcp.robot.walk_onnx import export_onnx
 from egovcp.robot.walking import WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.terminal import echo
-from egovcp_train.checkpoint import (
-    begin_checkpoint,
-    checkpoint_dir,
-    finish_checkpoint,
-    load_training_state,
-)
+from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
 from egovcp_train.iterations import run_iterations
 from egovcp_train.loop import Budget
 from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig, PpoConfig
@@ -115,7 +110,8 @@ def train(config: LowLevelTrainConfig) -> None:
 
 def _build(config: LowLevelTrainConfig, threads: int) -> Any:
     """The environment and PPO; imported here, so that --help needs neither."""
-    require_packages("egovcp-train", PROG, "rsl_rl", "tensordict", *SIMULATOR_MODULES)
+    # onnx, too: each checkpoint holds the controller as an ONNX graph
+    require_packages("egovcp-train", PROG, "onnx", "rsl_rl", "tensordict", *SIMULATOR_MODULES)
     from egovcp_train.lowlevel.env import LowLevelEnv
     from egovcp_train.lowlevel.learn import PpoLearner
 
@@ -171,9 +167,6 @@ class _Run:
 
     def save(self) -> None:
         """Write a checkpoint: the controller's file, and the training state."""
-        partial = begin_checkpoint(self.output, self.learner.iteration)
-        folder = partial / "pretrained_model"
-        folder.mkdir(parents=True)
         provenance = {
             "command": [PROG, *sys.argv[1:]],
             "seed": self.config.seed,
@@ -182,9 +175,10 @@ class _Run:
             "train_config": draccus.encode(self.config),
         }
         policy = self.learner.policy(self.config.walk, provenance)
-        policy.save(folder / POLICY_FILE)
-        export_onnx(policy, folder / ONNX_FILE)
-        finish_checkpoint(partial, self.learner.state_dict())
+        state = self.learner.state_dict()
+        with new_checkpoint(self.output, self.learner.iteration, state) as folder:
+            policy.save(folder / POLICY_FILE)
+            export_onnx(policy, folder / ONNX_FILE)
 
 
 def _summary(scalars: dict[str, float]) -> dict[str, str]:

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.errors import SimulationDiverged
 from egovcp.robot.controller import LowLevelController
 from egovcp.robot.g1 import WAIST
 from egovcp.robot.kinematics import torso_rotation
 from egovcp.robot.mjcf import FootModel
 from egovcp.robot.reach import nearest_reachable
 from egovcp.sim.config import SensorConfig
+from egovcp.sim.robot import MAX_SPEED
 from egovcp.sim.sensors import noise_std
 from egovcp.spec import CONTROLLER_HZ
 from egovcp_train.lowlevel import events
@@ -85,27 +88,42 @@ def play(
     feet: FootModel = "stock",
     threads: int = 1,
 ) -> Outcome:
-    """Run ``skill`` once with each of ``robots`` robots of different physical parameters."""
+    """Run ``skill`` once with each of ``robots`` robots of different physical parameters.
+
+    Raises:
+        SimulationDiverged: the physics of a robot that has not fallen is not that of a real one.
+    """
     rng = np.random.default_rng([seed, 1])
-    physics = Physics(robots, feet, disturbances, threads, seed)
     commands = skill.script(skill.ticks, robots, rng)
     qpos = events.neutral(robots)
-    physics.place(np.arange(robots), qpos, qpos[:, 7:])
-    delay = events.delays(robots, disturbances, rng)
     std, record = noise_std(sensors), _Record()
     alive = np.ones((skill.ticks, robots), dtype=bool)
-    x = physics.snapshot()
-    controller.reset(measure(x, commands[0], std, rng))
-    for tick, command in enumerate(commands):
-        if skill.push and tick == _PUSH_TICK:
-            physics.qvel[:, :2] += events.kick(skill.push, events.directions(robots, rng))
-        state = measure(x, command, std, rng)
-        physics.step(controller.step(state), delay)
+    with closing(Physics(robots, feet, disturbances, threads, seed)) as physics:
+        physics.place(np.arange(robots), qpos, qpos[:, 7:])
+        delay = events.delays(robots, disturbances, rng)
         x = physics.snapshot()
-        alive[tick:] &= ~_fallen(x)
-        record.add(x, command, controller.stepping)
-    physics.close()
+        controller.reset(measure(x, commands[0], std, rng))
+        for tick, command in enumerate(commands):
+            if skill.push and tick == _PUSH_TICK:
+                physics.qvel[:, :2] += events.kick(skill.push, events.directions(robots, rng))
+            state = measure(x, command, std, rng)
+            physics.step(controller.step(state), delay)
+            x = physics.snapshot()
+            _require_valid(physics, alive[tick], f"skill {skill.name}, seed {seed}, tick {tick}")
+            alive[tick:] &= ~_fallen(x)
+            record.add(x, command, controller.stepping)
     return _judge(skill, commands, record, alive)
+
+
+def _require_valid(physics: Physics, alive: NDArray[np.bool_], where: str) -> None:
+    speed = np.abs(physics.qvel).max(axis=1)
+    valid = np.isfinite(physics.state).all(axis=1) & (speed <= MAX_SPEED)
+    for robot in np.flatnonzero(alive & ~valid):
+        found = f"greatest velocity {speed[robot]:.3g} per second, expected at most {MAX_SPEED:g}"
+        raise SimulationDiverged(
+            f"the simulation diverged in {where}, robot {robot}: {found}; choose narrower ranges "
+            "of --disturbances, or another controller"
+        )
 
 
 def _fallen(x: Snapshot) -> NDArray[np.bool_]:

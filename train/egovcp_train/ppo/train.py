@@ -16,12 +16,7 @@ from egovcp.cli import run_command, save_config
 from egovcp.errors import ArtefactError
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.terminal import echo
-from egovcp_train.checkpoint import (
-    begin_checkpoint,
-    checkpoint_dir,
-    finish_checkpoint,
-    load_training_state,
-)
+from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
 from egovcp_train.iterations import run_iterations
 from egovcp_train.loop import Budget
 from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options
@@ -83,11 +78,9 @@ def _run(config: PpoTrainConfig, output: Path, learner: Any, spent: float) -> No
 
     def save() -> None:
         """The policy's file, and the training state."""
-        partial = begin_checkpoint(output, learner.iteration)
-        folder = partial / "pretrained_model"
-        folder.mkdir(parents=True)
-        learner.policy(_provenance(config, learner)).save(folder / POLICY_FILE)
-        finish_checkpoint(partial, learner.state_dict() | {"seconds": budget.spent})
+        state = learner.state_dict() | {"seconds": budget.spent}
+        with new_checkpoint(output, learner.iteration, state) as folder:
+            learner.policy(_provenance(config, learner)).save(folder / POLICY_FILE)
 
     recorder = Recorder(output, enabled=config.tensorboard)
     finished = run_iterations(learner, budget, recorder, save, config.save_freq, _summary)

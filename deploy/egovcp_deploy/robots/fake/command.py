@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
+from egovcp.atomic import write_bytes
 from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import EnvironmentFailure, UsageError
@@ -140,9 +141,8 @@ def _live(config: FakeConfig, bridge: FakeBridge, stage: Stage) -> None:
 
 def _write(path: str, outcomes: Sequence[Outcome]) -> None:
     """Complete or absent, and quickly: the robot waits meanwhile."""
-    part = Path(f"{path}.partial")
-    part.write_text(json.dumps([record(outcome) for outcome in outcomes], indent=2) + "\n")
-    part.replace(path)
+    text = json.dumps([record(outcome) for outcome in outcomes], indent=2) + "\n"
+    write_bytes(Path(path), text.encode(), durable=False)
 
 
 class Pace:

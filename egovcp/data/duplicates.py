@@ -1,0 +1,44 @@
+"""Finds episodes that are there twice: with equal content, or of the same scenario."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from egovcp.data.origin import ScenarioKey
+
+
+@dataclass(frozen=True)
+class Duplicate[P]:
+    """An episode that came before."""
+
+    place: P
+    """Where the earlier episode is."""
+    equal: bool
+    """Whether the content is equal. If not, seed, number and provenance are, so that one of the two
+    was altered, or they were simulated on different machines."""
+
+
+class DuplicateFinder[P]:
+    """Is told of episodes one by one; ``P`` is whatever says where one is."""
+
+    def __init__(self) -> None:
+        self._by_digest: dict[str, P] = {}
+        self._by_scenario: dict[ScenarioKey, P] = {}
+
+    def add(self, place: P, digest: str, scenario: ScenarioKey | None) -> Duplicate[P] | None:
+        """The earlier episode that this one repeats, if there is one.
+
+        Args:
+            place: where the episode is.
+            digest: its `Episode.digest`.
+            scenario: what it simulates; None: unknown.
+        """
+        if digest in self._by_digest:
+            return Duplicate(self._by_digest[digest], equal=True)
+        self._by_digest[digest] = place
+        if scenario is None:
+            return None
+        if scenario in self._by_scenario:
+            return Duplicate(self._by_scenario[scenario], equal=False)
+        self._by_scenario[scenario] = place
+        return None

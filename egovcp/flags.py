@@ -1,0 +1,129 @@
+"""Command-line flags of a configuration dataclass: ``--group.option=value``."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final, get_type_hints
+
+from draccus.utils import CONFIG_ARG
+
+from egovcp.errors import UsageError, suggest
+from egovcp.safe_files import UnsafeFileError, read_text
+from egovcp.values import WrongValue, convert, is_collection, is_dataclass_type, parse_collection
+
+CONFIG_FILE: Final = f"--{CONFIG_ARG}"
+HELP: Final = ("-h", "--help")
+_FILE_LIMIT_BYTES: Final = 4 << 20
+
+
+def flags_of(config_class: type) -> dict[str, Any]:
+    """Flag -> type, of all options and groups of options of a dataclass."""
+    return {CONFIG_FILE: str, **dict(_flags(config_class, "--"))}
+
+
+def _flags(config_class: type, prefix: str) -> Iterator[tuple[str, Any]]:
+    kinds = get_type_hints(config_class)
+    for field in dataclasses.fields(config_class):
+        kind = kinds[field.name]
+        yield f"{prefix}{field.name}", kind
+        if is_dataclass_type(kind):
+            yield from _flags(kind, f"{prefix}{field.name}.")
+
+
+def split_flags(argv: Sequence[str], flags: Mapping[str, Any]) -> list[str]:
+    """The arguments as ``--name=value`` each: ``--a b`` is ``--a=b``, a switch alone is true.
+
+    Raises:
+        UsageError: an argument is no flag, an unknown one, or lacks its value.
+    """
+    joined: list[str] = []
+    for arg in argv:
+        takes_value = bool(joined) and joined[-1].startswith("--") and "=" not in joined[-1]
+        if takes_value and not arg.startswith("--") and joined[-1] not in HELP:
+            joined[-1] += f"={arg}"
+        else:
+            joined.append(arg)
+    return [_checked(arg, flags) for arg in joined]
+
+
+def _checked(arg: str, flags: Mapping[str, Any]) -> str:
+    flag, equals, _ = arg.partition("=")
+    if arg in HELP:
+        return arg
+    if not flag.startswith("-"):
+        raise UsageError(f"unexpected argument {arg!r}; options are written --name=value")
+    if flag not in flags:
+        near = suggest(flag, flags).split(" choose from")[0].rstrip(";")
+        raise WrongValue(f"unknown option {flag}{near}")
+    if not equals and flags[flag] is not bool:
+        raise WrongValue(f"option {flag} needs a value, {flag}=...")
+    return arg if equals else f"{arg}=true"
+
+
+def flag_values(args: Sequence[str], flags: Mapping[str, Any]) -> dict[str, Any]:
+    """The values of all flags and of the config file, nested by group; the last flag decides.
+
+    Args:
+        args: as `split_flags` returns them.
+        flags: as `flags_of` returns them.
+
+    Raises:
+        UsageError: a value is not of the type of its option, or the file cannot be read.
+    """
+    given: dict[str, Any] = {}
+    file = ""
+    for arg in args:
+        flag, _, text = arg.partition("=")
+        if flag == CONFIG_FILE:
+            file = convert(str, text, flag)
+        else:
+            value: Any = _value(flag, text, flags[flag])
+            for part in reversed(flag.removeprefix("--").split(".")):
+                value = {part: value}
+            given = merged(given, value)
+    return merged(_read_file(file), given) if file else given
+
+
+def _value(flag: str, text: str, kind: Any) -> Any:
+    """The value as it is merged with others: checked, except that a group is left as a mapping."""
+    value: Any = text
+    if is_collection(kind) and text:
+        try:
+            value = parse_collection(text)
+        except ValueError:
+            value = text
+    if is_dataclass_type(kind) and isinstance(value, Mapping):
+        return value
+    convert(kind, value, flag)
+    return value
+
+
+def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
+    """Both, groups within groups; ``above`` has the last word."""
+    out = {**below}
+    for key, value in above.items():
+        old = out.get(key)
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            value = merged(old, value)
+        out[key] = value
+    return out
+
+
+def _read_file(file: str) -> dict[str, Any]:
+    """The options that a YAML, JSON or TOML file holds."""
+    try:
+        text = read_text(Path(file), _FILE_LIMIT_BYTES)
+        found: Any = tomllib.loads(text) if file.endswith(".toml") else parse_collection(text)
+    except OSError as error:
+        raise UsageError(f"{CONFIG_FILE}: cannot read {file}: {error.strerror}") from error
+    except UnsafeFileError as error:
+        raise UsageError(f"{CONFIG_FILE}: cannot read {file}: {error}") from error
+    except ValueError as error:
+        raise UsageError(f"{CONFIG_FILE}: {file} holds no options: {error}") from error
+    if not isinstance(found or {}, dict):
+        kind = type(found).__name__
+        raise UsageError(f"{CONFIG_FILE}: {file} holds a {kind}; expected options, name: value")
+    return found or {}
