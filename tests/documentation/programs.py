@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import io
 import re
 import runpy
@@ -14,11 +15,13 @@ from functools import cache
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, get_type_hints
 from unittest import mock
 
 import egovcp.cli
 from egovcp.entry_point import EntryPoint
+from lerobot_env_egovcp import EgovcpEnvConfig
+from lerobot_policy_egovcp import EgovcpConfig
 
 ROOT = Path(__file__).resolve().parents[2]
 #: LeRobot's commands that read their options into a dataclass -> that class.
@@ -41,7 +44,9 @@ class _Parsed(BaseException):
 def check(argv: Sequence[str]) -> None:
     """Raise `WrongCommand` if the program of this command line would refuse it."""
     program, *args = argv
-    if program == "make":
+    if not args and program not in ("make", "pip", "python"):
+        main_of(program)
+    elif program == "make":
         _require(args[0] in _makefile_targets(), f"make has no target {args[0]}")
     elif program == "pip":
         _check_packages(args[1:])
@@ -49,7 +54,9 @@ def check(argv: Sequence[str]) -> None:
         _check_script(args)
     elif program in _LEROBOT_CONFIGS:
         _check_lerobot(program, args)
-    elif program != "rerun":
+    elif program == "rerun":
+        main_of(program)
+    else:
         _check_parser(program, args, lambda: main_of(program)(args))
 
 
@@ -64,14 +71,31 @@ def main_of(program: str) -> Callable[..., int]:
 
 
 @cache
-def own_flags() -> frozenset[str]:
-    """Every flag of every command of ours, as their help names it."""
+def known_flags() -> frozenset[str]:
+    """Every flag of our commands, of our plugins in LeRobot's commands, and of the benchmarks."""
     found: set[str] = set()
     for point in metadata.entry_points(group="console_scripts"):
         if point.name.startswith("egovcp-"):
             for subcommand in _subcommands(point.name):
                 found |= set(re.findall(r"--[\w.-]+", _help(point.name, *subcommand)))
+    found |= set(_option_names(EgovcpConfig, "--policy."))
+    found |= set(_option_names(EgovcpEnvConfig, "--env."))
+    for script in (ROOT / "benchmarks").glob("*.py"):
+        found |= set(re.findall(r'"(--[\w.-]+)"', script.read_text(encoding="utf-8")))
+    for study in (ROOT / "experiment/egovcp_experiment/studies").glob("[a-z]*.py"):
+        module = import_module(f"egovcp_experiment.studies.{study.stem}")
+        found |= set(_option_names(module.CONFIG, "--")) if hasattr(module, "CONFIG") else set()
     return frozenset(found)
+
+
+def _option_names(config_class: type, prefix: str) -> Iterator[str]:
+    """Flags of a dataclass and of those within it."""
+    kinds = get_type_hints(config_class)
+    for field in dataclasses.fields(config_class):
+        name, kind = prefix + field.name, kinds[field.name]
+        yield name
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
+            yield from _option_names(kind, f"{name}.")
 
 
 def _subcommands(program: str) -> list[list[str]]:
@@ -148,8 +172,6 @@ def _check_script(args: Sequence[str]) -> None:
 def _check_lerobot(program: str, args: Sequence[str]) -> None:
     from lerobot.configs import parser
 
-    for plugin in ("policy", "env", "robot"):
-        import_module(f"lerobot_{plugin}_egovcp")
     module, name = _LEROBOT_CONFIGS[program].split(":")
 
     def parsed(cfg: Any) -> None:
