@@ -29,7 +29,7 @@ from egovcp.errors import DataError
 from egovcp.log.info import RunInfo
 from egovcp.log.mcap import METADATA_NAME, Line
 from egovcp.log.messages import VALUE_MAPS, Topic
-from egovcp.log.tick import BasePose, Candidates, SceneObject, Tick, ValueMap
+from egovcp.log.tick import BasePose, Candidates, MotorReadings, SceneObject, Tick, ValueMap
 from egovcp.spec import DEPTH_COLS
 
 _FLAGS = ("terminated", "truncated", "success")
@@ -237,10 +237,40 @@ def _tick(index: int, time_ns: int, messages: Mapping[str, Any]) -> Tick:
         scene=_scene(messages.get(Topic.SCENE)),
         events=tuple(log.msg.split("\n")) if log else (),
         mode=_mode(messages.get(Topic.MODE)),
+        motors=motor_readings(messages),
+        link=_scalars(messages.get(Topic.LINK)),
         terminated=flags["terminated"],
         truncated=flags["truncated"],
         success=flags["success"],
     )
+
+
+def motor_readings(messages: Mapping[str, Any]) -> MotorReadings | None:
+    """From the decoded messages of a tick, topic -> message; None: no torque was recorded."""
+    joints = messages.get(Topic.JOINTS)
+    if joints is None or not len(joints.effort):
+        return None
+    temperature = messages.get(Topic.MOTOR_TEMPERATURE)
+    status = _rows(messages.get(Topic.MOTOR_STATUS))
+    return MotorReadings(
+        torque=np.array(joints.effort, np.float64),
+        temperature=None if temperature is None else _array(temperature).T,
+        faults=_integers(status.get("faults")),
+        lost=_integers(status.get("lost")),
+        enabled=None if "enabled" not in status else status["enabled"] != 0.0,
+    )
+
+
+def _rows(message: Any) -> dict[str, NDArray[np.float64]]:
+    """Label -> row of a matrix."""
+    if message is None:
+        return {}
+    names = message.layout.dim[0].label.split(",")
+    return dict(zip(names, _array(message), strict=True))
+
+
+def _integers(row: NDArray[np.float64] | None) -> NDArray[np.int64] | None:
+    return None if row is None else row.astype(np.int64)
 
 
 def _array(message: Any) -> NDArray[np.float64]:
