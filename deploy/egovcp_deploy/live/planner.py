@@ -204,6 +204,8 @@ class PlannerLoop:
             timing_ms={} if reply is None else {"plan": reply.plan_ms},
             events=events,
             mode=report.mode,
+            motors=report.motors,
+            link=report.link,
             **thoughts(reply),
         )
 

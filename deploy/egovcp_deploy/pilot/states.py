@@ -92,6 +92,10 @@ class Facts:
     """False once the planner is known to be gone."""
     refusal: str = ""
     """Why the robot must not be armed; empty: nothing speaks against it."""
+    hold: str = ""
+    """Why the robot must be held, found by a check outside the state machine; empty: nothing."""
+    damp: str = ""
+    """Why its motors must be damped, likewise."""
 
 
 _NEXT: Final = {Request.STAND: State.INIT, Request.ARM: State.STAND, Request.RUN: State.ARMED}
@@ -142,6 +146,8 @@ class Supervisor:
 
     def _why_damp(self, facts: Facts) -> str:
         limits = self.limits
+        if facts.damp:
+            return facts.damp
         if facts.state_age_s > limits.state_damp_s:
             return f"no new proprioception for {facts.state_age_s * 1e3:.0f} ms"
         if not facts.controller_ok:
@@ -154,6 +160,8 @@ class Supervisor:
 
     def _why_hold(self, facts: Facts) -> str:
         limits = self.limits
+        if facts.hold:
+            return facts.hold
         if not facts.planner_alive:
             return "the planner is gone"
         if facts.planner_silence_s > limits.planner_hold_s:

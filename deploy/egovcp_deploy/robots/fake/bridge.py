@@ -7,16 +7,18 @@ without commands is this fake's own choice, not knowledge about the robot: after
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import zmq
+from numpy.typing import NDArray
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.sim.live import LIMP, LiveRobot, Phase, Servos
-from egovcp.spec import PHYSICS_DT
+from egovcp.spec import NUM_JOINTS, PHYSICS_DT
 from egovcp_deploy.robots.body import BodyState
 from egovcp_deploy.robots.depth_wire import WirePicture, encode_picture
 from egovcp_deploy.robots.fake.faults import Faults
@@ -35,6 +37,8 @@ from egovcp_deploy.robots.wire import (
 
 WATCHDOG_S: Final = 0.2
 MODE: Final = 5  # what the fake reports as its mode machine
+_MOTOR_DEG_C: Final = 35.0
+_DISCONNECTED: Final = 0x80000000  # see `motor_fields.FAULTS`
 _COUNTED_S: Final = 0.5  # how long a program counts as one that sends commands
 _MOST_PER_STEP: Final = 100  # commands taken in within 5 ms; the rest waits
 
@@ -73,6 +77,8 @@ class FakeBridge:
         faults: may be changed at any time.
         announce: whether states tell how many programs send commands, which LeRobot's bridge
             does not.
+        detailed: whether states tell casing and winding temperatures, status and lost packets of
+            each motor; LeRobot's bridge sends one temperature and no status.
 
     Raises:
         EnvironmentFailure: a port is in use.
@@ -84,12 +90,14 @@ class FakeBridge:
         ports: Ports | None = None,
         faults: Faults | None = None,
         announce: bool = False,
+        detailed: bool = False,
     ) -> None:
         self._robot = robot
         self.faults = faults or Faults()
         self.pressed: frozenset[str] = frozenset()
         self.counts = Counts()
         self._announce = announce
+        self._detailed = detailed
         self._rng = np.random.default_rng(0)
         self._senders: dict[int, float] = {}
         self._time = 0.0  # s of simulated time since the start
@@ -147,7 +155,7 @@ class FakeBridge:
         """Let 5 ms pass."""
         self._listen()
         self._happen()
-        self.robot.drive(self._intruder() if self.faults.intruder else self._servos)
+        self.robot.drive(self._obeyed())
         self.robot.advance()
         self._time += PHYSICS_DT
         self._publish_state()
@@ -199,6 +207,37 @@ class FakeBridge:
             self.robot.release()
             faults.release = False
 
+    def _obeyed(self) -> Servos:
+        """What the motors do: what they are told, or what a fault makes them do."""
+        servos = self._intruder() if self.faults.intruder else self._servos
+        if self.faults.dropped_motor is None:
+            return servos
+        works = np.arange(NUM_JOINTS) != self.faults.dropped_motor
+        return replace(
+            servos,
+            stiffness=works * servos.stiffness,
+            damping=works * servos.damping,
+            torque=works * servos.torque,
+        )
+
+    def _motors(self, torque: NDArray[np.float64]) -> MotorReadings:
+        """What the motors report, in as much detail as this fake's states have."""
+        faults = self.faults
+        temperature = np.full((NUM_JOINTS, 2), _MOTOR_DEG_C)
+        if faults.hot_motor is not None:
+            joint, degrees = faults.hot_motor
+            temperature[joint] = _MOTOR_DEG_C, degrees
+        if not self._detailed:
+            temperature = temperature.mean(axis=1, keepdims=True)  # as LeRobot's bridge does
+        readings = MotorReadings(torque, None if faults.no_temperature else temperature)
+        if not self._detailed:
+            return readings
+        status, lost = np.zeros(NUM_JOINTS, np.int64), np.zeros(NUM_JOINTS, np.int64)
+        if faults.dropped_motor is not None:
+            status[faults.dropped_motor] = _DISCONNECTED
+            lost[faults.dropped_motor] = self.robot.steps
+        return replace(readings, faults=status, lost=lost, enabled=status == 0)
+
     def _intruder(self) -> Servos:
         """Another program, which holds every joint where it is, a little askew."""
         joints = self.robot.robot.data.qpos[self.robot.robot.index.joint_qpos]
@@ -228,8 +267,9 @@ class FakeBridge:
             angular_velocity=seen.angular_velocity,
             mode=self._mode,
             remote=Remote.asking_for(self.robot.velocity_wish, self.pressed).to_bytes(),
+            motors=self._motors(seen.torque),
         )
-        return encode_state(LowState(body, seen.torque, self._sources()), seen.acceleration)
+        return encode_state(LowState(body, self._sources()), seen.acceleration)
 
     def _sources(self) -> int | None:
         """How many programs send commands."""
