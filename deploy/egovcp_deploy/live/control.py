@@ -49,6 +49,8 @@ class ControlLoop:
         pilot: the state machine and the way to the planner.
         velocity: bounds on what the operator may ask for.
         refusal: why the robot must not be armed; asked at every tick, empty: nothing.
+        fault: why the motors must be damped, likewise.
+        skipped: what was wrong with the readings since the newest that was used, likewise.
         link: figures about the connection for the log, `Tick.link`; asked at every planner tick.
     """
 
@@ -60,13 +62,15 @@ class ControlLoop:
         pilot: Pilot,
         velocity: VelocityCommand | None = None,
         refusal: Callable[[], str] = lambda: "",
+        fault: Callable[[], str] = lambda: "",
+        skipped: Callable[[], str] = lambda: "",
         link: Callable[[int], Mapping[str, float]] = lambda now_ns: {},
     ) -> None:
         self._body, self._eye = body, eye
         self._controller = controller
         self.pilot = pilot
         self._velocity = velocity or VelocityCommand()
-        self._refusal = refusal
+        self._refusal, self._fault, self._skipped = refusal, fault, skipped
         self._link = link
         self._motor_watch = MotorWatch()
         self._command: MotorCommand | None = None  # the last one written
@@ -89,7 +93,9 @@ class ControlLoop:
         sent = np.concatenate([self._moving, ACTION_BOX.to_metric(self.pilot.sent)])
         state = None if reading is None else proprioception(reading, sent)
         depth = None if picture is None else picture.depth
-        self.pilot.sense(now_ns, state, depth)
+        state_ns = None if reading is None else reading.time_ns
+        depth_ns = None if picture is None else picture.time_ns
+        self.pilot.sense(now_ns, state, depth, state_ns, depth_ns)
         before = self.state
         self._judge(now_ns, wishes.request, reading)
         if state is not None and self._count % CONTROLLER_TICKS_PER_PLAN == 0:
@@ -111,8 +117,14 @@ class ControlLoop:
             standing = self.state not in (State.INIT, State.DAMP)
             verdict = self._motor_watch.update(reading, self._command, standing)
         self.pilot.note(verdict.events)
-        refusal = self._refusal() or verdict.refusal
-        self.pilot.judge(now_ns, request, True, refusal, verdict.hold, verdict.damp)
+        self.pilot.judge(
+            now_ns,
+            request,
+            refusal=self._refusal() or verdict.refusal,
+            hold=verdict.hold,
+            damp=self._fault() or verdict.damp,
+            skipped=self._skipped(),
+        )
 
     def _read(self) -> BodyState | None:
         """The newest reading that is all numbers; a broken one would poison the controller."""

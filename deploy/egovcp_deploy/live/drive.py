@@ -227,7 +227,8 @@ def _connect(body: BridgeBody) -> str:
     body.connect()
     reading = body.read()
     assert reading is not None, "connect waits for a reading"
-    return f"answers at {body.config.host}, mode machine {reading.mode}"
+    found = f"answers at {body.config.host}, mode machine {reading.mode}"
+    return f"{found}; warning: {body.warning}" if body.warning else found
 
 
 def _alone(body: BridgeBody) -> str:

@@ -9,6 +9,7 @@ from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import Final
 
+from egovcp.log.background import tell_on_stderr
 from egovcp_deploy.live.process import last_words
 from egovcp_deploy.robots.body import Body
 from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
@@ -19,7 +20,8 @@ _ROUNDS: Final = 20  # of last words, 50 ms each
 @contextmanager
 def spare_body(config: BridgeConfig) -> Iterator[BridgeBody]:
     """A second connection to the robot that only speaks: 500 states a second are not decoded for
-    a few last words, which need the robot's mode and no more.
+    a few last words, which need the robot's mode and no more. What the operator should know of the
+    robot is printed once.
 
     Raises:
         EnvironmentFailure: the robot does not answer.
@@ -27,6 +29,8 @@ def spare_body(config: BridgeConfig) -> Iterator[BridgeBody]:
     body = BridgeBody(config)
     body.connect()
     try:
+        if body.warning:
+            tell_on_stderr(f"egovcp-deploy: warning: {body.warning}")
         body.deafen()
         yield body
     finally:

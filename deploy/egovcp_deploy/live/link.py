@@ -22,6 +22,7 @@ from egovcp_deploy.pilot.desk import BACKLOG, Reply, Report
 from egovcp_deploy.pilot.states import Request
 
 _REPLY_PARTS: Final = 2
+_MOST_RECEIVED: Final = 4 * BACKLOG  # messages per call
 _NONE: Final = np.zeros(0, np.float32)
 
 
@@ -182,10 +183,11 @@ class Link:
         return True
 
     def receive(self, timeout_s: float = 0.0) -> Iterator[list[bytes]]:
-        """Everything that is there; waits for the first at most ``timeout_s``."""
+        """Everything that is there, up to `_MOST_RECEIVED`, so that a sender cannot delay the
+        receiver for longer; waits for the first at most ``timeout_s``."""
         if timeout_s > 0 and not self._socket.poll(round(timeout_s * 1e3)):
             return
-        while True:
+        for _ in range(_MOST_RECEIVED):
             try:
                 yield self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:

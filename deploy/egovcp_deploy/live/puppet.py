@@ -6,7 +6,6 @@ stands the robot up, holds it when actions stop coming, damps it when it must.
 
 from __future__ import annotations
 
-import tempfile
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
@@ -22,6 +21,7 @@ from egovcp_deploy.live.guard import Guard, spare_body
 from egovcp_deploy.live.link import Link, Order, decode_report, encode_order, encode_reply
 from egovcp_deploy.live.operators import EASE_S, Auto, Operator
 from egovcp_deploy.live.run import LiveSetup, started
+from egovcp_deploy.live.run_folder import run_folder
 from egovcp_deploy.pilot.desk import Reply, Report
 from egovcp_deploy.pilot.states import Request, State
 
@@ -78,7 +78,7 @@ class Puppet:
             raise
 
     def _start(self) -> None:
-        folder = self._stack.enter_context(tempfile.TemporaryDirectory(prefix="egovcp-"))
+        folder = self._stack.enter_context(run_folder())
         address = f"ipc://{folder}/link"
         self._link = Link(address, serve=True)
         self._stack.callback(self._link.close)

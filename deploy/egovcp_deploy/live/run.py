@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -22,6 +21,7 @@ from egovcp_deploy.live.link import Link
 from egovcp_deploy.live.operators import Operator
 from egovcp_deploy.live.planner import LiveSummary, PlannerLoop
 from egovcp_deploy.live.process import ControlSetup, control_process
+from egovcp_deploy.live.run_folder import run_folder
 from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
 
@@ -54,7 +54,7 @@ def run_live(
         EnvironmentFailure: the robot does not answer, or the control process died.
     """
     with ExitStack() as stack:
-        folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="egovcp-"))
+        folder = stack.enter_context(run_folder())
         address = f"ipc://{folder}/link"
         link = Link(address, serve=True)
         stack.callback(link.close)

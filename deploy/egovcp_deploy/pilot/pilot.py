@@ -70,11 +70,21 @@ class Pilot:
         now_ns: int,
         state: NDArray[np.floating] | None,
         depth: NDArray[np.uint16] | None,
+        state_ns: int | None = None,
+        depth_ns: int | None = None,
     ) -> None:
-        """Take the newest readings, state (74,) and depth (48, 64); None: there are none."""
+        """Take the newest readings.
+
+        Args:
+            now_ns: now.
+            state: (74,) proprioception; None: there is none.
+            depth: (48, 64); None: there is none.
+            state_ns: when the state arrived, on the clock of ``now_ns``; None: now.
+            depth_ns: likewise.
+        """
         measured = None if state is None else np.delete(np.asarray(state), COMMAND_SLICE)
-        self._proprioception.update(now_ns, measured)
-        self._eye.update(now_ns, depth)
+        self._proprioception.update(now_ns if state_ns is None else state_ns, measured)
+        self._eye.update(now_ns if depth_ns is None else depth_ns, depth)
         if measured is not None and np.isfinite(measured).all():
             self._posture = posture(np.asarray(state))
 
@@ -86,10 +96,17 @@ class Pilot:
         refusal: str = "",
         hold: str = "",
         damp: str = "",
+        skipped: str = "",
     ) -> State:
         """Move the state machine on; where it is now. Reasons: see `Facts`."""
         before = self.supervisor.state
-        facts = replace(self._facts(now_ns, controller_ok), refusal=refusal, hold=hold, damp=damp)
+        facts = replace(
+            self._facts(now_ns, controller_ok),
+            refusal=refusal,
+            hold=hold,
+            damp=damp,
+            skipped=skipped,
+        )
         self._events += self.supervisor.update(facts, request)
         if before is State.ARMED and self.supervisor.state is State.RUN:
             self._first = True

@@ -96,6 +96,14 @@ class Facts:
     """Why the robot must be held, found by a check outside the state machine; empty: nothing."""
     damp: str = ""
     """Why its motors must be damped, likewise."""
+    skipped: str = ""
+    """What was wrong with the proprioception since the newest that was used; empty: none came."""
+
+
+def _stale(facts: Facts) -> str:
+    """That proprioception is too old, and why."""
+    words = f"no new proprioception for {facts.state_age_s * 1e3:.0f} ms"
+    return f"{words} ({facts.skipped})" if facts.skipped else words
 
 
 _NEXT: Final = {Request.STAND: State.INIT, Request.ARM: State.STAND, Request.RUN: State.ARMED}
@@ -149,7 +157,7 @@ class Supervisor:
         if facts.damp:
             return facts.damp
         if facts.state_age_s > limits.state_damp_s:
-            return f"no new proprioception for {facts.state_age_s * 1e3:.0f} ms"
+            return _stale(facts)
         if not facts.controller_ok:
             return "the low-level controller gave targets that are not numbers"
         if not facts.tilt <= limits.tilt_damp:
@@ -169,7 +177,7 @@ class Supervisor:
         if facts.misses > limits.misses_hold:
             return f"{facts.misses} ticks in a row without a plan in time"
         if facts.state_age_s > limits.state_hold_s:
-            return f"no new proprioception for {facts.state_age_s * 1e3:.0f} ms"
+            return _stale(facts)
         if facts.picture_age_s > limits.picture_hold_s:
             return f"no new picture for {facts.picture_age_s * 1e3:.0f} ms"
         return ""

@@ -10,12 +10,15 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
 import zmq
 
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import EnvironmentFailure
 from egovcp_deploy.robots.body import BodyState, MotorCommand
 from egovcp_deploy.robots.listener import Listener, join, probe
+from egovcp_deploy.robots.machine import objection, warning
+from egovcp_deploy.robots.plausibility import PlausibilityFilter
 from egovcp_deploy.robots.publisher import PublisherWatch
 from egovcp_deploy.robots.wire import (
     COMMAND_PORT,
@@ -32,6 +35,9 @@ _START: Final = (
 )
 
 
+MODE_CHANGE_S: Final = 0.1  # a single reading with another mode is not believed
+
+
 @dataclass(frozen=True)
 class BridgeConfig:
     """Where the robot is."""
@@ -44,8 +50,10 @@ class BridgeConfig:
     command_port: int = bounded(COMMAND_PORT, least=1, most=65535)
     """Its port for commands."""
     mode: int | None = None
-    """Mode machine that the robot must report, which tells its hardware; null: any, as long as it
-    stays the same."""
+    """Mode machine that the robot must report, which tells its hardware; null: any with 29 joints
+    and a free waist. Naming one with a locked waist accepts it."""
+    consistency: bool = True
+    """Reject readings whose positions and speeds contradict each other. Bounds are always on."""
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -56,6 +64,8 @@ class Traffic:
     """What has passed over the wire."""
 
     readings: int = 0
+    implausible: int = 0
+    """Readings that no G1 can produce (`plausibility`); none was used."""
     repeated: int = 0
     """Readings equal to the last, bit for bit: noise never repeats, so the driver is stuck."""
     garbled: int = 0
@@ -76,9 +86,13 @@ class BridgeBody:
         self.config = config or BridgeConfig()
         self.traffic = Traffic()
         self.watch = PublisherWatch()
+        self._filter = PlausibilityFilter(self.config.consistency)
         self._newest: BodyState | None = None
         self._payload = b""
         self._mode: int | None = None
+        self._other_mode_ns: int | None = None  # since when another mode has been reported
+        self._skipped = 0  # readings since the newest that was used
+        self._why_skipped = ""
         self._listener: Listener | None = None
 
     def connect(self, timeout: float = 5.0) -> None:
@@ -94,7 +108,7 @@ class BridgeBody:
         try:
             if self._newest is None:
                 raise EnvironmentFailure(self._diagnosis(timeout))
-            if trouble := self._mode_trouble():
+            if trouble := self._mode_trouble() or self._machine_trouble():
                 raise EnvironmentFailure(trouble)
         except EnvironmentFailure:
             self.close()
@@ -118,23 +132,40 @@ class BridgeBody:
         assert self._listener is not None, "connect first"
         self._listener.close()
 
-    def _take(self, payload: bytes, time_ns: int) -> None:
-        """A message that arrived at ``time_ns``."""
+    def _take(self, payload: bytes, time_ns: int) -> bool:
+        """A message that arrived at ``time_ns``; whether it is a usable reading."""
         if payload == self._payload:
             self.traffic.repeated += 1
-            return
+            return False
         self._payload = payload
         try:
             state = decode_state(payload, time_ns)
         except Garbled as error:
             self.traffic.garbled += 1
-            self.traffic.problem = str(error)
-            return
+            self._skip(str(error))
+            return False
+        if problem := self._filter.judge(state.body, np.asarray(state.motors.torque, np.float64)):
+            self.traffic.implausible += 1
+            self._skip(problem)
+            return False
         self.traffic.readings += 1
         self.watch.heard(state)
-        if self._mode is None:
-            self._mode = state.body.mode
+        self._watch_mode(state.body)
         self._newest = state.body
+        self._skipped = 0
+        return True
+
+    def _skip(self, problem: str) -> None:
+        self._skipped += 1
+        self._why_skipped = self.traffic.problem = problem
+
+    def _watch_mode(self, body: BodyState) -> None:
+        if self._mode is None:
+            self._mode = body.mode
+        if body.mode == self._mode:
+            self._other_mode_ns = None
+        elif self._other_mode_ns is None:
+            self._other_mode_ns = body.time_ns
 
     def read(self) -> BodyState | None:
         """The newest reading; its time is that of its arrival, whenever it is read."""
@@ -164,6 +195,33 @@ class BridgeBody:
         """
         return self._mode_trouble() or self.watch.verdict
 
+    @property
+    def fault(self) -> str:
+        """Why the motors must be damped, in words; empty: nothing.
+
+        The mode machine has been another than at the start for `MODE_CHANGE_S`: the robot no
+        longer is what the controller assumes, or has left low-level control.
+        """
+        newest, since = self._newest, self._other_mode_ns
+        if newest is None or since is None or newest.time_ns - since < MODE_CHANGE_S * 1e9:
+            return ""
+        return f"the mode machine changed from {self._mode} to {newest.mode}"
+
+    @property
+    def skipped(self) -> str:
+        """What was wrong with the messages since the newest reading; empty: there were none."""
+        count, why = self._skipped, self._why_skipped
+        return f"{count} readings rejected, the last: {why}" if count else ""
+
+    @property
+    def warning(self) -> str:
+        """What the operator should know of this robot; empty: nothing."""
+        return "" if self._newest is None else warning(self._newest.mode)
+
+    def _machine_trouble(self) -> str:
+        assert self._newest is not None, "asked after the first reading"
+        return objection(self._newest.mode, confirmed=self.config.mode is not None)
+
     def _mode_trouble(self) -> str:
         found = self._newest.mode if self._newest else None
         wanted = self._mode if self.config.mode is None else self.config.mode
@@ -182,6 +240,11 @@ class BridgeBody:
             return (
                 f"{traffic.garbled} messages from {where}, none a state of a G1: "
                 f"{traffic.problem}; expected LeRobot's bridge there, of lerobot 0.6"
+            )
+        if traffic.implausible:
+            return (
+                f"{traffic.implausible} states from {where}, none that a G1 can be in: "
+                f"{traffic.problem}; check the robot's sensors and joints"
             )
         if reason := probe(config.host, config.state_port):
             return f"nothing at {where} ({reason}): expected LeRobot's bridge; {_START}"

@@ -62,7 +62,8 @@ class ZmqEye:
             self.close()
             raise EnvironmentFailure(diagnosis)
 
-    def _take(self, frame: bytes, time_ns: int) -> None:
+    def _take(self, frame: bytes, time_ns: int) -> bool:
+        """A message that arrived at ``time_ns``; whether it is a new picture."""
         try:
             picture = decode_picture(frame)
             if abs(picture.vertical_fov - self.config.vertical_fov) > _FOV_SLACK:
@@ -73,13 +74,14 @@ class ZmqEye:
         except Garbled as error:
             self.garbled += 1
             self.problem = str(error)
-            return
+            return False
         if picture.sequence == self._sequence:
             self.repeated += 1
-            return
+            return False
         self.pictures += 1
         self._sequence = picture.sequence
         self._newest = Picture(time_ns, picture.depth)
+        return True
 
     def read(self) -> Picture | None:
         """The newest picture; its time is that of its arrival, whenever it is read."""

@@ -84,14 +84,14 @@ class SimBody:
 class SimEye:
     """The camera of a `LiveRobot`."""
 
-    def __init__(self, robot: LiveRobot, faults: Faults) -> None:
-        self._robot, self._faults = robot, faults
+    def __init__(self, robot: LiveRobot, clock: LockstepClock, faults: Faults) -> None:
+        self._robot, self._clock, self._faults = robot, clock, faults
         self._last: Picture | None = None
 
     def read(self) -> Picture | None:
         if not self._faults.blind or self._last is None:
-            step, depth = self._robot.picture
-            self._last = Picture(step * 5_000_000, depth)
+            _, depth = self._robot.picture
+            self._last = Picture(self._clock.now_ns(), depth)
         return self._last
 
     def close(self) -> None:
@@ -188,7 +188,7 @@ def make_rig() -> Callable[..., Rig]:
         controller = StanceController()
         loop = ControlLoop(
             body,
-            SimEye(robot, faults),
+            SimEye(robot, clock, faults),
             controller,
             Pilot(desk, Limits()),
             refusal=lambda: faults.refusal,
