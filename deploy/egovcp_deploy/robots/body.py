@@ -62,7 +62,8 @@ class Picture:
     depth: NDArray[np.uint16]
     """(48, 64) planar depth, mm, 0 invalid."""
     taken_ns: int | None = None
-    """When it was captured, on the same clock; None: the camera does not say."""
+    """When the camera's driver received it, on the same clock; the time of a network is not in it.
+    None: the camera does not say."""
 
 
 class Body(Protocol):

@@ -286,7 +286,8 @@ class FakeBridge:
         if not self.faults.freeze_camera:
             self._sequence += 1
             fov = self.robot.config.camera.vertical_fov
-            self._last_picture = encode_picture(WirePicture(self._sequence, fov, depth))
+            age = (self.robot.steps - taken) * PHYSICS_DT
+            self._last_picture = encode_picture(WirePicture(self._sequence, fov, depth, age))
         if self._sequence and not self._lost():
             self._pictures.send(self._last_picture)
 

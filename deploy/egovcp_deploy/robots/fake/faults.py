@@ -53,7 +53,7 @@ class Faults:
     @property
     def active(self) -> list[str]:
         """Names of those that are on."""
-        return [f.name for f in fields(self) if not _is_off(getattr(self, f.name))]
+        return [f.name for f in fields(self) if getattr(self, f.name) != f.default]
 
     def obey(self, line: str) -> str:
         """Do what a line of the console says; return what to answer.
@@ -100,10 +100,6 @@ class Faults:
             raise UsageError(
                 "hot_motor takes a joint and deg C, such as hot_motor left_knee_joint 125"
             ) from error
-
-
-def _is_off(value: object) -> bool:
-    return value is None or value is False or (type(value) is float and value == 0.0)
 
 
 def _joint(name: str) -> int:
