@@ -47,6 +47,7 @@ _TORN: Final = (
 ROW_TOPICS: Final = frozenset(
     {Topic.DEPTH, Topic.STATE, Topic.ACTION, Topic.REWARD, Topic.MODE, Topic.LOG}
 )
+_MOTOR_TOPICS: Final = frozenset({Topic.JOINTS, Topic.MOTOR_TEMPERATURE, Topic.MOTOR_STATUS})
 
 
 @dataclass(frozen=True)
@@ -98,6 +99,32 @@ class Moment:
     def text(self, topic: str) -> str:
         """The words on ``topic``, a log; empty where there are none."""
         return str(self._decode(topic).msg) if topic in self.messages else ""
+
+    def mode(self) -> str:
+        """`Tick.mode`.
+
+        Raises:
+            DataError: the message is damaged.
+        """
+        return _mode(self._decoded({Topic.MODE}).get(Topic.MODE))
+
+    def motors(self) -> MotorReadings | None:
+        """`Tick.motors`.
+
+        Raises:
+            DataError: a message is damaged.
+        """
+        try:
+            return motor_readings(self._decoded(_MOTOR_TOPICS))
+        except (ValueError, IndexError, AttributeError) as error:
+            raise DataError(f"tick {self.index} is damaged: {error}") from error
+
+    def _decoded(self, topics: Collection[str]) -> dict[str, Any]:
+        """Topic -> decoded message, of those of ``topics`` that the tick has."""
+        try:
+            return {name: self._decode(name) for name in self.messages.keys() & set(topics)}
+        except (struct.error, ValueError, IndexError, AttributeError) as error:
+            raise DataError(f"tick {self.index} is damaged: {error}") from error
 
     def _decode(self, topic: str) -> Any:
         line = self.lines[topic]

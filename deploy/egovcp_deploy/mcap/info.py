@@ -13,12 +13,14 @@ from egovcp.log.info import RunInfo
 from egovcp.log.mcap_reader import Moment, RecordingReader
 from egovcp.log.messages import Topic
 from egovcp.rate import NS_PER_S
+from egovcp_deploy.mcap.history import History, history_words
 
 
 @dataclass(frozen=True)
 class InfoConfig:
-    """Say what is in a recording: the run, its ticks and rates, its topics, what is missing, and
-    whether the file is complete."""
+    """Say what is in a recording: the run, its ticks and rates, its topics, what is missing,
+    every change of the runner's state with its reason, maxima per joint, and whether the file is
+    complete."""
 
     file: str = ""
     """The recording, an MCAP file."""
@@ -58,6 +60,7 @@ class Summary:
     """Lines in the log."""
     messages: Counter[str] = field(default_factory=Counter)
     types: dict[str, str] = field(default_factory=dict)
+    history: History = field(default_factory=History)
 
     @property
     def missing(self) -> int:
@@ -81,6 +84,9 @@ class Summary:
             "missing": self.missing,
             "gaps": [asdict(gap) for gap in self.gaps],
             "events": self.events,
+            "last_event": self.history.ending,
+            "states": [asdict(change) for change in self.history.changes],
+            "joint_maxima": None if self.history.joints is None else self.history.joints.to_json(),
             "topics": {
                 topic: {
                     "type": self.types[topic],
@@ -112,7 +118,11 @@ def run(config: InfoConfig) -> None:
 
 
 def summarise(path: Path) -> Summary:
-    """Go through the whole recording once; what is inside the messages is not looked at."""
+    """Go through the whole recording once.
+
+    Raises:
+        DataError: not a recording of ours, or one with a damaged message.
+    """
     reader = RecordingReader(path)
     summary = Summary(str(path), path.stat().st_size, reader.info)
     period_ns = NS_PER_S // reader.info.fps
@@ -125,6 +135,7 @@ def summarise(path: Path) -> Summary:
         last = moment
         summary.ticks += 1
         summary.messages.update(moment.messages.keys())
+        summary.history.add(moment)
         summary.events += len(moment.text(Topic.LOG).splitlines())
     if last is not None:
         summary.duration_s = (last.time_ns - first_ns + period_ns) / NS_PER_S
@@ -154,6 +165,7 @@ def text(summary: Summary) -> str:
         *(f"hash      {name} {value}" for name, value in info.hashes.items()),
         f"versions  {', '.join(f'{name} {v}' for name, v in info.versions.items())}",
         *([f"planner   computed by {info.backend}"] if info.backend else []),
+        *history_words(summary.history),
         "topics",
     ]
     width = max(map(len, summary.messages), default=0)
