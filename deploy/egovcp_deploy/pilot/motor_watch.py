@@ -334,6 +334,14 @@ def margins(temperature: Array) -> Margins:
     return Margins(*beyond.T)
 
 
+def hottest(motors: MotorReadings) -> str:
+    """The motor that is nearest to its limit, with its temperatures; empty: none reports any."""
+    if motors.temperature is None:
+        return ""
+    joint = int(np.argmax(margins(motors.temperature).hold))
+    return f"{JOINT_NAMES[joint]}, {degrees(motors, joint)}"
+
+
 def degrees(motors: MotorReadings, joint: int) -> str:
     """Temperatures of a joint's motor in words."""
     assert motors.temperature is not None, "only motors that report temperatures have one"
