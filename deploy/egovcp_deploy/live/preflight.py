@@ -87,7 +87,8 @@ def examine_hardware(config: DeployConfig, artefact: Artefact | None) -> Iterato
             return "answers"
 
         yield examine("camera", camera)
-        heard = listen(body if robot.error is None else None, eyes[0] if eyes else None)
+        connected = body if robot.error is None else None
+        heard = listen(connected, eyes[0] if eyes else None, LISTEN_S)
         if heard.reading is not None:
             yield from _examine_robot(body, heard.reading, heard, config.robot.limits)
         if eyes:
@@ -120,9 +121,7 @@ def _alone(body: BridgeBody) -> str:
     return "none noticed"
 
 
-def listen(
-    body: BridgeBody | None, eye: ZmqEye | RealSenseEye | None, seconds: float = LISTEN_S
-) -> Heard:
+def listen(body: BridgeBody | None, eye: ZmqEye | RealSenseEye | None, seconds: float) -> Heard:
     """Watch both for a while; None: not there, and not waited for."""
     heard, watch = Heard(), MotorWatch()
     if body is None and eye is None:

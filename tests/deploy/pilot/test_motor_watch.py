@@ -179,7 +179,7 @@ def test_an_overloaded_motor_is_held_and_a_sensor_fault_forbids_arming_only() ->
     faults[KNEE] = 0x100
     verdict = rig.run(0.1, replace(HEALTHY, faults=faults))
     assert "casing temperature sensor" in verdict.refusal
-    assert not (verdict.hold or verdict.damp)
+    assert (verdict.hold, verdict.damp) == ("", "")
 
 
 def test_a_motor_without_torque_although_much_is_commanded_is_damped_with_its_name() -> None:
