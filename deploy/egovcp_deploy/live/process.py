@@ -108,6 +108,7 @@ class ControlProcess:
             refusal=lambda: hardware.body.trouble,
             fault=lambda: hardware.body.fault,
             skipped=lambda: hardware.body.skipped,
+            link=hardware.link,
         )
         self._remote = RemoteKeys()
         self._orphaned = 0
