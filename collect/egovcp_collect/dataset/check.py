@@ -14,6 +14,7 @@ from tqdm import tqdm
 from egovcp.bounds import bounded
 from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetConfig, metadata
+from egovcp.data.paths import hidden_files
 from egovcp.data.source import local_root, locate
 from egovcp.errors import DataError
 from egovcp_collect.dataset.replace import write_report
@@ -53,6 +54,11 @@ def run(config: CheckConfig) -> None:
     write_report(config.json, content)
     for error in found:
         print(error)
+    if hidden := hidden_files(root / "data") + hidden_files(root / "meta"):
+        print(
+            f"ignored {hidden} hidden files such as ._NAME of macOS, which LeRobot would read; "
+            f"remove them: find {root} -name '.*' -delete"
+        )
     if found:
         raise DataError(_verdict(found, root, config.max_problems))
     print(f"{root}: {episodes} episodes, {frames} frames, nothing wrong")
