@@ -23,7 +23,7 @@ from typing import Any, Final
 import draccus
 
 from egovcp.atomic import write_text
-from egovcp.bounds import bounded, check_bounds
+from egovcp.bounds import bounded, check_bounds, check_cores
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
 from egovcp.flags import HELP, flag_values, flags_of, merged, split_flags
 from egovcp.help_text import print_help
@@ -93,6 +93,7 @@ def parse_config[C](
     except WrongValue as error:
         raise UsageError(f"{error}; see {prog} --help") from None
     check_bounds(config, "--")
+    check_cores(config, "--")
     return config
 
 

@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from egovcp.bounds import bounded, check_bounds
+from egovcp.bounds import bounded, check_bounds, require_cores
 from egovcp.data import DatasetConfig
 from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
+from egovcp.hardware import available_cores
+from egovcp.sim.capacity import require_robots
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT, TASKS
@@ -40,7 +42,7 @@ class CollectConfig:
     """Task to collect: ball, wall, arch, or all of them in turn."""
     mix: MixConfig = field(default_factory=MixConfig)
     """Shares of the tasks under --task=all."""
-    episodes: int = bounded(200, least=1)
+    episodes: int = bounded(200, least=1, most=10**6)
     """Number of episodes, those that --resume finds included."""
     resume: bool = False
     """Go on with the collection that is there, if any; with more episodes, extend the dataset."""
@@ -71,6 +73,10 @@ class CollectConfig:
     def check(self) -> None:
         """Raise `UsageError` for values that make no sense."""
         check_bounds(self, "--")
+        if self.backend == "local":  # a cluster has other cores and other memory
+            require_cores("--num_workers", self.num_workers)
+            workers = self.num_workers or available_cores()
+            require_robots("--num_envs", self.num_envs, min(self.num_envs * workers, self.episodes))
         choices = (*TASKS, ALL_TASKS)
         if self.task not in choices:
             raise UsageError(f"unknown task --task={self.task}{suggest(self.task, choices)}")

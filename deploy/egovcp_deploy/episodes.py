@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor, as_completed
@@ -18,6 +17,7 @@ from numpy.typing import NDArray
 
 from egovcp.artefact import Artefact
 from egovcp.errors import EnvironmentFailure
+from egovcp.hardware import available_cores
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork, ReactivePolicy
 from egovcp.sim.config import EnvConfig
@@ -165,7 +165,7 @@ class Stage:
     def __init__(
         self, setup: Setup, num_workers: int = 0, artefact: Artefact | None = None
     ) -> None:
-        self._workers = num_workers or len(os.sched_getaffinity(0))
+        self._workers = num_workers or available_cores()
         self._player = Player(setup, artefact)
         self._setup = setup
         self._executor: ProcessPoolExecutor | None = None

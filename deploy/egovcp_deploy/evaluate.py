@@ -14,12 +14,14 @@ from tqdm import tqdm
 
 from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
-from egovcp.bounds import bounded, check_bounds
+from egovcp.bounds import MOST_PER_CORE, bounded, check_bounds
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
+from egovcp.hardware import available_cores
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork
 from egovcp.robot.controllers import make_controller
+from egovcp.sim.capacity import require_robots
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.env import decided
 from egovcp.sim.scenario import PLAYABLE, Scenario
@@ -82,7 +84,7 @@ class EvalConfig:
     task: str = "ball"
     """ball, wall, arch, all (these three), or sequence: several in one episode, by default an arch
     and then a throw (--env.sequence.parts)."""
-    episodes: int = bounded(80, least=1)
+    episodes: int = bounded(80, least=1, most=10**6)
     """Scenarios per task."""
     seed: int = bounded(0, least=0)
     """Which held-out scenarios."""
@@ -97,7 +99,7 @@ class EvalConfig:
     """New folder for the results."""
     num_envs: int = bounded(8, least=1)
     """Robots that each process plays side by side."""
-    num_workers: int = bounded(0, least=0)
+    num_workers: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """Processes; 0: one per processor core."""
     env: EnvConfig = field(default_factory=eventful)
     """Scenes, sensors, delays and randomisation."""
@@ -119,6 +121,9 @@ class EvalConfig:
         for name in self.players:
             check_choice("--controllers", name, (*CONTROLLERS, PPO))
         check_bounds(self, "--")
+        workers = self.num_workers or available_cores()
+        robots = min(self.num_envs * workers, self.episodes * len(self.tasks))
+        require_robots("--num_envs", self.num_envs, robots)
         held_out(self.tasks[0], self.seed, 0)
         if "planner" in self.players:
             self.policy.require("leave planner out of --controllers")

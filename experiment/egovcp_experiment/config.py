@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from egovcp.bounds import bounded, check_bounds
+from egovcp.bounds import bounded, check_bounds, require_cores
 from egovcp.errors import UsageError, suggest
 from egovcp.spec import TASKS
 
@@ -189,6 +189,8 @@ class ExperimentConfig:
         if not self.output_dir:
             raise UsageError("--output_dir is missing; name the folder of cells and reports")
         check_bounds(self, "--")
+        if self.backend == "local":
+            require_cores("--jobs", self.jobs)
         models = (*TASKS, "all")
         for option, given, known in (
             ("tasks", self.tasks, TASKS),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from egovcp.bounds import bounded
+from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
 from egovcp.data import MixedReturnConfig, ReturnConfig, ShuffleConfig
 from egovcp.errors import UsageError
@@ -154,7 +154,7 @@ class TrainConfig:
     """Scenarios of each task that are played in simulation at every evaluation; 0: none."""
     save_freq: int = bounded(1000, least=1)
     """Steps between checkpoints; one is always written at the end."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """CPU threads; 0: all cores."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""

@@ -28,10 +28,10 @@ from egovcp.data import (
     survey_sample,
 )
 from egovcp.data.ahead import Ahead
-from egovcp.data.memory import available_bytes
 from egovcp.data.order import Shard
 from egovcp.data.source import is_local
 from egovcp.errors import DataError, UsageError
+from egovcp.hardware import available_bytes
 from egovcp.model import Batch, WorldModel
 from egovcp_train.batches import (
     EPISODES_AT_ONCE,

@@ -7,7 +7,7 @@ import dataclasses
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import draccus
 import torch
@@ -18,6 +18,7 @@ from egovcp.cli import run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.data.ahead import Ahead
 from egovcp.errors import ArtefactError, UsageError
+from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
 from egovcp.model.weights import tensor_shapes
@@ -29,7 +30,7 @@ from egovcp_train.card import versions, write_card
 from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
 from egovcp_train.closed_loop import ClosedLoop, require_simulator
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
-from egovcp_train.datasets import EVALUATION_EPISODES, Material, prepare
+from egovcp_train.datasets import EVALUATION_EPISODES, FRAME_BYTES, Material, prepare
 from egovcp_train.device import choose_bf16, choose_device
 from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
@@ -46,6 +47,7 @@ from egovcp_train.wandb_records import WandbRecorder, require_wandb
 
 PROG = "egovcp-train"
 LAUNCHER_ECHO_S = 5.0
+_BATCH_COPIES: Final = 4  # of a batch, as float32 and with what gradients need of it; at least
 _UNRECORDED = (
     f"{PROG}: steps are right but many times slower than this GPU could make them, because they "
     "cannot be recorded as a CUDA graph ({reason}); --device=cpu may be as fast; please report it"
@@ -86,6 +88,7 @@ def train(config: TrainConfig) -> None:
     ranks = join(cpu=config.device == "cpu")  # first: it says which GPU is this process' own
     device = choose_device(config.device)
     bf16 = choose_bf16(config.mixed_precision, device)
+    _require_batch_memory(config, ranks)
     output = _prepare_output(config, ranks)
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
@@ -105,6 +108,13 @@ def train(config: TrainConfig) -> None:
         simulation = None
     run = Run(config, output, learner, material, device, provenance, simulation, spent)
     run.execute()
+
+
+def _require_batch_memory(config: TrainConfig, ranks: Ranks) -> None:
+    """Raise `UsageError` for a batch that is too large for this machine."""
+    size, length = config.batch_size, config.sampling.length
+    option = f"--batch_size={size} with --sampling.length={length}"
+    require_memory(option, size * length * ranks.local * _BATCH_COPIES * FRAME_BYTES)
 
 
 class Run:

@@ -15,6 +15,7 @@ from tqdm import tqdm
 from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
 from egovcp.errors import EgovcpError, SafetyStop, UsageError
+from egovcp.hardware import available_cores
 from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.tick import Tick
 from egovcp.robot.controllers import make_controller
@@ -157,7 +158,7 @@ def _leave_a_core() -> None:
     """Plan on all cores but one, which the control process and the logs need: threads that wait
     for one that was put aside plan slower than fewer threads."""
     if "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(max(1, len(os.sched_getaffinity(0)) - 1))
+        torch.set_num_threads(max(1, available_cores() - 1))
 
 
 def _show(bar: Any, tick: Tick) -> None:

@@ -13,7 +13,7 @@ import torch
 
 from egovcp.artefact import Artefact, load_artefact
 from egovcp.atomic import write_text
-from egovcp.bounds import bounded
+from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore
 from egovcp.errors import ArtefactError, UsageError
@@ -61,7 +61,7 @@ class HeldoutConfig:
     """Rows between the starts of open-loop predictions; 1: from each row."""
     pictures: bool = True
     """Write open_loop_TASK.png, value_TASK.png and open_loop.rrd."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """CPU threads; 0: all cores."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -14,9 +13,10 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp.atomic import write_json
-from egovcp.bounds import bounded
+from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
+from egovcp.hardware import available_cores
 from egovcp.intervals import wilson
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import make_controller
@@ -68,7 +68,7 @@ class LowLevelEvalConfig:
     """Foot collision model."""
     seed: int = bounded(1000, least=0)
     """Seed of robots, commands, pushes and noise."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """CPU threads; 0: all cores."""
 
 
@@ -108,7 +108,7 @@ def _chosen(names: str) -> list[Skill]:
 def _play(config: LowLevelEvalConfig, skill: Skill, bar: Any) -> dict[str, NDArray[Any]]:
     from egovcp_train.lowlevel.trial import play  # MuJoCo; --help needs none
 
-    threads = config.threads or len(os.sched_getaffinity(0))
+    threads = config.threads or available_cores()
     parts: list[Any] = []
     for first in range(0, config.episodes, _BATCH):
         robots = min(_BATCH, config.episodes - first)

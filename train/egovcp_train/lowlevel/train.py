@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,12 +12,14 @@ from typing import Any, Literal
 import draccus
 import torch
 
-from egovcp.bounds import bounded
+from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import run_command, save_config
 from egovcp.errors import ArtefactError
+from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.walk_onnx import export_onnx
 from egovcp.robot.walking import WalkConfig
+from egovcp.sim.capacity import require_robots
 from egovcp.sim.config import SensorConfig
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
@@ -72,7 +73,7 @@ class LowLevelTrainConfig:
     """Wall-clock limit in minutes; 0: none."""
     seed: int = bounded(0, least=0)
     """Seed of networks, commands, disturbances and noise."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """CPU threads; 0: all cores."""
     resume: bool = False
     """Continue the run in output_dir from its last checkpoint, with its options unless given."""
@@ -93,8 +94,9 @@ def train(config: LowLevelTrainConfig) -> None:
     Raises:
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
+    require_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)
-    threads = config.threads or len(os.sched_getaffinity(0))
+    threads = config.threads or available_cores()
     torch.set_num_threads(threads)
     torch.manual_seed(config.seed)
     learner = _build(config, threads)

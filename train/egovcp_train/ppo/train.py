@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,7 +13,9 @@ import torch
 
 from egovcp.cli import run_command, save_config
 from egovcp.errors import ArtefactError
+from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
+from egovcp.sim.capacity import require_robots
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
 from egovcp_train.iterations import run_iterations
@@ -38,8 +39,9 @@ def train(config: PpoTrainConfig) -> None:
     Raises:
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
+    require_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)
-    torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
+    torch.set_num_threads(config.threads or available_cores())
     torch.manual_seed(config.seed)
     state = load_training_state(output) if config.resume else {}
     learner = _build(config, int(state.get("episodes", 0)))
