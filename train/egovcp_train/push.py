@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -66,4 +67,4 @@ def push(config: PushConfig) -> None:
     if config.json:
         facts = {"repo_id": config.repo_id, "branch": config.branch, "tag": config.tag}
         text = json.dumps({**facts, **asdict(published)}, indent=1) + "\n"
-        Path(config.json).expanduser().write_text(text, encoding="utf-8")
+        Path(os.path.expanduser(config.json)).write_text(text, encoding="utf-8")
