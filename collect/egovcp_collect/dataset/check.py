@@ -44,9 +44,9 @@ def run(config: CheckConfig) -> None:
     Raises:
         DataError: something is wrong.
     """
-    root = local_root(config.dataset) if config.dataset.root else locate(config.dataset).root
-    if not root.is_dir():
-        raise DataError(f"no dataset at {root}: there is no such folder")
+    root = local_root(config.dataset)
+    if not (config.dataset.root and root.is_dir()):  # of a damaged one every problem is listed
+        root = locate(config.dataset).root
     with _progress() as progress:
         found = list(islice(dataset_problems(root, progress), config.max_problems))
     episodes, frames = _size(root)
