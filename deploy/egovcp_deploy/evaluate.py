@@ -29,6 +29,7 @@ from egovcp_deploy.constant_search import Action, BestConstant, load_constants, 
 from egovcp_deploy.controllers import CONTROLLERS, PPO
 from egovcp_deploy.episodes import Group, Setup, Stage
 from egovcp_deploy.options import (
+    absolute_path,
     check_choice,
     check_output_dir,
     make_output_dir,
@@ -273,7 +274,7 @@ def _record(
 ) -> dict[str, Any]:
     """Content of ``eval_run.json``: what the figures came from."""
     return {
-        "config": draccus.encode(config),
+        "config": draccus.encode(_with_absolute_paths(config)),
         "artefact": artefact.manifest if artefact else None,
         "ppo": dict(ppo.provenance) if ppo else None,
         "low_level_controller": make_controller(config.env.controller).id,
@@ -285,6 +286,16 @@ def _record(
             for task, row in scores.items()
         },
     }
+
+
+def _with_absolute_paths(config: EvalConfig) -> EvalConfig:
+    return replace(
+        config,
+        policy=replace(config.policy, path=absolute_path(config.policy.path)),
+        constant=replace(config.constant, path=absolute_path(config.constant.path)),
+        ppo=replace(config.ppo, path=absolute_path(config.ppo.path)),
+        output_dir=absolute_path(config.output_dir),
+    )
 
 
 def _brief(score: EpisodeScore) -> dict[str, Any]:

@@ -261,3 +261,13 @@ def test_int8_is_refused_before_any_work_where_it_cannot_be_used(
     assert "there is no C compiler" in told
     assert "plan with --planner.backend=float32" in told
     assert not out.exists()
+
+
+def test_recorded_paths_are_absolute(
+    tmp_path: Path, artefact_dir: Path, short: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(artefact_dir.parent)
+    flags = [f"--policy.path={artefact_dir.name}", "--controllers=planner", "--episodes=1"]
+    assert run(tmp_path / "out", *flags, *short) == 0
+    config = json.loads((tmp_path / "out" / "eval_run.json").read_text())["config"]
+    assert config["policy"]["path"] == str(artefact_dir)

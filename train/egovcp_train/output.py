@@ -33,7 +33,13 @@ def resumed_options(argv: Sequence[str]) -> dict[str, Any]:
             f"--config_path={given['config_path']} says others; drop it, and give what is to "
             "change as flags of their own"
         )
-    if not (resume and saved.is_file()):
+    return saved_options(saved.parent) if resume else {}
+
+
+def saved_options(output: Path) -> dict[str, Any]:
+    """The options that the run in a folder has kept; empty if it has kept none."""
+    saved = output / CONFIG_FILE
+    if not saved.is_file():
         return {}
     options: dict[str, Any] = cfgparsing.load_config(saved.read_text("utf-8"), file=saved)
     return options

@@ -16,7 +16,6 @@ from tqdm import tqdm
 from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
-from egovcp.data.ahead import Ahead
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
@@ -29,7 +28,13 @@ from egovcp_train.card import versions, write_card
 from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
 from egovcp_train.closed_loop import ClosedLoop, require_simulator
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
-from egovcp_train.datasets import EVALUATION_EPISODES, Material, prepare
+from egovcp_train.datasets import (
+    EVALUATION_EPISODES,
+    Material,
+    prepare,
+    require_datasets,
+    require_same_content,
+)
 from egovcp_train.device import choose_bf16, choose_device
 from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
@@ -37,7 +42,13 @@ from egovcp_train.heldout.recording import record
 from egovcp_train.heldout.report import Report, measure, scalars
 from egovcp_train.heldout.table import table
 from egovcp_train.loop import Budget, Learner
-from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options, stop_on_signal
+from egovcp_train.output import (
+    CONFIG_FILE,
+    prepare_output,
+    resumed_options,
+    saved_options,
+    stop_on_signal,
+)
 from egovcp_train.publish import publish_trained, reserve_policy
 from egovcp_train.ranks import Ranks, join
 from egovcp_train.records import Everywhere, Recorder, Records
@@ -94,7 +105,7 @@ def train(config: TrainConfig) -> None:
     material = prepare(config, model, ranks)
     config = material.config
     learner = Learner(model.to(device), config.optimizer, config.seed, ranks, bf16)
-    spent = _restore(output, learner, material.stream) if config.resume else 0.0
+    spent = _restore(output, learner, material) if config.resume else 0.0
     provenance = _provenance(material)
     if ranks.is_first:
         simulation = _simulation(config, provenance, learner.model)
@@ -259,7 +270,9 @@ class Run:
         found = {"heldout": self.metrics, "heldout_tasks": self.tasks, "closed_loop": self.played}
         provenance = self.provenance | {"step": self.learner.step, **finite_or_null(found)}
         spent = {"seconds": self.budget.spent}
-        state = {"learner": self.learner.state_dict(), "streams": streams, **spent}
+        digests = [reader.content_digest for reader in self.material.readers]
+        learned = {"learner": self.learner.state_dict(), "streams": streams}
+        state = {**learned, "datasets": digests, **spent}
         with new_checkpoint(self.output, self.learner.step, state) as folder:
             save_artefact(folder, model, self.config.planner, provenance)
 
@@ -303,8 +316,12 @@ def _prepare_output(config: TrainConfig, ranks: Ranks) -> Path:
     _require_loadable(config)
     if config.eval_closed_loop:
         require_simulator()
-    output = Path(config.output_dir)
-    return prepare_output(config.output_dir, config.resume) if ranks.is_first else output
+    if not ranks.is_first:
+        return Path(config.output_dir)
+    output = prepare_output(config.output_dir, config.resume)
+    if config.resume:
+        require_datasets(config, saved_options(output))
+    return output
 
 
 def _simulation(
@@ -326,7 +343,7 @@ def _records(config: TrainConfig, output: Path) -> Everywhere:
     return Everywhere(found)
 
 
-def _restore(output: Path, learner: Learner, stream: Ahead) -> float:
+def _restore(output: Path, learner: Learner, material: Material) -> float:
     """Continue from the last checkpoint; returns the seconds that the run has taken so far.
 
     Raises:
@@ -334,7 +351,9 @@ def _restore(output: Path, learner: Learner, stream: Ahead) -> float:
         DataError: the dataset is another one.
         UsageError: the windows or the processes are others.
     """
-    state = load_training_state(output)
+    state, stream = load_training_state(output), material.stream
+    if "datasets" in state:  # not in checkpoints of earlier versions
+        require_same_content(material.readers, state["datasets"])
     try:
         learner.load_state_dict(state["learner"])
         streams = state.get("streams") or [state["stream"]]

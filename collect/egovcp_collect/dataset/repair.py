@@ -58,7 +58,7 @@ def run(config: RepairConfig) -> None:
     if not root.is_dir():
         raise DataError(f"no dataset at {root}: there is no such folder")
     output = new_folder(config.output_dir, [root])
-    originals = [Path(name).expanduser().absolute() for name in config.records.split(",") if name]
+    originals = _originals(config)
     book = open_book(root, originals, _command(config))
     dropped: list[DataError] = []
     with tqdm(unit="ep", delay=1) as bar:
@@ -74,9 +74,13 @@ def run(config: RepairConfig) -> None:
 
 
 def _command(config: RepairConfig) -> str:
-    root, records = local_root(config.dataset), config.records
+    root, records = local_root(config.dataset), ",".join(map(str, _originals(config)))
     flags = [f"--records={records}"] if records else []
     return shlex.join(["egovcp-dataset", "repair", str(root), *flags])
+
+
+def _originals(config: RepairConfig) -> list[Path]:
+    return [Path(name).expanduser().absolute() for name in config.records.split(",") if name]
 
 
 def _rebuild(

@@ -132,7 +132,7 @@ def _return_scales(artefact: Artefact) -> dict[str, ReturnScale]:
 
 def _run(config: HeldoutConfig, artefact: Artefact, reader: DatasetReader) -> dict[str, Any]:
     return {
-        "policy": str(artefact.path),
+        "policy": str(artefact.path.absolute()),
         "step": artefact.manifest.get("step"),
         "dataset": {
             "repo_id": reader.source.repo_id,

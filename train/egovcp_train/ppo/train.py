@@ -15,6 +15,7 @@ import torch
 from egovcp.cli import run_command, save_config
 from egovcp.errors import ArtefactError
 from egovcp.packages import SIMULATOR_MODULES, require_packages
+from egovcp.robot.controllers import absolute_controller
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
 from egovcp_train.iterations import run_iterations
@@ -39,6 +40,8 @@ def train(config: PpoTrainConfig) -> None:
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
     output = prepare_output(config.output_dir, config.resume)
+    controller = absolute_controller(config.env.controller)  # resumed from any working directory
+    config = dataclasses.replace(config, env=dataclasses.replace(config.env, controller=controller))
     torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
     torch.manual_seed(config.seed)
     state = load_training_state(output) if config.resume else {}
