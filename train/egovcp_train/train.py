@@ -21,6 +21,7 @@ from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
 from egovcp.model.weights import tensor_shapes
 from egovcp.plan.backends import judge_of_model
+from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo, one_line
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
@@ -47,7 +48,6 @@ from egovcp_train.output import (
     prepare_output,
     resumed_options,
     saved_options,
-    stop_on_signal,
 )
 from egovcp_train.publish import publish_trained, reserve_policy
 from egovcp_train.ranks import Ranks, join
