@@ -58,8 +58,7 @@ def run(config: RepairConfig) -> None:
     root = local_root(config.dataset)
     require_folder(root)
     output = new_folder(config.output_dir, [root])
-    named = [os.path.expanduser(name) for name in config.records.split(",") if name]
-    originals = [Path(name).absolute() for name in named]
+    originals = _originals(config)
     book = open_book(root, originals, _command(config))
     dropped: list[DataError] = []
     with tqdm(unit="ep", delay=1) as bar:
@@ -75,9 +74,14 @@ def run(config: RepairConfig) -> None:
 
 
 def _command(config: RepairConfig) -> str:
-    root, records = local_root(config.dataset), config.records
+    root, records = local_root(config.dataset), ",".join(map(str, _originals(config)))
     flags = [f"--records={records}"] if records else []
     return shlex.join(["egovcp-dataset", "repair", str(root), *flags])
+
+
+def _originals(config: RepairConfig) -> list[Path]:
+    named = [os.path.expanduser(name) for name in config.records.split(",") if name]
+    return [Path(name).absolute() for name in named]
 
 
 def _rebuild(

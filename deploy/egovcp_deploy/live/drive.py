@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-import draccus
 import numpy as np
 import torch
 from tqdm import tqdm
@@ -103,7 +102,7 @@ def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetu
         config.seed,
         0,
         CameraView(),
-        draccus.encode(config),
+        config.encoded(),
         controller_id,
         artefact,
         backend_of(policy),
@@ -188,7 +187,7 @@ def _report(
         "damped": summary.damped,
         "failure": "" if summary.failure is None else failure_words(summary.failure),
         "events": summary.events,
-        "config": draccus.encode(config),
+        "config": config.encoded(),
         "artefact": artefact.manifest["files"],
         "low_level_controller": info.hashes["low_level_controller"],
         "backend": info.backend,

@@ -98,7 +98,7 @@ def provenance(paths: Sequence[Path]) -> Provenance:
                 f"{paths[0]} with {ids[paths[0]]}; make a dataset of each"
             )
     first = infos[paths[0]]
-    command = shlex.join(["egovcp-mcap", "to-dataset", *map(str, paths)])
+    command = shlex.join(["egovcp-mcap", "to-dataset", *(str(path.absolute()) for path in paths)])
     return Provenance(
         controller_id=ids[paths[0]],
         command=command,
