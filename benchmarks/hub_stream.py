@@ -21,7 +21,7 @@ from egovcp.data import (
     ShuffleConfig,
     StreamConfig,
 )
-from egovcp.hub import Content, Patience, Publication, publish
+from egovcp.hub import Content, Publication, RetryPolicy, publish
 from egovcp.testing.hub import in_this_process
 
 _REPO = "me/bench"
@@ -56,7 +56,7 @@ def epoch_rates(
     contents = {path.relative_to(root).as_posix(): Content(path) for path in files}
     with serving(folder / "hub") as endpoint:
         with in_this_process(endpoint, folder / "home"):
-            publish(Publication(_REPO, contents, "a benchmark"), Patience())
+            publish(Publication(_REPO, contents, "a benchmark"), RetryPolicy())
         return [_round(root, endpoint, config, shuffle) for _ in range(rounds + 1)][1:]
 
 

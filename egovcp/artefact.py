@@ -11,9 +11,8 @@ as a model card and its pictures, are no part of it: neither read nor, from the 
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
-import json
+import os
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,25 +21,37 @@ from pathlib import Path
 from typing import Any, Final
 
 import draccus
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save
 from torch import Tensor
 
-from egovcp import spec
+from egovcp.atomic import write_bytes
+from egovcp.decode import DecodeError, decode, require_type, shown
 from egovcp.errors import ArtefactError, UsageError
-from egovcp.hub import Patience, snapshot
+from egovcp.hub import HubUnreachable, RetryPolicy, is_local_path, is_repo_id, snapshot
+from egovcp.manifest import (
+    MANIFEST,
+    SCHEMA_VERSION,
+    feature_spec,
+    read_manifest,
+    read_object,
+    write_json_file,
+    write_manifest,
+)
 from egovcp.model import WorldModel, WorldModelConfig
+from egovcp.model.weights import load_model, size_limit, tensor_shapes
 from egovcp.plan import PlannerConfig, Policy, require_answers
+from egovcp.plan.cost import require_affordable
 from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
+from egovcp.safe_files import JSON_LIMIT_BYTES, UnsafeFileError, read_bytes, sha256
 
-SCHEMA_VERSION = 2
-_NONE: Final[Mapping[str, Any]] = {}
 #: Options of models made before there were these, where the default is another.
 _BEFORE: Final[Mapping[str, Any]] = {"flight": {"enabled": False}}
-SEAL = "manifest_sha256"
-CONFIG, WEIGHTS, MANIFEST = "config.json", "model.safetensors", "manifest.json"
-_PATTERNS = ("*.json", "*.safetensors")
-_PATIENCE = Patience()
+CONFIG, WEIGHTS = "config.json", "model.safetensors"
+#: All files of an artefact: nothing else is read, nor fetched from the Hub.
+FILES: Final = (CONFIG, WEIGHTS, MANIFEST, *PROCESSORS)
+#: Where a training run keeps its latest policy.
+_IN_RUN: Final = "checkpoints/last/pretrained_model"
+_RETRY_POLICY = RetryPolicy()
 
 
 @dataclass(frozen=True)
@@ -74,18 +85,6 @@ class Artefact:
             )
 
 
-def feature_spec() -> dict[str, Any]:
-    """What an artefact reads and writes: names, shapes and the action box."""
-    return {
-        "spec_version": spec.SPEC_VERSION,
-        "planner_hz": spec.PLANNER_HZ,
-        "depth": [spec.DEPTH_ROWS, spec.DEPTH_COLS],
-        "state_names": list(spec.STATE_NAMES),
-        "action_names": list(spec.ACTION_NAMES),
-        "action_box": {k: list(v) for k, v in dataclasses.asdict(spec.ACTION_BOX).items()},
-    }
-
-
 def save_artefact(
     path: Path, model: WorldModel, planner: PlannerConfig, provenance: dict[str, Any]
 ) -> None:
@@ -98,7 +97,7 @@ def save_artefact(
             command made the policy.
 
     Raises:
-        ArtefactError: the provenance names no controller.
+        ArtefactError: the provenance names no controller, or a number in it is not finite.
     """
     _require_controller_id(path, provenance)
     work = path.with_name(path.name + ".partial")
@@ -130,28 +129,22 @@ def write_artefact(
         processors: JSON file name -> content; may be empty if somebody else writes them.
 
     Raises:
-        ArtefactError: the provenance names no controller.
+        ArtefactError: the provenance names no controller, or a number in it is not finite.
     """
     _require_controller_id(folder, provenance)
-    _write_json(folder / CONFIG, config)
+    write_json_file(folder / CONFIG, config)
     for name, content in processors.items():
-        _write_json(folder / name, content)
-    save_file({k: v.contiguous().cpu() for k, v in weights.items()}, folder / WEIGHTS)
+        write_json_file(folder / name, content)
+    tensors = {k: v.contiguous().cpu() for k, v in weights.items()}
+    write_bytes(folder / WEIGHTS, save(tensors))
     manifest = {
         "schema_version": SCHEMA_VERSION,
         "egovcp_version": version("egovcp"),
         "features": feature_spec(),
-        "files": {name: _sha256(folder / name) for name in (CONFIG, WEIGHTS, *processors)},
+        "files": {name: sha256(folder / name) for name in (CONFIG, WEIGHTS, *processors)},
         **provenance,
     }
-    _write_json(folder / MANIFEST, sealed(manifest))
-
-
-def sealed(manifest: Mapping[str, Any]) -> dict[str, Any]:
-    """A manifest with the SHA-256 of all that it says, so that no word of it changes unnoticed."""
-    content = json.loads(json.dumps({k: v for k, v in manifest.items() if k != SEAL}))
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return {**content, SEAL: hashlib.sha256(text.encode()).hexdigest()}
+    write_manifest(folder, manifest)
 
 
 def _require_controller_id(path: Path, provenance: Mapping[str, Any]) -> None:
@@ -174,7 +167,7 @@ def _replace(path: Path, new: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE) -> Artefact:
+def load_artefact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POLICY) -> Artefact:
     """Load and validate a policy from a folder or, failing that, a Hub model id.
 
     If the Hub cannot be reached, an earlier download of that revision serves.
@@ -183,152 +176,138 @@ def load_artefact(path: str, revision: str = "", patience: Patience = _PATIENCE)
         path: the folder, or `user/name`.
         revision: branch, tag or commit SHA on the Hub; empty: the latest. The name of
             `Artefact.path` is the commit's SHA then.
-        patience: how often and how long the Hub is asked.
+        retry: how often and how long the Hub is asked.
 
     Raises:
-        ArtefactError: missing, tampered with, or made for another feature spec.
+        ArtefactError: missing, tampered with, made for another feature spec, or with weights or
+            options that cannot be used.
         UsageError: a revision is asked of a folder.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
-    folder = _locate(path, revision, patience)
-    manifest = _read_json(folder / MANIFEST)
-    _check_manifest(folder, manifest)
+    folder = _locate(path, revision, retry)
+    manifest = read_manifest(folder)
+    digests = manifest["files"]
+    for name in (CONFIG, *(name for name in PROCESSORS if name in digests)):
+        _require_digest(folder / name, _json_digest(folder / name), digests.get(name))
+    _check_processors(folder)
     config, planner = read_options(folder)
-    try:
-        require_answers(config, planner)
-        model = WorldModel(config)
-        model.load_state_dict(load_file(folder / WEIGHTS))
-    except (RuntimeError, SafetensorError, UsageError, ValueError) as error:
-        reason = " ".join(str(error).split())[:300]
-        raise ArtefactError(
-            f"{folder}: weights and configuration disagree: {reason}; a policy of another version "
-            "of egovcp has to be trained again with this one"
-        ) from error
-    return Artefact(folder, model.eval(), planner, manifest)
+    model = _load_weights(folder, config, digests.get(WEIGHTS))
+    return Artefact(folder, model, planner, manifest)
 
 
 def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
-    """What the policy in a folder is and how it plans, without its weights, nothing validated.
+    """What the policy in a folder is and how it plans, without its weights.
 
     Raises:
-        ArtefactError: they are missing or not readable.
+        ArtefactError: they are missing, not readable, or ask too much of the machine.
     """
-    config = _read_json(folder / CONFIG)
+    config = read_object(folder / CONFIG)
     try:
-        model = _decode(WorldModelConfig, config, "world_model", _BEFORE)
-        return model, _decode(PlannerConfig, config, "planner")
-    except (
-        KeyError,
-        TypeError,
-        UsageError,
-        ValueError,
-        draccus.utils.DraccusException,
-    ) as error:
-        reason = " ".join(str(error).split())[:300]
+        if config.get("type") != "egovcp":
+            raise DecodeError(f'type is {shown(config.get("type"))}, expected "egovcp"')
+        world_model = config.get("world_model")
+        if isinstance(world_model, dict):
+            world_model = {**_BEFORE, **world_model}
+        model = decode(WorldModelConfig, world_model, "world_model")
+        planner = decode(PlannerConfig, config.get("planner"), "planner")
+        require_answers(model, planner)
+        require_affordable(model, planner)
+    except (DecodeError, UsageError) as error:
         raise ArtefactError(
-            f"{folder / CONFIG}: {reason}; a policy of another version of egovcp has to be trained "
+            f"{folder / CONFIG}: {error}; a policy of another version of egovcp has to be trained "
             "again with this one"
+        ) from error
+    return model, planner
+
+
+def _load_weights(folder: Path, config: WorldModelConfig, digest: object) -> WorldModel:
+    path = folder / WEIGHTS
+    try:
+        shapes = tensor_shapes(config)
+    except ValueError as error:
+        raise ArtefactError(f"{folder / CONFIG}: {error}") from error
+    try:
+        content = read_bytes(path, size_limit(shapes))
+        _require_digest(path, hashlib.sha256(content).hexdigest(), digest)
+        return load_model(config, shapes, content)
+    except OSError as error:
+        raise ArtefactError(f"{path}: {error.strerror}; the artefact is incomplete") from error
+    except UnsafeFileError as error:
+        raise ArtefactError(
+            f"{path}: {error}; expected the weights of the networks in {CONFIG}: fetch or train "
+            "the policy again"
         ) from error
 
 
-def _decode[C](
-    config_class: type[C], config: dict[str, Any], key: str, absent: Mapping[str, Any] = _NONE
-) -> C:
-    """The dataclass under ``key``; raises KeyError, TypeError, UsageError or DraccusException.
-
-    Options that are ``absent`` have the values given there, others their defaults.
-    """
-    values = config[key]
-    if not isinstance(values, dict):
-        raise TypeError(f"{key} is {type(values).__name__}, expected an object")
-    decoded: C = draccus.decode(config_class, {**absent, **values})
-    return decoded
-
-
-def _locate(path: str, revision: str, patience: Patience) -> Path:
-    folder = Path(path)
-    if folder.is_dir() and not revision:
-        return folder
-    if folder.is_dir():
+def _locate(path: str, revision: str, retry: RetryPolicy) -> Path:
+    folder = Path(os.path.expanduser(path))  # `Path.expanduser` raises for unknown users
+    is_folder = os.path.isdir(folder)
+    if is_folder and revision:
         raise UsageError(
             f"{path} is a folder, and revision {revision} pins a policy of the Hub; drop the one "
             "or the other"
         )
-    if folder.exists() or not _is_hub_id(path):
+    if is_folder:
+        _require_artefact_folder(folder)
+        return folder
+    if not is_repo_id(path) or (is_local_path(path) and not revision):
+        found = "not a folder" if os.path.lexists(folder) else "no such folder"
         raise ArtefactError(
-            f"no policy artefact at {path!r}: expected a folder with {CONFIG}, {WEIGHTS} and "
-            f"{MANIFEST} (a run's checkpoints/last/pretrained_model) or a Hub id 'user/name'"
+            f"{found}: {path!r}; expected a policy folder with {CONFIG}, {WEIGHTS} and "
+            f"{MANIFEST} (a run's {_IN_RUN}) or a Hub id 'user/name'"
         )
-    return snapshot(path, revision, patience, "model", patterns=_PATTERNS)
-
-
-def _is_hub_id(text: str) -> bool:
-    from huggingface_hub.errors import HFValidationError
-    from huggingface_hub.utils._validators import validate_repo_id
-
     try:
-        validate_repo_id(text)
-    except HFValidationError:
-        return False
-    return "/" in text
+        return snapshot(path, revision, retry, "model", patterns=FILES)
+    except HubUnreachable as error:
+        raise HubUnreachable(f"there is no folder {path!r}, and {error}") from error
 
 
-def _check_manifest(folder: Path, manifest: dict[str, Any]) -> None:
-    found = manifest.get("schema_version")
-    if found != SCHEMA_VERSION:
-        raise ArtefactError(
-            f"{folder / MANIFEST}: schema version {found!r}, this egovcp reads "
-            f"{SCHEMA_VERSION}; install the version that made it, or train again"
-        )
-    if manifest.get("features") != feature_spec():
-        ours, theirs = feature_spec(), _object(manifest, "features")
-        differing = [k for k in ours if theirs.get(k) != ours[k]]
-        raise ArtefactError(
-            f"{folder / MANIFEST}: made for another feature spec (differs in "
-            f"{', '.join(differing) or 'extra keys'}); train again on data of this version"
-        )
-    if not isinstance(manifest.get("controller_id"), str):
-        raise ArtefactError(f"{folder / MANIFEST}: no controller_id; the file is damaged")
-    if manifest.get(SEAL) != sealed(manifest)[SEAL]:
-        raise ArtefactError(
-            f"{folder / MANIFEST}: its SHA-256 is not the one that it names; it was changed or "
-            "damaged: fetch it again"
-        )
-    files = _object(manifest, "files")
-    for name in (CONFIG, WEIGHTS, *(name for name in PROCESSORS if name in files)):
-        expected, found = files.get(name), _sha256(folder / name)
-        if found != expected:
+def _require_artefact_folder(folder: Path) -> None:
+    """Raise `ArtefactError`, which names the policy, for the folder of a training run."""
+    if os.path.lexists(folder / MANIFEST):
+        return
+    for inner in (_IN_RUN, "last/pretrained_model", "pretrained_model"):
+        if os.path.lexists(folder / inner / MANIFEST):
             raise ArtefactError(
-                f"{folder / name}: SHA-256 is {found[:12]}..., the manifest says "
-                f"{str(expected)[:12]}...; the file was changed or damaged: fetch it again"
+                f"{folder} is the folder of a training run, not of a policy; its policy is "
+                f"{folder / inner}"
             )
 
 
-def _object(manifest: dict[str, Any], key: str) -> dict[str, Any]:
-    """The object under ``key``; empty where the manifest has none."""
-    value = manifest.get(key)
-    return value if isinstance(value, dict) else {}
+def _check_processors(folder: Path) -> None:
+    """Raise `ArtefactError` unless LeRobot's processors name only registered steps.
+
+    LeRobot imports whatever module a step of another kind names.
+    """
+    for name in PROCESSORS:
+        if not os.path.lexists(folder / name):
+            continue
+        try:
+            steps = read_object(folder / name).get("steps")
+            require_type(steps, list[dict[str, Any]], "steps")
+            for index, step in enumerate(steps or []):
+                require_type(step.get("registry_name"), str, f"steps[{index}].registry_name")
+                if "class" in step:
+                    raise DecodeError(f"steps[{index}] names a class to import")
+        except DecodeError as error:
+            raise ArtefactError(
+                f"{folder / name}: {error}; expected steps that LeRobot has registered"
+            ) from error
 
 
-def _sha256(path: Path) -> str:
+def _require_digest(path: Path, found: str, expected: object) -> None:
+    if found != expected:
+        raise ArtefactError(
+            f"{path}: SHA-256 is {found[:12]}..., the manifest says {shown(expected)[:13]}...; the "
+            "file was changed or damaged: fetch it again"
+        )
+
+
+def _json_digest(path: Path) -> str:
+    """SHA-256 of a JSON file."""
     try:
-        with path.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
+        return sha256(path, JSON_LIMIT_BYTES)
     except OSError as error:
         raise ArtefactError(f"{path}: {error.strerror}; the artefact is incomplete") from error
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ArtefactError(f"{path}: {error.strerror}; not a policy artefact") from error
-    except ValueError as error:
-        raise ArtefactError(f"{path}: not valid JSON ({error}); the file is damaged") from error
-    if not isinstance(content, dict):
-        raise ArtefactError(f"{path}: expected a JSON object, found {type(content).__name__}")
-    return content
-
-
-def _write_json(path: Path, content: Mapping[str, Any]) -> None:
-    path.write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    except UnsafeFileError as error:
+        raise ArtefactError(f"{path}: {error}; the file is damaged") from error

@@ -32,11 +32,13 @@ class Bounds:
     most: float | None = None
     above: float | None = None
     below: float | None = None
+    longest: int | None = None
+    """Most numbers of a list."""
 
     def hold(self, value: float) -> bool:
         """Whether a number lies within."""
         return (
-            math.isfinite(value)
+            _is_finite(value)
             and (self.least is None or value >= self.least)
             and (self.most is None or value <= self.most)
             and (self.above is None or value > self.above)
@@ -65,10 +67,11 @@ def bounded[T](
     most: float | None = None,
     above: float | None = None,
     below: float | None = None,
+    longest: int | None = None,
 ) -> T:
     """A dataclass field with this default whose value, or each number in it, has bounds; None,
     where the type allows it, stands for no number."""
-    metadata = {_KEY: Bounds(least, most, above, below)}
+    metadata = {_KEY: Bounds(least, most, above, below, longest)}
     if isinstance(default, dict):
         return field(default_factory=partial(copy, default), metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -109,10 +112,19 @@ def check_bounds(config: Any, prefix: str = "") -> None:
             check_bounds(value, f"{name}.")
             continue
         bounds = bounds_of(option) or _ANY
+        if bounds.longest is not None and len(value) > bounds.longest:
+            raise OutOfBounds(name, f"a list of {len(value)}", f"at most {bounds.longest} numbers")
         for number in _numbers(value, name):
             if not bounds.hold(number):
-                expected = str(bounds) if math.isfinite(number) else _FINITE
+                expected = str(bounds) if _is_finite(number) else _FINITE
                 raise OutOfBounds(name, value, expected)
+
+
+def _is_finite(number: float) -> bool:
+    try:
+        return math.isfinite(number)
+    except OverflowError:  # an integer that no float can hold
+        return False
 
 
 def _numbers(value: object, name: str) -> Iterator[float]:

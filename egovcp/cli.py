@@ -22,7 +22,7 @@ import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import NoneType
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Any, Final, Literal, get_args, get_origin, get_type_hints
 
 import draccus
 from draccus.argparsing import ArgumentParser
@@ -31,6 +31,10 @@ from draccus.utils import CONFIG_ARG, DecodingError, DraccusException
 
 from egovcp.bounds import Bounds, OutOfBounds, bounded, bounds_of, check_bounds
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError, suggest
+from egovcp.interrupts import EXIT_CODE as INTERRUPTED
+from egovcp.interrupts import raise_on_sigint
+from egovcp.packages import missing_package
+from egovcp.terminal import echo, one_line
 
 
 @dataclass(frozen=True)
@@ -331,37 +335,63 @@ def run_command[C](
     switch = ("--debug", "--debug=true")
     debug = any(a in switch for a in args)
     epilog = (epilog + "\n" if epilog else "") + "--debug prints the traceback of an error."
+    raise_on_sigint()
     try:
         plain = [a for a in args if a not in switch]
         config = parse_config(config_class, plain, prog, epilog, defaults)
         run(config)
     except KeyboardInterrupt:
-        print(f"{prog}: interrupted", file=sys.stderr)
-        return 130
-    except OSError as error:
-        if error.errno not in _ENVIRONMENT_ERRNOS:
-            raise
-        failure = EnvironmentFailure(f"{error.strerror}: {error.filename or ''}".rstrip(": "))
-        return _report(prog, failure, debug)
+        echo(f"{prog}: interrupted", error=True)
+        return INTERRUPTED
     except EgovcpError as error:
-        return _report(prog, error, debug)
+        return report_error(prog, error, debug)
+    except ModuleNotFoundError as error:
+        missing = missing_package(error, config_class.__module__, prog)
+        if missing is None:
+            raise
+        return report_error(prog, missing, debug)
+    except BrokenPipeError:
+        raise  # the reader of the output has gone: `EntryPoint` ends the process
+    except (OSError, UnicodeEncodeError) as error:
+        failure = _user_error(error)
+        if failure is None:
+            raise
+        return report_error(prog, failure, debug)
     return 0
 
 
-_ENVIRONMENT_ERRNOS = {
-    errno.EACCES,
-    errno.EPERM,
-    errno.EROFS,
-    errno.ENOSPC,
-    errno.EDQUOT,
-    errno.EADDRINUSE,
+#: What a path on the command line can be wrong in.
+_PATH_ERRNOS: Final = {
+    *(errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.ENOENT),
+    *(errno.EEXIST, errno.ENOTEMPTY, errno.ENXIO, errno.ENODEV, errno.ESPIPE),
+}
+#: What the system refuses, whether it names a file or not.
+_ENVIRONMENT_ERRNOS: Final = {
+    *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EADDRINUSE),
+    *(errno.EMFILE, errno.ENFILE, errno.EIO, errno.EBUSY, errno.EFBIG, errno.ESTALE),
+    *(errno.ENOTCONN, errno.ENOMEM, errno.EXDEV, errno.EADDRNOTAVAIL, errno.ETXTBSY),
 }
 
 
-def _report(prog: str, error: EgovcpError, debug: bool) -> int:
+def _user_error(error: OSError | UnicodeEncodeError) -> EgovcpError | None:
+    """The error as one that a user can cause; None: a bug."""
+    if isinstance(error, UnicodeEncodeError):
+        if error.reason != "surrogates not allowed":
+            return None
+        return UsageError(f"{error.object!r} is not valid UTF-8; rename the file or folder")
+    reason = f"{error.strerror}: {error.filename or ''}".rstrip(": ")
+    if error.errno in _ENVIRONMENT_ERRNOS:
+        return EnvironmentFailure(reason)
+    if error.errno in _PATH_ERRNOS and error.filename is not None:
+        return UsageError(f"{reason}; check the path")
+    return None
+
+
+def report_error(prog: str, error: EgovcpError, debug: bool = False) -> int:
+    """Print the error as one line, with ``debug`` after its traceback; return its exit code."""
     if debug:
-        print(_without_token(traceback.format_exc()), end="", file=sys.stderr)
-    print(f"{prog}: error: {error}", file=sys.stderr)
+        echo(_without_token(traceback.format_exc()), end="", error=True)
+    echo(f"{prog}: error: {one_line(error)}", error=True)
     return error.exit_code
 
 

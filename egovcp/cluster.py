@@ -10,6 +10,7 @@ import os
 from typing import Any
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.packages import require_packages
 
 
 def ray_package(distribution: str) -> Any:
@@ -21,12 +22,8 @@ def ray_package(distribution: str) -> Any:
     Raises:
         EnvironmentFailure: it is not installed.
     """
-    try:
-        return importlib.import_module("ray")
-    except ModuleNotFoundError as error:
-        raise EnvironmentFailure(
-            f"--backend=ray needs Ray: pip install '{distribution}[ray]'"
-        ) from error
+    require_packages(distribution, "--backend=ray", "ray")
+    return importlib.import_module("ray")
 
 
 def connect(distribution: str) -> Any:

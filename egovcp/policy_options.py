@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 
 from egovcp.artefact import Artefact, load_artefact
-from egovcp.bounds import bounded
+from egovcp.bounds import OutOfBounds, bounded
 from egovcp.errors import UsageError
 from egovcp.plan import PlannerConfig, require_answers
 from egovcp.plan.choices import Ensemble, Latent
 from egovcp.plan.config import BackendName, Objective, OptimiserName, Process, TerminationRule
+from egovcp.plan.cost import require_affordable
 
 
 @dataclass(frozen=True)
@@ -69,9 +70,12 @@ class PlannerOptions:
         """``planner`` with these changes.
 
         Raises:
-            UsageError: the numbers do not go together.
+            UsageError: a number is out of bounds, or the numbers do not go together.
         """
-        return replace(planner, **{k: v for k, v in asdict(self).items() if v is not None})
+        try:
+            return replace(planner, **{k: v for k, v in asdict(self).items() if v is not None})
+        except OutOfBounds as error:
+            raise error.under("--planner.") from error
 
 
 def load_policy(policy: PolicyOptions, planner: PlannerOptions) -> Artefact:
@@ -80,10 +84,11 @@ def load_policy(policy: PolicyOptions, planner: PlannerOptions) -> Artefact:
     Raises:
         ArtefactError: missing, tampered with, or made for another feature spec.
         EnvironmentFailure: the Hub cannot be reached.
-        UsageError: the planner's numbers do not go together, or it asks what the model never
-            learned.
+        UsageError: the planner's numbers do not go together, a plan would take too long or too
+            much memory, or it asks what the model never learned.
     """
     artefact = load_artefact(policy.path, policy.revision)
     changed = planner.apply(artefact.planner)
     require_answers(artefact.world_model.config, changed)
+    require_affordable(artefact.world_model.config, changed)
     return replace(artefact, planner=changed)

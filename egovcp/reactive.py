@@ -9,6 +9,7 @@ it comes from.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
@@ -19,21 +20,24 @@ import draccus
 import numpy as np
 import torch
 import torch.nn.functional as F
-from draccus.utils import DraccusException
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors import SafetensorError
+from safetensors.torch import load, save
 from torch import Tensor
 
 from egovcp import spec
+from egovcp.atomic import write_bytes
 from egovcp.bounds import bounded, check_bounds
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.decode import decode, shown
+from egovcp.errors import ArtefactError
 from egovcp.model.depth import nearness
 from egovcp.plan import PolicyStep
+from egovcp.tensor_file import TensorFile, read_tensor_file
 
 SCHEMA: Final = "egovcp-reactive-1"
 KERNELS: Final = (8, 3, 3)
 STRIDES: Final = (4, 2, 2)
+_LIMIT_BYTES: Final = 64 << 20
 
 type Layer = tuple[Tensor, Tensor]  # weight, bias
 
@@ -42,18 +46,27 @@ type Layer = tuple[Tensor, Tensor]  # weight, bias
 class ReactiveConfig:
     """Sizes of the networks, and how much of the past they see."""
 
-    frames: int = bounded(3, least=1)
+    frames: int = bounded(3, least=1, most=64)
     """Pictures seen at once, the present one and those of the ticks before: one alone does not show
     where a ball is going."""
-    channels: tuple[int, int, int] = bounded((16, 32, 32), least=1)
+    channels: tuple[int, int, int] = bounded((16, 32, 32), least=1, most=1024)
     """Channels of the three layers of the depth CNN; actor and critic have one each."""
-    hidden: tuple[int, ...] = bounded((256, 128), least=1)
+    hidden: tuple[int, ...] = bounded((256, 128), least=1, most=8192, longest=16)
     """Hidden layers of actor and critic, after the CNN."""
-    depth_max_m: float = bounded(spec.DEPTH_MAX_M, above=0)
+    depth_max_m: float = bounded(spec.DEPTH_MAX_M, least=0.1, most=100)
     """Depth, in metres, at which nearness is 0."""
 
     def __post_init__(self) -> None:
         check_bounds(self)
+
+
+@dataclass(frozen=True)
+class _Content:
+    """The metadata's JSON."""
+
+    config: ReactiveConfig
+    controller_id: str
+    provenance: dict[str, Any]
 
 
 class Eyes:
@@ -109,11 +122,9 @@ class ReactiveNetwork:
             "controller_id": self.controller_id,
             "provenance": dict(self.provenance),
         }
-        save_file(
-            {name: tensor.contiguous() for name, tensor in self._tensors().items()},
-            path,
-            metadata={"schema": SCHEMA, "content": json.dumps(content)},
-        )
+        tensors = {name: tensor.contiguous() for name, tensor in self._tensors().items()}
+        metadata = {"schema": SCHEMA, "content": json.dumps(content, allow_nan=False)}
+        write_bytes(path, save(tensors, metadata))
 
     @classmethod
     def load(cls, path: Path) -> ReactiveNetwork:
@@ -122,26 +133,17 @@ class ReactiveNetwork:
         Raises:
             ArtefactError: missing, damaged, or of another schema.
         """
-        if not path.is_file():
+        if not os.path.lexists(path):
             raise ArtefactError(
                 f"{path}: no such policy; expected a .safetensors file that egovcp-train-ppo wrote"
             )
         try:
-            with safe_open(path, framework="pt") as file:
-                metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return cls._from(tensors, metadata)
-        except (
-            SafetensorError,
-            KeyError,
-            TypeError,
-            ValueError,
-            UsageError,
-            DraccusException,
-        ) as error:
-            reason = " ".join(str(error).split())[:200]
+            return cls._from(read_tensor_file(path, _LIMIT_BYTES))
+        except OSError as error:
+            raise ArtefactError(f"{path}: {error.strerror}; it cannot be read") from error
+        except (SafetensorError, ValueError) as error:
             raise ArtefactError(
-                f"{path}: not a policy of schema {SCHEMA} ({reason}); train one with "
+                f"{path}: not a policy of schema {SCHEMA} ({error}); train one with "
                 "egovcp-train-ppo"
             ) from error
 
@@ -154,12 +156,13 @@ class ReactiveNetwork:
             )
 
     @classmethod
-    def _from(cls, tensors: dict[str, Tensor], metadata: Mapping[str, str]) -> ReactiveNetwork:
-        if metadata.get("schema") != SCHEMA:
-            raise ValueError(f"its schema is {metadata.get('schema')!r}")
-        content = json.loads(metadata["content"])
-        config = draccus.decode(ReactiveConfig, content["config"])
-        return cls.of(tensors, config, str(content["controller_id"]), content["provenance"])
+    def _from(cls, file: TensorFile) -> ReactiveNetwork:
+        if file.metadata.get("schema") != SCHEMA:
+            raise ValueError(f"its schema is {shown(file.metadata.get('schema'))}")
+        content = decode(_Content, file.json_metadata("content"), "content")
+        file.require(tensor_shapes(content.config))
+        tensors = load(file.content)
+        return cls.of(tensors, content.config, content.controller_id, content.provenance)
 
     @classmethod
     def of(

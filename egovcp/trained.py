@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
-import draccus
-
 from egovcp.artefact import Artefact
 from egovcp.cli import WeightedDatasetConfig
 from egovcp.data import ReturnConfig
+from egovcp.decode import DecodeError, decode
 from egovcp.errors import ArtefactError, UsageError
+from egovcp.manifest import MANIFEST
 
 
 def trained_with[C](artefact: Artefact, name: str, kind: type[C]) -> C:
@@ -47,13 +47,11 @@ def returns_of(artefact: Artefact, steps: int | None = None) -> ReturnConfig:
     return replace(returns, steps=found.pop())
 
 
-def _decoded[C](artefact: Artefact, name: str, kind: type[C], default: Any) -> C:
+def _decoded[C](artefact: Artefact, name: str, kind: type[C], default: object) -> C:
     options: Any = artefact.manifest.get("train_config", {})
     try:
-        found: C = draccus.decode(kind, options.get(name, default))
-    except (AttributeError, draccus.utils.DraccusException) as error:
+        return decode(kind, options.get(name, default), f"train_config.{name}")
+    except DecodeError as error:
         raise ArtefactError(
-            f"{artefact.path}: its manifest's train_config.{name} cannot be read "
-            f"({' '.join(str(error).split())}); train again with this version"
+            f"{artefact.path / MANIFEST}: {error}; train again with this version"
         ) from error
-    return found

@@ -20,6 +20,7 @@ from egovcp.data.source import local_root
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.env import decided
 from egovcp.sim.scenario import Scenario
+from egovcp.terminal import echo
 from egovcp_collect.backend import Backend
 from egovcp_collect.config import SHAPING, CollectConfig
 from egovcp_collect.crew import Crew
@@ -65,7 +66,7 @@ def collect(config: CollectConfig, command: str = "") -> None:
     root = local_root(config.dataset)
     with committing(root, provenance, config.shard_episodes, agree) as committer:
         missing = _missing(config, committer)
-        require_room(root.parent, missing, config.env, config.shard_episodes)
+        require_room(committer.root.parent, missing, config.env, config.shard_episodes)
         already = committer.committed + committer.sealed
         with Progress(config.episodes, already, lambda: _disk_bytes(committer)) as progress:
             try:
@@ -74,7 +75,7 @@ def collect(config: CollectConfig, command: str = "") -> None:
                 _commit_after(error, committer)
                 raise
             committer.commit()
-        print(_summary(committer, progress))
+        echo(_summary(committer, progress))
         if committer.committed < config.episodes:
             raise KeyboardInterrupt
 
@@ -86,7 +87,7 @@ def _commit_after(error: BaseException, committer: Committer) -> None:
     except Exception as second:  # noqa: BLE001 - whatever it is, it came after, and from, the first
         words = f"what is sealed could not be committed, --resume will do it: {second}"
         error.add_note(words)
-        print(f"{PROG}: warning: {words}", file=sys.stderr)
+        echo(f"{PROG}: warning: {words}", error=True)
 
 
 def _missing(config: CollectConfig, committer: Committer) -> list[Scenario]:

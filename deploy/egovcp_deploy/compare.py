@@ -10,6 +10,7 @@ from typing import Any, Final
 
 from egovcp.cli import run_command
 from egovcp.errors import DataError, UsageError, suggest
+from egovcp.terminal import echo
 from egovcp_deploy.report import aligned
 from egovcp_deploy.scores import (
     EpisodeScore,
@@ -110,11 +111,11 @@ def compare(config: CompareConfig) -> None:
         _line(task, run.played_by(task, config.controller), other.played_by(task, theirs))
         for task in tasks
     ]
-    print(f"{config.controller} of {run.folder} beside {theirs} of {other.folder}")
+    echo(f"{config.controller} of {run.folder} beside {theirs} of {other.folder}")
     for name, ours, others in _differences(run.config, other.config):
         if name not in _PLACES:
-            print(f"--{name}={ours}, of the other {others}")
-    print(aligned([_HEAD, *lines], words=1))
+            echo(f"--{name}={ours}, of the other {others}")
+    echo(aligned([_HEAD, *lines], words=1))
 
 
 def load_evaluation(folder: Path) -> Evaluation:

@@ -8,7 +8,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.plan import PolicyStep
+from egovcp.plan import PolicyStep, blank_observation
 from egovcp.sim.env import Observation, VectorEnv
 from egovcp.sim.oracles import Oracle
 from egovcp.sim.policies import Hold, RandomWalk
@@ -45,6 +45,14 @@ class Planned:
 
     def __init__(self, policy: RolloutPolicy) -> None:
         self._policy = policy
+        self.skipped: NDArray[np.bool_] = np.zeros(0, np.bool_)
+        """(E,) observations that the policy did not use in its last `act`; empty: unknown."""
+
+    def warm_up(self, robots: int) -> None:
+        """Act for nothing and forget it: the first calls compile, pack and allocate."""
+        for _ in range(2):
+            self._policy.act(*blank_observation(robots))
+        self._policy.reset()
 
     def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
         """Forget the past of every row."""
@@ -52,7 +60,9 @@ class Planned:
 
     def act(self, env: VectorEnv, observation: Observation) -> NDArray[np.floating]:
         """The first action of every row's plan."""
-        return self._policy.act(observation.depth, observation.state).action
+        step = self._policy.act(observation.depth, observation.state)
+        self.skipped = step.skipped
+        return step.action
 
     def advance(self, sent: Array) -> None:
         """Advance the recurrence with what was sent."""

@@ -9,6 +9,7 @@ from typing import Final
 from egovcp.artefact import Artefact
 from egovcp.cli import run_command
 from egovcp.errors import EgovcpError, UsageError
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.policy_options import load_policy
 from egovcp.sim.scenario import PLAYABLE
 from egovcp_deploy import dry_run
@@ -91,6 +92,8 @@ def _check(config: DeployConfig) -> None:
         raise UsageError(
             "--robot.recordings is missing; name an MCAP file, a folder of them, or a dataset"
         )
+    if config.robot.type == SIM:
+        require_packages("egovcp-deploy", "--robot.type=sim", *SIMULATOR_MODULES)
     if config.imagine < 0:
         raise UsageError(f"--imagine={config.imagine}: expected a number of ticks from 0")
     check_live(config)

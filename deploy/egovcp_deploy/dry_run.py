@@ -13,8 +13,7 @@ from typing import Final
 import numpy as np
 
 from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.plan import until
-from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, STATE_DIM, STATE_SLICES
+from egovcp.plan import blank_observation, until
 from egovcp_deploy.pilot.effort import BUDGET_S
 from egovcp_deploy.policy import RolloutPolicy, backend_of
 
@@ -110,9 +109,7 @@ def plan_time(policy: RolloutPolicy) -> str:
     Raises:
         EnvironmentFailure: too long for 25 Hz.
     """
-    depth = np.zeros((1, DEPTH_ROWS, DEPTH_COLS), np.uint16)
-    state = np.zeros((1, STATE_DIM), np.float32)
-    state[0, STATE_SLICES["projected_gravity"].stop - 1] = -1.0
+    depth, state = blank_observation(1)
     policy.reset()
     times, iterations = list[float](), list[int]()
     end = time.monotonic() + _PLANNING_S

@@ -25,6 +25,8 @@ from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.controllers import PPO, Constants, Controller, Planned, reference
+from egovcp_deploy.options import PLANNER
+from egovcp_deploy.policy import RolloutPolicy
 from egovcp_deploy.safety import SafetyFilter
 from egovcp_deploy.scores import EpisodeScore
 
@@ -63,6 +65,7 @@ class Player:
         self._setup = setup
         self._artefact = artefact
         self._envs: dict[int, VectorEnv] = {}
+        self._planned: dict[tuple[str, int], Planned] = {}
 
     def play(self, group: Group, stopped: Callable[[], bool] = lambda: False) -> list[EpisodeScore]:
         """Scores in the order of the group's scenarios; raises `Stopped` when asked to."""
@@ -74,15 +77,21 @@ class Player:
     def _controller(self, group: Group) -> Controller:
         if group.controller == "constant":
             return Constants(np.array(group.actions))
-        if group.controller == PPO:
-            network = ReactiveNetwork.load(Path(self._setup.ppo))
-            return Planned(ReactivePolicy(network, len(group.scenarios)))
-        if group.controller != "planner":
+        if group.controller not in (PPO, PLANNER):
             return reference(group.controller)
+        key = group.controller, len(group.scenarios)
+        if key not in self._planned:
+            self._planned[key] = Planned(self._policy(*key))
+            self._planned[key].warm_up(len(group.scenarios))  # else the first plan is timed
+        return self._planned[key]
+
+    def _policy(self, controller: str, robots: int) -> RolloutPolicy:
         setup = self._setup
+        if controller == PPO:
+            return ReactivePolicy(ReactiveNetwork.load(Path(setup.ppo)), robots)
         if self._artefact is None:
             self._artefact = load_policy(setup.policy, setup.planner)
-        return Planned(self._artefact.make_policy(len(group.scenarios), setup.seed))
+        return self._artefact.make_policy(robots, setup.seed)
 
 
 def play(
@@ -103,6 +112,8 @@ def play(
         begin = time.perf_counter()
         planned = controller.act(env, observation)
         tally.plan_ms.append((time.perf_counter() - begin) * 1e3 / env.num_envs)
+        if isinstance(controller, Planned) and controller.skipped.size:
+            tally.skipped += live & controller.skipped
         result = env.step(safety.filter(planned).action)
         controller.advance(result.sent_action)
         tally.rewards += np.where(live, result.reward, 0.0)
@@ -119,6 +130,7 @@ class _Tally:
     def __init__(self, rows: int) -> None:
         self.rewards = np.zeros(rows)
         self.steps = np.zeros(rows, np.int64)
+        self.skipped = np.zeros(rows, np.int64)
         self.success: NDArray[np.bool_] = np.zeros(rows, np.bool_)
         self.terminated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
         self.parts: tuple[dict[str, bool], ...] = ({},) * rows
@@ -134,6 +146,7 @@ class _Tally:
                 success=bool(self.success[i]),
                 terminated=bool(self.terminated[i]),
                 parts=self.parts[i],
+                skipped=int(self.skipped[i]),
                 plan_ms=self.plan_ms[: int(self.steps[i])],
             )
             for i, scenario in enumerate(scenarios)

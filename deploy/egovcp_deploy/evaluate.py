@@ -24,6 +24,7 @@ from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.env import decided
 from egovcp.sim.scenario import PLAYABLE, Scenario
 from egovcp.spec import TASKS
+from egovcp.terminal import echo
 from egovcp_deploy.constant_search import Action, BestConstant, load_constants, search_constant
 from egovcp_deploy.controllers import CONTROLLERS, PPO
 from egovcp_deploy.episodes import Group, Setup, Stage
@@ -142,12 +143,14 @@ def evaluate(config: EvalConfig) -> None:
         DataError: ``--constant.path`` cannot be used.
         ArtefactError: the artefact, or the policy of --ppo.path, is missing, damaged, or of another
             low-level controller.
+        EnvironmentFailure: the backend of the planner cannot be used here.
     """
     config.check()
     config = replace(config, env=decided(config.env))
     constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
     artefact = _load_policy(config)
     ppo = _load_ppo(config)
+    backend = _prepare_planner(artefact, config.seed)
     folder = make_output_dir(config.output_dir)
     setup = Setup(config.env, config.policy, config.planner, config.seed, config.ppo.path)
     with closing(Stage(setup, config.num_workers, artefact)) as stage:
@@ -156,14 +159,15 @@ def evaluate(config: EvalConfig) -> None:
             write_json(folder / "constant.json", {k: asdict(v) for k, v in constants.items()})
         scores = _play(config, stage, constants)
     figures = summary(scores)
-    backend = backend_of(artefact.make_policy(1, config.seed)) if artefact else ""
     record = _record(config, artefact, ppo, constants, scores)
     write_json(folder / "eval_run.json", {"backend": backend, **record})
     write_json(folder / "eval.json", figures)
-    print(table(figures))
+    echo(table(figures))
     if backend:
-        print(f"plans computed by {backend}")
-    print(f"figures: {folder / 'eval.json'}")
+        echo(f"plans computed by {backend}")
+    if skipped := sum(s.skipped for row in scores.values() for each in row.values() for s in each):
+        echo(f"{skipped} observations were not finite and were skipped; see eval_run.json")
+    echo(f"figures: {folder / 'eval.json'}")
 
 
 def _load_policy(config: EvalConfig) -> Artefact | None:
@@ -172,6 +176,15 @@ def _load_policy(config: EvalConfig) -> Artefact | None:
     artefact = load_policy(config.policy, config.planner)
     artefact.require_controller(make_controller(config.env.controller).id)
     return artefact
+
+
+def _prepare_planner(artefact: Artefact | None, seed: int) -> str:
+    """What computes the plans; compiled here, once, before workers need it. Empty: no planner."""
+    if artefact is None:
+        return ""
+    policy = artefact.make_policy(1, seed)
+    policy.prepare()
+    return backend_of(policy)
 
 
 def _load_ppo(config: EvalConfig) -> ReactiveNetwork | None:

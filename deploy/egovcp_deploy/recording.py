@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
@@ -16,6 +15,8 @@ from egovcp.log.live import LiveRerun
 from egovcp.log.mcap import McapSink
 from egovcp.log.rerun import RerunSink
 from egovcp.log.sink import Fanout, Sink
+from egovcp.packages import is_installed
+from egovcp.terminal import echo
 from egovcp_deploy.options import versions
 
 
@@ -71,7 +72,7 @@ def _files(stem: Path, episode: int, options: LogOptions) -> dict[str, Sink]:
     sinks: dict[str, Sink] = {mcap.name: McapSink(mcap)}
     if options.rrd:
         sinks[rrd.name] = RerunSink(rrd)
-    if episode == 0 and importlib.util.find_spec("matplotlib") is not None:
+    if episode == 0 and is_installed("matplotlib"):
         from egovcp.log.picture import PictureSink
 
         sinks[png.name] = PictureSink(png)
@@ -82,7 +83,7 @@ def _viewers(options: LogOptions, stack: ExitStack) -> Iterator[BackgroundSink]:
     if options.live:
         live = stack.enter_context(LiveRerun.of(options.live))
         if live.page:
-            print(f"look at it: {live.page}")
+            echo(f"look at it: {live.page}")
         yield BackgroundSink(RerunSink(live.viewer), "Rerun")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
+from egovcp.terminal import one_line
 from egovcp_deploy.scores import EpisodeScore, success_gain, success_rate, summarise
 
 type Played = Mapping[str, Mapping[str, Sequence[EpisodeScore]]]
@@ -46,6 +47,7 @@ def table(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
 
 def aligned(lines: Sequence[Sequence[str]], words: int) -> str:
     """Columns of equal width: the first ``words`` to the left, numbers to the right."""
+    lines = [[one_line(cell) for cell in line] for line in lines]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join(
         "  ".join(

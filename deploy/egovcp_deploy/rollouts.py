@@ -13,11 +13,11 @@ from tqdm import tqdm
 
 from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
-from egovcp.errors import EnvironmentFailure
 from egovcp.log.info import RunInfo
 from egovcp.log.tick import Tick
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import PLANNER_HZ
+from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.options import make_output_dir, versions
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
@@ -69,18 +69,9 @@ def _make_policy(config: DeployConfig, artefact: Artefact | None, robot: SimRobo
 
 
 def make_robot(config: DeployConfig) -> SimRobot:
-    """The robot of ``--robot.type``.
+    """The robot of ``--robot.type=sim``; importing it needs the simulator."""
+    from egovcp_deploy.robots.sim import SimRobot
 
-    Raises:
-        EnvironmentFailure: the simulator is not installed.
-    """
-    try:
-        from egovcp_deploy.robots.sim import SimRobot
-    except ModuleNotFoundError as error:
-        raise EnvironmentFailure(
-            f"--robot.type=sim needs the simulator, but {error.name} is not installed; "
-            "install it: pip install 'egovcp-deploy[sim]'"
-        ) from error
     return SimRobot(config.env, config.task, config.seed)
 
 
@@ -88,9 +79,12 @@ def _play(
     config: DeployConfig, artefact: Artefact | None, robot: Robot, policy: RolloutPolicy
 ) -> None:
     """Record one rollout after the other and, whatever ends them, sum up the complete ones."""
+    thinker = Thinker(policy, config.imagine)
+    if artefact is not None:
+        thinker.warm_up()
     folder = make_output_dir(config.output_dir)
     clock = LockstepClock()
-    desk = InlineDesk(Thinker(policy, config.imagine), clock)
+    desk = InlineDesk(thinker, clock)
     backend = backend_of(policy)
     runner = Runner(desk, robot, FixedRate(PLANNER_HZ, clock), limits=config.robot.limits)
     summaries: list[RolloutSummary] = []
@@ -160,6 +154,7 @@ def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
         "success": summary.success,
         "terminated": summary.terminated,
         "rejected_plans": summary.rejected,
+        "skipped_observations": summary.skipped,
         "held_ticks": summary.held,
         "damped": summary.damped,
         "overruns": summary.overruns,
@@ -173,9 +168,10 @@ def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
 def _print(summaries: Sequence[RolloutSummary], folder: Path) -> None:
     for i, summary in enumerate(summaries):
         verdict = "success" if summary.success else "fell" if summary.terminated else "failure"
-        print(
+        echo(
             f"rollout {i}: {verdict}, {summary.steps} ticks, "
             f"mean reward {summary.reward / summary.steps:+.4f}, "
             f"plan {np.median(summary.plan_ms):.0f} ms"
+            + (f", {summary.skipped} observations skipped" if summary.skipped else "")
         )
-    print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
+    echo(f"look at it:  rerun {folder / 'rollout-0.rrd'}")

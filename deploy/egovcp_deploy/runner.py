@@ -17,7 +17,7 @@ from egovcp.log.tick import Candidates, Tick
 from egovcp.plan import PolicyStep
 from egovcp.rate import FixedRate
 from egovcp.spec import ACTION_BOX, ACTION_HANDS
-from egovcp_deploy.pilot.desk import Desk, Reply
+from egovcp_deploy.pilot.desk import SKIPPED, Desk, Reply
 from egovcp_deploy.pilot.pilot import REJECTED, Pilot
 from egovcp_deploy.pilot.states import Limits, Request, State
 from egovcp_deploy.robots.base import Outcome, Robot, Sensed
@@ -37,6 +37,8 @@ class RolloutSummary:
     truncated: bool = False
     rejected: int = 0
     """Plans that were not finite and were not used."""
+    skipped: int = 0
+    """Observations that the policy did not use, because their state was not finite."""
     held: int = 0
     """Ticks on HOLD."""
     damped: str = ""
@@ -58,6 +60,7 @@ class RolloutSummary:
         self.success = tick.success
         self.terminated, self.truncated = tick.terminated, tick.truncated
         self.rejected += REJECTED in tick.events
+        self.skipped += tick.events.count(SKIPPED)
         self.held += tick.mode == State.HOLD
         if "plan" in tick.timing_ms:
             self.plan_ms.append(tick.timing_ms["plan"])

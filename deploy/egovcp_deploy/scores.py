@@ -26,6 +26,8 @@ class EpisodeScore:
     terminated: bool
     plan_ms: list[float] = field(default_factory=list)
     """Time per tick to decide on one action, ms; shared by robots planned together."""
+    skipped: int = 0
+    """Observations that the policy did not use, because their state was not finite."""
     parts: dict[str, bool] = field(default_factory=dict)
     """Success of each part of a sequence of tasks; of a single task, nothing."""
 

@@ -20,20 +20,22 @@ from pathlib import Path
 
 from egovcp.data import files, metadata, schema
 from egovcp.data.continued import read_provenance, read_version
+from egovcp.data.destination import is_vacant, make_parent, require_replaceable, resolve_root
 from egovcp.data.encoded import EncodedEpisode
 from egovcp.data.lock import only_writer
 from egovcp.data.provenance import Provenance
 from egovcp.data.spool import Spool
 from egovcp.data.version import Contents, Version, publish, recover
-from egovcp.data.writer import make_parent
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
 
 type Agree = Callable[[Provenance], None]
 
 
 def work_folder(root: Path) -> Path:
-    """Where a collection keeps what is not in the dataset yet."""
-    return root.with_name(f".{root.name}.collect")
+    """Where a collection keeps what is not in the dataset yet; beside the real folder if ``root``
+    is a symbolic link."""
+    real = resolve_root(root)
+    return real.with_name(f".{real.name}.collect")
 
 
 class Committer:
@@ -115,7 +117,7 @@ class Committer:
             for encoded in (*self._tail, *episodes):
                 version.add(encoded)
             contents = version.close()
-            publish(self._next, self.root)
+            publish(self._next, self.root, replace=previous is not None)
         finally:
             version.discard()
         self.committed, self.frames = len(contents.records), contents.frames
@@ -130,7 +132,7 @@ class Committer:
         recover(self._next, self.root)
         shutil.rmtree(self._next, ignore_errors=True)
         run = work_folder(self.root) / "run.json"
-        if self.root.exists():
+        if not is_vacant(self.root):
             self._contents, self._tail, provenance = read_version(self.root)
             agree(provenance)
         elif run.is_file():
@@ -157,7 +159,7 @@ def committing(
     """A committer that alone may write the dataset at ``root``.
 
     Args:
-        root: the dataset.
+        root: the dataset; a symbolic link stands for the folder that it leads to.
         provenance: what its ``meta/collection.json`` will say.
         shard_episodes: episodes per shard of a new dataset; an old one keeps its own.
         resume: take up a dataset or an unfinished collection that is there; called with its
@@ -165,13 +167,16 @@ def committing(
 
     Raises:
         UsageError: something is there and ``resume`` is None, or ``root`` cannot exist.
-        EnvironmentFailure: another process writes it, or nothing can be written there.
+        EnvironmentFailure: another process writes it, nothing can be written there, or it is a
+            mount point.
         DataError: what is there is damaged.
     """
+    root = resolve_root(root)
     make_parent(root)
     work = work_folder(root)
     if resume is None:
         _require_nothing(root, work)
+    require_replaceable(root)
     try:
         work.mkdir(exist_ok=True)
     except OSError as error:
@@ -193,7 +198,7 @@ def _nothing_to_agree(provenance: Provenance) -> None:
 
 
 def _require_nothing(root: Path, work: Path) -> None:
-    if root.exists() or root.is_symlink():
+    if not is_vacant(root):
         raise UsageError(
             f"{root} exists already; continue it with --resume, or choose another --dataset.root"
         )

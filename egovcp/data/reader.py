@@ -24,10 +24,10 @@ from egovcp.data.paths import require_file
 from egovcp.data.selection import select_episodes
 from egovcp.data.source import Source, is_local, locate, shelve
 from egovcp.errors import DataError, suggest
-from egovcp.hub import Patience, Shelf
+from egovcp.hub import RetryPolicy, Shelf
 
 _OPEN_FILES = 8
-_PATIENCE = Patience()
+_RETRY_POLICY = RetryPolicy()
 _TIMESTAMP_SLACK = 1e-3  # s; float32 timestamps
 
 
@@ -77,7 +77,7 @@ class DatasetReader:
         return reader
 
     @classmethod
-    def on_demand(cls, config: DatasetConfig, patience: Patience = _PATIENCE) -> Self:
+    def on_demand(cls, config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Self:
         """Open a dataset to stream from: what is only on the Hub comes file by file, when it is
         read, at the commit that the revision is now.
 
@@ -88,7 +88,7 @@ class DatasetReader:
         """
         if is_local(config):
             return cls.open(config)
-        shelf = shelve(config, patience)
+        shelf = shelve(config, retry)
         source = Source(shelf.folder, shelf.repo_id, shelf.commit)
         return cls(source, shelf, _asked_for(config))
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,10 +11,9 @@ from egovcp.cli import DatasetConfig
 from egovcp.data import schema
 from egovcp.data.files import write_json
 from egovcp.errors import DataError, UsageError
-from egovcp.hub import Patience, Shelf, snapshot
+from egovcp.hub import RetryPolicy, Shelf, is_repo_id, snapshot
 
-_PATIENCE = Patience()
-_REPO_ID = re.compile(r"\w[\w.-]*/\w[\w.-]*", re.ASCII)
+_RETRY_POLICY = RetryPolicy()
 
 
 @dataclass(frozen=True)
@@ -46,7 +44,7 @@ def local_root(config: DatasetConfig) -> Path:
     return lerobot_home() / config.repo_id
 
 
-def locate(config: DatasetConfig, patience: Patience = _PATIENCE) -> Source:
+def locate(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Source:
     """Find the dataset; download it only if no root is given and no local copy exists.
 
     If the Hub cannot be reached, a complete earlier download serves.
@@ -68,7 +66,7 @@ def locate(config: DatasetConfig, patience: Patience = _PATIENCE) -> Source:
         raise DataError(
             f"no dataset at {root}: {schema.INFO_PATH} is missing; check --dataset.root"
         )
-    return _download(config, patience)
+    return _download(config, retry)
 
 
 def is_local(config: DatasetConfig) -> bool:
@@ -81,7 +79,7 @@ def is_local(config: DatasetConfig) -> bool:
     return bool(config.root) or (there and not config.revision)
 
 
-def shelve(config: DatasetConfig, patience: Patience = _PATIENCE) -> Shelf:
+def shelve(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Shelf:
     """A dataset of the Hub with its `meta` folder; the other files can be brought from there.
 
     If the Hub cannot be reached, a complete `meta` folder of an earlier download serves.
@@ -92,7 +90,7 @@ def shelve(config: DatasetConfig, patience: Patience = _PATIENCE) -> Shelf:
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
     _require_repo_id(config.repo_id)
-    return Shelf.open(config.repo_id, config.revision, patience, _hub_cache(), ["meta/*"])
+    return Shelf.open(config.repo_id, config.revision, retry, _hub_cache(), ["meta/*"])
 
 
 def record(source: Source) -> None:
@@ -118,11 +116,6 @@ def recorded(root: Path, repo_id: str = "") -> Source:
     return found if repo_id in ("", found.repo_id) else Source(root, repo_id)
 
 
-def is_repo_id(text: str) -> bool:
-    """Whether ``text`` has the form of an id on the Hub, ``user/name``."""
-    return bool(_REPO_ID.fullmatch(text)) and ".." not in text
-
-
 def _require_repo_id(repo_id: str) -> None:
     if not repo_id:
         raise UsageError("which dataset? give --dataset.repo_id=user/name or --dataset.root=FOLDER")
@@ -130,8 +123,8 @@ def _require_repo_id(repo_id: str) -> None:
         raise UsageError(f"--dataset.repo_id={repo_id!r} is not of the form user/name")
 
 
-def _download(config: DatasetConfig, patience: Patience) -> Source:
-    folder = snapshot(config.repo_id, config.revision, patience, cache_dir=_hub_cache())
+def _download(config: DatasetConfig, retry: RetryPolicy) -> Source:
+    folder = snapshot(config.repo_id, config.revision, retry, cache_dir=_hub_cache())
     return Source(folder, config.repo_id, commit=folder.name)
 
 

@@ -17,12 +17,17 @@ from typing import Any, Final
 
 from egovcp import spec
 from egovcp.data import files, schema, stats
+from egovcp.data.destination import is_vacant
 from egovcp.data.encoded import EncodedEpisode
 from egovcp.data.provenance import Provenance
 from egovcp.data.shard import Shard, shard_paths
+from egovcp.errors import EnvironmentFailure, UsageError
 
 #: A file system or kernel that cannot exchange two folders.
 _NO_EXCHANGE: Final = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
+#: A mount point, or a folder of a lower layer of an overlay file system (a container's image).
+_NO_RENAME: Final = (errno.EBUSY, errno.EXDEV)
+_OCCUPIED: Final = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)
 
 
 @dataclass(frozen=True)
@@ -200,21 +205,45 @@ class Version:
         return {**self._hashes, **meta}
 
 
-def publish(folder: Path, root: Path) -> None:
+def publish(folder: Path, root: Path, replace: bool = False) -> None:
     """Make the finished version ``folder`` the dataset at ``root``, in one step.
 
-    A version that was there lies in ``folder`` afterwards, or is gone.
+    Args:
+        folder: the new version, on the file system of ``root``.
+        root: the dataset.
+        replace: whether ``root`` is the version before, which lies in ``folder`` afterwards, or is
+            gone. Otherwise nothing may be there but an empty folder.
+
+    Raises:
+        UsageError: something is there that must not be replaced.
+        EnvironmentFailure: ``root`` cannot be renamed.
     """
-    if not root.exists():
-        files.rename(folder, root)
-    else:
-        try:
-            files.exchange(folder, root)
-        except OSError as error:
-            if error.errno not in _NO_EXCHANGE:
-                raise
-            _swap(folder, root)
+    try:
+        if replace:
+            _exchange(folder, root)
+        else:
+            files.rename(folder, root)  # replaces an empty folder, and nothing else
+    except OSError as error:
+        if error.errno in _OCCUPIED:
+            raise UsageError(
+                f"output folder {root} is not empty any more: another program has written there"
+            ) from error
+        if error.errno in _NO_RENAME:
+            raise EnvironmentFailure(
+                f"{root} cannot be renamed ({error.strerror}): it is a mount point, or comes from "
+                "a container image; copy it to a folder inside a volume and use that"
+            ) from error
+        raise
     files.sync(root.parent)
+
+
+def _exchange(folder: Path, root: Path) -> None:
+    try:
+        files.exchange(folder, root)
+    except OSError as error:
+        if error.errno not in _NO_EXCHANGE:
+            raise
+        _swap(folder, root)
 
 
 def _swap(folder: Path, root: Path) -> None:
@@ -229,10 +258,10 @@ def recover(folder: Path, root: Path) -> None:
     """Put a version back that a crash within `publish` left aside."""
     aside = _aside(folder)
     if aside.exists():
-        if root.exists():
-            shutil.rmtree(aside)
-        else:
+        if is_vacant(root):
             files.rename(aside, root)
+        else:
+            shutil.rmtree(aside)
 
 
 def _aside(folder: Path) -> Path:

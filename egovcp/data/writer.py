@@ -13,29 +13,12 @@ from types import TracebackType
 from typing import Self
 
 from egovcp.data import schema
+from egovcp.data.destination import make_parent, require_new, require_replaceable, resolve_root
 from egovcp.data.encoded import encode
 from egovcp.data.episode import Episode
 from egovcp.data.provenance import Provenance
 from egovcp.data.version import Contents, Version, publish
 from egovcp.errors import UsageError
-
-
-def require_new(root: Path) -> None:
-    """Raise `UsageError` if ``root`` exists; nothing is ever overwritten."""
-    if root.exists() or root.is_symlink():
-        raise UsageError(f"output folder {root} exists already; choose another or remove it")
-
-
-def make_parent(root: Path) -> None:
-    """Make the folder that will hold ``root``.
-
-    Raises:
-        UsageError: it would lie below a file.
-    """
-    try:
-        root.parent.mkdir(parents=True, exist_ok=True)
-    except (FileExistsError, NotADirectoryError) as error:
-        raise UsageError(f"output folder {root} would lie below a file; choose another") from error
 
 
 class DatasetWriter:
@@ -53,10 +36,12 @@ class DatasetWriter:
         """Create the temporary folder.
 
         Raises:
-            UsageError: ``root`` exists, or cannot exist.
+            UsageError: ``root`` exists and is not an empty folder, or cannot exist.
+            EnvironmentFailure: ``root`` is a mount point.
         """
-        self.root = Path(root).absolute()
+        self.root = resolve_root(root)
         require_new(self.root)
+        require_replaceable(self.root)
         make_parent(self.root)
         folder = self.root.with_name(f".{self.root.name}.{secrets.token_hex(4)}.partial")
         self._version = Version(folder, provenance, Contents(shard_episodes))
@@ -89,7 +74,6 @@ class DatasetWriter:
             self.discard()
             raise UsageError(f"no episode was written to {self.root}; nothing to keep")
         self._version.close()
-        require_new(self.root)
         publish(self._version.folder, self.root)
         return self.root
 

@@ -24,7 +24,7 @@ from typing import IO, Any, Final
 
 from tqdm import tqdm
 
-from egovcp.hub.patience import Line, Patience
+from egovcp.hub.retry import RetryingClient, RetryPolicy
 
 _LOG = logging.getLogger(__name__)
 _WORKERS: Final = 16  # more than are asked for at a time: shelves limit themselves
@@ -168,7 +168,8 @@ def serve(orders: IO[str], answers: IO[str], timeout_s: float) -> None:
     """
     import huggingface_hub.file_download  # noqa: F401  takes a while, so before the first errand
 
-    line, lock = Line(Patience(attempts=1, timeout_s=timeout_s)), threading.Lock()
+    client = RetryingClient(RetryPolicy(attempts=1, timeout_s=timeout_s))
+    lock = threading.Lock()
 
     def say(what: object) -> None:
         with lock:
@@ -176,7 +177,7 @@ def serve(orders: IO[str], answers: IO[str], timeout_s: float) -> None:
 
     def run(number: int, errand: Errand) -> None:
         try:
-            with line.open():
+            with client.open():
                 errand.run()
         except Exception:  # noqa: BLE001  whatever it is: who asked tries again, and explains
             say([number, False])

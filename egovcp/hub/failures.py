@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Iterator
-from typing import Final, Literal
-
-import httpx
+from typing import TYPE_CHECKING, Final, Literal
 
 from egovcp.errors import (
     ArtefactError,
@@ -16,6 +14,10 @@ from egovcp.errors import (
     EnvironmentFailure,
     UsageError,
 )
+from egovcp.hub.retry import http_library
+
+if TYPE_CHECKING:
+    from huggingface_hub.errors import HfHubHTTPError
 
 type RepoType = Literal["dataset", "model"]
 """What a repository of the Hub holds; the two have their ids apart from each other."""
@@ -43,11 +45,17 @@ def explained(
     """
     try:
         yield
-    except (OSError, httpx.HTTPError, ValueError, KeyError, RuntimeError, EgovcpError) as error:
+    except (OSError, ValueError, KeyError, RuntimeError, EgovcpError, _http_error()) as error:
         explanation = _explain(error, repo_id, revision or "main", writing, repo_type)
         if explanation is error:
             raise
         raise explanation from error
+
+
+def _http_error() -> type[Exception]:
+    """The root of the errors of the library's HTTP library; evaluated once something was raised."""
+    error: type[Exception] = http_library().HTTPError
+    return error
 
 
 def token() -> str | None:
@@ -116,11 +124,8 @@ def _explain(
 
 
 def _refused(
-    error: httpx.HTTPError, repo_id: str, writing: bool, repo_type: RepoType
+    error: HfHubHTTPError, repo_id: str, writing: bool, repo_type: RepoType
 ) -> EgovcpError:
-    from huggingface_hub.errors import HfHubHTTPError
-
-    assert isinstance(error, HfHubHTTPError)
     status, path = error.response.status_code, error.response.url.path
     user = repo_id.split("/")[0]
     need = f"write access to {repo_type}s of {user}" if writing else f"read access to {repo_id}"

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.hub.failures import RepoType, explained, token
-from egovcp.hub.patience import HubUnreachable, Patience, patient
+from egovcp.hub.retry import HubUnreachable, RetryPolicy, retrying
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -24,14 +24,14 @@ _FOREIGN = (".gitattributes", ".gitignore")
 _WORKERS = 4
 
 
-def resolve(repo_id: str, revision: str, patience: Patience) -> str:
+def resolve(repo_id: str, revision: str, retry: RetryPolicy) -> str:
     """The commit SHA of a branch, a tag or a shortened SHA.
 
     Raises:
         DataError: there is no such dataset or revision.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
-    with explained(repo_id, revision), patient(patience):
+    with explained(repo_id, revision), retrying(retry):
         from huggingface_hub import HfApi
 
         commit = HfApi(token=token()).dataset_info(repo_id, revision=revision or None).sha
@@ -42,7 +42,7 @@ def resolve(repo_id: str, revision: str, patience: Patience) -> str:
 def snapshot(
     repo_id: str,
     revision: str,
-    patience: Patience,
+    retry: RetryPolicy,
     repo_type: RepoType = "dataset",
     cache_dir: Path | None = None,
     patterns: Sequence[str] | None = None,
@@ -54,7 +54,7 @@ def snapshot(
     Args:
         repo_id: `user/name`.
         revision: branch, tag or commit SHA; empty: the latest.
-        patience: how often and how long to try.
+        retry: how often and how long to try.
         repo_type: what kind of repository it is.
         cache_dir: the cache; None: the library's own.
         patterns: of the files to bring; None: all.
@@ -75,7 +75,7 @@ def snapshot(
         allow_patterns=None if patterns is None else list(patterns),
     )
     try:
-        with explained(repo_id, revision, repo_type=repo_type), patient(patience):
+        with explained(repo_id, revision, repo_type=repo_type), retrying(retry):
             return Path(bring(token=token()))
     except HubUnreachable as error:
         try:
@@ -86,7 +86,7 @@ def snapshot(
         return found
 
 
-def fetch(repo_id: str, commit: str, folder: Path, patience: Patience) -> None:
+def fetch(repo_id: str, commit: str, folder: Path, retry: RetryPolicy) -> None:
     """Make ``folder`` hold exactly the files of a commit.
 
     What an interrupted call has brought is used; files that do not belong are removed.
@@ -95,7 +95,7 @@ def fetch(repo_id: str, commit: str, folder: Path, patience: Patience) -> None:
         EnvironmentFailure: the Hub cannot be reached, refuses, or sends something else than it
             lists; the damaged file is removed, so that the next call fetches it anew.
     """
-    with explained(repo_id, commit), patient(patience):
+    with explained(repo_id, commit), retrying(retry):
         from huggingface_hub import HfApi, snapshot_download
 
         listing = _listing(HfApi(token=token()), repo_id, commit)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from egovcp.hub.patience import Patience
+from egovcp.hub.retry import RetryPolicy
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class PublishConfig:
     """A tag for this version; empty: none. It cannot be moved later."""
     message: str = ""
     """Title of the commit; empty: what was published says it."""
-    network: Patience = field(default_factory=Patience)
+    network: RetryPolicy = field(default_factory=RetryPolicy)
     """How long to try."""
     json: str = ""
     """File for {"repo_id", "branch", "tag", "commit", "new"}; empty: none."""

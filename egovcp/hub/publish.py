@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.hub.failures import LostUpdate, RepoType, explained, token
-from egovcp.hub.patience import HubUnreachable, Patience, patient
+from egovcp.hub.retry import HubUnreachable, RetryPolicy, retrying
 
 if TYPE_CHECKING:
     from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
@@ -89,7 +89,7 @@ class _State:
     files: Mapping[str, RepoFile]
 
 
-def publish(publication: Publication, patience: Patience) -> Published:
+def publish(publication: Publication, retry: RetryPolicy) -> Published:
     """Make the branch hold the contents, then set the tags.
 
     Repeating it completes what an interrupted one has left undone: large files that have
@@ -101,7 +101,7 @@ def publish(publication: Publication, patience: Patience) -> Published:
         LostUpdate: somebody else has changed the branch meanwhile.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
-    with publication.failures, patient(patience):
+    with publication.failures, retrying(retry):
         from huggingface_hub import HfApi
 
         api = HfApi(token=token())
@@ -111,20 +111,20 @@ def publish(publication: Publication, patience: Patience) -> Published:
         _require_free(publication, tags, seen)
         commit = seen.head
         if _operations(publication, seen):
-            commit = _commit(api, publication, seen, patience)
+            commit = _commit(api, publication, seen, retry)
         for tag in filter(None, (publication.moving_tag, publication.tag)):
             _set_tag(api, publication, tag, commit, tags.get(tag))
     return Published(commit, commit != seen.head)
 
 
-def reserve(publication: Publication, patience: Patience) -> None:
+def reserve(publication: Publication, retry: RetryPolicy) -> None:
     """Make the repository that a long computation is to fill, or see that one may write there.
 
     Raises:
         UsageError: the id is none, or names a public repository and a private one is asked for.
         EnvironmentFailure: nobody is logged in, the Hub refuses, or cannot be reached.
     """
-    with publication.failures, patient(patience):
+    with publication.failures, retrying(retry):
         from huggingface_hub import HfApi
 
         if (known := token()) is None:
@@ -204,7 +204,7 @@ def _same(content: Content, file: RepoFile) -> bool:
     return size in (None, file.size) and content.git_oid == file.blob_id
 
 
-def _commit(api: HfApi, publication: Publication, seen: _State, patience: Patience) -> str:
+def _commit(api: HfApi, publication: Publication, seen: _State, retry: RetryPolicy) -> str:
     """Upload, then commit on top of what was seen; the SHA of the commit."""
     from huggingface_hub import CommitOperationAdd
 
@@ -218,7 +218,7 @@ def _commit(api: HfApi, publication: Publication, seen: _State, patience: Patien
         revision=publication.branch,
         free_memory=False,
     )
-    for attempt in range(1, patience.attempts + 1):
+    for attempt in range(1, retry.attempts + 1):
         try:
             with publication.failures:
                 made = api.create_commit(
@@ -235,9 +235,9 @@ def _commit(api: HfApi, publication: Publication, seen: _State, patience: Patien
                 return now.head  # it has arrived, only the answer was lost
             if now.head != seen.head:
                 raise _lost(publication, seen, now) from error
-            if attempt == patience.attempts:
+            if attempt == retry.attempts:
                 raise
-            time.sleep(patience.pause(attempt))
+            time.sleep(retry.pause(attempt))
         else:
             _require_complete(publication, _look(api, publication, made.oid))
             return made.oid

@@ -12,7 +12,7 @@ from egovcp.errors import DataError, EgovcpError
 from egovcp.hub.carrier import Errand, carrier
 from egovcp.hub.failures import explained, token
 from egovcp.hub.fetch import snapshot
-from egovcp.hub.patience import Line, Patience, is_plain
+from egovcp.hub.retry import RetryingClient, RetryPolicy, uses_default_client
 
 #: Files that come at a time: one connection rarely fills a line to the Hub.
 AHEAD: Final = 3
@@ -25,10 +25,11 @@ class Shelf:
     is asked of the Hub for a file that is there.
     """
 
-    def __init__(self, repo_id: str, folder: Path, cache_dir: Path, patience: Patience) -> None:
+    def __init__(self, repo_id: str, folder: Path, cache_dir: Path, retry: RetryPolicy) -> None:
         """See `open`; the folder is named by the commit."""
         self.repo_id, self.folder, self.commit = repo_id, folder, folder.name
-        self._cache_dir, self._patience, self._line = cache_dir, patience, Line(patience)
+        self._cache_dir, self._retry = cache_dir, retry
+        self._client = RetryingClient(retry)
         self._here: set[str] = set()
         self._locks: dict[str, threading.Lock] = {}
         self._coming: dict[str, threading.Thread] = {}
@@ -38,7 +39,7 @@ class Shelf:
         cls,
         repo_id: str,
         revision: str,
-        patience: Patience,
+        retry: RetryPolicy,
         cache_dir: Path,
         patterns: Sequence[str],
     ) -> Self:
@@ -50,8 +51,8 @@ class Shelf:
             DataError: there is no such dataset or revision.
             EnvironmentFailure: the Hub cannot be reached, or refuses.
         """
-        folder = snapshot(repo_id, revision, patience, cache_dir=cache_dir, patterns=patterns)
-        return cls(repo_id, folder, cache_dir, patience)
+        folder = snapshot(repo_id, revision, retry, cache_dir=cache_dir, patterns=patterns)
+        return cls(repo_id, folder, cache_dir, retry)
 
     def has(self, name: str) -> bool:
         """Whether a file has been brought."""
@@ -99,14 +100,14 @@ class Shelf:
         """Whether the file is here, or came by a process that takes no time of this one's."""
         if self.has(name):
             return True
-        if not is_plain():
+        if not uses_default_client():
             return False
-        return carrier(self._patience.timeout_s).carry(self._errand(name)) and self.has(name)
+        return carrier(self._retry.timeout_s).carry(self._errand(name)) and self.has(name)
 
     def _fetch(self, name: str) -> None:
         if self.has(name):  # whoever held the lock brought it
             return
-        with explained(self.repo_id, self.commit), self._line.open():
+        with explained(self.repo_id, self.commit), self._client.open():
             from huggingface_hub.errors import EntryNotFoundError
 
             try:

@@ -61,6 +61,10 @@ class AppendFile:
         finally:
             self._file.close()
 
+    def abandon(self) -> None:
+        """Close the file without what has been collected."""
+        self._file.close()
+
     def _sync(self) -> None:
         os.fsync(self._file.fileno())
         self._synced = time.monotonic()

@@ -39,6 +39,7 @@ from egovcp.log.frames import Inbox, Outbox, enlarge, pack
 from egovcp.log.info import RunInfo
 from egovcp.log.sink import Sink
 from egovcp.log.tick import Tick
+from egovcp.terminal import echo
 
 QUEUE_TICKS: Final = 300  # 12 s at 25 Hz: a disk may hang for 10 s and nothing is lost
 START_TIMEOUT_S: Final = 60.0
@@ -48,7 +49,7 @@ _LAST_BREATH_S: Final = 1.0  # for a killed process to be gone; one that waits f
 
 def tell_on_stderr(line: str) -> None:
     """Print ``line`` to the standard error."""
-    print(line, file=sys.stderr, flush=True)
+    echo(line, error=True)
 
 
 class BackgroundSink:

@@ -8,6 +8,8 @@ reach the disk every second, so losing power loses little more. `messages.Topic`
 
 from __future__ import annotations
 
+import json
+import zlib
 from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass
@@ -27,6 +29,30 @@ from egovcp.log.ros2 import definition
 from egovcp.log.tick import Tick
 
 METADATA_NAME: Final = "egovcp"
+_CHECKSUM: Final = "checksum"
+#: A tick is one chunk, so that damage to a chunk leaves no half of a tick: larger than any tick.
+_CHUNK_BYTES: Final = 64 << 20
+
+
+def with_checksum(metadata: Mapping[str, str]) -> dict[str, str]:
+    """The metadata and a CRC-32 of it: MCAP itself has none for metadata records."""
+    return {**metadata, _CHECKSUM: _checksum(metadata)}
+
+
+def without_checksum(metadata: Mapping[str, str]) -> dict[str, str]:
+    """The inverse of `with_checksum`."""
+    return {name: text for name, text in metadata.items() if name != _CHECKSUM}
+
+
+def checksum_matches(metadata: Mapping[str, str]) -> bool:
+    """Whether the metadata is undamaged; true for a recording of an earlier version, without
+    checksum."""
+    found = metadata.get(_CHECKSUM)
+    return found is None or found == _checksum(without_checksum(metadata))
+
+
+def _checksum(metadata: Mapping[str, str]) -> str:
+    return f"{zlib.crc32(json.dumps(dict(metadata), sort_keys=True).encode()):08x}"
 
 
 @dataclass(frozen=True)
@@ -65,9 +91,15 @@ class McapFile:
             raise EnvironmentFailure(f"{self._path} would lie in a folder that is not there") from (
                 error
             )
-        self._writer = Writer(cast(IO[bytes], self._file), compression=CompressionType.ZSTD)
+        self._writer = Writer(
+            cast(IO[bytes], self._file),
+            chunk_size=_CHUNK_BYTES,
+            compression=CompressionType.ZSTD,
+            enable_data_crcs=True,
+        )
         self._writer.start(profile=Profile.ROS2, library="egovcp")
-        self._writer.add_metadata(METADATA_NAME, dict(metadata))
+        self._metadata = with_checksum(metadata)
+        self._writer.add_metadata(METADATA_NAME, self._metadata)
         self.flush()
 
     def add(self, line: Line, index: int, time_ns: int, data: bytes) -> None:
@@ -92,7 +124,15 @@ class McapFile:
             return
         with closing(file):
             self.flush()  # first, so that a disk with little room gets at least this
+            self._writer.add_metadata(METADATA_NAME, self._metadata)  # a copy, against damage
             self._writer.finish()  # type: ignore[no-untyped-call]
+
+    def discard(self) -> None:
+        """Close and remove the file."""
+        file, self._file = self._file, None
+        if file is not None:
+            file.abandon()
+        self._path.unlink(missing_ok=True)
 
     def _channel(self, line: Line) -> int:
         if line.topic not in self._channels:
@@ -144,6 +184,10 @@ class McapSink:
     def close(self) -> None:
         """Write the index and close the file."""
         self._file.close()
+
+    def discard(self) -> None:
+        """Close and remove the file."""
+        self._file.discard()
 
 
 @cache

@@ -1,11 +1,12 @@
-"""Reads a recorded run back: what `McapSink` wrote, also from a file that was cut short.
+"""Reads recorded runs: what `McapSink` wrote, also from a torn or damaged file.
 
-Moment by moment, so that an hour takes no more memory than a second::
+::
 
     reader = RecordingReader(path)
     for moment in reader.moments():
         moment.tick()
-    reader.complete  # False: the file was torn
+    reader.complete  # False: the file is torn or damaged
+    reader.losses  # where ticks could not be read
 """
 
 from __future__ import annotations
@@ -18,35 +19,26 @@ from types import SimpleNamespace
 from typing import Any, Final
 
 import numpy as np
-import zstandard
-from mcap.exceptions import McapError
 from mcap.records import Channel, McapRecord, Message, Metadata, Schema
-from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 from numpy.typing import NDArray
 
 from egovcp.errors import DataError
 from egovcp.log.info import RunInfo
-from egovcp.log.mcap import METADATA_NAME, Line
+from egovcp.log.mcap import METADATA_NAME, Line, checksum_matches, without_checksum
+from egovcp.log.mcap_records import MAGIC, Damage, RecordFile
 from egovcp.log.messages import VALUE_MAPS, Topic
 from egovcp.log.tick import BasePose, Candidates, MotorReadings, SceneObject, Tick, ValueMap
+from egovcp.rate import NS_PER_S
 from egovcp.spec import DEPTH_COLS
 
 _FLAGS = ("terminated", "truncated", "success")
-_MAGIC: Final = b"\x89MCAP0\r\n"
-#: What is left of a record where a file was torn can go wrong in any of these ways.
-_TORN: Final = (
-    McapError,
-    struct.error,
-    ValueError,
-    OverflowError,
-    MemoryError,
-    zstandard.ZstdError,
-)
 #: What a row of a dataset needs of a tick.
 ROW_TOPICS: Final = frozenset(
     {Topic.DEPTH, Topic.STATE, Topic.ACTION, Topic.REWARD, Topic.MODE, Topic.LOG}
 )
+#: What every tick has.
+REQUIRED_TOPICS: Final = frozenset({Topic.DEPTH, Topic.STATE, Topic.ACTION, Topic.REWARD})
 _MOTOR_TOPICS: Final = frozenset({Topic.JOINTS, Topic.MOTOR_TEMPERATURE, Topic.MOTOR_STATUS})
 
 
@@ -57,17 +49,19 @@ class Recording:
     info: RunInfo
     ticks: list[Tick]
     complete: bool
-    """False when the file ends in the middle: the process died or the disk filled up."""
+    """False if the end is missing (the process died, the disk was full), or a part is damaged."""
 
 
-def read_recording(path: Path) -> Recording:
-    """Read ``path`` into memory, up to its end, or up to where it was torn off.
+def read_recording(path: Path, damaged_ok: bool = True) -> Recording:
+    """Read all readable ticks of ``path`` into memory.
 
     Raises:
-        DataError: not an MCAP file, or not one of ours.
+        DataError: not an MCAP file, not one of ours, or damaged without ``damaged_ok``.
     """
     reader = RecordingReader(path)
     ticks = [moment.tick() for moment in reader.moments()]
+    if not damaged_ok:
+        reader.require_undamaged()
     return Recording(reader.info, ticks, reader.complete)
 
 
@@ -134,8 +128,22 @@ class Moment:
         return decode(self.messages[topic].data)
 
 
+@dataclass(frozen=True)
+class Loss:
+    """Damage to a recording, and the ticks that it made unreadable."""
+
+    after: tuple[int, int] | None
+    """Index and time, ns, of the last readable tick before it; None: there is none."""
+    before: tuple[int, int] | None
+    """Index and time, ns, of the first readable tick after it; None: there is none."""
+    ticks: int | None
+    """How many ticks were lost; None: unknown."""
+
+
 class RecordingReader:
-    """Goes through a recording once, up to its end, or to where it was torn off.
+    """Goes through a recording, in memory that does not grow with its length.
+
+    A damaged part is skipped: all ticks before and after it are read. `mcap_records` says how.
 
     Raises:
         DataError: not an MCAP file, or not one of ours.
@@ -144,73 +152,179 @@ class RecordingReader:
     def __init__(self, path: Path) -> None:
         self._path = path
         _require_mcap(path)
+        self._file = RecordFile(path)
         self.complete = False
-        """Whether `moments` has come to the end that the writer gave the file."""
+        """Whether `moments` has reached the end of the file and found everything intact."""
+        self.losses: list[Loss] = []
+        """The damage that `moments` has met. What is missing at the end of a torn file is not
+        listed."""
         self.lines: dict[str, Line] = {}
         """The topics met so far."""
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._decoders = DecoderFactory()
-        self._records = self._read()
-        self.metadata = self._first_metadata()
-        """The record ``egovcp`` as it stands in the file."""
+        self._metadata_damaged = False
+        self._start_ns = 0
+        self.metadata = self._read_metadata()
+        """The record ``egovcp``, without its checksum."""
         self.info = self._info()
 
+    @property
+    def torn(self) -> bool:
+        """Whether the end of the file is missing, as after a kill."""
+        return self._file.torn
+
+    @property
+    def damaged(self) -> bool:
+        """Whether `moments` has met damage, other than a missing end."""
+        return self._file.damaged or self._metadata_damaged
+
     def moments(self) -> Iterator[Moment]:
-        """The ticks in order, once."""
+        """The readable ticks in order."""
+        self.losses, self.complete = [], False
+        count, last, open_loss = 0, None, False
+        for moment in self._grouped():
+            if isinstance(moment, Damage):
+                open_loss = True
+                continue
+            if self._file.damage and not moment.messages.keys() >= REQUIRED_TOPICS:
+                open_loss = True  # some of its chunks were damaged
+                continue
+            if open_loss:
+                self._add_loss(last, moment)
+            if last is None:
+                self._start_ns = moment.time_ns - moment.index * NS_PER_S // self.info.fps
+            last, open_loss, count = moment, False, count + 1
+            yield moment
+        if open_loss:
+            self._add_final_loss(last, count)
+        self.complete = not self.torn and not self.damaged
+
+    def require_undamaged(self) -> None:
+        """Check what `moments` has read.
+
+        Raises:
+            DataError: a part is damaged. A missing end is no damage.
+        """
+        if self.damaged:
+            raise DataError(
+                f"{self._path} is damaged: {self.loss_text()}; keep the readable ticks: "
+                f"egovcp-mcap recover {self._path} RECOVERED.mcap"
+            )
+
+    def loss_text(self) -> str:
+        """How many ticks were lost, and where; "no tick is lost" if damage hit none."""
+        lost = [loss for loss in self.losses if loss.ticks != 0]
+        if not lost:
+            return "no tick is lost"
+        known = [loss.ticks for loss in lost if loss.ticks is not None]
+        total = f"{sum(known)} ticks are lost" if sum(known) != 1 else "1 tick is lost"
+        if len(known) < len(lost):
+            total = f"at least {total}" if known else "an unknown number of ticks is lost"
+        return f"{total} ({', '.join(map(self._place, lost[:_SHOWN_LOSSES]))}" + (
+            f" and {len(lost) - _SHOWN_LOSSES} more places)" if len(lost) > _SHOWN_LOSSES else ")"
+        )
+
+    def _place(self, loss: Loss) -> str:
+        first = loss.after[0] + 1 if loss.after else 0
+        if loss.before is None and loss.ticks is None:
+            return f"from tick {first} on"
+        end = loss.before[0] if loss.before else first + (loss.ticks or 0)
+        ticks = f"tick {first}" if end - first == 1 else f"ticks {first} to {end - 1}"
+        if loss.after is None or loss.before is None:
+            return ticks
+        start, stop = (
+            (time - self._start_ns) / NS_PER_S for time in (loss.after[1], loss.before[1])
+        )
+        return f"{ticks} between {start:.2f} and {stop:.2f} s"
+
+    def _add_loss(self, last: Moment | None, moment: Moment) -> None:
+        after = (last.index, last.time_ns) if last else None
+        first = last.index + 1 if last else 0
+        before = (moment.index, moment.time_ns)
+        self.losses.append(Loss(after, before, max(0, moment.index - first)))
+
+    def _add_final_loss(self, last: Moment | None, count: int) -> None:
+        """Damage after which no tick follows: the statistics say how many ticks there were."""
+        after = (last.index, last.time_ns) if last else None
+        summary, ticks = self._file.summary, None
+        if summary and summary.statistics:
+            written = [
+                summary.statistics.channel_message_counts.get(channel.id, 0)
+                for channel in summary.channels.values()
+                if channel.topic == Topic.STATE
+            ]
+            ticks = max(0, sum(written) - count - sum(loss.ticks or 0 for loss in self.losses))
+        self.losses.append(Loss(after, None, ticks))
+
+    def _grouped(self) -> Iterator[Moment | Damage]:
+        """The messages of each tick together."""
         moment: Moment | None = None
-        for record in self._records:
+        for record in self._file.records():
             if isinstance(record, Schema):
                 self._schemas[record.id] = record
             elif isinstance(record, Channel):
                 self._add_channel(record)
-            elif isinstance(record, Message):
-                if moment is None or moment.index != record.sequence:
-                    if moment is not None:
-                        yield moment
-                    moment = self._moment(record)
-                moment.messages[self._channels[record.channel_id].topic] = record
+            elif isinstance(record, Message | Damage):
+                same = isinstance(record, Message) and moment and moment.index == record.sequence
+                if moment is not None and not same:
+                    yield moment
+                    moment = None
+                if isinstance(record, Damage):
+                    yield record
+                elif channel := self._channel(record.channel_id):
+                    moment = moment or self._moment(record)
+                    moment.messages[channel.topic] = record
         if moment is not None:
             yield moment
 
     def _moment(self, first: Message) -> Moment:
         return Moment(first.sequence, first.log_time, self.lines, self._decoders)
 
+    def _channel(self, number: int) -> Channel | None:
+        """A channel; one whose own record was damaged is taken from the summary."""
+        if number not in self._channels and self._file.summary:
+            channel = self._file.summary.channels.get(number)
+            if channel is not None:
+                self._add_channel(channel)
+        return self._channels.get(number)
+
     def _add_channel(self, channel: Channel) -> None:
-        self._channels[channel.id] = channel
-        schema = self._schemas[channel.schema_id]
-        self.lines[channel.topic] = Line(channel.topic, schema, channel.message_encoding)
+        repeated = self._file.summary.schemas if self._file.summary else {}
+        schema = self._schemas.get(channel.schema_id) or repeated.get(channel.schema_id)
+        if schema is not None:
+            self._channels[channel.id] = channel
+            self.lines[channel.topic] = Line(channel.topic, schema, channel.message_encoding)
 
-    def _read(self) -> Iterator[McapRecord]:
-        """Every record that is whole and belongs to what was read before."""
-        with self._path.open("rb") as file:
-            limit = self._path.stat().st_size  # no record is longer than its file
-            reader = StreamReader(file, validate_crcs=True, record_size_limit=limit)
-            try:
-                for record in reader.records:
-                    if self._is_orphan(record):
-                        return
-                    yield record
-            except _TORN:
-                return
-            self.complete = True
-
-    def _is_orphan(self, record: McapRecord) -> bool:
-        if isinstance(record, Message):
-            return record.channel_id not in self._channels
-        return isinstance(record, Channel) and record.schema_id not in self._schemas
-
-    def _first_metadata(self) -> Mapping[str, str]:
-        """The metadata record, which comes before any tick."""
-        for record in self._records:
+    def _read_metadata(self) -> Mapping[str, str]:
+        """The metadata record before the first tick, or its copy at the end."""
+        found = False
+        for record in self._first_records():
             if isinstance(record, Metadata) and record.name == METADATA_NAME:
-                return record.metadata
-            if isinstance(record, Message | Channel | Schema):
-                break
+                found = True
+                if checksum_matches(record.metadata):
+                    return without_checksum(record.metadata)
+        for entry in self._file.summary.metadata if self._file.summary else ():
+            copy = self._file.metadata_at(entry.offset)
+            if copy and copy.name == METADATA_NAME and checksum_matches(copy.metadata):
+                self._metadata_damaged = True
+                return without_checksum(copy.metadata)
+        if found or self._file.damage:
+            raise DataError(
+                f"{self._path}: its metadata record {METADATA_NAME!r} is damaged, and there is no "
+                "readable copy of it at the end; the recording cannot be read"
+            )
         raise DataError(
             f"{self._path} has no metadata record {METADATA_NAME!r} before its first message; "
             "expected a recording of egovcp"
         )
+
+    def _first_records(self) -> Iterator[McapRecord | Damage]:
+        """The records before the first tick."""
+        for record in self._file.records():
+            if isinstance(record, Message | Channel | Schema):
+                return
+            yield record
 
     def _info(self) -> RunInfo:
         try:
@@ -220,16 +334,21 @@ class RecordingReader:
             raise DataError(f"{self._path}: {problem}") from error
 
 
+_SHOWN_LOSSES: Final = 5
+
+
 def _require_mcap(path: Path) -> None:
-    """Raise `DataError` for what does not begin like an MCAP file."""
+    """Raise `DataError` for a file that neither begins nor ends like an MCAP file."""
     try:
         with path.open("rb") as file:
-            start = file.read(len(_MAGIC))
+            start = file.read(len(MAGIC))
+            file.seek(max(0, path.stat().st_size - len(MAGIC)))
+            end = file.read(len(MAGIC))
     except FileNotFoundError as error:
         raise DataError(f"no recording at {path}; expected an MCAP file") from error
     except IsADirectoryError as error:
         raise DataError(f"{path} is a folder; expected an MCAP file") from error
-    if start != _MAGIC:
+    if MAGIC not in (start, end):
         found = "is empty" if not start else f"begins with {start!r}"
         raise DataError(f"{path} {found}; expected an MCAP file")
 

@@ -10,6 +10,14 @@ from egovcp import spec
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError
 
+#: Largest sizes of the networks; `egovcp.model.weights` also bounds their weights together.
+_WIDEST = 8192
+_MOST_CHANNELS = 1024
+_MOST_HEADS = 64
+#: Longest horizon and longest list of horizons that losses and heads may have, ticks.
+_FARTHEST = 1000
+_LONGEST = 64
+
 ValueLoss = Literal["mse", "two_hot"]
 FreeNatsPer = Literal["step", "dimension"]
 Dynamics = Literal["joint", "autoregressive"]
@@ -67,7 +75,7 @@ class LossConfig:
     td_decay: float = bounded(0.98, least=0, below=1)
     """td: Q' is a copy of Q's heads that follows them with this decay per step; 0: the heads as
     they are, without gradient."""
-    imagined_steps: int = bounded(1, least=0)
+    imagined_steps: int = bounded(1, least=0, most=_FARTHEST)
     """Also regress Q on states imagined this many steps ahead of the posterior; 0: never."""
     imagined_value: float = bounded(1.0, least=0)
     """Weight of the value loss on imagined states."""
@@ -77,11 +85,13 @@ class LossConfig:
     """Weight of the proprioception of states imagined several ticks ahead; 0: none."""
     foresight_motion: float = bounded(10.0, least=0)
     """Weight of the place of what flies in states imagined several ticks ahead; 0: none."""
-    foresight_ahead: tuple[int, ...] = bounded((4, 8, 12), least=1)
+    foresight_ahead: tuple[int, ...] = bounded(
+        (4, 8, 12), least=1, most=_FARTHEST, longest=_LONGEST
+    )
     """Ticks ahead at which they are compared with what was recorded."""
     foresight_every: int = bounded(4, least=1)
     """Imagine from every n-th row of a window only, the first one drawn at random."""
-    autoregressive_steps: int = bounded(8, least=1)
+    autoregressive_steps: int = bounded(8, least=1, most=_FARTHEST)
     """`dynamics` autoregressive: ticks over which predictions are fed back, all of them compared
     with what was recorded; from the rows that `foresight_every` says."""
     reward: float = bounded(0.0, least=0)
@@ -96,11 +106,13 @@ class LossConfig:
 class CameraGeometry:
     """Where the camera sits, as far as the robot knows."""
 
-    position: tuple[float, float, float] = (0.058, 0.0, 0.42)
+    position: tuple[float, float, float] = bounded((0.058, 0.0, 0.42), least=-1, most=1)
     """Mount in the torso frame, m (the simulator's default)."""
-    pitch: float = math.radians(-2.5)
+    pitch: float = bounded(math.radians(-2.5), least=-math.pi / 2, most=math.pi / 2)
     """Tilt below the torso's horizontal, rad (the middle of the simulator's range)."""
-    vertical_fov: float = bounded(math.radians(58.0), above=0, below=math.pi)
+    vertical_fov: float = bounded(
+        math.radians(58.0), least=math.radians(10.0), most=math.radians(150.0)
+    )
     """Vertical field of view, rad; pixels are square."""
 
     @property
@@ -117,55 +129,75 @@ class FlightConfig:
     """Q is told the path that the filter follows; else what the state says of it."""
     camera: CameraGeometry = field(default_factory=CameraGeometry)
     """Of the recordings."""
-    plane: float = bounded(0.32, above=0)
+    plane: float = bounded(0.32, above=0, most=2)
     """The plane, before the pelvis, whose crossing is told, m."""
-    picture_ages: Ages = bounded((0.02, 0.04, 0.06, 0.08), least=0)
+    picture_ages: Ages = bounded((0.02, 0.04, 0.06, 0.08), least=0, most=2 * spec.PLANNER_DT)
     """How much older than the state beside it a picture may be, s, at most two ticks; the floor
     says how likely each is (`egovcp.model.picture_age`)."""
-    age_deviation: float = bounded(0.03, above=0)
+    age_deviation: float = bounded(0.03, least=1e-4, most=10)
     """By how much the floor may seem to rise and sink in the pictures that count, m: with a tenth
     of it the stillest floor alone is believed, with ten times as much all ages alike."""
     age_memory: float = bounded(0.95, least=0, most=1)
     """What one picture says of their age counts for so much less with each tick."""
-    radius: float = bounded(0.10, least=0)
+    radius: float = bounded(0.10, least=0, most=1)
     """What is added to the depth of a surface to reach the middle of the thing, m."""
-    search: float = bounded(0.25, above=0)
+    search: float = bounded(0.25, least=0.01, most=5)
     """Pixels this near the place that the encoder sees, across and in depth, are its own, m."""
-    deviation: float = bounded(0.01, above=0)
+    deviation: float = bounded(0.01, least=1e-4, most=1)
     """Deviation of a sighting, m per m of distance."""
-    prior: tuple[AxisPrior, AxisPrior, AxisPrior] = (
-        (2.9, -3.5, 7.8, 1.2, 2.4),
-        (0.0, 0.0, 5.6, 1.1, 0.5),
-        (0.4, 3.5, 8.7, -0.3, 1.6),
+    prior: tuple[AxisPrior, AxisPrior, AxisPrior] = bounded(
+        (
+            (2.9, -3.5, 7.8, 1.2, 2.4),
+            (0.0, 0.0, 5.6, 1.1, 0.5),
+            (0.4, 3.5, 8.7, -0.3, 1.6),
+        ),
+        least=-1000,
+        most=1000,
     )
     """Of place and velocity at the first sighting, forward, left and up: mean place (m), mean speed
     (m/s), and the precision's (place, place), (place, speed), (speed, speed); of 254 throws of the
     default task."""
-    aim: tuple[tuple[float, float], tuple[float, float]] = ((0.0, 0.24), (0.45, 0.18))
+    aim: tuple[tuple[float, float], tuple[float, float]] = bounded(
+        ((0.0, 0.24), (0.45, 0.18)), least=-10, most=10
+    )
     """Mean and deviation of y and z where throws cross the plane, m."""
-    doubt: float = bounded(2.0, above=0)
+    doubt: float = bounded(2.0, least=0.01, most=1000)
     """The variance of a crossing is this many times what independent sightings would give."""
-    gate: float = bounded(0.5, above=0)
+    gate: float = bounded(0.5, least=0.01, most=100)
     """A sighting farther than this from the path of three or more is not its own, m."""
-    painted: float = bounded(0.25, least=0)
+    painted: float = bounded(0.25, least=0, most=1)
     """A path at least so sure says where it is painted (`paint_flight`); else `motion` does."""
-    forget: float = bounded(0.5, least=0)
+    forget: float = bounded(0.5, least=0, most=60)
     """A path whose thing has not been seen for so long is forgotten, s."""
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+        for mean in self.aim:
+            if mean[1] <= 0:
+                raise UsageError(
+                    f"aim {list(mean)}: the second number, a deviation, must be above 0"
+                )
+        for axis in self.prior:
+            place, both, speed = axis[2:]
+            if place <= 0 or speed <= 0 or place * speed <= both**2:
+                raise UsageError(
+                    f"prior {list(axis)}: the last three numbers must be a positive definite matrix"
+                )
 
 
 @dataclass(frozen=True)
 class WorldModelConfig:
     """Sizes of the networks (paper III-C) and the losses they are trained with."""
 
-    hidden: int = bounded(256, least=1)
+    hidden: int = bounded(256, least=1, most=_WIDEST)
     """Size of the deterministic state h (GRU)."""
-    latent: int = bounded(32, least=1)
+    latent: int = bounded(32, least=1, most=_WIDEST)
     """Size of the stochastic state z (diagonal Gaussian)."""
-    units: int = bounded(256, least=1)
+    units: int = bounded(256, least=1, most=_WIDEST)
     """Width of every MLP."""
-    channels: tuple[int, int, int] = bounded((32, 64, 64), least=1)
+    channels: tuple[int, int, int] = bounded((32, 64, 64), least=1, most=_MOST_CHANNELS)
     """Channels of the three layers of the depth CNN; the decoder uses the last."""
-    motion_ahead: tuple[int, ...] = bounded((0, 3, 6, 9), least=0)
+    motion_ahead: tuple[int, ...] = bounded((0, 3, 6, 9), least=0, most=_FARTHEST, longest=_LONGEST)
     """Ticks ahead at which the place of what flies is predicted straight from the state; the first
     is 0, now."""
     paint_flight: bool = True
@@ -175,25 +207,25 @@ class WorldModelConfig:
     """How the dynamics are learned. joint: equation 8, prior and posterior are pulled to each
     other; autoregressive: predictions are fed back for several ticks and compared with the
     recorded observations instead (the baseline ARWM), with no KL at all."""
-    value_state: int = bounded(8, least=0)
+    value_state: int = bounded(8, least=0, most=_WIDEST)
     """Numbers to which (h, z) is reduced for Q; 0: Q reads all of it."""
     value_of_passing: bool = True
     """Q is told what is on its way (`loss.passing` teaches it) by a head of its own."""
     value_loss: ValueLoss = "mse"
     """mse: Q is a number, fitted by its squared error; two_hot: a distribution over bins of
     symlog returns, fitted by cross entropy, whose mean is the number."""
-    q_heads: int = bounded(1, least=1)
+    q_heads: int = bounded(1, least=1, most=_MOST_HEADS)
     """Heads of Q that differ in their start. A search finds what one of them is wrong about; where
     the least of them is high, none says otherwise (`planner.ensemble`)."""
-    value_units: int = bounded(0, least=0)
+    value_units: int = bounded(0, least=0, most=_WIDEST)
     """Width of a head of Q, half of it for the part that is told what is on its way; 0: `units`."""
     flight: FlightConfig = field(default_factory=FlightConfig)
     """Follows what is thrown at the robot; only where `value_of_passing`."""
-    min_std: float = bounded(0.1, above=0)
+    min_std: float = bounded(0.1, least=1e-6, most=10)
     """Floor of the latent standard deviation."""
-    update_bias: float = -1.0
+    update_bias: float = bounded(-1.0, least=-20, most=20)
     """Bias of the GRU's update gate: memory is kept at the start of training."""
-    depth_max_m: float = bounded(spec.DEPTH_MAX_M, above=0)
+    depth_max_m: float = bounded(spec.DEPTH_MAX_M, least=0.1, most=100)
     """Depth, in metres, at which nearness is 0."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Loss weights."""

@@ -4,7 +4,7 @@ from egovcp.plan.choices import require_answers
 from egovcp.plan.config import PlannerConfig
 from egovcp.plan.objective import Judge, StepByStep
 from egovcp.plan.optimisers import optimiser_of
-from egovcp.plan.policy import Policy, PolicyStep
+from egovcp.plan.policy import Policy, PolicyStep, blank_observation
 from egovcp.plan.search import Optimiser, Plan, make_plan, until
 from egovcp.plan.value_map import HandGrid, hand_grid, value_map
 
@@ -17,6 +17,7 @@ __all__ = [
     "Policy",
     "PolicyStep",
     "StepByStep",
+    "blank_observation",
     "hand_grid",
     "make_plan",
     "optimiser_of",

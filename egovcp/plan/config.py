@@ -33,21 +33,21 @@ class PlannerConfig:
     """Rounds of the search; fewer where a deadline comes first."""
     elites: int = bounded(64, least=1)
     """Best candidates that the next round is fitted to."""
-    min_std: float = bounded(0.1, least=0)
+    min_std: float = bounded(0.1, least=0, most=10)
     """Floor of the sampling deviation, in units of delta."""
-    eta: float = bounded(spec.ACTION_ETA, above=0, most=2)
+    eta: float = bounded(spec.ACTION_ETA, least=1e-4, most=2)
     """Step of the action process, box units per tick."""
-    hands_cost: float = bounded(0.0, least=0)
+    hands_cost: float = bounded(0.0, least=0, most=1e6)
     """What hands away from the neutral pose cost a candidate, in units of return: times their mean
     squared action. Q knows the price of a pose, but not as exactly as it would have to."""
-    step_cost: float = bounded(0.0, least=0)
+    step_cost: float = bounded(0.0, least=0, most=1e6)
     """What moving costs a candidate, in units of return: times its mean squared step, of which 1 is
     the largest. Where Q has nothing to say, whoever pays for steps stays where it is."""
     process: Process = "walk"
     """What candidates are made of. walk: a step of its own in every tick, as the paper's data;
     ramp: the steps drawn add up to one place, to which it goes by eta a tick and where it rests, as
     data collected with longer --step_ticks. Its first action is found with fewer candidates."""
-    termination_threshold: float = 0.9
+    termination_threshold: float = bounded(0.9, least=0, most=1)
     """A candidate whose termination probability exceeds this loses its later values."""
     termination_rule: TerminationRule = "shift"
     """paper: later values are 0; shift: they are the data's worst return; survival: each
@@ -62,13 +62,13 @@ class PlannerConfig:
     optimiser: OptimiserName = "cem"
     """How candidates are drawn: cem (fitted to the elites), icem (with coloured noise, elites kept
     and fewer samples each round), mppi (all weighted by their value), shooting (uniform)."""
-    temperature: float = bounded(0.3, above=0)
+    temperature: float = bounded(0.3, least=1e-6, most=1e6)
     """mppi: a value this many deviations of all values below the best weighs 1/e of it."""
-    noise_exponent: float = 2.0
+    noise_exponent: float = bounded(2.0, least=0, most=10)
     """icem: power of the noise over frequency, f^-x; 0: white, larger: steadier plans."""
     kept_elites: float = bounded(0.3, least=0, most=1)
     """icem: share of the elites that are candidates again in the next round."""
-    sample_decay: float = bounded(1.25, least=1)
+    sample_decay: float = bounded(1.25, least=1, most=1000)
     """icem: each round draws this many times fewer samples than the one before."""
     backend: BackendName = "auto"
     """Who computes. eager: the world model itself; float32, bfloat16: its networks packed; int8: in

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import torch
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from egovcp import spec
+from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.backends import judge_of_model
 from egovcp.plan.config import PlannerConfig
@@ -20,6 +21,10 @@ from egovcp.plan.process import shift
 from egovcp.plan.search import make_plan
 
 type Array = NDArray[np.float32]
+
+LARGEST_STATE: Final = 1e3
+"""No quantity of the proprioception reaches this, in the units of `spec.STATE_SLICES`."""
+_WARM_UP_PLANS: Final = 2
 
 
 class PolicyStep(NamedTuple):
@@ -32,10 +37,15 @@ class PolicyStep(NamedTuple):
     candidates: Array  # (E, elites, N, 7), best first
     candidate_values: Array  # (E, elites)
     iterations: int
+    skipped: NDArray[np.bool_] = np.zeros(0, np.bool_)  # (E,) see `Policy.skipped`
 
 
 class Policy:
     """Filters and plans for E robots in step; call `act`, then `advance`, once a tick.
+
+    An observation of a robot is skipped if its state is not finite or exceeds `LARGEST_STATE`:
+    the prior predicts the state of this tick, and the next observation is used as always. Depth
+    that is not finite counts as invalid (0).
 
     The recurrence advances with the action that was actually sent, so `advance` must be
     told what the safety layer made of the planned one. The planner packs the model's weights
@@ -50,6 +60,8 @@ class Policy:
         self.num_envs = num_envs
         self._seed = seed
         self._judge: Judge[Carry] | None = None
+        self.skipped: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
+        """(E,) whether the last observation of each robot was skipped."""
         self.reset()
 
     @torch.inference_mode()
@@ -70,15 +82,50 @@ class Policy:
 
     @torch.inference_mode()
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
-        """Take depth (E, 48, 64) mm and state (E, 74) into the recurrence, without planning."""
-        self._carry = self.model.observe(
-            self._carry,
+        """Take depth (E, 48, 64) mm and state (E, 74) into the recurrence, without planning.
+
+        Raises:
+            UsageError: another shape.
+        """
+        self._check_shapes(depth, state)
+        if np.issubdtype(depth.dtype, np.floating):
+            depth = np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
+        # NaN compares as false: a state that is not a number is no valid one.
+        valid = (np.abs(state) <= LARGEST_STATE).all(1)
+        before, first = self._carry, self._first
+        observed = self.model.observe(
+            before,
             self._sent,
             torch.from_numpy(depth.astype(np.int32)).to(self._device),
-            torch.as_tensor(state, dtype=torch.float32, device=self._device),
-            self._first,
+            torch.as_tensor(
+                np.where(valid[:, None], state, 0.0), dtype=torch.float32, device=self._device
+            ),
+            first,
         )
-        self._first = torch.zeros_like(self._first)
+        usable = torch.from_numpy(valid).to(self._device) & _finite_rows(observed)
+        if bool(usable.all()):
+            self._carry, self._first = observed, torch.zeros_like(first)
+        else:
+            predicted = self._predicted(before, first)
+            self._carry = _choose_rows(usable, observed, predicted)
+            self._first = first & ~usable  # the recurrence begins at the first usable one
+        self.skipped = ~usable.cpu().numpy()
+
+    def _predicted(self, carry: Carry, first: Tensor) -> Carry:
+        """The carry at this tick without its observation; from zeros where ``first`` (E,)."""
+        start = _choose_rows(first, self.model.initial(self.num_envs), carry)
+        return self.model.imagine(start, self._sent.masked_fill(first[:, None], 0.0))
+
+    def _check_shapes(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
+        expected = (
+            (self.num_envs, spec.DEPTH_ROWS, spec.DEPTH_COLS),
+            (self.num_envs, spec.STATE_DIM),
+        )
+        if (depth.shape, state.shape) != expected:
+            raise UsageError(
+                f"depth {depth.shape} and state {state.shape}: expected {expected[0]} and "
+                f"{expected[1]}, for {self.num_envs} robots"
+            )
 
     @torch.inference_mode()
     def act(
@@ -116,7 +163,18 @@ class Policy:
             _numpy(plan.candidates),
             _numpy(plan.candidate_values),
             plan.iterations,
+            self.skipped.copy(),
         )
+
+    def warm_up(self) -> None:
+        """Plan for nothing and `reset`: the first plans compile, pack and allocate.
+
+        Raises:
+            UsageError, EnvironmentFailure: as `prepare`.
+        """
+        for _ in range(_WARM_UP_PLANS):
+            self.act(*blank_observation(self.num_envs))
+        self.reset()
 
     def prepare(self) -> Judge[Carry]:
         """Pack the planner now and not at the first observation: it may have to be compiled.
@@ -130,7 +188,13 @@ class Policy:
         return self._judge
 
     def advance(self, sent: NDArray[np.floating]) -> None:
-        """Tell the recurrence which action (E, 7) was really sent."""
+        """Tell the recurrence which action (E, 7) was really sent.
+
+        Raises:
+            UsageError: it is not finite.
+        """
+        if not np.isfinite(sent).all():
+            raise UsageError("the action that was sent is not finite; report what the robot took")
         self._sent = torch.from_numpy(np.array(sent, np.float32)).to(self._device)
 
     @property
@@ -163,6 +227,29 @@ class Policy:
         states = Carry.join(path, lambda parts: torch.stack(parts, 1).flatten(0, 1))
         film = _numpy(self.model.decode(states)[0])
         return film.reshape(-1, horizon, *film.shape[1:])
+
+
+def blank_observation(num_envs: int) -> tuple[NDArray[np.uint16], Array]:
+    """Depth (E, 48, 64) mm without a valid pixel and state (E, 74) of a robot that is upright."""
+    depth = np.zeros((num_envs, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16)
+    state = np.zeros((num_envs, spec.STATE_DIM), np.float32)
+    state[:, spec.STATE_SLICES["projected_gravity"].stop - 1] = -1.0
+    return depth, state
+
+
+def _finite_rows(carry: Carry) -> Tensor:
+    """(E,) whether all numbers of a robot's carry (E, ...) are finite."""
+    parts = [part for part in carry if part is not None]
+    return torch.stack([part.isfinite().flatten(1).all(1) for part in parts]).all(0)
+
+
+def _choose_rows(rows: Tensor, chosen: Carry, other: Carry) -> Carry:
+    """Of each robot the carry ``chosen`` where ``rows`` (E,), else ``other``."""
+
+    def choose(parts: list[Tensor]) -> Tensor:
+        return torch.where(rows[:, None], parts[0], parts[1])  # each part is (E, n)
+
+    return Carry.join((chosen, other), choose)
 
 
 def _numpy(x: Tensor) -> Array:

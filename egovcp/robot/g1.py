@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.packages import require_packages
 from egovcp.spec import JOINT_NAMES
 
 _XML: Final = Path("asset_zoo/robots/unitree_g1/xmls/g1.xml")
@@ -28,12 +29,10 @@ def model_path() -> Path:
     Raises:
         EnvironmentFailure: mjlab is not installed, or its wheel lacks the model.
     """
+    require_packages("egovcp", "the G1 model", "mjlab")
     found = importlib.util.find_spec("mjlab")
     if found is None or found.origin is None:
-        raise EnvironmentFailure(
-            "the G1 model needs the mjlab package, which is not installed here; "
-            "install egovcp with its simulator: pip install 'egovcp[sim]'"
-        )
+        raise EnvironmentFailure("the package mjlab has no location; install it again")
     path = Path(found.origin).parent / _XML
     if not path.is_file():
         raise EnvironmentFailure(

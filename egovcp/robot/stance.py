@@ -18,8 +18,6 @@ from egovcp.robot import arms, balance, reach
 from egovcp.robot.balance import Balance, BalanceConfig
 from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS
 from egovcp.robot.kinematics import (
-    JOINT_LOWER,
-    JOINT_UPPER,
     Array,
     foot_positions,
     heading_rotation,
@@ -29,12 +27,10 @@ from egovcp.robot.kinematics import (
 from egovcp.robot.memory import replace_rows
 from egovcp.robot.reach import TORSO_ORIGIN, Reach, ReachConfig
 from egovcp.robot.stance_table import stance_table
+from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import STATE_DIM, STATE_SLICES
 
 _SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the sole
-_TARGET_SLACK: Final = 0.6  # rad that a target may pass a joint limit by, to make torque there
-TARGET_LOW: Final = JOINT_LOWER - _TARGET_SLACK
-TARGET_HIGH: Final = JOINT_UPPER + _TARGET_SLACK
 
 
 @dataclass(frozen=True)

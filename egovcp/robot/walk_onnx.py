@@ -8,6 +8,8 @@ pose, the action's scale, the observation's layout, and the configuration of `wa
 from __future__ import annotations
 
 import json
+import os
+import re
 from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
@@ -17,15 +19,22 @@ import draccus
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp.bounds import check_bounds
+from egovcp.decode import decode, require_type, shown
+from egovcp.errors import ArtefactError
+from egovcp.packages import require_packages
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.robot.stance_table import standing_pose
 from egovcp.robot.walk_policy import OBSERVATION_CLIP, WalkPolicy
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
+from egovcp.safe_files import parse_json, read_bytes
 from egovcp.spec import ACTION_BOX, JOINT_NAMES, STATE_NAMES
 
 SCHEMA: Final = "egovcp-walk-onnx-1"
 _OPSET: Final = 17
+_OPERATORS: Final = frozenset(("Sub", "Div", "Clip", "Gemm", "Elu"))
+_LIMIT_BYTES: Final = 64 << 20
+_DIGEST: Final = re.compile("[0-9a-f]{8}")
 _INPUT, _OUTPUT = "observation", "action"
 
 #: What each number of the observation is.
@@ -47,10 +56,9 @@ def export_onnx(policy: WalkPolicy, path: Path) -> None:
     Raises:
         EnvironmentFailure: the package onnx is missing.
     """
-    try:
-        import onnx
-    except ImportError as error:
-        raise _missing("onnx") from error
+    require_packages("egovcp", "exporting a controller", "onnx")
+    import onnx
+
     model = onnx.helper.make_model(
         _graph(policy), opset_imports=[onnx.helper.make_opsetid("", _OPSET)], ir_version=9
     )
@@ -122,21 +130,22 @@ class OnnxPolicy:
             ArtefactError: missing, damaged, or not of this observation and action.
             EnvironmentFailure: the package onnxruntime is missing.
         """
-        try:
-            import onnxruntime
-        except ImportError as error:
-            raise _missing("onnxruntime") from error
-        if not path.is_file():
+        require_packages("egovcp", "a controller in ONNX", "onnx", "onnxruntime")
+        import onnxruntime
+
+        if not os.path.lexists(path):
             raise ArtefactError(f"{path}: no such controller; expected an exported .onnx file")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # a policy step must not wait for other threads
         try:
+            content = read_bytes(path, _LIMIT_BYTES)
+            _check_graph(content)
             self._session = onnxruntime.InferenceSession(
-                str(path), options, providers=["CPUExecutionProvider"]
+                content, options, providers=["CPUExecutionProvider"]
             )
             self._metadata = self._session.get_modelmeta().custom_metadata_map
             self.config: WalkConfig = self._check()
-        except Exception as error:  # onnxruntime raises a class per kind of damage
+        except Exception as error:  # onnx and onnxruntime raise a class per kind of damage
             reason = " ".join(str(error).split())[:200]
             raise ArtefactError(
                 f"{path}: not a controller of schema {SCHEMA} ({reason})"
@@ -144,15 +153,22 @@ class OnnxPolicy:
 
     def _check(self) -> WalkConfig:
         if self._metadata.get("schema") != SCHEMA:
-            raise ValueError(f"its schema is {self._metadata.get('schema')!r}")
+            raise ValueError(f"its schema is {shown(self._metadata.get('schema'))}")
         shapes = [v.shape[1:] for v in (*self._session.get_inputs(), *self._session.get_outputs())]
         if shapes != [[OBSERVATION_DIM], [ACTIONS]]:
             raise ValueError(f"its shapes are {shapes}")
         expected = {"joint_names": list(JOINT_NAMES), "observation_names": list(OBSERVATION_NAMES)}
         for name, value in expected.items():
-            if json.loads(self._metadata[name]) != value:
+            if parse_json(self._metadata[name]) != value:
                 raise ValueError(f"its {name} are others")
-        config: WalkConfig = draccus.decode(WalkConfig, json.loads(self._metadata["config"]))
+        require_type(parse_json(self._metadata["provenance"]), dict[str, Any], "provenance")
+        if _DIGEST.fullmatch(self._metadata["digest"]) is None:
+            raise ValueError("its digest is not one")
+        config = decode(WalkConfig, parse_json(self._metadata["config"]), "config")
+        check_bounds(config, "config.")
+        action = self(np.zeros((1, OBSERVATION_DIM), np.float32))
+        if action.shape != (1, ACTIONS) or not np.isfinite(action).all():
+            raise ValueError("its action on an observation of zeros is not finite")
         return config
 
     @cached_property
@@ -172,7 +188,19 @@ class OnnxPolicy:
         return out
 
 
-def _missing(package: str) -> EnvironmentFailure:
-    return EnvironmentFailure(
-        f"this needs the package {package}, which is not installed here: pip install 'egovcp[onnx]'"
-    )
+def _check_graph(content: bytes) -> None:
+    """Raise ValueError unless a model holds only what `export_onnx` writes: its operators allocate
+    no more than their inputs, and nothing lies in other files."""
+    import onnx
+
+    model = onnx.load_model_from_string(content)
+    operators = {node.op_type if not node.domain else "?" for node in model.graph.node}
+    if model.functions or not operators <= _OPERATORS:
+        raise ValueError(f"its operators are not only {', '.join(sorted(_OPERATORS))}")
+    for tensor in model.graph.initializer:
+        if tensor.data_location != onnx.TensorProto.DEFAULT:
+            raise ValueError("its weights are in another file")
+        if tensor.data_type != onnx.TensorProto.FLOAT:
+            raise ValueError("expected weights of type float32")
+        if not np.isfinite(onnx.numpy_helper.to_array(tensor)).all():
+            raise ValueError("expected finite weights")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,18 +17,30 @@ from typing import Any, Final
 
 import draccus
 import numpy as np
-from draccus.utils import DraccusException
 from numpy.typing import NDArray
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.atomic import write_bytes
+from egovcp.bounds import check_bounds
+from egovcp.decode import decode, shown
+from egovcp.errors import ArtefactError
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
+from egovcp.tensor_file import TensorFile, read_tensor_file
 
 SCHEMA: Final = "egovcp-walk-1"
 OBSERVATION_CLIP: Final = 10.0  # standard deviations: one wild measurement must not kick
+_LIMIT_BYTES: Final = 64 << 20
 
 Array32 = NDArray[np.float32]
+
+
+@dataclass(frozen=True)
+class _Content:
+    """The metadata's JSON."""
+
+    config: WalkConfig
+    provenance: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -65,11 +78,9 @@ class WalkPolicy:
         for i, (weight, bias) in enumerate(self.layers):
             tensors |= {f"layers.{i}.weight": weight, f"layers.{i}.bias": bias}
         content = {"config": draccus.encode(self.config), "provenance": dict(self.provenance)}
-        save_file(
-            {name: np.ascontiguousarray(array) for name, array in tensors.items()},
-            path,
-            metadata={"schema": SCHEMA, "content": json.dumps(content)},
-        )
+        arrays = {name: np.ascontiguousarray(array) for name, array in tensors.items()}
+        metadata = {"schema": SCHEMA, "content": json.dumps(content, allow_nan=False)}
+        write_bytes(path, save(arrays, metadata))
 
     @classmethod
     def load(cls, path: Path) -> WalkPolicy:
@@ -78,37 +89,36 @@ class WalkPolicy:
         Raises:
             ArtefactError: missing, damaged, of another schema or of another observation.
         """
-        if not path.is_file():
+        if not os.path.lexists(path):
             raise ArtefactError(
                 f"{path}: no such controller; expected a .safetensors file that "
                 "egovcp-train-lowlevel wrote"
             )
         try:
-            with safe_open(path, framework="numpy") as file:
-                metadata = file.metadata() or {}
-                tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-            return cls._from(tensors, metadata)
-        except (SafetensorError, KeyError, ValueError, TypeError, DraccusException) as error:
-            reason = " ".join(str(error).split())[:200]
+            return cls._from(read_tensor_file(path, _LIMIT_BYTES))
+        except OSError as error:
+            raise ArtefactError(f"{path}: {error.strerror}; it cannot be read") from error
+        except (SafetensorError, ValueError) as error:
             raise ArtefactError(
-                f"{path}: not a controller of schema {SCHEMA} ({reason}); train one with "
+                f"{path}: not a controller of schema {SCHEMA} ({error}); train one with "
                 "egovcp-train-lowlevel"
             ) from error
 
     @classmethod
-    def _from(cls, tensors: dict[str, Any], metadata: Mapping[str, str]) -> WalkPolicy:
-        if metadata.get("schema") != SCHEMA:
-            raise ValueError(f"its schema is {metadata.get('schema')!r}")
-        content = json.loads(metadata["content"])
-        count = sum(name.endswith(".weight") for name in tensors)
+    def _from(cls, file: TensorFile) -> WalkPolicy:
+        if file.metadata.get("schema") != SCHEMA:
+            raise ValueError(f"its schema is {shown(file.metadata.get('schema'))}")
+        content = decode(_Content, file.json_metadata("content"), "content")
+        count = sum(name.endswith(".weight") for name in file.tensors)
+        names = {f"layers.{i}.{part}" for i in range(count) for part in ("weight", "bias")}
+        names |= {"mean", "std"}
+        file.require_names(names)
+        tensors = load(file.content)
         layers = tuple(
             (tensors[f"layers.{i}.weight"], tensors[f"layers.{i}.bias"]) for i in range(count)
         )
-        try:
-            config = draccus.decode(WalkConfig, content["config"])
-        except UsageError as error:
-            raise ValueError(str(error)) from error
-        policy = cls(tensors["mean"], tensors["std"], layers, config, content["provenance"])
+        check_bounds(content.config, "content.config.")
+        policy = cls(tensors["mean"], tensors["std"], layers, content.config, content.provenance)
         policy.check()
         return policy
 
@@ -119,7 +129,7 @@ class WalkPolicy:
             if array.shape != (width,):
                 raise ValueError(f"{name} has shape {array.shape}, expected ({width},)")
         for i, (weight, bias) in enumerate(self.layers):
-            if weight.shape != (len(bias), width):
+            if bias.ndim != 1 or weight.shape != (len(bias), width):
                 raise ValueError(f"layer {i} has shape {weight.shape}, expected (*, {width})")
             width = len(bias)
         if width != ACTIONS:

@@ -25,8 +25,9 @@ from egovcp.robot.gait import Gait, GaitConfig
 from egovcp.robot.kinematics import Array, heading_rotation, rotate, torso_rotation
 from egovcp.robot.memory import replace_rows
 from egovcp.robot.reach import TORSO_ORIGIN, Reach, ReachConfig
-from egovcp.robot.stance import TARGET_HIGH, TARGET_LOW, pelvis_height
+from egovcp.robot.stance import pelvis_height
 from egovcp.robot.stance_table import NU, stance_table
+from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import NUM_JOINTS, STATE_DIM, STATE_SLICES
 
 ACTIONS: Final = NU  # legs and waist

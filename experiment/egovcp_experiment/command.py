@@ -12,8 +12,9 @@ from typing import Any, Final
 
 import draccus
 
-from egovcp.cli import run_command
+from egovcp.cli import report_error, run_command
 from egovcp.errors import UsageError, suggest
+from egovcp.terminal import echo
 from egovcp_experiment.cell import in_order
 from egovcp_experiment.cluster import RayRunner
 from egovcp_experiment.config import ExperimentConfig
@@ -36,15 +37,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     if not args or args[0] in ("-h", "--help"):
-        print(_help())
+        echo(_help())
         return 0 if args else UsageError.exit_code
     name, *flags = args
     if name not in EXPERIMENTS:
-        print(
-            f"{PROG}: error: unknown experiment {name!r}{suggest(name, EXPERIMENTS)}",
-            file=sys.stderr,
-        )
-        return UsageError.exit_code
+        unknown = f"unknown experiment {name!r}{suggest(name, EXPERIMENTS)}"
+        return report_error(PROG, UsageError(unknown))
     run = partial(execute, name=name, command=shlex.join([PROG, *args]))
     prog = f"{PROG} {name}"
     return run_command(ExperimentConfig, run, flags, prog=prog, epilog=_EPILOG, defaults=scale_of)
@@ -79,10 +77,10 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
     experiment = EXPERIMENTS[name]
     cells = in_order(experiment.cells(config))
     store = Store(Path(config.output_dir))
-    say = partial(print, flush=True)
+    say = echo
     with store.locked(), closing(_runner(config, say)) as runner:
         schedule = Schedule(cells, store, config.jobs, say, runner)
-        print(f"{PROG} {name}: {len(cells)} cells, {len(schedule.records)} complete", flush=True)
+        echo(f"{PROG} {name}: {len(cells)} cells, {len(schedule.records)} complete")
         try:
             schedule.run()
         finally:
@@ -94,8 +92,8 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
             encoded = draccus.encode(config)
             publish(store.folder, name, report, records, missing, encoded, command)
     for line in report.shows:
-        print(f"- {line}")
-    print(f"report: {store.folder / name}.html, .md, .json")
+        echo(f"- {line}")
+    echo(f"report: {store.folder / name}.html, .md, .json")
 
 
 def _runner(config: ExperimentConfig, say: Callable[[str], None]) -> Runner:

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.artefact import MANIFEST, SEAL
 from egovcp.data.files import sha256
 from egovcp.data.schema import COLLECTION_PATH, HASHES_PATH
+from egovcp.manifest import MANIFEST, SEAL, read_manifest
 from egovcp.reactive import ReactiveNetwork
 from egovcp_experiment.cell import Flags, Tool
 
@@ -46,13 +46,13 @@ def dataset_digest(folder: Path) -> str:
 
 
 def _trained(folder: Path) -> dict[str, Any]:
-    manifest = read_json(folder / ARTEFACT / MANIFEST)
+    manifest = read_manifest(folder / ARTEFACT)
     return {"step": manifest["step"], "tasks": manifest["heldout_tasks"]}
 
 
 def artefact_digest(folder: Path) -> str:
     """The SHA-256 that seals an artefact's manifest, and with it all of its files."""
-    return str(read_json(folder / MANIFEST)[SEAL])
+    return str(read_manifest(folder)[SEAL])
 
 
 def _trained_ppo(folder: Path) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egovcp.artefact import MANIFEST
+from egovcp.manifest import MANIFEST
 from egovcp_experiment.cell import Cell, Output
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.report.document import Plot, Report, Table

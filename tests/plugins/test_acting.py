@@ -13,9 +13,10 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.artefact import CONFIG, MANIFEST, WEIGHTS, load_artefact
+from egovcp.artefact import CONFIG, WEIGHTS, load_artefact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.errors import ArtefactError, DataError, UsageError
+from egovcp.manifest import MANIFEST
 from egovcp.processors import PROCESSORS
 from egovcp.testing import random_episode
 from lerobot_policy_egovcp import EgovcpConfig, EgovcpPolicy, make_egovcp_pre_post_processors

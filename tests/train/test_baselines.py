@@ -11,8 +11,9 @@ import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
-from egovcp.artefact import load_artefact, sealed
+from egovcp.artefact import load_artefact
 from egovcp.errors import EgovcpError
+from egovcp.manifest import sealed
 from egovcp.model import Batch, WorldModel
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.loop import Learner

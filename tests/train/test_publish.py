@@ -12,7 +12,7 @@ import yaml
 
 from egovcp.artefact import load_artefact, save_artefact
 from egovcp.checks import check_artefact
-from egovcp.hub import Patience
+from egovcp.hub import RetryPolicy
 from egovcp.plan import PlannerConfig
 from egovcp.processors import PROCESSORS
 from egovcp.testing import toy_model
@@ -32,8 +32,8 @@ QUICK = ("--network.attempts=2", "--network.wait_s=0.01", "--network.timeout_s=2
 def logged_in(monkeypatch: pytest.MonkeyPatch) -> None:
     """Somebody is, and waits for nothing."""
     monkeypatch.setenv("HF_TOKEN", "hf_right")
-    quick = Patience(attempts=2, wait_s=0.01, timeout_s=20)
-    monkeypatch.setattr(publishing, "PATIENCE", quick)
+    quick = RetryPolicy(attempts=2, wait_s=0.01, timeout_s=20)
+    monkeypatch.setattr(publishing, "RETRY_POLICY", quick)
 
 
 @pytest.fixture(scope="module")

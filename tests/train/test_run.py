@@ -12,10 +12,11 @@ import pytest
 import torch
 
 from egovcp import spec
-from egovcp.artefact import MANIFEST, load_artefact
+from egovcp.artefact import load_artefact
 from egovcp.checks import check_artefact
 from egovcp.cli import parse_config
 from egovcp.data import DatasetWriter, Episode, Provenance
+from egovcp.manifest import MANIFEST
 from egovcp.model import PRESETS, Batch
 from egovcp_train import device
 from egovcp_train.checkpoint import load_training_state

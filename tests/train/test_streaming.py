@@ -12,7 +12,7 @@ from egovcp.artefact import load_artefact
 from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader, DatasetWriter, Provenance
 from egovcp.data.source import lerobot_home
-from egovcp.hub import Content, Patience, Publication, publish
+from egovcp.hub import Content, Publication, RetryPolicy, publish
 from egovcp.model import Batch
 from egovcp.testing.hub import FakeHub
 from egovcp_train.checkpoint import load_training_state
@@ -22,7 +22,7 @@ from egovcp_train.train import main
 type Arguments = Callable[..., list[str]]
 
 CONTROLLER = "stance-test"
-QUICK = Patience(attempts=2, wait_s=0.01, timeout_s=20)
+QUICK = RetryPolicy(attempts=2, wait_s=0.01, timeout_s=20)
 
 
 def _publish(root: Path) -> str:

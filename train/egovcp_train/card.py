@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 import platform
 import shlex
@@ -122,9 +121,8 @@ def _front_matter(manifest: Mapping[str, Any], title: str) -> Any:
 
 
 def _figures(manifest: Mapping[str, Any]) -> dict[str, float]:
-    """The held-out metrics that are numbers; JSON's neighbours of a number are none."""
-    found = {k: float(v) for k, v in manifest.get("heldout", {}).items()}
-    return {k: v for k, v in found.items() if math.isfinite(v)}
+    """The held-out metrics that are numbers; null stands for one that was not finite."""
+    return {k: float(v) for k, v in manifest.get("heldout", {}).items() if v is not None}
 
 
 def _meaning(metric: str) -> str:

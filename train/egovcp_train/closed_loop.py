@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from importlib.util import find_spec
 from itertools import batched
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import UsageError
 from egovcp.model import WorldModel
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.plan import PlannerConfig
 from egovcp.plan.policy import Policy
 
@@ -27,13 +27,8 @@ type Played = tuple[NDArray[np.float64], NDArray[np.bool_]]
 
 
 def require_simulator() -> None:
-    """Raise `EnvironmentFailure` where the simulator is not installed."""
-    for package in ("mujoco", "mjlab"):
-        if find_spec(package) is None:
-            raise EnvironmentFailure(
-                f"--eval_closed_loop plays in simulation, which needs the package {package}; it is "
-                "not installed here: pip install 'egovcp[sim]', or train without the option"
-            )
+    """Raise `MissingPackage` where the simulator is not installed."""
+    require_packages("egovcp-train", "--eval_closed_loop", *SIMULATOR_MODULES)
 
 
 class ClosedLoop:

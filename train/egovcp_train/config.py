@@ -8,12 +8,12 @@ from typing import Any, Literal
 from egovcp.bounds import bounded
 from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
 from egovcp.data import MixedReturnConfig, ReturnConfig, ShuffleConfig
-from egovcp.data.source import is_repo_id
 from egovcp.errors import UsageError
-from egovcp.hub import Patience
+from egovcp.hub import RetryPolicy, is_repo_id
 from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_answers
+from egovcp.plan.cost import require_affordable
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.value_fit import ValueFitConfig
 from egovcp_train.wandb_records import WandbConfig
@@ -65,7 +65,7 @@ class LoadingConfig:
     sample_files: int = bounded(16, least=1)
     """Files of each task that are fetched before the first step where the data comes from the Hub:
     the episodes in them give the scale of the returns, are evaluated on, and Q is fitted to."""
-    network: Patience = field(default_factory=Patience)
+    network: RetryPolicy = field(default_factory=RetryPolicy)
     """How long the Hub is asked for a file before the run ends; its checkpoints remain."""
 
 
@@ -177,6 +177,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         require_answers(self.policy, self.planner)
+        require_affordable(self.policy, self.planner)
         loss = self.policy.loss
         if loss.q_target == "td" and self.returns.scale == "per_task":
             raise UsageError(

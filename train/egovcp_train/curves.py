@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -24,10 +23,8 @@ _DPI: Final = 100
 def draw_curves(run: Path, path: Path) -> bool:
     """Draw the curves of the run in folder ``run`` to ``path``; whether there were any.
 
-    None are drawn where nothing was recorded, or matplotlib is not installed.
+    None are drawn where nothing was recorded.
     """
-    if find_spec("matplotlib") is None:
-        return False
     known = recorded(run / "tensorboard")
     panels = {
         title: {label: known[name] for name, label in names.items() if name in known}

@@ -13,19 +13,22 @@ import os
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
 import draccus
 import numpy as np
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 
-from egovcp.artefact import MANIFEST, WEIGHTS, Artefact, load_artefact
+from egovcp.artefact import WEIGHTS, Artefact, load_artefact
+from egovcp.atomic import write_bytes
 from egovcp.cli import run_command
-from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.errors import ArtefactError, UsageError
+from egovcp.manifest import MANIFEST
+from egovcp.packages import require_packages
 from egovcp.policy_options import PolicyOptions
+from egovcp.terminal import echo
 from egovcp_train.onnx_networks import (
     NETWORKS,
     OPSET,
@@ -88,8 +91,8 @@ def export(config: ExportConfig) -> None:
     finally:
         shutil.rmtree(work, ignore_errors=True)
     for name, error in errors.items():
-        print(f"{output / name}.onnx: at most {error:.1e} from the original")
-    print(f"golden vectors: {output / GOLDEN}; description: {output / REPORT}")
+        echo(f"{output / name}.onnx: at most {error:.1e} from the original")
+    echo(f"golden vectors: {output / GOLDEN}; description: {output / REPORT}")
 
 
 def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:
@@ -107,7 +110,7 @@ def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:
     golden = {f"inputs/{name}": tensor for name, tensor in inputs.items()}
     for name, outputs in reference(model, inputs, ensemble).items():
         golden |= {f"outputs/{name}/{key}": tensor for key, tensor in outputs.items()}
-    save_file({name: t.contiguous() for name, t in golden.items()}, folder / GOLDEN)
+    write_bytes(folder / GOLDEN, save({name: t.contiguous() for name, t in golden.items()}))
     errors = verify(folder)
     report = _report(artefact, folder, golden) | {"largest_error": errors}
     text = json.dumps(report, indent=2, allow_nan=False) + "\n"
@@ -217,8 +220,4 @@ def _sha256(path: Path) -> str:
 
 
 def _require_packages() -> None:
-    missing = [name for name in ("onnx", "onnxruntime") if find_spec(name) is None]
-    if missing:
-        raise EnvironmentFailure(
-            f"this needs {' and '.join(missing)}, not installed here: pip install 'egovcp[onnx]'"
-        )
+    require_packages("egovcp-train", PROG, "onnx", "onnxruntime")

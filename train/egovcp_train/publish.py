@@ -6,13 +6,14 @@ import shlex
 from pathlib import Path
 from typing import Final
 
-from egovcp.artefact import Artefact, load_artefact
+from egovcp.artefact import FILES, Artefact, load_artefact
 from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.hub import Content, Patience, Publication, Published, publish, reserve
-from egovcp_train.card import ASSETS, CARD, card_text
+from egovcp.hub import Content, Publication, Published, RetryPolicy, publish, reserve
+from egovcp.terminal import echo
+from egovcp_train.card import ASSETS, CARD, CURVES, card_text
 from egovcp_train.config import PolicyConfig
 
-PATIENCE: Final = Patience()
+RETRY_POLICY: Final = RetryPolicy()
 
 
 def reserve_policy(policy: PolicyConfig) -> None:
@@ -24,7 +25,7 @@ def reserve_policy(policy: PolicyConfig) -> None:
     """
     if policy.push_to_hub:
         target = Publication(policy.repo_id, {}, "", private=policy.private, repo_type="model")
-        reserve(target, PATIENCE)
+        reserve(target, RETRY_POLICY)
 
 
 def publication(
@@ -32,8 +33,8 @@ def publication(
 ) -> Publication:
     """The artefact with a card of its own, as one commit; nothing else that lies beside it."""
     folder = artefact.path
-    data = [*folder.glob("*.json"), *folder.glob("*.safetensors"), *folder.glob(f"{ASSETS}/*.png")]
-    contents = {path.relative_to(folder).as_posix(): Content(path) for path in data}
+    names = [name for name in (*FILES, CURVES) if (folder / name).is_file()]
+    contents = {name: Content(folder / name) for name in names}
     contents[CARD] = Content(card_text(artefact, repo_id).encode())
     return Publication(
         repo_id=repo_id,
@@ -53,7 +54,7 @@ def publish_trained(folder: Path, policy: PolicyConfig) -> None:
     """
     try:
         target = publication(load_artefact(str(folder)), policy.repo_id, policy.private)
-        report(target, publish(target, PATIENCE))
+        report(target, publish(target, RETRY_POLICY))
     except (EgovcpError, OSError) as error:
         private = ["--private"] if policy.private else []
         again = ["egovcp-push", f"--policy.path={folder}", f"--repo_id={policy.repo_id}", *private]
@@ -66,7 +67,5 @@ def publish_trained(folder: Path, policy: PolicyConfig) -> None:
 def report(target: Publication, published: Published) -> None:
     """Say where the policy is and how to use it."""
     name, commit = target.repo_id, published.commit
-    print(f"{name}@{target.branch} {'is now' if published.new else 'was already'} {commit}")
-    print(
-        f"egovcp-eval --policy.path={name} --policy.revision={commit} --task=... --output_dir=..."
-    )
+    echo(f"{name}@{target.branch} {'is now' if published.new else 'was already'} {commit}")
+    echo(f"egovcp-eval --policy.path={name} --policy.revision={commit} --task=... --output_dir=...")

@@ -9,9 +9,8 @@ from pathlib import Path
 
 from egovcp.artefact import load_artefact
 from egovcp.cli import run_command
-from egovcp.data.source import is_repo_id
 from egovcp.errors import UsageError
-from egovcp.hub import PublishConfig, publish
+from egovcp.hub import PublishConfig, is_repo_id, publish
 from egovcp_train.publish import publication, report
 
 PROG = "egovcp-push"

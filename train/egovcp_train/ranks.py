@@ -18,6 +18,7 @@ from torch import Tensor
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.model.shared import WHOLE, Share
+from egovcp.packages import require_packages
 
 type Terms = dict[str, Tensor]
 
@@ -80,13 +81,9 @@ class LaunchedRanks(Ranks):
         Raises:
             EnvironmentFailure: accelerate is not installed, or the others cannot be reached.
         """
-        try:
-            from accelerate import PartialState  # a second that a single process should not wait
-        except ImportError as error:
-            raise EnvironmentFailure(
-                "several processes need the package accelerate, which is not installed here: "
-                "pip install accelerate"
-            ) from error
+        require_packages("egovcp-train", "training on several processes", "accelerate")
+        from accelerate import PartialState  # a second that a single process should not wait
+
         try:
             state = PartialState(cpu=cpu, timeout=PATIENCE)
         except (RuntimeError, ValueError) as error:  # torch.distributed has no narrower one

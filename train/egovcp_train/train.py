@@ -18,7 +18,11 @@ from egovcp.cli import run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.data.ahead import Ahead
 from egovcp.errors import ArtefactError, UsageError
+from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
+from egovcp.model.weights import tensor_shapes
+from egovcp.plan.backends import judge_of_model
+from egovcp.terminal import echo, one_line
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
 from egovcp_train.card import versions, write_card
@@ -98,7 +102,7 @@ def train(config: TrainConfig) -> None:
     spent = _restore(output, learner, material.stream) if config.resume else 0.0
     provenance = _provenance(material)
     if ranks.is_first:
-        simulation = _simulation(config, provenance)
+        simulation = _simulation(config, provenance, learner.model)
         reserve_policy(config.policy)
         output.mkdir(parents=True, exist_ok=True)
         save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
@@ -153,7 +157,7 @@ class Run:
     def _conclude(self, final: Path, finished: bool) -> None:
         """Say where everything is, and publish what is finished."""
         artefact = final / "pretrained_model"
-        print(self._last_words(final, stopped=not finished))
+        echo(self._last_words(final, stopped=not finished))
         write_card(artefact, self.output, self.config.policy.repo_id)
         if finished:
             self.recorder.artefact(self.learner.step, artefact)
@@ -193,7 +197,7 @@ class Run:
                     bar.set_postfix(self._summary(terms, bar, frames))
                     if learner.unrecorded and not warned:
                         warned = True
-                        bar.write(_UNRECORDED.format(reason=learner.unrecorded))
+                        bar.write(one_line(_UNRECORDED.format(reason=learner.unrecorded)))
 
     def _pause(self) -> None:
         """Between two steps: measure, save and show, in this order, what is due after the first."""
@@ -259,7 +263,7 @@ class Run:
             return
         partial = begin_checkpoint(self.output, self.learner.step)
         found = {"heldout": self.metrics, "heldout_tasks": self.tasks, "closed_loop": self.played}
-        provenance = self.provenance | {"step": self.learner.step, **found}
+        provenance = self.provenance | {"step": self.learner.step, **finite_or_null(found)}
         save_artefact(partial / "pretrained_model", model, self.config.planner, provenance)
         spent = {"seconds": self.budget.spent}
         state = {"learner": self.learner.state_dict(), "streams": streams, **spent}
@@ -291,18 +295,30 @@ class Run:
         )
 
 
+def _require_loadable(config: TrainConfig) -> None:
+    """Raise `UsageError` for networks so large that their artefact would be refused."""
+    try:
+        tensor_shapes(config.policy.world_model())
+    except ValueError as error:
+        raise UsageError(f"--policy: {error}; make the networks smaller") from error
+
+
 def _prepare_output(config: TrainConfig, ranks: Ranks) -> Path:
     """Refuse what makes no sense, or cannot be done here, before any work starts."""
     require_wandb(config.wandb)
+    _require_loadable(config)
     if config.eval_closed_loop:
         require_simulator()
     output = Path(config.output_dir)
     return prepare_output(config.output_dir, config.resume) if ranks.is_first else output
 
 
-def _simulation(config: TrainConfig, provenance: dict[str, Any]) -> ClosedLoop | None:
+def _simulation(
+    config: TrainConfig, provenance: dict[str, Any], model: WorldModel
+) -> ClosedLoop | None:
     if not config.eval_closed_loop:
         return None
+    judge_of_model(model, config.planner)  # refuse a backend that cannot be used here before work
     tasks, controller = provenance["tasks"], provenance["controller_id"]
     return ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, Literal
 
@@ -12,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.packages import require_packages
 
 RUN_ID: Final = "wandb/run_id.txt"
 
@@ -37,12 +37,9 @@ class WandbConfig:
 
 
 def require_wandb(config: WandbConfig) -> None:
-    """Raise `EnvironmentFailure` where it is asked for and not installed."""
-    if config.enable and find_spec("wandb") is None:
-        raise EnvironmentFailure(
-            "--wandb.enable needs the package wandb, which is not installed here: "
-            "pip install wandb; or train without it: TensorBoard records are always written"
-        )
+    """Raise `MissingPackage` where it is asked for and not installed."""
+    if config.enable:
+        require_packages("egovcp-train", "--wandb.enable", "wandb")
 
 
 class WandbRecorder:

@@ -12,6 +12,7 @@ from tqdm import tqdm
 from egovcp.bounds import bounded
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import DataError, UsageError
+from egovcp.terminal import echo
 from egovcp_collect.dataset.again import changed_versions, simulated_again
 from egovcp_collect.dataset.replace import write_report
 
@@ -49,7 +50,7 @@ def run(config: AuditConfig) -> None:
     write_report(config.json, {**facts, "versions": versions})
     if different:
         raise DataError(_verdict(reader.root, different, versions))
-    print(f"{reader.root}: {len(chosen)} episodes simulated again, the same bit for bit")
+    echo(f"{reader.root}: {len(chosen)} episodes simulated again, the same bit for bit")
 
 
 def _chosen(config: AuditConfig, total: int) -> list[int]:

@@ -13,6 +13,7 @@ from huggingface_hub import DatasetCard, DatasetCardData
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.errors import UsageError
+from egovcp.terminal import echo
 from egovcp_collect.dataset import card_tables
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
 from egovcp_collect.dataset.replace import replace_text
@@ -69,7 +70,7 @@ def run(config: CardConfig) -> None:
     paths = draw_figures(found, ReturnConfig(), output.parent / config.assets)
     pictures = {path.stem: f"{config.assets}/{path.name}" for path in paths}
     replace_text(output, _render(reader, config.repo_id, found, pictures))
-    print(f"wrote {output} and {len(paths)} pictures in {output.parent / config.assets}")
+    echo(f"wrote {output} and {len(paths)} pictures in {output.parent / config.assets}")
 
 
 def card_text(reader: DatasetReader, repo_id: str) -> str:

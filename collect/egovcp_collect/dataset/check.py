@@ -16,6 +16,7 @@ from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetConfig, metadata
 from egovcp.data.source import local_root, locate
 from egovcp.errors import DataError
+from egovcp.terminal import echo, one_line
 from egovcp_collect.dataset.replace import write_report
 
 
@@ -52,10 +53,10 @@ def run(config: CheckConfig) -> None:
     content = {"ok": not found, "episodes": episodes, "frames": frames, "problems": problems}
     write_report(config.json, content)
     for error in found:
-        print(error)
+        echo(one_line(error))
     if found:
         raise DataError(_verdict(found, root, config.max_problems))
-    print(f"{root}: {episodes} episodes, {frames} frames, nothing wrong")
+    echo(f"{root}: {episodes} episodes, {frames} frames, nothing wrong")
 
 
 def _verdict(found: list[DataError], root: Path, limit: int) -> str:

@@ -20,9 +20,10 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, get_type_hints
 
-from egovcp.cli import run_command
-from egovcp.data.source import is_repo_id
+from egovcp.cli import report_error, run_command
 from egovcp.errors import UsageError, suggest
+from egovcp.hub import is_repo_id
+from egovcp.terminal import echo
 
 PROG: Final = "egovcp-dataset"
 
@@ -77,15 +78,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     if not args or args[0] in ("-h", "--help"):
-        print(_help())
+        echo(_help())
         return 0 if args else UsageError.exit_code
     try:
         name = _known(args[0])
         module = importlib.import_module(SUBCOMMANDS[name].module)
         flags = _flags(args[1:], module)
     except UsageError as error:
-        print(f"{PROG}: error: {error}", file=sys.stderr)
-        return error.exit_code
+        return report_error(PROG, error)
     return run_command(module.CONFIG, module.run, flags, prog=f"{PROG} {name}", epilog=_EPILOG)
 
 

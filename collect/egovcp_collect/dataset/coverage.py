@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig
+from egovcp.terminal import echo, echo_lines
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
 from egovcp_collect.dataset.replace import replace_json
 from egovcp_collect.dataset.spread import Spread
@@ -50,13 +51,13 @@ def run(config: CoverageConfig) -> None:
     reader = DatasetReader.open(config.dataset)
     found = survey(reader, config.returns)
     findings = judge(found, config.limits)
-    print(f"{reader.root}: {len(reader)} episodes, {reader.num_frames} steps\n")
+    echo(f"{reader.root}: {len(reader)} episodes, {reader.num_frames} steps\n")
     for task in found.tasks:
-        print("\n".join(_describe(task)), end="\n\n")
-    print("\n".join(_verdict(findings)))
+        echo_lines([*_describe(task), ""])
+    echo_lines(_verdict(findings))
     if config.output_dir:
         for path in draw_figures(found, config.returns, Path(config.output_dir)):
-            print(f"drew {path}")
+            echo(f"drew {path}")
     if config.json:
         verdict = {
             "worth_training": all(finding.fine for finding in findings),

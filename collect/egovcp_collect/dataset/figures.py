@@ -6,7 +6,6 @@ matplotlib draws them without a display; it is imported only when a picture is a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.data import ReturnConfig
-from egovcp.errors import EnvironmentFailure
+from egovcp.packages import require_packages
 from egovcp.spec import ACTION_BOX, ACTION_NAMES, DEPTH_MAX_M, PLANNER_DT
 from egovcp_collect.dataset.occupancy import BINS
 from egovcp_collect.dataset.rows import TaskRows
@@ -30,12 +29,8 @@ _DENSITY_ROWS: Final = 200_000  # of the actions that densities are drawn from
 
 
 def require_matplotlib() -> None:
-    """Raise `EnvironmentFailure` where there is no matplotlib."""
-    if find_spec("matplotlib") is None:
-        raise EnvironmentFailure(
-            "the pictures need matplotlib, which is not installed: "
-            "pip install 'egovcp-collect[pictures]', or do without --output_dir"
-        )
+    """Raise `MissingPackage` where there is no matplotlib."""
+    require_packages("egovcp-collect", "a picture", "matplotlib")
 
 
 def draw_figures(found: Survey, returns: ReturnConfig, folder: Path) -> list[Path]:

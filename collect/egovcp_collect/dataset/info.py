@@ -8,6 +8,7 @@ from typing import Any
 
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.data.split import HELDOUT_FRACTION, in_split
+from egovcp.terminal import echo_lines
 from egovcp_collect.dataset.replace import write_report
 
 
@@ -31,7 +32,7 @@ def run(config: InfoConfig) -> None:
         DataError: the dataset is incomplete, or of another specification.
     """
     facts = describe(DatasetReader.open(config.dataset))
-    print(_table(facts))
+    echo_lines(_table(facts))
     write_report(config.json, facts)
 
 
@@ -65,7 +66,7 @@ def describe(reader: DatasetReader) -> dict[str, Any]:
     }
 
 
-def _table(facts: dict[str, Any]) -> str:
+def _table(facts: dict[str, Any]) -> list[str]:
     rows = [
         ("dataset", facts["root"]),
         ("Hub", f"{facts['repo_id']}@{facts['commit']}" if facts["commit"] else "no, a folder"),
@@ -81,7 +82,7 @@ def _table(facts: dict[str, Any]) -> str:
         *((f"  {key}", f"{f['dtype']} {f['shape']}") for key, f in facts["features"].items()),
     ]
     width = max(len(name) for name, _ in rows)
-    return "\n".join(f"{name:{width}}  {value}".rstrip() for name, value in rows)
+    return [f"{name:{width}}  {value}".rstrip() for name, value in rows]
 
 
 def _count(count: dict[str, int]) -> str:

@@ -13,6 +13,7 @@ from tqdm import tqdm
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter
 from egovcp.data.continued import read_provenance
 from egovcp.errors import DataError, UsageError
+from egovcp.terminal import echo
 from egovcp_collect.dataset.origin import joint, moved, require_one_controller
 from egovcp_collect.dataset.output import new_folder
 from egovcp_collect.dataset.replace import write_report
@@ -59,7 +60,7 @@ def run(config: MergeConfig) -> None:
     frames = _write(readers, chosen, output, command)
     facts = {"episodes": len(chosen), "frames": frames, "dropped": dropped}
     write_report(config.json, facts)
-    print(f"{output}: {len(chosen)} episodes, {frames} frames; {dropped} duplicates dropped")
+    echo(f"{output}: {len(chosen)} episodes, {frames} frames; {dropped} duplicates dropped")
 
 
 def _chosen(readers: Sequence[DatasetReader], duplicates: str) -> tuple[list[tuple[int, int]], int]:

@@ -7,13 +7,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader, schema
-from egovcp.data.files import rename, sync, sync_tree
+from egovcp.data.destination import require_new, require_replaceable, resolve_root
+from egovcp.data.files import sync_tree
 from egovcp.data.hashes import verify_hashes
 from egovcp.data.lock import only_writer
-from egovcp.data.source import Source, is_repo_id, record, recorded
-from egovcp.data.writer import require_new
+from egovcp.data.source import Source, record, recorded
+from egovcp.data.version import publish
 from egovcp.errors import DataError, UsageError
-from egovcp.hub import Patience, fetch, resolve
+from egovcp.hub import RetryPolicy, fetch, is_repo_id, resolve
+from egovcp.terminal import echo
 from egovcp_collect.dataset.replace import write_report
 
 
@@ -29,7 +31,7 @@ class PullConfig:
     """The dataset: its id on the Hub, and the revision; empty: the latest."""
     output_dir: str = ""
     """The new folder."""
-    network: Patience = field(default_factory=Patience)
+    network: RetryPolicy = field(default_factory=RetryPolicy)
     """How long to try."""
     json: str = ""
     """File for {"repo_id", "commit", "root", "episodes", "frames"}; empty: none."""
@@ -44,19 +46,21 @@ def run(config: PullConfig) -> None:
     Raises:
         UsageError: no id, or the folder is taken.
         DataError: the Hub has no such dataset, or what it has is damaged.
-        EnvironmentFailure: the Hub cannot be reached, or refuses.
+        EnvironmentFailure: the Hub cannot be reached, or refuses; the folder is a mount point.
     """
     repo_id = config.dataset.repo_id
     if config.dataset.root or not is_repo_id(repo_id):
         raise UsageError("pull takes the id of a dataset on the Hub, user/name")
     if not config.output_dir:
         raise UsageError("--output_dir is missing: the new folder for the dataset")
-    root = Path(config.output_dir).expanduser().absolute()
+    root = resolve_root(config.output_dir)
+    if not (root / schema.SOURCE_PATH).is_file():
+        _require_free(root)
     commit = resolve(repo_id, config.dataset.revision, config.network)
     if _is_there(root, repo_id, commit):
-        print(f"{root} is {repo_id}@{commit} already")
+        echo(f"{root} is {repo_id}@{commit} already")
     else:
-        require_new(root)
+        _require_free(root)
         _bring(Source(root, repo_id, commit), config.network)
     _report(config, DatasetReader.open(DatasetConfig(root=str(root))))
 
@@ -68,13 +72,18 @@ def _is_there(root: Path, repo_id: str, commit: str) -> bool:
     return True
 
 
-def _bring(source: Source, patience: Patience) -> None:
+def _require_free(root: Path) -> None:
+    require_new(root)
+    require_replaceable(root)
+
+
+def _bring(source: Source, retry: RetryPolicy) -> None:
     """Everything into a folder aside, then that folder to its place."""
     aside = source.root.with_name(f".{source.root.name}.pull")
     files = aside / "files"
     files.mkdir(parents=True, exist_ok=True)
     with only_writer(source.root, aside):
-        fetch(source.repo_id, source.commit, files, patience)
+        fetch(source.repo_id, source.commit, files, retry)
         try:
             (files / schema.SOURCE_PATH).unlink(missing_ok=True)
             verify_hashes(files)
@@ -84,17 +93,15 @@ def _bring(source: Source, patience: Patience) -> None:
             raise
         record(Source(files, source.repo_id, source.commit))
         sync_tree(files)
-        require_new(source.root)
-        rename(files, source.root)
-        sync(source.root.parent)
+        publish(files, source.root)
     shutil.rmtree(aside, ignore_errors=True)
 
 
 def _report(config: PullConfig, reader: DatasetReader) -> None:
     source = reader.source
-    print(f"{source.root}: {source.repo_id}@{source.commit}")
-    print(f"{len(reader)} episodes, {reader.num_frames} steps")
-    print(f"egovcp-train --dataset.root={source.root}")
+    echo(f"{source.root}: {source.repo_id}@{source.commit}")
+    echo(f"{len(reader)} episodes, {reader.num_frames} steps")
+    echo(f"egovcp-train --dataset.root={source.root}")
     facts = {
         "repo_id": source.repo_id,
         "commit": source.commit,

@@ -13,9 +13,9 @@ from tqdm import tqdm
 from egovcp.checks import check_dataset
 from egovcp.data import DatasetConfig, DatasetReader, schema
 from egovcp.data.committer import work_folder
-from egovcp.data.source import is_repo_id
 from egovcp.errors import DataError, UsageError
-from egovcp.hub import Content, Publication, PublishConfig, Published, publish
+from egovcp.hub import Content, Publication, PublishConfig, Published, is_repo_id, publish
+from egovcp.terminal import echo
 from egovcp_collect.dataset.card import ASSETS, CARD, card_text
 from egovcp_collect.dataset.replace import write_report
 
@@ -125,7 +125,7 @@ def _message(reader: DatasetReader) -> str:
 
 def _report(config: PushConfig, published: Published) -> None:
     name, commit = config.repo_id, published.commit
-    print(f"{name}@{config.branch} {'is now' if published.new else 'was already'} {commit}")
-    print(f"egovcp-train --dataset.repo_id={name} --dataset.revision={commit}")
+    echo(f"{name}@{config.branch} {'is now' if published.new else 'was already'} {commit}")
+    echo(f"egovcp-train --dataset.repo_id={name} --dataset.revision={commit}")
     facts = {"repo_id": name, "branch": config.branch, "tag": config.tag, **asdict(published)}
     write_report(config.json, facts)

@@ -14,6 +14,7 @@ from egovcp.checks.dataset import command_problems
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode
 from egovcp.data.source import Source, local_root
 from egovcp.errors import DataError
+from egovcp.terminal import echo, one_line
 from egovcp_collect.dataset.book import Book, open_book
 from egovcp_collect.dataset.check import as_json
 from egovcp_collect.dataset.output import new_folder
@@ -61,13 +62,13 @@ def run(config: RepairConfig) -> None:
     with tqdm(unit="ep", delay=1) as bar:
         kept, frames = _rebuild(root, book, output, dropped, bar)
     for error in dropped:
-        print(f"dropped: {error}")
+        echo(one_line(f"dropped: {error}"))
     facts = {"episodes": kept, "frames": frames}
     problems = [as_json(error, root) for error in dropped]
     write_report(config.json, {**facts, "dropped": problems})
     if not kept:
         raise DataError(f"nothing of {root} can be kept; {len(dropped)} problem(s), see above")
-    print(f"{output}: {kept} episodes, {frames} frames; {len(dropped)} problem(s) left behind")
+    echo(f"{output}: {kept} episodes, {frames} frames; {len(dropped)} problem(s) left behind")
 
 
 def _command(config: RepairConfig) -> str:

@@ -10,12 +10,13 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import UsageError
+from egovcp.packages import require_packages
 from egovcp.rollouts import POSE, run_info, ticks_of
+from egovcp.terminal import echo
 
 
 @dataclass(frozen=True)
@@ -47,11 +48,7 @@ def run(config: VizConfig) -> None:
         DataError: the dataset is damaged.
         EnvironmentFailure: Rerun is not installed, or the recording exists already.
     """
-    if find_spec("rerun") is None:
-        raise EnvironmentFailure(
-            "the recording needs rerun-sdk, which is not installed: pip install "
-            "'egovcp-collect[viz]'"
-        )
+    require_packages("egovcp-collect", "the recording", "rerun")
     reader = DatasetReader.open(config.dataset)
     if not 0 <= config.episode < len(reader):
         raise UsageError(
@@ -62,11 +59,11 @@ def run(config: VizConfig) -> None:
         name = f"{reader.source.repo_id.partition('/')[2]}-episode-{config.episode}.rrd"
     output = Path(config.output or name)
     write_recording(reader, config.episode, output)
-    print(f"wrote {output}; {POSE}")
+    echo(f"wrote {output}; {POSE}")
     if config.spawn:
         open_viewer(output)
     else:
-        print(f"open it with: rerun {output}")
+        echo(f"open it with: rerun {output}")
 
 
 def write_recording(reader: DatasetReader, index: int, output: Path, meshes: bool = True) -> None:

@@ -18,8 +18,9 @@ from egovcp.errors import EgovcpError, SafetyStop, UsageError
 from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.tick import Tick
 from egovcp.robot.controllers import make_controller
+from egovcp.terminal import echo, one_line
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.hardware import CAMERAS, HardwareOptions
+from egovcp_deploy.live.hardware import CAMERAS, REALSENSE, HardwareOptions
 from egovcp_deploy.live.operators import OPERATORS, operator
 from egovcp_deploy.live.planner import LiveSummary, failure_words
 from egovcp_deploy.live.run import LiveSetup, run_live
@@ -29,14 +30,22 @@ from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.policy import backend_of
 from egovcp_deploy.recording import missing_ticks, recording, run_info
+from egovcp_deploy.robots.realsense_eye import require_realsense
 
 SIMULATED_S: Final = 15.0  # in RUN: the crane lets go, the robot settles, the episode
 
 
 def check_live(config: DeployConfig) -> None:
-    """Raise `UsageError` for options that make no sense on the wall clock."""
+    """Refuse options that make no sense on the wall clock.
+
+    Raises:
+        UsageError: names the option.
+        MissingPackage: the driver of the camera is not installed.
+    """
     check_choice("--operator.type", config.operator.type, OPERATORS)
     check_choice("--robot.camera.type", config.robot.camera.type, CAMERAS)
+    if config.robot.camera.type == REALSENSE:
+        require_realsense()
     if not np.isfinite(config.operator.velocity).all():
         raise UsageError(f"--operator.velocity={config.operator.velocity}: expected numbers")
     if not config.operator.duration >= 0:
@@ -153,7 +162,7 @@ def _leave_a_core() -> None:
 
 def _show(bar: Any, tick: Tick) -> None:
     for event in tick.events:
-        bar.write(f"{tick.time_ns / 1e9:8.2f} s  {event}")
+        bar.write(one_line(f"{tick.time_ns / 1e9:8.2f} s  {event}"))
     plan = f", plan {tick.timing_ms['plan']:.0f} ms" if "plan" in tick.timing_ms else ""
     bar.set_postfix_str(f"{tick.mode}{plan}", refresh=False)
     bar.update(1)
@@ -170,6 +179,7 @@ def _report(
         "ticks_held": summary.held,
         "plans": summary.planned,
         "plans_late": summary.late,
+        "skipped_observations": summary.skipped,
         **_percentiles("plan_ms", summary.plan_ms),
         **_percentiles("latency_ms", summary.latency_ms),
         "iterations_mean": float(np.mean(summary.iterations or [0])),
@@ -192,9 +202,10 @@ def _percentiles(name: str, values: list[float]) -> dict[str, float]:
 
 def _print(summary: LiveSummary, backend: str, folder: Path) -> None:
     latency = _percentiles("ms", summary.latency_ms)
-    print(
+    echo(
         f"{summary.ticks} ticks, {summary.running} running, {summary.held} held; observation to "
         f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late; plans "
         f"computed by {backend}"
+        + (f"; {summary.skipped} observations skipped" if summary.skipped else "")
     )
-    print(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
+    echo(f"look at it:  rerun {folder / 'rollout-0.rrd'}")

@@ -11,13 +11,13 @@ import errno
 import os
 import stat
 import struct
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from typing import Final
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.terminal import echo
 from egovcp_deploy.live.buttons import Buttons
 from egovcp_deploy.live.link import Order
 from egovcp_deploy.robots.remote import Remote
@@ -156,10 +156,10 @@ class Gamepad:
         self.close()
         self._forget()
         with suppress(OSError):
-            print(
+            echo(
                 f"the gamepad {self._options.path} is gone: the robot stops walking; Ctrl-C holds "
                 "it, twice damps it",
-                file=sys.stderr,
+                error=True,
             )
 
     def _found_again(self, now_ns: int) -> bool:
@@ -192,7 +192,7 @@ def gamepad(options: GamepadOptions) -> Iterator[Gamepad]:
         EnvironmentFailure: there is none, or it may not be read.
     """
     pad = Gamepad(options)
-    print(GAMEPAD_HELP)
+    echo(GAMEPAD_HELP)
     try:
         yield pad
     finally:

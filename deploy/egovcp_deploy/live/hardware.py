@@ -9,7 +9,8 @@ from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
 from egovcp_deploy.robots.realsense_eye import RealSenseEye, RealSenseEyeConfig
 from egovcp_deploy.robots.zmq_eye import ZmqEye, ZmqEyeConfig
 
-CAMERAS: Final = ("server", "realsense")
+REALSENSE: Final = "realsense"
+CAMERAS: Final = ("server", REALSENSE)
 
 
 @dataclass(frozen=True)
@@ -82,7 +83,7 @@ def open_eye(options: CameraOptions) -> ZmqEye | RealSenseEye:
     Raises:
         EnvironmentFailure: it does not answer.
     """
-    if options.type == "realsense":
+    if options.type == REALSENSE:
         return RealSenseEye.connect(options.realsense)
     eye = ZmqEye(options.server)
     eye.connect()

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Final, Protocol
 
 from egovcp.errors import UsageError
+from egovcp.terminal import echo
 from egovcp_deploy.live.gamepad import GamepadOptions, gamepad
 from egovcp_deploy.live.link import Order
 from egovcp_deploy.pilot.states import Request, State
@@ -156,7 +157,7 @@ def _keyboard() -> Iterator[Keyboard]:
             "run it in one, or choose --operator.type=auto"
         )
     before = termios.tcgetattr(sys.stdin)
-    print(KEYBOARD_HELP)
+    echo(KEYBOARD_HELP)
     try:
         tty.setcbreak(sys.stdin)
         yield Keyboard()

@@ -19,7 +19,7 @@ from egovcp.spec import PLANNER_DT
 from egovcp_deploy.live.interrupts import Interrupts
 from egovcp_deploy.live.link import Link, Order, decode_report, encode_order, encode_reply
 from egovcp_deploy.live.operators import EASE_S, Operator
-from egovcp_deploy.pilot.desk import Reply, Report, Thinker
+from egovcp_deploy.pilot.desk import SKIPPED, Reply, Report, Thinker
 from egovcp_deploy.pilot.effort import BUDGET_S
 from egovcp_deploy.pilot.states import Request, State
 from egovcp_deploy.runner import thoughts
@@ -38,6 +38,8 @@ class LiveSummary:
     ticks: int = 0
     planned: int = 0
     """Ticks whose plan came from their own observation."""
+    skipped: int = 0
+    """Observations that the policy did not use, because their state was not finite."""
     late: int = 0
     """Plans that came after their tick."""
     running: int = 0
@@ -165,6 +167,7 @@ class PlannerLoop:
         late = latency > PLANNER_DT
         self.summary.planned += 1
         self.summary.late += late
+        self.summary.skipped += reply.events.count(SKIPPED)
         before = self._thinker.samples
         if self._thinker.pace(reply, late):
             after = self._thinker.samples

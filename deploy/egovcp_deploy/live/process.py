@@ -18,6 +18,7 @@ from egovcp.errors import EgovcpError
 from egovcp.rate import FixedRate, MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.spec import CONTROLLER_HZ
+from egovcp.terminal import echo, one_line
 from egovcp_deploy.live import motors
 from egovcp_deploy.live.buttons import Buttons
 from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
@@ -55,15 +56,17 @@ def control_process(setup: ControlSetup) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the planner's process to judge
     quitting = Flag()
     signal.signal(signal.SIGTERM, lambda number, frame: quitting.set())
+    _prefer_punctuality()
     try:
         hardware = open_hardware(setup.hardware)
     except EgovcpError as error:
-        print(f"\negovcp-deploy: error: {error}", file=sys.stderr)  # a progress bar is above
+        # a progress bar is above
+        echo("\n" + one_line(f"egovcp-deploy: error: {error}"), error=True)
         sys.exit(error.exit_code)
     link = Link(setup.address, serve=False)
     try:
         control = ControlProcess(setup, hardware, link)
-        _prefer_punctuality()
+        gc.freeze()  # what the imports brought is not searched for garbage again
         control.run(quitting)
     finally:
         last_words(hardware.body)
@@ -72,9 +75,9 @@ def control_process(setup: ControlSetup) -> None:
 
 
 def _prefer_punctuality() -> None:
-    """Do what this process may so that its ticks are on time."""
+    """Do what this process may so that its ticks are on time; before it has threads, which inherit
+    the priority: one that holds the interpreter's lock must not be put aside either."""
     sys.setswitchinterval(_SWITCH_S)
-    gc.freeze()  # what the imports brought is not searched for garbage again
     with suppress(OSError):  # needs a privilege
         os.setpriority(os.PRIO_PROCESS, 0, _PRIORITY)
 
@@ -142,11 +145,10 @@ class ControlProcess:
 
 def _say_who_is_left() -> None:
     with suppress(OSError):  # the terminal may be gone as well
-        print(
+        echo(
             "egovcp-deploy: the planner's process is gone; the robot is held, and stands until it "
             f"is ended: kill {os.getpid()} damps it, as does L1 + B on its remote control",
-            file=sys.stderr,
-            flush=True,
+            error=True,
         )
 
 

@@ -37,14 +37,9 @@ def simulated(config: DeployConfig, outcomes: Path) -> Iterator[HardwareOptions]
     Raises:
         EnvironmentFailure: the simulator is not installed, or does not come up.
     """
-    try:
-        from egovcp_deploy.robots.fake.bridge import Ports
-        from egovcp_deploy.robots.fake.command import FakeConfig
-    except ModuleNotFoundError as error:
-        raise EnvironmentFailure(
-            f"--realtime needs the simulator, but {error.name} is not installed; "
-            "install it: pip install 'egovcp-deploy[sim]'"
-        ) from error
+    from egovcp_deploy.robots.fake.bridge import Ports
+    from egovcp_deploy.robots.fake.command import FakeConfig
+
     fake = FakeConfig(
         task=config.task,
         seed=config.seed,

@@ -10,8 +10,9 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Final
 
-from egovcp.cli import run_command
+from egovcp.cli import report_error, run_command
 from egovcp.errors import UsageError, suggest
+from egovcp.terminal import echo
 
 PROG: Final = "egovcp-mcap"
 
@@ -65,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     if not args or args[0] in ("-h", "--help"):
-        print(_help())
+        echo(_help())
         return 0 if args else UsageError.exit_code
     try:
         if args[0] not in SUBCOMMANDS:
@@ -73,8 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         entry = SUBCOMMANDS[args[0]]
         flags = _flags(args[1:], entry)
     except UsageError as error:
-        print(f"{PROG}: error: {error}", file=sys.stderr)
-        return error.exit_code
+        return report_error(PROG, error)
     module: Any = importlib.import_module(entry.module)
     return run_command(module.CONFIG, module.run, flags, prog=f"{PROG} {args[0]}")
 

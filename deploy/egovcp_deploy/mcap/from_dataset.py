@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 
 from egovcp.cli import DatasetConfig
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import UsageError
 from egovcp.log.mcap import McapSink
+from egovcp.packages import DATA_MODULES, require_packages
+from egovcp.terminal import echo
 
 
 @dataclass(frozen=True)
@@ -37,10 +38,7 @@ def run(config: FromDatasetConfig) -> None:
     """
     if not config.output:
         raise UsageError("where to? egovcp-mcap from-dataset ROOT OUT.mcap --episode=N")
-    if find_spec("pyarrow") is None:
-        raise EnvironmentFailure(
-            "datasets are read with pyarrow, which is not installed: pip install 'egovcp[data]'"
-        )
+    require_packages("egovcp-deploy", "reading a dataset", *DATA_MODULES)
     from egovcp.data import DatasetReader
     from egovcp.rollouts import run_info, ticks_of
 
@@ -55,6 +53,8 @@ def run(config: FromDatasetConfig) -> None:
     try:
         for tick in ticks_of(episode):
             sink.write(tick)
-    finally:
         sink.close()
-    print(f"{config.output}: {len(episode)} ticks of {episode.task}")
+    except BaseException:
+        sink.discard()
+        raise
+    echo(f"{config.output}: {len(episode)} ticks of {episode.task}")

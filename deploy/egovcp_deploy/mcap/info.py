@@ -1,4 +1,4 @@
-"""`egovcp-mcap info`: what is in a recording, and is it whole?"""
+"""`egovcp-mcap info`: the content of a recording, and whether it is complete."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from egovcp.log.info import RunInfo
 from egovcp.log.mcap_reader import Moment, RecordingReader
 from egovcp.log.messages import Topic
 from egovcp.rate import NS_PER_S
+from egovcp.terminal import echo, echo_lines
 from egovcp_deploy.mcap.history import History, history_words
 
 
@@ -51,7 +52,11 @@ class Summary:
     bytes: int
     info: RunInfo
     complete: bool = False
-    """The file ends as its writer meant it to."""
+    """The file has its end, and no part of it is damaged."""
+    damaged: bool = False
+    """A part of the file is damaged."""
+    lost: str = ""
+    """How many ticks the damage cost, and where; empty if nothing is damaged."""
     ticks: int = 0
     duration_s: float = 0.0
     """From the first tick to one period after the last."""
@@ -78,6 +83,8 @@ class Summary:
             "file": self.file,
             "bytes": self.bytes,
             "complete": self.complete,
+            "damaged": self.damaged,
+            "lost": self.lost,
             "ticks": self.ticks,
             "duration_s": self.duration_s,
             "rate_hz": self.rate_hz,
@@ -103,27 +110,28 @@ def run(config: InfoConfig) -> None:
     """Print the summary.
 
     Raises:
-        DataError: not a recording of ours.
+        DataError: not a recording of ours, or a damaged one; the summary is printed before.
     """
     if not config.file:
         raise UsageError("which recording? egovcp-mcap info FILE")
-    summary = summarise(Path(config.file))
+    reader = RecordingReader(Path(config.file))
+    summary = _summarise(Path(config.file), reader)
     report = json.dumps(summary.to_json(), indent=2)
-    if config.json == "-":
-        print(report)
-        return
-    if config.json:
+    if config.json and config.json != "-":
         Path(config.json).write_text(report + "\n", encoding="utf-8")
-    print(text(summary))
+    if config.json == "-":
+        echo(report)
+    else:
+        echo_lines(text(summary))
+    reader.require_undamaged()
 
 
 def summarise(path: Path) -> Summary:
-    """Go through the whole recording once.
+    """Read the whole recording once. Depth images and plans are not decoded."""
+    return _summarise(path, RecordingReader(path))
 
-    Raises:
-        DataError: not a recording of ours, or one with a damaged message.
-    """
-    reader = RecordingReader(path)
+
+def _summarise(path: Path, reader: RecordingReader) -> Summary:
     summary = Summary(str(path), path.stat().st_size, reader.info)
     period_ns = NS_PER_S // reader.info.fps
     first_ns, last = 0, None
@@ -139,7 +147,8 @@ def summarise(path: Path) -> Summary:
         summary.events += len(moment.text(Topic.LOG).splitlines())
     if last is not None:
         summary.duration_s = (last.time_ns - first_ns + period_ns) / NS_PER_S
-    summary.complete = reader.complete
+    summary.complete, summary.damaged = reader.complete, reader.damaged
+    summary.lost = reader.loss_text() if reader.damaged else ""
     summary.types = {line.topic: line.schema.name for line in reader.lines.values()}
     return summary
 
@@ -151,12 +160,11 @@ def _gap(before: Moment, moment: Moment, period_ns: int) -> Gap | None:
     return Gap(before.index, missing, passed / NS_PER_S) if missing or late else None
 
 
-def text(summary: Summary) -> str:
-    """For reading."""
+def text(summary: Summary) -> list[str]:
+    """Lines for reading."""
     info = summary.info
     lines = [
-        f"{summary.file}: {'complete' if summary.complete else 'TORN'}, "
-        f"{summary.bytes / 1e6:.1f} MB",
+        f"{summary.file}: {_state(summary)}, {summary.bytes / 1e6:.1f} MB",
         f"run       {info.task}, seed {info.seed}, episode {info.episode}",
         f"ticks     {summary.ticks} in {summary.duration_s:.2f} s, {summary.rate_hz:.2f} Hz",
         f"missing   {summary.missing} ticks in {len(summary.gaps)} gaps",
@@ -173,9 +181,15 @@ def text(summary: Summary) -> str:
         f"  {topic:{width}}  {count:6d}  {summary.types[topic]}"
         for topic, count in sorted(summary.messages.items())
     ]
-    if not summary.complete:
+    if not summary.complete and not summary.damaged:  # damage ends the command with an error
         lines.append(f"save its ticks: egovcp-mcap recover {summary.file} OUT.mcap")
-    return "\n".join(lines)
+    return lines
+
+
+def _state(summary: Summary) -> str:
+    if summary.damaged:
+        return f"DAMAGED, {summary.lost}"
+    return "complete" if summary.complete else "TORN"
 
 
 _SHOWN_GAPS = 10

@@ -1,4 +1,4 @@
-"""`egovcp-mcap recover`: every whole tick of a torn recording, in a new file with an index."""
+"""`egovcp-mcap recover`: the readable ticks of a torn or damaged recording, in a new file."""
 
 from __future__ import annotations
 
@@ -8,15 +8,16 @@ from pathlib import Path
 from egovcp.errors import UsageError
 from egovcp.log.mcap import McapFile
 from egovcp.log.mcap_reader import RecordingReader
+from egovcp.terminal import echo
 
 
 @dataclass(frozen=True)
 class RecoverConfig:
-    """Copy everything of a torn recording up to where it was torn into a new file, which has an
-    index and opens everywhere. The torn file is left as it is, and nothing is overwritten."""
+    """Copy all readable ticks of a torn or damaged recording into a new file with an index, and
+    report which ticks are lost. The old file is not changed, and nothing is overwritten."""
 
     file: str = ""
-    """The torn recording."""
+    """The torn or damaged recording."""
     output: str = ""
     """The new recording."""
 
@@ -25,7 +26,7 @@ CONFIG = RecoverConfig
 
 
 def run(config: RecoverConfig) -> None:
-    """Copy, and say how much.
+    """Copy the ticks and print how many were copied and lost.
 
     Raises:
         DataError: not a recording of ours.
@@ -33,14 +34,24 @@ def run(config: RecoverConfig) -> None:
     """
     if not config.file or not config.output:
         raise UsageError("from where, and where to? egovcp-mcap recover TORN OUT")
-    ticks, complete = recover(Path(config.file), Path(config.output))
-    was = "was complete already" if complete else "was torn"
-    print(f"{config.output}: {ticks} ticks; {config.file} {was}")
+    ticks, reader = recover(Path(config.file), Path(config.output))
+    echo(f"{config.output}: {ticks} ticks; {config.file} {_state(reader)}")
 
 
-def recover(torn: Path, output: Path) -> tuple[int, bool]:
-    """Copy the whole ticks of ``torn``; their number, and whether it was complete."""
-    reader = RecordingReader(torn)
+def _state(reader: RecordingReader) -> str:
+    if reader.damaged:
+        torn = ", and its end is missing" if reader.torn else ""
+        return f"is damaged: {reader.loss_text()}{torn}"
+    return "is torn: its end is missing" if reader.torn else "was complete already"
+
+
+def recover(source: Path, output: Path) -> tuple[int, RecordingReader]:
+    """Copy the readable ticks of ``source``.
+
+    Returns:
+        Their number, and the reader, which knows what is lost.
+    """
+    reader = RecordingReader(source)
     copy = McapFile(output)
     copy.open(reader.metadata)
     ticks = 0
@@ -50,6 +61,8 @@ def recover(torn: Path, output: Path) -> tuple[int, bool]:
                 copy.add(reader.lines[topic], moment.index, moment.time_ns, message.data)
             copy.flush()
             ticks += 1
-    finally:
         copy.close()
-    return ticks, reader.complete
+    except BaseException:
+        copy.discard()
+        raise
+    return ticks, reader

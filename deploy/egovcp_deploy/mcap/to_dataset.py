@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
 import shlex
 from collections import deque
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from egovcp.cli import DatasetConfig
-from egovcp.errors import DataError, EnvironmentFailure, UsageError
+from egovcp.errors import DataError, UsageError
 from egovcp.log.info import RunInfo
 from egovcp.log.mcap_reader import ROW_TOPICS, RecordingReader
 from egovcp.log.tick import Tick
+from egovcp.packages import DATA_MODULES, require_packages
+from egovcp.terminal import echo
 from egovcp_deploy.pilot.states import State
 
 if TYPE_CHECKING:
@@ -48,27 +50,31 @@ def run(config: ToDatasetConfig) -> None:
 
     Raises:
         UsageError: no file is given, or the dataset exists.
-        DataError: a file is no recording of ours, has gaps, or another controller.
+        DataError: a file is no recording of ours, is damaged, has gaps, another controller, or
+            repeats another file.
         EnvironmentFailure: what writes datasets is not installed.
     """
     if not config.files:
         raise UsageError("which recordings? egovcp-mcap to-dataset FILE... --dataset.root=ROOT")
     if config.dataset.revision:
         raise UsageError("--dataset.revision has no meaning for a new dataset; drop it")
-    if find_spec("pyarrow") is None:
-        raise EnvironmentFailure(
-            "datasets are written with pyarrow, which is not installed: pip install 'egovcp[data]'"
-        )
+    require_packages("egovcp-deploy", "writing a dataset", *DATA_MODULES)
     from egovcp.data import DatasetWriter
+    from egovcp.data.destination import require_new, require_replaceable, resolve_root
     from egovcp.data.source import local_root
 
     paths = [Path(file).expanduser() for file in config.files]
-    with DatasetWriter(local_root(config.dataset), provenance(paths)) as writer:
+    root = resolve_root(local_root(config.dataset))
+    require_new(root)
+    require_replaceable(root)
+    known = provenance(paths)
+    require_different(paths, config.gaps)
+    with DatasetWriter(root, known) as writer:
         for path in paths:
             episode, cut = read_episode(path, config.gaps)
             writer.add(episode)
-            print(f"{path}: {len(episode)} ticks{cut}")
-    print(f"{writer.root}: {writer.num_episodes} episodes, {writer.num_frames} frames")
+            echo(f"{path}: {len(episode)} ticks{cut}")
+    echo(f"{writer.root}: {writer.num_episodes} episodes, {writer.num_frames} frames")
 
 
 def provenance(paths: Sequence[Path]) -> Provenance:
@@ -106,11 +112,41 @@ def _config(info: RunInfo) -> dict[str, object]:
     return {name: value for name, value in info.config.items() if name not in own}
 
 
+def require_different(paths: Sequence[Path], gaps: str = "refuse") -> None:
+    """Check that each recording holds another run, before anything is written.
+
+    A copy of a recording is recognised by its rows. The copy may end earlier: a torn or damaged
+    recording that was recovered begins with the same rows.
+
+    Raises:
+        DataError: two recordings have the same rows, or one cannot be converted.
+    """
+    seen: dict[bytes, list[tuple[Path, list[bytes]]]] = {}
+    for path in paths:
+        rows = _row_digests(read_episode(path, gaps)[0])
+        for other, other_rows in seen.setdefault(rows[0], []):
+            shared = min(len(rows), len(other_rows))
+            if rows[:shared] == other_rows[:shared]:
+                raise DataError(
+                    f"{path} repeats {other}: its first {shared} rows are the same; give each "
+                    "rollout once, as its longest recording"
+                )
+        seen[rows[0]].append((path, rows))
+
+
+def _row_digests(episode: Episode) -> list[bytes]:
+    """A digest of each row: what was observed, sent and earned."""
+    columns = (episode.depth, episode.state, episode.action, episode.reward)
+    rows = (b"".join(column[t].tobytes() for column in columns) for t in range(len(episode)))
+    return [hashlib.blake2b(row, digest_size=16).digest() for row in rows]
+
+
 def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
     """A recording as an episode, and words on what was left out.
 
     Raises:
-        DataError: not a recording of ours, ticks are missing, or a value is out of its range.
+        DataError: not a recording of ours, it is damaged, ticks are missing, or a value is out of
+            its range.
     """
     from egovcp.rollouts import episode_of
 
@@ -118,7 +154,8 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
     try:
         moments = reader.moments()
         ticks = _until_over(_driven(moment.tick(ROW_TOPICS) for moment in moments))
-        deque(moments, maxlen=0)  # on to the end: is the file whole?
+        deque(moments, maxlen=0)  # read on to the end: damage may follow the episode
+        reader.require_undamaged()
         whole, why = _before_gap(ticks)
         if why and gaps == "refuse":
             raise DataError(
@@ -128,7 +165,8 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
         episode = episode_of(reader.info, whole)
         episode.validate()
     except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+        place = "" if str(error).startswith(str(path)) else f"{path}: "
+        raise DataError(f"{place}{error}") from error
     cut = f", cut: {why}" if why else ""
     return episode, cut if reader.complete else f"{cut}; the file is torn there"
 

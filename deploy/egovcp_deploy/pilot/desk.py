@@ -18,13 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log.tick import MotorReadings, ValueMap
-from egovcp.plan import Policy, PolicyStep
+from egovcp.plan import Policy, PolicyStep, blank_observation
 from egovcp.rate import Clock
-from egovcp.spec import ACTION_DIM, DEPTH_COLS, DEPTH_ROWS, STATE_DIM, STATE_SLICES
+from egovcp.spec import ACTION_DIM
 from egovcp_deploy.pilot.effort import Effort
 from egovcp_deploy.policy import Adjustable, ImaginingPolicy, RolloutPolicy
 from egovcp_deploy.value_maps import value_maps
 
+SKIPPED: Final = "observation skipped: its state is not finite, or impossible"
 BACKLOG: Final = 8  # reports that may wait for a busy planner; older ones are lost
 
 
@@ -129,6 +130,7 @@ class Thinker:
         last = reports[-1]
         events += self._begin(last)
         step = self._policy.act(last.depth[None], last.state[None], remaining)
+        events += self._skipped()
         plan_ms = (time.perf_counter() - begin) * 1e3
         return Reply(last.tick, step, plan_ms, events=tuple(events))
 
@@ -147,10 +149,8 @@ class Thinker:
 
     def warm_up(self) -> None:
         """Plan and decode once for nothing: the first time takes long."""
-        state = np.zeros(STATE_DIM, np.float32)
-        state[STATE_SLICES["projected_gravity"].stop - 1] = -1.0
-        blind = np.zeros((DEPTH_ROWS, DEPTH_COLS), np.uint16)
-        nothing = Report(0, 0, blind, state, np.zeros(ACTION_DIM), first=True)
+        depth, state = blank_observation(1)
+        nothing = Report(0, 0, depth[0], state[0], np.zeros(ACTION_DIM), first=True)
         for _ in range(2):
             self.decode(self.think([nothing]))
         self._next_tick = None
@@ -159,7 +159,12 @@ class Thinker:
         """A report that is too old to plan from."""
         events = self._begin(report)
         self._policy.observe(report.depth[None], report.state[None])
-        return events
+        return events + self._skipped()
+
+    def _skipped(self) -> list[str]:
+        """The event of an observation that the policy did not use."""
+        policy = self._policy
+        return [SKIPPED] if isinstance(policy, Policy) and policy.skipped.any() else []
 
     def _begin(self, report: Report) -> list[str]:
         gap = self._next_tick is not None and report.tick != self._next_tick

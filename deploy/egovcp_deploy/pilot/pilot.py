@@ -30,6 +30,7 @@ from egovcp_deploy.safety import SafetyFilter
 Array = NDArray[np.float64]
 
 REJECTED: Final = "plan rejected: not finite"
+UNASKED: Final = "plan rejected: for a tick that was not reported"
 _UPRIGHT: Final = Posture(0.0, 0.74)
 
 
@@ -157,6 +158,9 @@ class Pilot:
         """Fetch what the planner has answered by ``now_ns``; the reply of this tick, if it came."""
         fresh = None
         for reply in self._desk.poll(now_ns):
+            if reply.tick > self.tick:  # of no report; it would outlast all that are
+                self._events.append(UNASKED)
+                continue
             while self._unanswered and self._unanswered[0].tick <= reply.tick:
                 self._unanswered.popleft()
             self._events += reply.events

@@ -14,6 +14,7 @@ from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import EnvironmentFailure
 from egovcp.rate import NS_PER_S, FixedRate, MonotonicClock
+from egovcp.terminal import echo
 from egovcp_deploy.robots.body import Eye, Picture
 from egovcp_deploy.robots.depth_wire import WirePicture, encode_picture
 from egovcp_deploy.robots.realsense_eye import RealSenseEye, RealSenseEyeConfig
@@ -99,7 +100,7 @@ def serve(config: DepthServerConfig) -> None:
     eye = RealSenseEye.connect(config.camera)
     try:
         server = DepthServer(eye, config.camera.vertical_fov, config.host, config.port)
-        print(f"{PROG}: depth at {config.host}:{server.port}; Ctrl-C ends it", flush=True)
+        echo(f"{PROG}: depth at {config.host}:{server.port}; Ctrl-C ends it")
         rate = FixedRate(_LOOK_HZ, MonotonicClock())
         rate.start()
         while True:

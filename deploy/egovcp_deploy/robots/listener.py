@@ -1,9 +1,13 @@
-"""Receives from a publisher, newest message only, in a thread that stamps each on arrival.
+"""Receives from a publisher in a thread that stamps each message on arrival.
 
-After a usable message the thread rests for 3 ms. After any message it rests for four times as long
-as handling it took: a flood costs it messages, and this process at most a fifth of one core and of
-the interpreter's lock, whatever the messages are. Nothing queues up: ZMQ keeps the newest message
-and throws the older ones away in a thread of its own, so no reading is older than it seems.
+All messages that have arrived are taken at once, and the newest usable one counts. After that the
+thread rests: for 3 ms or four times as long as its work took, whichever is longer; where nothing
+was usable, or much had to be searched, for forty times as long, up to 15 ms. So a flood costs
+messages, but the interpreter's lock, which the control loop needs as well, is held for little of
+the time: on loaded cores a thread that holds it may be put aside for many milliseconds.
+
+Nothing is believed to be newer than it is: where more messages wait than the queue holds, older
+ones may wait in the network as well, and none of them is used.
 """
 
 from __future__ import annotations
@@ -20,8 +24,13 @@ import zmq
 from egovcp.errors import EnvironmentFailure
 
 _POLL_MS: Final = 50
+_QUEUE: Final = 512  # messages
 _REST_S: Final = 0.003  # after a usable message: 50 Hz loops need no 500 Hz
-_REST_SHARE: Final = 4.0  # of the time that handling a message took
+_REST_SHARE: Final = 4.0  # of the time that handling the messages took
+_FLOOD_SHARE: Final = 40.0  # likewise in a flood
+_MOST_REST_S: Final = 0.015
+_FLOOD: Final = 8  # more messages at once than this are one
+_WORK_NS: Final = 2_000_000  # after which no older message is tried
 _SILENCE_S: Final = 1.0  # after which the connection is made anew
 _PROBE_S: Final = 1.0
 
@@ -34,6 +43,7 @@ def join(end: zmq.Socket[bytes], host: str, port: int) -> None:
     """
     address = f"tcp://{host}:{port}"
     end.setsockopt(zmq.LINGER, 0)
+    end.setsockopt(zmq.RECONNECT_IVL, 20)  # ms
     end.setsockopt(zmq.HEARTBEAT_IVL, 200)  # ms
     end.setsockopt(zmq.HEARTBEAT_TIMEOUT, 1000)
     try:
@@ -56,6 +66,17 @@ def probe(host: str, port: int) -> str:
     return ""
 
 
+def _waiting(end: zmq.Socket[bytes]) -> list[bytes]:
+    """What has arrived, oldest first; at most `_QUEUE`."""
+    messages: list[bytes] = []
+    while len(messages) < _QUEUE:
+        try:
+            messages.append(end.recv(zmq.NOBLOCK))
+        except zmq.Again:
+            break
+    return messages
+
+
 class Listener:
     """One subscription.
 
@@ -64,7 +85,7 @@ class Listener:
         port: its port.
         most_bytes: longer messages end the connection, which is then made anew.
         take: handles a message, given with its time of arrival, monotonic ns; returns whether it
-            was usable. Called in the thread.
+            was usable. Called in the thread, with the newest message first until one is.
 
     Raises:
         EnvironmentFailure: that is no address.
@@ -77,7 +98,7 @@ class Listener:
         self._take = take
         self._context = zmq.Context()
         end = self._context.socket(zmq.SUB)
-        end.setsockopt(zmq.CONFLATE, 1)
+        end.setsockopt(zmq.RCVHWM, _QUEUE)
         end.setsockopt(zmq.MAXMSGSIZE, most_bytes)
         end.setsockopt(zmq.SUBSCRIBE, b"")
         try:
@@ -95,15 +116,31 @@ class Listener:
             while not self._stop.is_set():
                 if end.poll(_POLL_MS):
                     begin = time.monotonic()
-                    usable = self._take(end.recv(), time.monotonic_ns())
+                    messages = _waiting(end)
+                    usable = self._take_newest(messages)
                     heard = time.monotonic()
-                    rest = _REST_SHARE * (heard - begin)
+                    calm = usable and len(messages) <= _FLOOD
+                    share = _REST_SHARE if calm else _FLOOD_SHARE
+                    rest = min(share * (heard - begin), _MOST_REST_S)
                     self._stop.wait(max(rest, _REST_S) if usable else rest)
                 elif time.monotonic() - heard > _SILENCE_S:
                     # libzmq never comes back by itself from a message that was too long
                     end.disconnect(self._address)
                     end.connect(self._address)
                     heard = time.monotonic()
+
+    def _take_newest(self, messages: list[bytes]) -> bool:
+        """Whether one of ``messages``, oldest first, was usable."""
+        now = time.monotonic_ns()
+        deadline = now + _WORK_NS
+        if len(messages) >= _QUEUE:
+            return False
+        for message in reversed(messages):
+            if self._take(message, now):
+                return True
+            if time.monotonic_ns() > deadline:
+                return False
+        return False
 
     def close(self) -> None:
         """End the thread; further calls do nothing."""

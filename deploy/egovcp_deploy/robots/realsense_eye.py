@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from egovcp.bounds import bounded
 from egovcp.errors import EnvironmentFailure
+from egovcp.packages import require_packages
 from egovcp.sim.config import CameraConfig
 from egovcp_deploy.robots.arrivals import Arrivals
 from egovcp_deploy.robots.body import Picture
 from egovcp_deploy.robots.resample import Intrinsics, Resampler
 
-_INSTALL: Final = "install the camera's driver: pip install 'egovcp-deploy[realsense]'"
 _LEAST_COVERAGE: Final = 0.9
 _OLDEST_MS: Final = 10_000  # the age of a picture is the caller's business; this only peeks
 
@@ -129,6 +129,11 @@ class RealSenseEye:
             camera.disconnect()
 
 
+def require_realsense() -> None:
+    """Raise `MissingPackage` where LeRobot's RealSense camera is not installed."""
+    require_packages("egovcp-deploy", "the camera", "lerobot", "pyrealsense2")
+
+
 def _start(config: RealSenseEyeConfig) -> Any:
     """LeRobot's camera, connected."""
     if not config.serial:
@@ -136,10 +141,9 @@ def _start(config: RealSenseEyeConfig) -> Any:
             "no camera was named; give its serial number, which lerobot-find-cameras realsense "
             "prints"
         )
-    try:
-        from lerobot.cameras.realsense import RealSenseCamera, RealSenseCameraConfig
-    except ImportError as error:
-        raise EnvironmentFailure(f"LeRobot is not installed here; {_INSTALL}") from error
+    require_realsense()
+    from lerobot.cameras.realsense import RealSenseCamera, RealSenseCameraConfig
+
     wanted = RealSenseCameraConfig(
         serial_number_or_name=config.serial,
         fps=config.fps,
@@ -151,8 +155,6 @@ def _start(config: RealSenseEyeConfig) -> Any:
     try:
         camera = RealSenseCamera(wanted)
         camera.connect()
-    except ImportError as error:
-        raise EnvironmentFailure(f"{error}; {_INSTALL}") from error
     except (ConnectionError, RuntimeError, TimeoutError, ValueError) as error:
         raise EnvironmentFailure(
             f"the camera {config.serial} cannot be used: {error}; see lerobot-find-cameras "

@@ -15,10 +15,11 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.errors import DataError, EnvironmentFailure, UsageError
+from egovcp.errors import DataError, UsageError
 from egovcp.log.info import CameraView
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import Tick
+from egovcp.packages import DATA_MODULES, require_packages
 from egovcp.sim.config import CameraConfig
 from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.base import Outcome, Sensed
@@ -144,14 +145,14 @@ def _number(path: Path) -> tuple[int, str]:
 
 
 def recorded_run(path: Path) -> Recorded:
-    """The run in an MCAP file of ours, also if it was cut short.
+    """The run in an MCAP file of ours, also if its end is missing.
 
     One on the wall clock begins where the planner took over: its recurrence started there.
 
     Raises:
-        DataError: it is none, or holds no ticks.
+        DataError: it is none, is damaged, or holds no ticks.
     """
-    recording = read_recording(path)
+    recording = read_recording(path, damaged_ok=False)
     ticks = recording.ticks[_take_over(recording.ticks) :]
     return Recorded(
         name=str(path),
@@ -183,13 +184,9 @@ def _outcome(tick: Tick) -> Outcome:
 
 
 def _reader(root: Path) -> DatasetReader:
-    try:
-        from egovcp.data import DatasetConfig, DatasetReader
-    except ModuleNotFoundError as error:
-        raise EnvironmentFailure(
-            f"reading a dataset needs {error.name}, which is not installed here: "
-            "pip install 'egovcp[data]'"
-        ) from error
+    require_packages("egovcp-deploy", "reading a dataset", *DATA_MODULES)
+    from egovcp.data import DatasetConfig, DatasetReader
+
     return DatasetReader.open(DatasetConfig(root=str(root)))
 
 

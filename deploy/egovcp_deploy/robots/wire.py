@@ -24,6 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log.tick import MotorReadings
+from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import NUM_JOINTS
 from egovcp_deploy.robots.body import BodyState, MotorCommand
 from egovcp_deploy.robots.motor_fields import decode_motor_fields, encode_motor_fields
@@ -46,6 +47,7 @@ _MOST_ANGLE: Final = 10.0  # rad
 _MOST_SPEED: Final = 200.0  # rad/s
 _MOST_TORQUE: Final = 1000.0  # N m
 _MOST_GAIN: Final = 1e4
+_ROUNDING: Final = 1e-6  # rad
 _QUATERNION_SLACK: Final = 0.1  # an IMU that is not ready sends zeros
 
 
@@ -92,6 +94,9 @@ def encode_command(command: MotorCommand) -> bytes:
             must not be sent.
     """
     position = _checked(command.position, _MOST_ANGLE, "position")
+    target = np.asarray(command.position)
+    if ((target < TARGET_LOW - _ROUNDING) | (target > TARGET_HIGH + _ROUNDING)).any():
+        raise Garbled("position of a command is beyond the bounds of the joints' targets")
     stiffness = _checked(command.stiffness, _MOST_GAIN, "stiffness", least=0.0)
     damping = _checked(command.damping, _MOST_GAIN, "damping", least=0.0)
     motors = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.backends import library
 from egovcp.plan.backends.judges import FloatJudge, IntegerJudge
@@ -18,6 +18,7 @@ __all__ = ["judge_of_model"]
 def judge_of_model(model: WorldModel, config: PlannerConfig) -> Judge[Carry]:
     """The judge that ``config.backend`` names, made from the model's weights as they are now.
 
+    If ``auto`` cannot use int8 on a processor that is fast at it, a line on stderr says why.
     A subclass of the world model may think differently from its networks: under ``auto`` it is
     asked step by step.
 
@@ -34,9 +35,10 @@ def judge_of_model(model: WorldModel, config: PlannerConfig) -> Judge[Carry]:
         return _integers(model, config)
     if backend == "auto" and model.state_mean.device.type == "cpu" and library.processor_is_fast():
         try:
-            return _integers(model, config)
-        except (EnvironmentFailure, UsageError):
-            pass  # float32 does everywhere
+            if library.library_if_possible() is not None:
+                return _integers(model, config)
+        except UsageError as error:
+            library.warn_float32(str(error))
     dtype = torch.bfloat16 if backend == "bfloat16" else torch.float32
     return FloatJudge(model, config, dtype, compiled=backend == "compile")
 

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from egovcp.cuda_graphs import Recorded
 from egovcp.model import Carry, WorldModel
+from egovcp.plan.backends.compiled import compiled as compile_function
 from egovcp.plan.backends.integers import IntegerNetwork
 from egovcp.plan.backends.network import PlanningNetwork
 from egovcp.plan.backends.reading import noise_of
@@ -40,7 +41,7 @@ class FloatJudge:
         self._worth: Callable[[Root, Tensor, Tensor | None], Tensor]
         self._worth = PlanningNetwork(model, config, dtype).worth
         if compiled:
-            self._worth = torch.compile(self._worth, dynamic=False)
+            self._worth = compile_function(self._worth)
         elif model.state_mean.device.type == "cuda":
             self._root, self._worth = Recorded(self._root), Recorded(self._worth)
 

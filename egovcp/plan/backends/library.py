@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import multiprocessing
 import os
 import platform
 import shutil
@@ -17,6 +18,8 @@ from threading import Lock
 from typing import Final, NamedTuple
 
 from egovcp.errors import EnvironmentFailure
+from egovcp.terminal import echo
+from egovcp.trusted_cache import TrustedCache, load_library, user_cache_folder
 
 SOURCE: Final = Path(__file__).parent / "kernel" / "kernel.c"
 FLAGS: Final = (
@@ -189,19 +192,23 @@ def compiler() -> str | None:
 
 @cache
 def library() -> ctypes.CDLL:
-    """The kernel; compiled, in some 2 s, unless this processor's is in the cache.
+    """The kernel, from the user's cache folder; compiled in about 2 s if it is not there.
 
     Raises:
-        EnvironmentFailure: there is no compiler, or it fails, or the cache cannot be written.
+        EnvironmentFailure: there is no compiler, or it fails, or another user can write to the
+            cache folder.
     """
     flags = (*FLAGS, WITHOUT_TILES) if tiles_are_refused() else FLAGS
-    path = _folder() / f"planner-{_identity(flags)}.so"
+    name = f"planner-{_identity(flags)}.so"
     try:
-        if not path.exists():
-            _compile(path, flags)
-        kernel = ctypes.CDLL(str(path))
+        content = _cached(name, flags)
+        kernel = load_library(content, name)
+    except EnvironmentFailure as error:
+        raise EnvironmentFailure(f"the int8 planner cannot be used: {error}; {OTHERWISE}") from None
     except OSError as error:
-        raise EnvironmentFailure(f"cannot build or load {path}: {error}; {OTHERWISE}") from error
+        raise EnvironmentFailure(
+            f"the int8 planner cannot be compiled or loaded ({error}); {OTHERWISE}"
+        ) from error
     p, i = ctypes.c_void_p, ctypes.c_int32
     for function in (kernel.judge, kernel.help):
         function.argtypes = [p]
@@ -245,9 +252,54 @@ def tiles_are_refused() -> bool:
     return answer != 0
 
 
-def _folder() -> Path:
-    root = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(root) / "egovcp"
+@cache
+def library_if_possible() -> ctypes.CDLL | None:
+    """`library`; None where it cannot be used, which is reported on stderr once."""
+    try:
+        return library()
+    except EnvironmentFailure as error:
+        warn_float32(str(error))
+        return None
+
+
+@cache
+def warn_float32(reason: str) -> None:
+    """Say once, on stderr, why ``--planner.backend=auto`` computes in float32."""
+    _warn(f"{reason}. Planning in float32, which is slower")
+
+
+def _warn(text: str) -> None:
+    if multiprocessing.parent_process() is None:  # else every worker would repeat it
+        echo(f"egovcp: warning: {text}", error=True)
+
+
+def _cached(name: str, flags: Sequence[str]) -> bytes:
+    """The compiled kernel; without a cache folder it is compiled for this process alone."""
+    folder = user_cache_folder()
+    if folder is None:
+        _warn_uncached("the user has no home folder")
+        return _compile(flags)
+    try:
+        cache = TrustedCache(folder)
+    except OSError as error:
+        _warn_uncached(f"{error.filename or folder}: {error.strerror}")
+        return _compile(flags)
+    with cache:
+        content = cache.read(name)
+        if content is None:
+            content = _compile(flags)
+            try:
+                cache.write(name, content)
+            except OSError as error:
+                _warn_uncached(f"{folder}: {error.strerror}")
+        return content
+
+
+def _warn_uncached(reason: str) -> None:
+    _warn(
+        f"the compiled planner cannot be cached ({reason}) and is compiled again by every "
+        "process; set XDG_CACHE_HOME to a folder of your own"
+    )
 
 
 def _identity(flags: Sequence[str]) -> str:
@@ -266,20 +318,31 @@ def _identity(flags: Sequence[str]) -> str:
     return digest.hexdigest()[:16]
 
 
-def _compile(path: Path, flags: Sequence[str]) -> None:
-    """Into a temporary file beside ``path``, then in one step to its place."""
+def _compile(flags: Sequence[str]) -> bytes:
+    """The shared library that the compiler makes of the kernel.
+
+    Raises:
+        EnvironmentFailure: there is no compiler, or it fails.
+        OSError: the temporary folder cannot be written.
+    """
     command = compiler()
     if command is None:
         raise EnvironmentFailure(
-            "the int8 planner needs a C compiler (cc, gcc or clang, or $CC), and there is none; "
-            f"install one, or {OTHERWISE}"
+            "it is compiled on first use, and there is no C compiler (cc, gcc or clang, or $CC); "
+            "install one"
         )
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-        made = Path(folder) / path.name
+    with tempfile.TemporaryDirectory(prefix="egovcp-") as folder:
+        made = Path(folder) / "planner.so"
         arguments = [command, *flags, str(SOURCE), "-o", str(made), "-lm"]
-        done = subprocess.run(arguments, capture_output=True, text=True, check=False)
-        if done.returncode:
-            reason = " ".join(done.stderr.split())[:300]
-            raise EnvironmentFailure(f"{command} cannot compile {SOURCE}: {reason}; {OTHERWISE}")
-        os.replace(made, path)
+        try:
+            done = subprocess.run(
+                arguments, capture_output=True, text=True, errors="replace", check=False
+            )
+        except OSError as error:
+            raise EnvironmentFailure(
+                f"cannot run the compiler {command}: {error.strerror}"
+            ) from error
+        if done.returncode or not made.is_file():
+            reason = " ".join(done.stderr.split())[:300] or f"exit code {done.returncode}"
+            raise EnvironmentFailure(f"{command} cannot compile {SOURCE}: {reason}")
+        return made.read_bytes()

@@ -6,12 +6,9 @@ differs from `egovcp.plan.cem`, which says what is right, by rounding only.
 
 from __future__ import annotations
 
-from functools import cache
-
 import torch
 from torch import Tensor
 
-from egovcp.errors import EnvironmentFailure
 from egovcp.plan.backends import library
 from egovcp.plan.config import PlannerConfig
 from egovcp.plan.search import Belief, white
@@ -60,13 +57,6 @@ class KernelCrossEntropy:
         return Belief(mean, std, elites, top, value)
 
 
-@cache
 def is_at_hand() -> bool:
     """Whether a search may use the kernel: the processor is made for it, and it can be built."""
-    if not library.processor_is_fast():
-        return False
-    try:
-        library.library()
-    except EnvironmentFailure:
-        return False
-    return True
+    return library.processor_is_fast() and library.library_if_possible() is not None

@@ -7,8 +7,8 @@ disk, counts requests and fails on demand (`FakeHub.fail`). On the command line:
     python -m egovcp.testing.hub --root DIR --port 8080
 """
 
-from egovcp.testing.hub.environment import environment, in_this_process
+from egovcp.testing.hub.environment import client_factory, environment, in_this_process
 from egovcp.testing.hub.faults import Fault
 from egovcp.testing.hub.server import FakeHub
 
-__all__ = ["FakeHub", "Fault", "environment", "in_this_process"]
+__all__ = ["FakeHub", "Fault", "client_factory", "environment", "in_this_process"]

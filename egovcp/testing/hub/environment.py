@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 
@@ -61,3 +62,16 @@ def in_this_process(endpoint: str, home: Path) -> Iterator[None]:
         finally:
             huggingface_hub.HfFileSystem.clear_instance_cache()
             huggingface_hub.close_session()
+
+
+@contextlib.contextmanager
+def client_factory(factory: Callable[[], Any]) -> Iterator[None]:
+    """Let `huggingface_hub` send with the clients of ``factory`` until the block ends."""
+    import huggingface_hub
+    from huggingface_hub.utils._http import default_client_factory  # there is no public name
+
+    huggingface_hub.set_client_factory(factory)
+    try:
+        yield
+    finally:
+        huggingface_hub.set_client_factory(default_client_factory)

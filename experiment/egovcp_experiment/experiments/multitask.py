@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.artefact import MANIFEST
+from egovcp.manifest import MANIFEST, read_manifest
 from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.experiment import Experiment
@@ -18,7 +18,7 @@ from egovcp_experiment.report.comparison import comparison
 from egovcp_experiment.report.document import Plot, Report, Table, number
 from egovcp_experiment.report.svg import drawn
 from egovcp_experiment.store import Record
-from egovcp_experiment.tools import read_json, study
+from egovcp_experiment.tools import study
 
 SINGLE: Final = "single"
 MIXED: Final = "mixed"
@@ -118,10 +118,10 @@ def _lengths(config: ExperimentConfig) -> str:
 
 
 def _steps(policy: str) -> str:
-    manifest = Path(policy).expanduser() / MANIFEST
-    if not manifest.is_file():
+    folder = Path(policy).expanduser()
+    if not (folder / MANIFEST).is_file():
         return f"`{policy}`"  # on the Hub, or gone since
-    return f"{read_json(manifest)['step']} gradient steps"
+    return f"{read_manifest(folder).get('step', '?')} gradient steps"
 
 
 def _models(config: ExperimentConfig) -> dict[str, str]:

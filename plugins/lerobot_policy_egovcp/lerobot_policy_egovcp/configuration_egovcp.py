@@ -13,6 +13,7 @@ from egovcp.errors import DataError, UsageError
 from egovcp.model import LossConfig, WorldModelConfig
 from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_answers
+from egovcp.plan.cost import require_affordable
 
 FEATURE_SHAPES = {
     spec.DEPTH_KEY: (1, spec.DEPTH_ROWS, spec.DEPTH_COLS),
@@ -82,6 +83,7 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
                 "none"
             )
         require_answers(self.world_model, self.planner)
+        require_affordable(self.world_model, self.planner)
         self._check_losses()
         if any(mode is not NormalizationMode.IDENTITY for mode in self._modes()):
             raise UsageError(

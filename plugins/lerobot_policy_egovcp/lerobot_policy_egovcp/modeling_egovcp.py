@@ -10,15 +10,17 @@ from typing import Any, Self
 import draccus
 import numpy as np
 import torch
+from draccus.utils import DraccusException
 from lerobot.configs import PreTrainedConfig
 from lerobot.datasets import LeRobotDatasetMetadata
 from lerobot.policies import PreTrainedPolicy
 from torch import Tensor, nn
 
 from egovcp import spec
-from egovcp.artefact import SEAL, Artefact, load_artefact, write_artefact
+from egovcp.artefact import CONFIG, Artefact, load_artefact, write_artefact
 from egovcp.data import DatasetReader
 from egovcp.errors import ArtefactError, UsageError
+from egovcp.manifest import SEAL
 from egovcp.model import WorldModel, world_model_loss
 from egovcp.model.statistics import set_statistics
 from egovcp.plan import Policy
@@ -105,7 +107,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """
         artefact = load_artefact(str(pretrained_name_or_path), revision or "")
         if config is None:
-            config = PreTrainedConfig.from_pretrained(artefact.path)
+            config = _read_config(artefact.path)
         policy = cls(config, dataset_meta=dataset_meta)
         if policy._reader is not None:
             artefact.require_controller(policy._reader.controller_id)
@@ -211,6 +213,15 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         }
         config = draccus.encode(self.config, PreTrainedConfig)
         write_artefact(Path(save_directory), config, weights, self._provenance, {})
+
+
+def _read_config(folder: Path) -> EgovcpConfig:
+    try:
+        config: EgovcpConfig = PreTrainedConfig.from_pretrained(folder)
+        return config
+    except (UsageError, DraccusException, TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())[:300]
+        raise ArtefactError(f"{folder / CONFIG}: {reason}; the file is damaged") from error
 
 
 def _reader(meta: LeRobotDatasetMetadata | None) -> DatasetReader | None:

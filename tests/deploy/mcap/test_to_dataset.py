@@ -163,3 +163,21 @@ def test_a_run_whose_beginning_is_missing_is_refused(
     path = record(missing=missing, keep=live if 3 in missing else lambda tick: tick)
     assert main(["to-dataset", str(path), f"--dataset.root={tmp_path / 'out'}"]) == 3
     assert "its first ticks are missing" in capsys.readouterr().err
+
+
+def test_the_same_rollout_twice_is_refused_before_anything_is_written(
+    record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = record()
+    copy, recovered = tmp_path / "copy.mcap", tmp_path / "recovered.mcap"
+    copy.write_bytes(file.read_bytes())
+    torn = tmp_path / "torn.mcap"
+    torn.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
+    assert main(["recover", str(torn), str(recovered)]) == 0
+    for other in (file, copy, recovered):
+        different = record(f"other-{other.stem}.mcap", number=1)
+        capsys.readouterr()
+        call = ["to-dataset", str(file), str(different), str(other)]
+        assert main([*call, f"--dataset.root={tmp_path / 'new'}"]) == 3
+        assert f"{other} repeats {file}" in capsys.readouterr().err
+        assert not [path for path in tmp_path.iterdir() if "new" in path.name]

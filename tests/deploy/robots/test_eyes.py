@@ -226,7 +226,7 @@ def test_a_narrow_camera_is_refused(camera: FakeRealSense) -> None:
 
 @pytest.mark.skipif(find_spec("pyrealsense2") is not None, reason="the driver is installed")
 def test_a_missing_driver_says_what_to_install() -> None:
-    with pytest.raises(EnvironmentFailure, match=r"lerobot\[intelrealsense\]"):
+    with pytest.raises(EnvironmentFailure, match=r"pyrealsense2.*egovcp-deploy\[realsense\]"):
         RealSenseEye.connect(RealSenseEyeConfig(serial="0123"))
     with pytest.raises(EnvironmentFailure, match="lerobot-find-cameras"):
         RealSenseEye.connect(RealSenseEyeConfig())

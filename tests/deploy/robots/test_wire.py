@@ -15,6 +15,7 @@ from lerobot.robots.unitree_g1.g1_utils import G1_29_JointIndex
 from lerobot.robots.unitree_g1.unitree_sdk2_socket import LowStateMsg
 
 from egovcp.log.tick import MotorReadings
+from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import JOINT_NAMES
 from egovcp_deploy.robots.body import BodyState, MotorCommand
 from egovcp_deploy.robots.remote import Remote
@@ -31,10 +32,11 @@ from egovcp_deploy.robots.wire import (
 
 GRAVITY = np.array([0.0, 0.0, 9.81])
 COUNT = np.arange(29.0)
+TARGETS = TARGET_LOW + COUNT / 28 * (TARGET_HIGH - TARGET_LOW)
 
 
 def command(**changes: Any) -> MotorCommand:
-    fields = {"position": COUNT / 10, "stiffness": COUNT + 50, "damping": COUNT / 7, "mode": 5}
+    fields = {"position": TARGETS, "stiffness": COUNT + 50, "damping": COUNT / 7, "mode": 5}
     return MotorCommand(**(fields | changes))
 
 
@@ -179,6 +181,8 @@ def test_commands_survive_the_wire() -> None:
         {"position": np.full(29, np.inf)},
         {"position": np.full(29, 1e9)},
         {"position": np.zeros(28)},
+        {"position": TARGETS - 0.01 * (COUNT == 0)},
+        {"position": TARGETS + 0.01 * (COUNT == 28)},
         {"stiffness": np.full(29, -1.0)},
         {"damping": np.full(29, -np.inf)},
         {"damping": np.full(29, 1e9)},

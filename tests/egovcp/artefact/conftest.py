@@ -9,14 +9,15 @@ from typing import Any
 
 import pytest
 
-from egovcp.artefact import CONFIG, MANIFEST, WEIGHTS, save_artefact, sealed
-from egovcp.hub import Patience
+from egovcp.artefact import CONFIG, WEIGHTS, save_artefact
+from egovcp.hub import RetryPolicy
+from egovcp.manifest import MANIFEST, sealed
 from egovcp.plan import PlannerConfig
 from egovcp.processors import PROCESSORS
 from egovcp.testing import toy_model
 
 PLANNER = PlannerConfig(samples=32, elites=4, iterations=1, termination_rule="survival")
-QUICK = Patience(attempts=2, wait_s=0.01, timeout_s=20)
+QUICK = RetryPolicy(attempts=2, wait_s=0.01, timeout_s=20)
 PROVENANCE = {"controller_id": "stance-1", "datasets": [{"repo_id": "me/ball"}]}
 
 FILES = {CONFIG, WEIGHTS, MANIFEST, *PROCESSORS}

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.artefact import MANIFEST, WEIGHTS, load_artefact, sealed
+from egovcp.artefact import WEIGHTS, load_artefact
 from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
 from egovcp.hub import Content, Publication, publish
+from egovcp.manifest import MANIFEST, sealed
 from egovcp.testing.hub import FakeHub
 from egovcp.testing.hub.faults import Trouble
 
@@ -27,13 +28,13 @@ def commit(hub: FakeHub, original: Path) -> str:
 
 @pytest.mark.parametrize("path", ["./absent", "/absent/policy", "absent", "a/b/c", "a/b--c", "/"])
 def test_a_path_without_artefact_is_refused_without_network(hub: FakeHub, path: str) -> None:
-    with pytest.raises(ArtefactError, match=rf"no policy artefact at '{path}'|{MANIFEST}"):
+    with pytest.raises(ArtefactError, match=rf"no such folder: '{path}'|{MANIFEST}"):
         load_artefact(path)
     assert not hub.requests
 
 
 def test_a_file_is_no_artefact(original: Path) -> None:
-    with pytest.raises(ArtefactError, match="no policy artefact"):
+    with pytest.raises(ArtefactError, match="not a folder"):
         load_artefact(str(original / WEIGHTS))
 
 

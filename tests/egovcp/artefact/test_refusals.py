@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from egovcp.artefact import CONFIG, MANIFEST, WEIGHTS, load_artefact, read_options
+from egovcp.artefact import CONFIG, WEIGHTS, load_artefact, read_options
 from egovcp.errors import ArtefactError
+from egovcp.manifest import MANIFEST
 from egovcp.model import PRESETS
 from egovcp.processors import PROCESSORS
 
@@ -62,17 +63,17 @@ def test_a_truncated_file_is_noticed(folder: Path, name: str) -> None:
     ("change", "message"),
     [
         (lambda m: m.update(schema_version=1), "schema version 1"),
-        (lambda m: m.pop("schema_version"), "schema version None"),
+        (lambda m: m.pop("schema_version"), "schema version null"),
         (lambda m: m["features"].update(planner_hz=50), "another feature spec.*planner_hz"),
         (lambda m: m["features"]["action_box"].update(low=[0] * 7), "feature spec.*action_box"),
         (lambda m: m["features"]["state_names"].pop(), "feature spec.*state_names"),
         (lambda m: m["features"].update(smell=1), "another feature spec"),
         (lambda m: m.update(features=[1]), "another feature spec"),
         (lambda m: m.pop("features"), "another feature spec"),
-        (lambda m: m.pop("controller_id"), "no controller_id"),
-        (lambda m: m.update(controller_id=7), "no controller_id"),
-        (lambda m: m.pop("files"), "SHA-256"),
-        (lambda m: m.update(files=["a"]), "SHA-256"),
+        (lambda m: m.pop("controller_id"), "controller_id is missing"),
+        (lambda m: m.update(controller_id=7), "controller_id is 7, expected a string"),
+        (lambda m: m.pop("files"), "files is missing"),
+        (lambda m: m.update(files=["a"]), "files is a list, expected an object"),
         (lambda m: m["files"].pop(WEIGHTS), f"{WEIGHTS}.*SHA-256"),
     ],
 )

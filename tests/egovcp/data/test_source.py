@@ -8,11 +8,11 @@ import pytest
 
 from egovcp.data import DatasetConfig, DatasetReader, source
 from egovcp.errors import DataError, EnvironmentFailure
-from egovcp.hub import Content, Patience, Publication, publish
+from egovcp.hub import Content, Publication, RetryPolicy, publish
 from egovcp.testing.hub import FakeHub
 from egovcp.testing.hub.faults import Trouble
 
-QUICK = Patience(attempts=2, wait_s=0.01, timeout_s=20)
+QUICK = RetryPolicy(attempts=2, wait_s=0.01, timeout_s=20)
 SIX = DatasetConfig(repo_id="me/six")
 
 

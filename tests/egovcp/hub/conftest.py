@@ -1,14 +1,14 @@
-"""A small publication, and patience short enough for tests."""
+"""A small publication, and a retry policy short enough for tests."""
 
 import pytest
 
-from egovcp.hub import Content, Patience, Publication
+from egovcp.hub import Content, Publication, RetryPolicy
 
 
 @pytest.fixture
-def quick() -> Patience:
+def quick() -> RetryPolicy:
     """Two tries, hardly a pause."""
-    return Patience(attempts=2, wait_s=0.01, timeout_s=20)
+    return RetryPolicy(attempts=2, wait_s=0.01, timeout_s=20)
 
 
 @pytest.fixture

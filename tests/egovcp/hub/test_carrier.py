@@ -11,19 +11,16 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import httpx
-import huggingface_hub
 import psutil
 import pytest
-from huggingface_hub.utils import _http
 
 from egovcp.errors import EnvironmentFailure
-from egovcp.hub import Patience, Publication, Shelf, publish
+from egovcp.hub import Publication, RetryPolicy, Shelf, publish
 from egovcp.hub import carrier as carriers
 from egovcp.hub import shelf as shelves
 from egovcp.hub.carrier import Carrier, Errand, serve
-from egovcp.hub.patience import Line, is_plain
-from egovcp.testing.hub import FakeHub
+from egovcp.hub.retry import RetryingClient, http_library, uses_default_client
+from egovcp.testing.hub import FakeHub, client_factory
 
 DATA = "data/chunk-000/file-000.parquet"
 
@@ -39,7 +36,7 @@ def carrier(monkeypatch: pytest.MonkeyPatch) -> Iterator[Carrier]:
 
 
 @pytest.fixture
-def shelf(hub: FakeHub, publication: Publication, quick: Patience, tmp_path: Path) -> Shelf:
+def shelf(hub: FakeHub, publication: Publication, quick: RetryPolicy, tmp_path: Path) -> Shelf:
     publish(publication, quick)
     return Shelf.open("me/small", "", quick, tmp_path / "cache", ["meta/*"])
 
@@ -149,19 +146,15 @@ def test_errands_are_answered_by_their_numbers(hub: FakeHub, shelf: Shelf) -> No
 
 
 def test_a_client_of_ones_own_is_used(
-    shelf: Shelf, quick: Patience, monkeypatch: pytest.MonkeyPatch
+    shelf: Shelf, quick: RetryPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shelves, "carrier", lambda _: pytest.fail("by a process without it"))
-    assert is_plain()
-    before = _http._GLOBAL_CLIENT_FACTORY
-    huggingface_hub.set_client_factory(lambda: httpx.Client(follow_redirects=True))
-    try:
-        assert not is_plain()
-        with Line(quick).open():
-            assert not is_plain()
+    assert uses_default_client()
+    with client_factory(lambda: http_library().Client(follow_redirects=True)):
+        assert not uses_default_client()
+        with RetryingClient(quick).open():
+            assert not uses_default_client()
         _expect(shelf)
         assert shelf.has(DATA)
-    finally:
-        huggingface_hub.set_client_factory(before)
-    with Line(quick).open():
-        assert is_plain()
+    with RetryingClient(quick).open():
+        assert uses_default_client()

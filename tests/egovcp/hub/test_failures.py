@@ -7,7 +7,7 @@ import pytest
 from huggingface_hub import constants
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.hub import Patience, Publication, explained, publish, token
+from egovcp.hub import Publication, RetryPolicy, explained, publish, token
 from egovcp.testing.hub import FakeHub
 
 
@@ -20,7 +20,7 @@ def test_a_token_that_is_none_is_refused_unseen(monkeypatch: pytest.MonkeyPatch,
 
 
 def test_a_token_that_the_server_echoes_is_hidden(
-    hub: FakeHub, publication: Publication, quick: Patience, monkeypatch: pytest.MonkeyPatch
+    hub: FakeHub, publication: Publication, quick: RetryPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HF_TOKEN", "hf_secret")
     hub.fail("create", 418, message="who are you, hf_secret?")
@@ -40,7 +40,7 @@ def test_a_full_disk_is_not_the_network() -> None:
 
 
 def test_offline_means_offline(
-    hub: FakeHub, publication: Publication, quick: Patience, monkeypatch: pytest.MonkeyPatch
+    hub: FakeHub, publication: Publication, quick: RetryPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
     with pytest.raises(EnvironmentFailure, match="HF_HUB_OFFLINE is set"):

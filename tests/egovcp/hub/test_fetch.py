@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 from egovcp.errors import DataError, EgovcpError, EnvironmentFailure
-from egovcp.hub import Content, Patience, Publication, fetch, publish, resolve
+from egovcp.hub import Content, Publication, RetryPolicy, fetch, publish, resolve
 from egovcp.testing.hub import FakeHub
 from egovcp.testing.hub.faults import Trouble
 
-HEALTHY = Patience(attempts=3, wait_s=0.01)
+HEALTHY = RetryPolicy(attempts=3, wait_s=0.01)
 ROUTES = ("info", "tree", "metadata", "resolve")
 TROUBLES: tuple[Trouble, ...] = (401, 403, 404, 429, 503, "reset", "truncate")
 
@@ -22,10 +22,10 @@ def commit(hub: FakeHub, publication: Publication) -> str:
     return made
 
 
-def pull(folder: Path, patience: Patience) -> EgovcpError | None:
+def pull(folder: Path, retry: RetryPolicy) -> EgovcpError | None:
     """Resolve and fetch; the error, if there is one."""
     try:
-        fetch("me/small", resolve("me/small", "v3.0", patience), folder, patience)
+        fetch("me/small", resolve("me/small", "v3.0", retry), folder, retry)
     except EgovcpError as error:
         return error
     return None
@@ -46,7 +46,7 @@ def test_trouble_that_lasts_ends_clearly_and_the_next_try_succeeds(
     hub: FakeHub,
     publication: Publication,
     commit: str,
-    quick: Patience,
+    quick: RetryPolicy,
     tmp_path: Path,
     route: str,
     trouble: Trouble,
@@ -85,13 +85,13 @@ def test_a_silent_hub_is_given_up(
     hub: FakeHub, publication: Publication, commit: str, tmp_path: Path
 ) -> None:
     hub.fail("resolve", "stall")
-    error = pull(tmp_path / "folder", Patience(attempts=2, wait_s=0.01, timeout_s=0.5))
+    error = pull(tmp_path / "folder", RetryPolicy(attempts=2, wait_s=0.01, timeout_s=0.5))
     assert isinstance(error, EnvironmentFailure)
     assert "ReadTimeout" in str(error)
 
 
 def test_files_that_have_arrived_are_not_fetched_again(
-    hub: FakeHub, publication: Publication, commit: str, quick: Patience, tmp_path: Path
+    hub: FakeHub, publication: Publication, commit: str, quick: RetryPolicy, tmp_path: Path
 ) -> None:
     hub.fail("resolve", 503, after=2)
     assert pull(tmp_path / "folder", quick) is not None

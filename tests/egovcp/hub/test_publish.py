@@ -6,12 +6,12 @@ from pathlib import Path
 import pytest
 
 from egovcp.errors import DataError, EgovcpError, EnvironmentFailure, UsageError
-from egovcp.hub import Content, LostUpdate, Patience, Publication, publish
+from egovcp.hub import Content, LostUpdate, Publication, RetryPolicy, publish
 from egovcp.testing.hub import FakeHub
 from egovcp.testing.hub.faults import Trouble
 
 REPO = "datasets/me/small"
-HEALTHY = Patience(attempts=3, wait_s=0.01)
+HEALTHY = RetryPolicy(attempts=3, wait_s=0.01)
 
 #: Every request of a push to a new repository.
 ROUTES = (
@@ -35,10 +35,10 @@ REFUSALS = {
 TROUBLES: tuple[Trouble, ...] = (*REFUSALS, 429, 503, "reset", "lose", "truncate")
 
 
-def outcome(publication: Publication, patience: Patience) -> str | EgovcpError:
+def outcome(publication: Publication, retry: RetryPolicy) -> str | EgovcpError:
     """The commit, or the error."""
     try:
-        return publish(publication, patience).commit
+        return publish(publication, retry).commit
     except EgovcpError as error:
         return error
 
@@ -61,7 +61,7 @@ def require_published(hub: FakeHub, publication: Publication, commit: str) -> No
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize("trouble", TROUBLES)
 def test_trouble_that_lasts_ends_clearly_and_publishes_nothing_by_halves(
-    hub: FakeHub, publication: Publication, quick: Patience, route: str, trouble: Trouble
+    hub: FakeHub, publication: Publication, quick: RetryPolicy, route: str, trouble: Trouble
 ) -> None:
     hub.fail(route, trouble, retry_after=0 if trouble == 429 else None)
     found = outcome(publication, quick)
@@ -82,7 +82,7 @@ def test_trouble_that_lasts_ends_clearly_and_publishes_nothing_by_halves(
 def test_a_refusal_says_what_to_do(
     hub: FakeHub,
     publication: Publication,
-    quick: Patience,
+    quick: RetryPolicy,
     route: str,
     status: int,
     message: str,
@@ -106,7 +106,7 @@ def test_trouble_that_passes_is_not_noticed(
 @pytest.mark.parametrize("route", ["info", "lfs_upload", "commit", "tag"])
 def test_a_silent_hub_is_given_up(hub: FakeHub, publication: Publication, route: str) -> None:
     hub.fail(route, "stall")
-    found = outcome(publication, Patience(attempts=2, wait_s=0.01, timeout_s=0.5))
+    found = outcome(publication, RetryPolicy(attempts=2, wait_s=0.01, timeout_s=0.5))
     if route == "commit":  # it was made, as a second look shows
         require_published(hub, publication, str(found))
     else:

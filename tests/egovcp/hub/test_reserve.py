@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.hub import Content, Patience, Publication, publish, reserve
+from egovcp.hub import Content, Publication, RetryPolicy, publish, reserve
 from egovcp.testing.hub import FakeHub, in_this_process
 
 POLICY = Publication("me/policy", {"config.json": Content(b"{}")}, "a policy", repo_type="model")
@@ -18,7 +18,7 @@ def logged_in(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_nobody_is_logged_in(
-    hub: FakeHub, quick: Patience, monkeypatch: pytest.MonkeyPatch
+    hub: FakeHub, quick: RetryPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("HF_TOKEN", raising=False)
     with pytest.raises(EnvironmentFailure, match=r"nobody is logged in.*hf auth login"):
@@ -27,7 +27,7 @@ def test_nobody_is_logged_in(
 
 
 @pytest.mark.usefixtures("logged_in")
-def test_a_token_without_the_right_is_refused(tmp_path: Path, quick: Patience) -> None:
+def test_a_token_without_the_right_is_refused(tmp_path: Path, quick: RetryPolicy) -> None:
     with (
         FakeHub(tmp_path / "hub", token="hf_other") as hub,
         in_this_process(hub.endpoint, tmp_path / "home"),
@@ -37,7 +37,9 @@ def test_a_token_without_the_right_is_refused(tmp_path: Path, quick: Patience) -
 
 
 @pytest.mark.usefixtures("logged_in")
-def test_a_public_repository_is_not_taken_for_a_private_one(hub: FakeHub, quick: Patience) -> None:
+def test_a_public_repository_is_not_taken_for_a_private_one(
+    hub: FakeHub, quick: RetryPolicy
+) -> None:
     reserve(POLICY, quick)
     with pytest.raises(UsageError, match="is public, --private was given"):
         reserve(replace(POLICY, private=True), quick)
@@ -46,7 +48,7 @@ def test_a_public_repository_is_not_taken_for_a_private_one(hub: FakeHub, quick:
 @pytest.mark.usefixtures("logged_in")
 @pytest.mark.parametrize("private", [False, True])
 def test_what_is_reserved_is_empty_and_is_filled_later(
-    hub: FakeHub, quick: Patience, private: bool
+    hub: FakeHub, quick: RetryPolicy, private: bool
 ) -> None:
     policy = replace(POLICY, private=private)
     reserve(policy, quick)
@@ -58,7 +60,7 @@ def test_what_is_reserved_is_empty_and_is_filled_later(
     assert "config.json" in hub.store.commit("models/me/policy", "main").files
 
 
-def test_a_model_and_a_dataset_of_one_name_are_apart(hub: FakeHub, quick: Patience) -> None:
+def test_a_model_and_a_dataset_of_one_name_are_apart(hub: FakeHub, quick: RetryPolicy) -> None:
     publish(POLICY, quick)
     dataset = replace(POLICY, contents={"info.json": Content(b"{}")}, repo_type="dataset")
     publish(dataset, quick)

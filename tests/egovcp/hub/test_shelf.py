@@ -6,14 +6,14 @@ from pathlib import Path
 import pytest
 
 from egovcp.errors import DataError, EnvironmentFailure
-from egovcp.hub import Content, Patience, Publication, Shelf, publish
+from egovcp.hub import Content, Publication, RetryPolicy, Shelf, publish
 from egovcp.testing.hub import FakeHub
 
 DATA = "data/chunk-000/file-000.parquet"
 
 
 @pytest.fixture
-def shelf(hub: FakeHub, publication: Publication, quick: Patience, tmp_path: Path) -> Shelf:
+def shelf(hub: FakeHub, publication: Publication, quick: RetryPolicy, tmp_path: Path) -> Shelf:
     commit = publish(publication, quick).commit
     found = Shelf.open("me/small", "", quick, tmp_path / "cache", ["meta/*"])
     assert found.commit == commit
@@ -82,7 +82,7 @@ def test_a_commit_that_lacks_a_file_is_a_data_error(shelf: Shelf) -> None:
 
 
 def test_a_commit_stays_the_same_whatever_is_published(
-    shelf: Shelf, quick: Patience, publication: Publication
+    shelf: Shelf, quick: RetryPolicy, publication: Publication
 ) -> None:
     other = dict(publication.contents) | {DATA: Content(b"other")}
     publish(Publication("me/small", other, "another version"), quick)

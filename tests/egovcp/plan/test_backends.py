@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import UsageError
 from egovcp.model import PRESETS, Carry, WorldModel, flight
 from egovcp.model.config import FlightConfig, LossConfig
 from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
@@ -257,28 +257,6 @@ def test_where_tiles_are_refused_vectors_say_exactly_the_same(
     finally:
         library.library.cache_clear()
     assert torch.equal(tiles, vectors)
-
-
-def test_without_a_compiler_auto_takes_float32_and_int8_says_what_to_do(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(library, "compiler", lambda: None)
-    monkeypatch.setattr(library, "processor_is_fast", lambda: True)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    library.library.cache_clear()
-    assert isinstance(judge_of_model(toy_model(), PlannerConfig(backend="auto")), FloatJudge)
-    with pytest.raises(EnvironmentFailure, match=r"compiler.*--planner\.backend=float32"):
-        judge_of_model(toy_model(), PlannerConfig(backend="int8"))
-
-
-@needs_compiler
-def test_a_compiler_that_fails_is_quoted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(library, "FLAGS", ("--no-such-flag",))
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    library.library.cache_clear()
-    with pytest.raises(EnvironmentFailure, match="no-such-flag"):
-        judge_of_model(toy_model(), PlannerConfig(backend="int8"))
-    assert not list(tmp_path.rglob("*.so"))
 
 
 @needs_compiler

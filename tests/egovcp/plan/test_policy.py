@@ -177,21 +177,6 @@ def test_a_row_after_its_reset_filters_as_a_new_robot_does() -> None:
         new.advance(sent[1:])
 
 
-def test_a_reset_heals_a_row_that_saw_no_numbers() -> None:
-    policy = Policy(toy_model(), CONFIG, num_envs=2)
-    sight = _see(2, 0)
-    sight.state[1] = np.nan
-    policy.act(*sight)
-    policy.advance(np.zeros((2, A)))
-    hurt = policy.act(*_see(2, 1))
-    assert np.isfinite(hurt.value[0])
-    assert not np.isfinite(hurt.value[1])
-    assert np.isfinite(hurt.action).all()
-    policy.advance(hurt.action)
-    policy.reset(np.array([1]))
-    assert np.isfinite(policy.act(*_see(2, 2)).value).all()
-
-
 def test_a_seed_repeats_a_run_and_a_full_reset_starts_it_again() -> None:
     model = toy_model()
     first = Policy(model, CONFIG, num_envs=2, seed=5)

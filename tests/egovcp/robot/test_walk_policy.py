@@ -87,14 +87,14 @@ GOOD = {"schema": SCHEMA, "content": json.dumps({"config": {}, "provenance": {}}
 @pytest.mark.parametrize(
     ("change", "metadata", "reason"),
     [
-        ({}, {}, "schema is None"),
+        ({}, {}, "schema is null"),
         ({}, GOOD | {"schema": "egovcp-walk-0"}, "egovcp-walk-0"),
         ({}, {"schema": SCHEMA}, "content"),
         ({}, GOOD | {"content": "{"}, "double quotes"),
         ({}, GOOD | {"content": '{"config": {"gaits": 1}, "provenance": {}}'}, "gaits"),
         ({"mean": np.zeros(94, np.float32)}, GOOD, r"mean has shape \(94,\)"),
         ({"mean": np.full(OBSERVATION_DIM, np.nan, np.float32)}, GOOD, "finite"),
-        ({"mean": np.zeros(OBSERVATION_DIM)}, GOOD, "float32"),
+        ({"mean": np.zeros(OBSERVATION_DIM)}, GOOD, "mean has dtype F64, expected F32"),
         ({"std": np.zeros(OBSERVATION_DIM, np.float32)}, GOOD, "not positive"),
         ({"layers.0.bias": np.zeros(5, np.float32)}, GOOD, "layer 0"),
         ({"layers.3.weight": np.zeros((ACTIONS, 3), np.float32)}, GOOD, "layers.3.bias"),

@@ -17,6 +17,7 @@ from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.policy_options import PolicyOptions
+from egovcp.terminal import echo
 from egovcp.trained import returns_of, trained_with
 from egovcp_train.device import choose_device
 from egovcp_train.heldout.episodes import recorded
@@ -86,11 +87,11 @@ def evaluate(config: HeldoutConfig) -> None:
         store = on_task_scales(store, _return_scales(artefact))
     model = artefact.world_model.to(device)
     report = measure(model, recorded(store, device), config.stride)
-    print(table(report.tasks))
+    echo(table(report.tasks))
     _write(output, report, _run(config, artefact, reader))
     if config.pictures:
         _show(output, report, model.config.depth_max_m)
-    print(f"figures: {output / RESULT}")
+    echo(f"figures: {output / RESULT}")
 
 
 def _check(config: HeldoutConfig) -> Path:
@@ -155,9 +156,9 @@ def _show(output: Path, report: Report, depth_max_m: float) -> None:
 
     for name, picture in draw(report).items():
         Image.fromarray(picture).save(output / f"{name}.png", optimize=True)
-        print(f"picture: {output / name}.png")
+        echo(f"picture: {output / name}.png")
     if recording := record(report, output, depth_max_m):
-        print(f"recording: rerun {recording}")
+        echo(f"recording: rerun {recording}")
 
 
 if __name__ == "__main__":

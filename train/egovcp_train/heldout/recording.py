@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -11,6 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from egovcp.model.depth import to_metres
+from egovcp.packages import is_installed
 from egovcp.spec import PLANNER_DT
 from egovcp_train.heldout.report import Report
 from egovcp_train.heldout.strips import STRIP
@@ -32,7 +32,7 @@ def record(report: Report, folder: Path, depth_max_m: float) -> Path | None:
     Returns:
         The file; None where rerun is not installed, or the episodes are too short to foresee.
     """
-    if find_spec("rerun") is None or not any(report.strips.values()):
+    if not is_installed("rerun") or not any(report.strips.values()):
         return None
     import rerun as rr  # half a second
 

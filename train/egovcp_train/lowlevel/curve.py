@@ -18,6 +18,7 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.errors import ArtefactError, EgovcpError
+from egovcp.terminal import echo
 
 COLUMNS: Final = {
     "difficulty": "episode/difficulty",
@@ -107,7 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         write(read(args.runs), args.out)
     except EgovcpError as error:
-        print(f"{parser.prog}: {error}", file=sys.stderr)
+        echo(f"{parser.prog}: {error}", error=True)
         return error.exit_code
     return 0
 

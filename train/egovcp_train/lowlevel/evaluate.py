@@ -18,9 +18,11 @@ from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
 from egovcp.intervals import wilson
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import JOINT_NAMES
+from egovcp.terminal import echo
 from egovcp_train.lowlevel.skills import SKILLS, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
 from egovcp_train.output import require_writable
@@ -78,6 +80,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def evaluate(config: LowLevelEvalConfig) -> None:
     """Play, print the table, write the JSON."""
     skills = _chosen(config.skills)
+    require_packages("egovcp-train", PROG, *SIMULATOR_MODULES)
     controller = make_controller(config.controller)
     output = Path(config.output_dir)
     require_writable(output)
@@ -86,12 +89,12 @@ def evaluate(config: LowLevelEvalConfig) -> None:
         for skill in skills:
             bar.set_postfix_str(skill.name)
             figures[skill.name] = _figures(skill, _play(config, skill, bar))
-    print(table(figures))
+    echo(table(figures))
     loads = _standing_load(config) if "rest" in figures else {}
     output.mkdir(parents=True, exist_ok=True)
     run = {"controller": controller.id, "command": [PROG, *sys.argv[1:]], "seed": config.seed}
     (output / RESULT).write_text(json.dumps(figures | loads | {"_run": run}, indent=2))
-    print(f"figures: {output / RESULT}")
+    echo(f"figures: {output / RESULT}")
 
 
 def _chosen(names: str) -> list[Skill]:
@@ -151,7 +154,7 @@ def _standing_load(config: LowLevelEvalConfig) -> dict[str, Any]:
     from egovcp_train.lowlevel.heat import describe, standing_load
 
     load = standing_load(make_controller(config.controller), config.feet)
-    print(describe(load))
+    echo(describe(load))
     joints = {
         name: {"mean_nm": mean, "needed_nm": needed, "excess_relative": excess}
         for name, mean, needed, excess in zip(

@@ -15,10 +15,12 @@ import torch
 
 from egovcp.bounds import bounded
 from egovcp.cli import run_command, save_config
-from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp.errors import ArtefactError
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.walk_onnx import export_onnx
 from egovcp.robot.walking import WalkConfig
 from egovcp.sim.config import SensorConfig
+from egovcp.terminal import echo
 from egovcp_train.checkpoint import (
     begin_checkpoint,
     checkpoint_dir,
@@ -113,14 +115,10 @@ def train(config: LowLevelTrainConfig) -> None:
 
 def _build(config: LowLevelTrainConfig, threads: int) -> Any:
     """The environment and PPO; imported here, so that --help needs neither."""
-    try:
-        from egovcp_train.lowlevel.env import LowLevelEnv
-        from egovcp_train.lowlevel.learn import PpoLearner
-    except ImportError as error:
-        raise EnvironmentFailure(
-            f"{PROG} needs the package {error.name}, which is not installed here: "
-            "pip install 'egovcp-train[lowlevel]'"
-        ) from error
+    require_packages("egovcp-train", PROG, "rsl_rl", "tensordict", *SIMULATOR_MODULES)
+    from egovcp_train.lowlevel.env import LowLevelEnv
+    from egovcp_train.lowlevel.learn import PpoLearner
+
     env = LowLevelEnv(
         config.robots,
         config.task,
@@ -161,9 +159,9 @@ class _Run:
         )
         final = checkpoint_dir(self.output, learner.iteration) / "pretrained_model" / POLICY_FILE
         state = "done" if finished else "stopped early"
-        print(f"{PROG}: {state} after {learner.steps} steps, difficulty {self._difficulty:.2f}")
-        print(f"controller: {final}")
-        print(f"next: egovcp-eval-lowlevel --controller={final} --output_dir=...")
+        echo(f"{PROG}: {state} after {learner.steps} steps, difficulty {self._difficulty:.2f}")
+        echo(f"controller: {final}")
+        echo(f"next: egovcp-eval-lowlevel --controller={final} --output_dir=...")
         if not finished:
             raise KeyboardInterrupt
 

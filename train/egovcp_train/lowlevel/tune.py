@@ -22,12 +22,13 @@ from tqdm import tqdm
 
 from egovcp.bounds import bounded
 from egovcp.cli import run_command
-from egovcp.errors import EnvironmentFailure
+from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.gait import GaitConfig
 from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.sensors import noise_std
 from egovcp.spec import ACTION_BOX, CONTROLLER_HZ
+from egovcp.terminal import echo
 from egovcp_train.lowlevel import events, rewards
 from egovcp_train.lowlevel.physics import Physics
 from egovcp_train.lowlevel.sensing import measure
@@ -83,13 +84,9 @@ def tune(config: TuneConfig) -> None:
         UsageError: an option makes no sense.
         EnvironmentFailure: the package cma is missing, or the folder cannot be written.
     """
-    try:
-        import cma
-    except ImportError as error:
-        raise EnvironmentFailure(
-            f"{PROG} needs the package cma, which is not installed here: "
-            "pip install 'egovcp-train[lowlevel]'"
-        ) from error
+    require_packages("egovcp-train", PROG, "cma", *SIMULATOR_MODULES)
+    import cma
+
     output = Path(config.output_dir)
     require_writable(output)
     output.mkdir(parents=True, exist_ok=True)
@@ -110,7 +107,7 @@ def tune(config: TuneConfig) -> None:
             most = config.seconds * _MOST
             bar.set_postfix_str(f"best {scores.max() / most:.0%}, mean {scores.mean() / most:.0%}")
             bar.update(1)
-    print(f"gait: {output / RESULT}")
+    echo(f"gait: {output / RESULT}")
 
 
 def flat(gait: GaitConfig) -> Array:

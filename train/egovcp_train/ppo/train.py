@@ -13,7 +13,9 @@ import draccus
 import torch
 
 from egovcp.cli import run_command, save_config
-from egovcp.errors import ArtefactError, EnvironmentFailure
+from egovcp.errors import ArtefactError
+from egovcp.packages import SIMULATOR_MODULES, require_packages
+from egovcp.terminal import echo
 from egovcp_train.checkpoint import (
     begin_checkpoint,
     checkpoint_dir,
@@ -58,13 +60,9 @@ def train(config: PpoTrainConfig) -> None:
 
 def _build(config: PpoTrainConfig, first: int) -> Any:
     """The simulator and PPO; imported here, so that --help needs neither."""
-    try:
-        from egovcp_train.ppo.learn import ContactLearner
-    except ImportError as error:
-        raise EnvironmentFailure(
-            f"{PROG} needs the package {error.name}, which is not installed here: "
-            "pip install 'egovcp-train[lowlevel]'"
-        ) from error
+    require_packages("egovcp-train", PROG, "rsl_rl", "tensordict", *SIMULATOR_MODULES)
+    from egovcp_train.ppo.learn import ContactLearner
+
     return ContactLearner(config, first)
 
 
@@ -94,9 +92,9 @@ def _run(config: PpoTrainConfig, output: Path, learner: Any, spent: float) -> No
     recorder = Recorder(output, enabled=config.tensorboard)
     finished = run_iterations(learner, budget, recorder, save, config.save_freq, _summary)
     final = checkpoint_dir(output, learner.iteration) / "pretrained_model" / POLICY_FILE
-    print(f"{PROG}: {'done' if finished else 'stopped early'} after {learner.steps} steps")
-    print(f"policy: {final}")
-    print(f"next: egovcp-eval --controllers=ppo --ppo.path={final} --task=... --output_dir=...")
+    echo(f"{PROG}: {'done' if finished else 'stopped early'} after {learner.steps} steps")
+    echo(f"policy: {final}")
+    echo(f"next: egovcp-eval --controllers=ppo --ppo.path={final} --task=... --output_dir=...")
     if not finished:
         raise KeyboardInterrupt
 

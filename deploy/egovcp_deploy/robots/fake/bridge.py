@@ -6,7 +6,9 @@ without commands is this fake's own choice, not knowledge about the robot: after
 
 from __future__ import annotations
 
+import os
 from collections import deque
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -18,7 +20,7 @@ from egovcp.errors import EnvironmentFailure
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.sim.live import LIMP, LiveRobot, Phase, Servos
-from egovcp.spec import NUM_JOINTS, PHYSICS_DT
+from egovcp.spec import JOINT_NAMES, NUM_JOINTS, PHYSICS_DT
 from egovcp_deploy.robots.body import BodyState
 from egovcp_deploy.robots.depth_wire import WirePicture, encode_picture
 from egovcp_deploy.robots.fake.faults import Faults
@@ -41,6 +43,8 @@ _MOTOR_DEG_C: Final = 35.0
 _DISCONNECTED: Final = 0x80000000  # see `motor_fields.FAULTS`
 _COUNTED_S: Final = 0.5  # how long a program counts as one that sends commands
 _MOST_PER_STEP: Final = 100  # commands taken in within 5 ms; the rest waits
+_GARBAGE_BYTES: Final = 2000
+_FALSE_JOINT: Final = JOINT_NAMES.index("left_knee_joint")
 
 
 @dataclass(frozen=True)
@@ -95,6 +99,12 @@ class FakeBridge:
         self._robot = robot
         self.faults = faults or Faults()
         self.pressed: frozenset[str] = frozenset()
+        self.tamper_state: Callable[[bytes], Iterable[bytes]] = lambda message: (message,)
+        """A state as it is -> the messages that are sent for it."""
+        self.tamper_picture: Callable[[bytes], Iterable[bytes]] = lambda message: (message,)
+        """Likewise for pictures."""
+        self.on_command: Callable[[bytes], None] = lambda message: None
+        """Called with every message on the command port."""
         self.counts = Counts()
         self._announce = announce
         self._detailed = detailed
@@ -171,6 +181,7 @@ class FakeBridge:
                 break
             self._senders[int(frame.get(zmq.SRCFD))] = self._time
             waiting.append(frame.bytes)
+            self.on_command(frame.bytes)
         while waiting and not self.faults.deaf:
             if self._take(waiting.pop()):
                 self.counts.commands += len(waiting)
@@ -252,19 +263,28 @@ class FakeBridge:
         if self._lost():
             return
         torn = faults.garble_state and self.robot.steps % 2
-        self._states.send(self._last_state[: len(self._last_state) // 2 if torn else None])
+        state = self._last_state[: len(self._last_state) // 2 if torn else None]
+        for message in self.tamper_state(state):
+            self._states.send(message)
+        for _ in range(faults.flood):
+            self._states.send(os.urandom(_GARBAGE_BYTES))
 
     def _lost(self) -> bool:
         return self.faults.drop > 0.0 and bool(self._rng.random() < self.faults.drop)
 
     def _state(self) -> bytes:
         seen = self.robot.measure()
+        speed, rate = seen.joint_velocity, seen.angular_velocity
+        if self.faults.joint_speed:
+            speed[_FALSE_JOINT] = self.faults.joint_speed
+        if self.faults.gyroscope:
+            rate[0] = self.faults.gyroscope
         body = BodyState(
             time_ns=0,
             joint_position=seen.joint_position,
-            joint_velocity=seen.joint_velocity,
+            joint_velocity=speed,
             quaternion_w=seen.quaternion_w,
-            angular_velocity=seen.angular_velocity,
+            angular_velocity=rate,
             mode=self._mode,
             remote=Remote.asking_for(self.robot.velocity_wish, self.pressed).to_bytes(),
             motors=self._motors(seen.torque),
@@ -289,7 +309,8 @@ class FakeBridge:
             age = (self.robot.steps - taken) * PHYSICS_DT
             self._last_picture = encode_picture(WirePicture(self._sequence, fov, depth, age))
         if self._sequence and not self._lost():
-            self._pictures.send(self._last_picture)
+            for message in self.tamper_picture(self._last_picture):
+                self._pictures.send(message)
 
     @property
     def over(self) -> bool:

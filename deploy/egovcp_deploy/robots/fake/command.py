@@ -20,6 +20,7 @@ from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.live import LiveRobot, Outcome
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import PHYSICS_DT
+from egovcp.terminal import echo
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from egovcp_deploy.robots.fake.faults import WORDS, Faults
 from egovcp_deploy.robots.fake.stage import Schedule, Stage
@@ -208,7 +209,7 @@ def _sum_up(outcomes: Sequence[Outcome]) -> None:
 
 
 def _say(line: str) -> None:
-    print(f"{PROG}: {line}", flush=True)
+    echo(f"{PROG}: {line}")
 
 
 if __name__ == "__main__":

@@ -43,6 +43,12 @@ class Faults:
     """A joint's motor no longer obeys: no torque. Without detailed states nothing tells of it."""
     no_temperature: bool = False
     """States carry no temperatures, as from older firmware."""
+    gyroscope: float = 0.0
+    """The gyroscope's x axis reports this rate, rad/s, whatever the robot does."""
+    joint_speed: float = 0.0
+    """The left knee reports this speed, rad/s, whatever it does."""
+    flood: int = 0
+    """Messages of 2 kB of garbage on the state port, for each state."""
     push: tuple[float, float] | None = None
     """Change of the base's velocity, m/s, world x and y; happens once."""
     release: bool = False
@@ -68,7 +74,7 @@ class Faults:
             self.push = _pair(rest) if rest else _PUSH
         elif word in ("hot_motor", "dropped_motor"):
             self._set_motor(word, rest)
-        elif word in ("drop", "mode"):
+        elif word in _NUMBERS:
             self._set_number(word, rest)
         elif word in _SWITCHES:
             setattr(self, word, rest != ["off"])
@@ -77,14 +83,15 @@ class Faults:
         return f"faults: {', '.join(self.active) or 'none'}"
 
     def _set_number(self, word: str, rest: list[str]) -> None:
+        kind, low, high, example = _NUMBERS[word]
+        if rest == ["off"]:
+            setattr(self, word, getattr(Faults(), word))
+            return
         try:
             number = float(rest[0])
+            setattr(self, word, kind(min(max(number, low), high)))
         except (IndexError, ValueError) as error:
-            raise UsageError(f"{word} needs a number, such as {word} 0.5") from error
-        if word == "drop":
-            self.drop = min(max(number, 0.0), 1.0)
-        else:
-            self.mode = int(number)
+            raise UsageError(f"{word} needs a number, such as {word} {example}") from error
 
     def _set_motor(self, word: str, rest: list[str]) -> None:
         if rest == ["off"]:
@@ -119,6 +126,14 @@ def _pair(words: list[str]) -> tuple[float, float]:
     return x, y
 
 
+#: Word -> type, least, greatest and an example of its number.
+_NUMBERS: Final[dict[str, tuple[type[int] | type[float], float, float, str]]] = {
+    "drop": (float, 0.0, 1.0, "0.5"),
+    "mode": (int, 0, 255, "6"),
+    "gyroscope": (float, -1e6, 1e6, "150"),
+    "joint_speed": (float, -1e6, 1e6, "190"),
+    "flood": (int, 0, 1000, "20"),
+}
 _SWITCHES: Final = tuple(f.name for f in fields(Faults) if f.type == "bool")
 #: All that `Faults.obey` knows.
-WORDS: Final = (*_SWITCHES, "hot_motor", "dropped_motor", "push", "drop", "mode", "heal")
+WORDS: Final = (*_SWITCHES, *_NUMBERS, "hot_motor", "dropped_motor", "push", "heal")

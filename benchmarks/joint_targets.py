@@ -1,0 +1,85 @@
+"""How far each joint's target passes the joint's range: what `egovcp.robot.targets` allows.
+
+Plays every task with both low-level controllers, once with random hands and once with the oracle
+(blocks, braces after pushes, walks under the arch). Robots that fall are left out: a controller
+that has lost its balance asks for anything.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from report import parser, publish
+
+from egovcp.robot.controller import LowLevelController
+from egovcp.robot.controllers import make_controller
+from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER
+from egovcp.sim.config import eventful
+from egovcp.sim.env import VectorEnv
+from egovcp.sim.oracles import Oracle
+from egovcp.sim.policies import Policy, RandomWalk
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import JOINT_NAMES, TASKS
+
+Array = NDArray[np.float64]
+
+
+class Recorder:
+    """A controller that remembers the greatest excess of its targets, per robot."""
+
+    def __init__(self, controller: LowLevelController, robots: int) -> None:
+        self._controller = controller
+        self.below = np.full((robots, len(JOINT_NAMES)), -np.inf)
+        self.above = np.full((robots, len(JOINT_NAMES)), -np.inf)
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._controller, name)
+
+    def step(self, state: NDArray[np.floating]) -> Array:
+        target = self._controller.step(state)
+        if len(target) == len(self.above):
+            self.below = np.maximum(self.below, JOINT_LOWER - target)
+            self.above = np.maximum(self.above, target - JOINT_UPPER)
+        return target
+
+
+def excess(which: str, task: str, policy: Policy, robots: int, seed: int) -> tuple[Array, Array]:
+    """(29,) rad below and above the range, the greatest of all robots that did not fall."""
+    recorder = Recorder(make_controller(which), robots)
+    config = replace(eventful(), controller=which)
+    env = VectorEnv(config, robots, recorder, pictures=False)  # type: ignore[arg-type]
+    scenarios = [Scenario(task, seed, i) for i in range(robots)]
+    env.reset(scenarios)
+    policy.reset(env, scenarios)
+    while not env.done.all():
+        env.step(policy.act(env))
+    stood = np.array([not lane.terminated for lane in env.lanes])
+    nothing = np.full(len(JOINT_NAMES), -np.inf)
+    below = recorder.below[stood].max(axis=0, initial=-np.inf)
+    above = recorder.above[stood].max(axis=0, initial=-np.inf)
+    return np.maximum(below, nothing), np.maximum(above, nothing)
+
+
+def main() -> None:
+    p = parser(__doc__)
+    p.add_argument("--robots", type=int, default=16, help="episodes of each kind")
+    p.add_argument("--seed", type=int, default=5, help="of the scenarios")
+    args = p.parse_args()
+    below = np.full(len(JOINT_NAMES), -np.inf)
+    above = below.copy()
+    for which in ("walk", "stance"):
+        for task in TASKS:
+            for policy in (RandomWalk(), Oracle()):
+                found = excess(which, task, policy, args.robots, args.seed)
+                below, above = np.maximum(below, found[0]), np.maximum(above, found[1])
+    figures: dict[str, object] = {}
+    for i, name in enumerate(JOINT_NAMES):
+        figures[f"{name}_below_rad"] = float(below[i])
+        figures[f"{name}_above_rad"] = float(above[i])
+    publish(figures, args.json)
+
+
+if __name__ == "__main__":
+    main()

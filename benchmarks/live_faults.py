@@ -1,0 +1,116 @@
+"""Every kind of fault, many times, against the fake G1 over the real wire, on loaded cores.
+
+Writes the table of docs/robot.md. Fails (exit code 1) if a fault does not end as it must, or if
+the 99th percentile of the time to DAMP of any kind that must damp is beyond 250 ms.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from report import parser, publish
+
+from egovcp_deploy.fault_injection.kinds import FAULTS, FaultKind, Outcome
+from egovcp_deploy.fault_injection.rig import FaultRig
+from egovcp_deploy.fault_injection.table import DAMP_LIMIT_MS, Row, markdown, percentile, run_fault
+
+
+def burn() -> None:
+    """Occupy a core until killed."""
+    while True:
+        sum(range(10000))
+
+
+@contextmanager
+def loaded(processes: int) -> Iterator[None]:
+    """``processes`` busy processes beside the measurement."""
+    context = multiprocessing.get_context("spawn")
+    busy = [context.Process(target=burn, daemon=True) for _ in range(processes)]
+    for process in busy:
+        process.start()
+    try:
+        yield
+    finally:
+        for process in busy:
+            process.kill()
+            process.join()
+
+
+def run_all(kinds: Sequence[FaultKind], repetitions: int) -> list[Row]:
+    """All faults in turn, ``repetitions`` times over."""
+    rows = []
+    rig = FaultRig()
+    try:
+        for repetition in range(repetitions):
+            for kind in kinds:
+                row = run_fault(rig, kind)
+                rows.append(row)
+                if row.problem:
+                    print(f"{kind.name}: {row.problem}", file=sys.stderr, flush=True)
+            print(f"{repetition + 1} of {repetitions}", file=sys.stderr, flush=True)
+    finally:
+        rig.close()
+    return rows
+
+
+def figures(rows: Sequence[Row]) -> dict[str, object]:
+    """Flat keys: per kind and over all."""
+    out: dict[str, object] = {"kinds": len({row.kind.name for row in rows}), "runs": len(rows)}
+    for name in dict.fromkeys(row.kind.name for row in rows):
+        same = [row for row in rows if row.kind.name == name]
+        key = "".join(c if c.isalnum() else "_" for c in name)
+        out[f"{key}_ends"] = ",".join(sorted({row.end for row in same}))
+        out[f"{key}_hold_ms_p50"] = percentile([row.held_ms for row in same], 50)
+        out[f"{key}_damp_ms_p50"] = percentile([row.damped_ms for row in same], 50)
+        out[f"{key}_damp_ms_p99"] = percentile([row.damped_ms for row in same], 99)
+        out[f"{key}_greatest_change_rad"] = max(row.greatest_change for row in same)
+    timed = [row.damped_ms for row in rows if row.kind.outcome is Outcome.DAMP]
+    out["all_damp_ms_p50"] = percentile(timed, 50)
+    out["all_damp_ms_p99"] = percentile(timed, 99)
+    out["all_damp_ms_max"] = percentile(timed, 100)
+    out["unsound_commands"] = sum(row.unsound for row in rows)
+    out["problems"] = sum(bool(row.problem) for row in rows)
+    return out
+
+
+def too_late(rows: Sequence[Row]) -> list[str]:
+    """Kinds that must damp and do so too late."""
+    names = dict.fromkeys(r.kind.name for r in rows if r.kind.outcome is Outcome.DAMP)
+    late = []
+    for name in names:
+        p99 = percentile([row.damped_ms for row in rows if row.kind.name == name], 99)
+        if p99 is not None and p99 > DAMP_LIMIT_MS:
+            late.append(f"{name}: {p99:.0f} ms")
+    return late
+
+
+def main() -> None:
+    p = parser(__doc__)
+    p.add_argument("--repetitions", type=int, default=20, help="runs of each kind")
+    p.add_argument("--only", default="", help="kinds whose name contains this")
+    p.add_argument("--load", type=int, default=os.cpu_count(), help="busy processes beside it")
+    p.add_argument("--markdown", type=Path, help="also write the table to this file")
+    args = p.parse_args()
+    kinds = [kind for kind in FAULTS if args.only in kind.name]
+    with loaded(args.load):
+        rows = run_all(kinds, args.repetitions)
+    table = markdown(rows)
+    print(table)
+    if args.markdown is not None:
+        args.markdown.write_text(table, encoding="utf-8")
+    publish(figures(rows) | {"load_processes": args.load}, args.json)
+    late = too_late(rows)
+    problems = [f"{row.kind.name}: {row.problem}" for row in rows if row.problem]
+    for line in [*problems, *late]:
+        print(f"problem: {line}", file=sys.stderr)
+    if problems or late:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,453 @@
+"""Every kind of fault that a live run is tested with, and what must come of it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import zlib
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Any, Final
+
+import numpy as np
+
+from egovcp.plan import PolicyStep
+from egovcp.spec import ACTION_DIM, JOINT_NAMES
+from egovcp_deploy.fault_injection.proxy import Stream
+from egovcp_deploy.fault_injection.rig import FaultRig, answer_steadily, steady
+from egovcp_deploy.live.link import Order, encode_reply
+from egovcp_deploy.pilot.desk import Reply, Report
+from egovcp_deploy.pilot.states import Request
+
+Begin = Callable[[FaultRig], None]
+Tamper = Callable[[bytes], Iterable[bytes]]
+Edit = Callable[[dict[str, Any]], None]
+
+_KNEE: Final = JOINT_NAMES.index("left_knee_joint")
+
+
+class Outcome(StrEnum):
+    """What must come of a fault."""
+
+    RUN = "run"
+    """It is bridged: never damped, never held for want of proprioception, and back in RUN."""
+    HOLD = "hold"
+    """Held, not damped, and back in RUN when the fault is over."""
+    DAMP = "damp"
+    """Damped within the limit of the last good reading."""
+    LATER = "later"
+    """Damped at some time: once the robot tilts, or once no more good states get through."""
+    ANY = "any"
+    """Not known here, or not the runner's to decide; only the commands are judged."""
+
+
+@dataclass(frozen=True)
+class FaultKind:
+    """One fault.
+
+    Args:
+        name: unique.
+        outcome: what must come of it.
+        begin: starts it; called in the robot's thread, between two steps.
+        duration_s: how long it lasts, if it does not damp.
+        since_onset: whether times count from the onset, for faults that are not of the states;
+            else from the last good state.
+    """
+
+    name: str
+    outcome: Outcome
+    begin: Begin
+    duration_s: float = 0.5
+    since_onset: bool = False
+
+
+# --- states ------------------------------------------------------------------------------
+def _fault(name: str, value: object = True) -> Begin:
+    """One of the fake's own faults (`robots.fake.Faults`)."""
+    return lambda rig: setattr(rig.fake.faults, name, value)
+
+
+def _states(tamper: Tamper) -> Begin:
+    return lambda rig: setattr(rig.fake, "tamper_state", tamper)
+
+
+def _replaced(*messages: bytes) -> Begin:
+    return _states(lambda message: messages)
+
+
+def _edited(edit: Edit) -> Tamper:
+    def tamper(message: bytes) -> Iterable[bytes]:
+        content = json.loads(message)
+        edit(content["data"])
+        return (json.dumps(content).encode(),)
+
+    return tamper
+
+
+def _once(tamper: Tamper) -> Tamper:
+    """Only the first state."""
+    return _every(10**9, tamper)
+
+
+def _every(period: int, tamper: Tamper) -> Tamper:
+    """The first state and then every ``period``-th."""
+    count = iter(range(10**12))
+    return lambda message: tamper(message) if next(count) % period == 0 else (message,)
+
+
+def _for_states(number: int, tamper: Tamper) -> Tamper:
+    """Only the first ``number`` states."""
+    count = iter(range(10**12))
+    return lambda message: tamper(message) if next(count) < number else (message,)
+
+
+def _nothing(message: bytes) -> Iterable[bytes]:
+    return ()
+
+
+def _garbage(number: int) -> list[bytes]:
+    """New each time: a message that repeats the one before costs nothing."""
+    return [os.urandom(_GARBAGE_BYTES) for _ in range(number)]
+
+
+def _valid_json(number: int) -> list[bytes]:
+    """30 kB each."""
+    values = np.random.default_rng().random(1500).tolist()
+    body = {"topic": "rt/lowstate", "data": {"x": values}}
+    return [json.dumps(body | {"n": i}).encode() for i in range(number)]
+
+
+def _with(extra: Callable[[], Iterable[bytes]]) -> Tamper:
+    """Each state, and further messages after it."""
+    return lambda message: (message, *extra())
+
+
+def _instead(messages: Callable[[], Iterable[bytes]]) -> Begin:
+    return _states(lambda message: messages())
+
+
+def _motor(joint: int, name: str, change: Callable[[float], object]) -> Edit:
+    def edit(data: dict[str, Any]) -> None:
+        motor = data["motor_state"][joint]
+        motor[name] = change(motor[name])
+
+    return edit
+
+
+def _all_motors(name: str, change: Callable[[int, float], object]) -> Edit:
+    def edit(data: dict[str, Any]) -> None:
+        for i, motor in enumerate(data["motor_state"][: len(JOINT_NAMES)]):
+            motor[name] = change(i, motor[name])
+
+    return edit
+
+
+def _imu(name: str, change: Callable[[list[float]], object]) -> Edit:
+    def edit(data: dict[str, Any]) -> None:
+        data["imu_state"][name] = change(data["imu_state"][name])
+
+    return edit
+
+
+def _set(name: str, value: object) -> Edit:
+    return lambda data: data.__setitem__(name, value)
+
+
+def _without(name: str) -> Edit:
+    def edit(data: dict[str, Any]) -> None:
+        del data[name]
+
+    return edit
+
+
+def _rolled(quaternion: list[float], angle: float = 0.8) -> list[float]:
+    w, x, y, z = quaternion
+    c, s = np.cos(angle / 2), np.sin(angle / 2)
+    return [float(v) for v in (w * c - x * s, w * s + x * c, y * c + z * s, z * c - y * s)]
+
+
+def _wild(data: dict[str, Any]) -> None:
+    rng = np.random.default_rng(zlib.crc32(json.dumps(data["motor_state"][0]).encode()))
+    for motor in data["motor_state"][: len(JOINT_NAMES)]:
+        motor["q"] = float(rng.uniform(-0.2, 0.2))
+        motor["dq"] = float(rng.uniform(-10, 10))
+
+
+def _raw(text: str, number: str) -> Tamper:
+    """The first knee position replaced by ``number`` as it stands."""
+
+    def tamper(message: bytes) -> Iterable[bytes]:
+        content = json.loads(message)
+        content["data"]["motor_state"][_KNEE]["q"] = text
+        return (json.dumps(content).replace(f'"{text}"', number).encode(),)
+
+    return tamper
+
+
+def _number(number: str) -> Begin:
+    return _states(_raw("PLACEHOLDER", number))
+
+
+_GARBAGE_BYTES: Final = 2000
+_FULL_RATE: Final = 100  # messages per state, 20 000 a second
+
+
+def _repeats() -> Tamper:
+    """Each state is the first one, twenty times."""
+    first: list[bytes] = []
+
+    def tamper(message: bytes) -> Iterable[bytes]:
+        first.extend([message] if not first else [])
+        return first * 20
+
+    return tamper
+
+
+def _stream(stream: Stream, tamper: Tamper | None = None) -> Begin:
+    def begin(rig: FaultRig) -> None:
+        rig.proxy.stream = stream
+        if tamper is not None:
+            rig.fake.tamper_state = tamper
+
+    return begin
+
+
+_R, _H, _D, _ANY = Outcome.RUN, Outcome.HOLD, Outcome.DAMP, Outcome.ANY
+
+_STATES: Final = (
+    FaultKind("state: silent", _D, _fault("mute_state")),
+    FaultKind("state: silent for 60 ms", _R, _states(_for_states(12, _nothing))),
+    FaultKind("state: silent for 150 ms", _H, _states(_for_states(30, _nothing))),
+    FaultKind("state: frozen", _D, _fault("freeze_state")),
+    FaultKind("state: every second torn", _R, _fault("garble_state")),
+    FaultKind("state: all torn", _D, _states(lambda m: (m[: len(m) // 2],))),
+    FaultKind("state: 30 % lost", _R, _fault("drop", 0.3)),
+    FaultKind("state: empty messages", _D, _replaced(b"")),
+    FaultKind("state: not JSON", _D, _replaced(b"\xff\xfe not json")),
+    FaultKind("state: another topic", _D, _replaced(b'{"topic": "rt/other", "data": {}}')),
+    FaultKind("state: a JSON list", _D, _replaced(b"[1, 2, 3]")),
+    FaultKind("state: nested 30000 deep", _D, _replaced(b"[" * 30000)),
+    FaultKind("state: position NaN", _D, _number("NaN")),
+    FaultKind("state: position Infinity", _D, _number("-Infinity")),
+    FaultKind("state: position 1e400", _D, _number("1e400")),
+    FaultKind("state: position with 4000 digits", _D, _number("9" * 4000)),
+    FaultKind("state: position null", _D, _number("null")),
+    FaultKind("state: position a string", _D, _number('"0.3"')),
+    FaultKind("state: position true", _D, _number("true")),
+    FaultKind("state: no motors", _D, _states(_edited(_without("motor_state")))),
+    FaultKind(
+        "state: 29 motor slots",
+        _D,
+        _states(_edited(lambda d: d.__setitem__("motor_state", d["motor_state"][:29]))),
+    ),
+    FaultKind("state: no IMU", _D, _states(_edited(_without("imu_state")))),
+    FaultKind("state: no mode machine", _D, _states(_edited(_without("mode_machine")))),
+    FaultKind(
+        "state: remote control not base64", _D, _states(_edited(_set("wireless_remote", "%")))
+    ),
+    FaultKind(
+        "state: quaternion zero", _D, _states(_edited(_imu("quaternion", lambda q: [0.0] * 4)))
+    ),
+    FaultKind(
+        "state: quaternion of length 2",
+        _D,
+        _states(_edited(_imu("quaternion", lambda q: [2 * v for v in q]))),
+    ),
+)
+_gyro: Final = _edited(_imu("gyroscope", lambda w: [150.0, *w[1:]]))
+_speed: Final = _edited(_motor(_KNEE, "dq", lambda v: 190.0))
+_jump: Final = _edited(_motor(_KNEE, "q", lambda q: q + 0.5))
+_IMPLAUSIBLE: Final = (
+    FaultKind("gyroscope: 150 rad/s", _D, _fault("gyroscope", 150.0)),
+    FaultKind("gyroscope: 150 rad/s once", _R, _states(_once(_gyro))),
+    FaultKind("gyroscope: 150 rad/s at 50 Hz", _R, _states(_every(4, _gyro))),
+    FaultKind("gyroscope: 20 rad/s", _D, _fault("gyroscope", 20.0)),
+    FaultKind("joint speed: 190 rad/s", _D, _fault("joint_speed", 190.0)),
+    FaultKind("joint speed: 190 rad/s once", _R, _states(_once(_speed))),
+    FaultKind("joint speed: 190 rad/s at 50 Hz", _R, _states(_every(4, _speed))),
+    FaultKind("joint speed: 25 rad/s", _D, _fault("joint_speed", 25.0)),
+    FaultKind(
+        "joint speed: all +-190 rad/s",
+        _D,
+        _states(_edited(_all_motors("dq", lambda i, v: 190.0 * (-1) ** i))),
+    ),
+    FaultKind("joint position: 9 rad", _D, _states(_edited(_motor(_KNEE, "q", lambda q: 9.0)))),
+    FaultKind("joint position: jumps by 0.5 rad", _D, _states(_jump)),
+    FaultKind("joint position: jumps by 0.5 rad once", _R, _states(_once(_jump))),
+    FaultKind("joint position: all zero", _D, _states(_edited(_all_motors("q", lambda i, q: 0.0)))),
+    FaultKind("joints: random within bounds", _D, _states(_edited(_wild))),
+    FaultKind("torque: 900 N m", _D, _states(_edited(_motor(_KNEE, "tau_est", lambda t: 900.0)))),
+    FaultKind(
+        "torque: 900 N m once",
+        _R,
+        _states(_once(_edited(_motor(_KNEE, "tau_est", lambda t: 900.0)))),
+    ),
+    FaultKind("orientation: jumps by 0.8 rad", _D, _states(_edited(_imu("quaternion", _rolled)))),
+    FaultKind(
+        "orientation: jumps by 0.8 rad once",
+        _R,
+        _states(_once(_edited(_imu("quaternion", _rolled)))),
+    ),
+    FaultKind("mode machine: 5 to 6", _D, _fault("mode", 6)),
+    FaultKind("mode machine: 5 to 4", _D, _fault("mode", 4)),
+    FaultKind("mode machine: 0 once", _R, _states(_once(_edited(_set("mode_machine", 0))))),
+)
+_FLOODS: Final = (
+    FaultKind("flood: 2 kB garbage, 40 per 10 ms", _R, _states(_with(lambda: _garbage(20)))),
+    FaultKind("flood: the same without states", _D, _instead(lambda: _garbage(20))),
+    FaultKind("flood: garbage at full rate", _ANY, _states(_with(lambda: _garbage(_FULL_RATE)))),
+    FaultKind(
+        "flood: the same without states, full rate", _D, _instead(lambda: _garbage(_FULL_RATE))
+    ),
+    FaultKind("flood: 30 kB of valid JSON without states", _D, _instead(lambda: _valid_json(5))),
+    FaultKind("flood: one state repeated", _D, _states(_repeats())),
+    FaultKind("flood: oversized messages", Outcome.LATER, _states(_with(lambda: [b"x" * 200_000]))),
+    FaultKind("flood: oversized without states", _D, _replaced(*[b"x" * 200_000] * 4)),
+    FaultKind("flood: garbage in split packets", _D, _stream(Stream.SPLIT, lambda m: _garbage(4))),
+    FaultKind("connection: split packets", _R, _stream(Stream.SPLIT)),
+    FaultKind("connection: 20 kB/s", _D, _stream(Stream.SLOW)),
+    FaultKind("connection: stalls", _D, _stream(Stream.STALL)),
+    FaultKind("connection: cut, port closed", _D, _stream(Stream.CUT)),
+)
+
+
+# --- pictures ----------------------------------------------------------------------------
+def _pictures(tamper: Tamper) -> Begin:
+    return lambda rig: setattr(rig.fake, "tamper_picture", tamper)
+
+
+def _bad_checksum(message: bytes) -> Iterable[bytes]:
+    return (message[:-1] + bytes([message[-1] ^ 1]),)
+
+
+def _wrong_view(message: bytes) -> Iterable[bytes]:
+    return (message[:12] + np.float32(2.0).tobytes() + message[16:],)
+
+
+def _picture(name: str, outcome: Outcome, begin: Begin) -> FaultKind:
+    return FaultKind(f"picture: {name}", outcome, begin, since_onset=True)
+
+
+_PICTURES: Final = (
+    _picture("silent", _H, _fault("mute_camera")),
+    _picture("frozen", _H, _fault("freeze_camera")),
+    _picture("cut short", _H, _pictures(lambda m: (m[:-100],))),
+    _picture("wrong checksum", _H, _pictures(_bad_checksum)),
+    _picture("another field of view", _H, _pictures(_wrong_view)),
+    _picture("garbage", _H, _pictures(lambda m: _garbage(1))),
+    _picture("flood of garbage", _R, _pictures(_with(lambda: _garbage(20)))),
+    _picture("oversized", _H, _pictures(lambda m: (m * 20,))),
+)
+
+
+# --- planner and operator ----------------------------------------------------------------
+def _planner(answer: Callable[[Report], list[list[bytes]]]) -> Begin:
+    return lambda rig: setattr(rig, "answer", answer)
+
+
+def _plan_of(value: float) -> Callable[[Report], list[list[bytes]]]:
+    return lambda report: [encode_reply(_filled(report, np.full((1, 4, ACTION_DIM), value)))]
+
+
+def _filled(report: Report, plan: np.ndarray[Any, np.dtype[np.floating[Any]]]) -> Reply:
+    values = plan.astype(np.float32)
+    none = np.zeros(0, np.float32)
+    return Reply(report.tick, PolicyStep(values[:, 0], values, none, none, none, none, 1), 1.0)
+
+
+def _shaking() -> Callable[[Report], list[list[bytes]]]:
+    rng = np.random.default_rng(0)
+    return lambda report: [
+        encode_reply(_filled(report, rng.choice([-1.0, 1.0], (1, 4, ACTION_DIM))))
+    ]
+
+
+def _late(ticks: int) -> Callable[[Report], list[list[bytes]]]:
+    waiting: list[list[bytes]] = []
+
+    def answer(report: Report) -> list[list[bytes]]:
+        waiting.append(encode_reply(steady(report)))
+        return [waiting.pop(0)] if len(waiting) > ticks else []
+
+    return answer
+
+
+def _shifted(report: Report) -> list[list[bytes]]:
+    return [encode_reply(Reply(report.tick + 1000, steady(report).step, 1.0))]
+
+
+def _told(*orders: Order) -> Begin:
+    def begin(rig: FaultRig) -> None:
+        for order in orders:
+            rig.order(order)
+
+    return begin
+
+
+def _flood_of_messages(rig: FaultRig) -> None:
+    rig.answer = lambda report: [*([g] for g in _garbage(100)), *answer_steadily(report)]
+
+
+def _pressed(*buttons: str) -> Begin:
+    return lambda rig: setattr(rig.fake, "pressed", frozenset(buttons))
+
+
+def _other(name: str, outcome: Outcome, begin: Begin, duration_s: float = 0.5) -> FaultKind:
+    return FaultKind(name, outcome, begin, duration_s, since_onset=True)
+
+
+_OTHERS: Final = (
+    _other("planner: silent", _H, _planner(lambda report: [])),
+    _other("planner: 200 ms late", _H, _planner(_late(5))),
+    _other("planner: plans NaN", _H, _planner(_plan_of(np.nan)), 0.6),
+    _other("planner: plans Infinity", _H, _planner(_plan_of(np.inf)), 0.6),
+    _other("planner: plans 1e30", _R, _planner(_plan_of(1e30))),
+    _other("planner: random full strokes", _R, _planner(_shaking())),
+    _other("planner: answers garbage", _H, _planner(lambda report: [_garbage(1), [b"", b""]])),
+    _other("planner: answers of other ticks", _H, _planner(_shifted)),
+    _other("planner: flood of messages", _ANY, _flood_of_messages),
+    _other("operator: velocity NaN", _R, _told(Order(velocity=(np.nan,) * 3))),
+    _other("operator: velocity 1e9", _R, _told(Order(velocity=(1e9,) * 3))),
+    _other("operator: emergency stop", _D, _told(Order(Request.ESTOP))),
+    _other("remote control: emergency stop", _D, _pressed("L1", "B")),
+    _other(
+        "remote control: sticks NaN",
+        _R,
+        _states(
+            _edited(
+                _set("wireless_remote", "VVEAAP//////////////////////////////////////////////")
+            ),
+        ),
+    ),
+    _other("robot: pushed", _R, _fault("push", (0.2, 0.0))),
+    _other("robot: pushed over", Outcome.LATER, _fault("push", (-2.5, 1.0)), 3.0),
+    _other("robot: hears no commands", Outcome.LATER, _fault("deaf"), 4.0),
+    _other("robot: another program commands it", _ANY, _fault("intruder")),
+)
+
+
+# --- processes ---------------------------------------------------------------------------
+def _signal(number: signal.Signals) -> Begin:
+    def begin(rig: FaultRig) -> None:
+        assert rig.process.pid is not None
+        os.kill(rig.process.pid, number)
+
+    return begin
+
+
+_PROCESSES: Final = (
+    _other("control process: SIGKILL", _D, _signal(signal.SIGKILL)),
+    _other("control process: SIGTERM", _D, _signal(signal.SIGTERM)),
+)
+
+FAULTS: Final = (
+    *_STATES,
+    *_IMPLAUSIBLE,
+    *_FLOODS,
+    *_PICTURES,
+    *_OTHERS,
+    *_PROCESSES,
+)
+"""All kinds; names are unique."""

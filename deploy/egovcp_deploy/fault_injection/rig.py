@@ -1,0 +1,333 @@
+"""A live run that faults are injected into: fake G1, wire, control process, scripted planner.
+
+The control process is the real one, in a process of its own; here its robot is simulated on the
+wall clock, its planner answers every report, and every command that it sends is recorded.
+"""
+
+from __future__ import annotations
+
+import gc
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field, replace
+from multiprocessing.process import BaseProcess
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.plan import PolicyStep
+from egovcp.rate import MonotonicClock
+from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
+from egovcp.sim.config import EnvConfig, EpisodeConfig
+from egovcp.sim.live import LIMP, LiveRobot
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import ACTION_DIM
+from egovcp_deploy.fault_injection.proxy import Proxy, Stream
+from egovcp_deploy.live.guard import Guard, spare_body
+from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions
+from egovcp_deploy.live.link import Link, Order, decode_report, encode_order, encode_reply
+from egovcp_deploy.live.process import ControlSetup, control_process
+from egovcp_deploy.live.run_folder import run_folder
+from egovcp_deploy.pilot.desk import Reply, Report
+from egovcp_deploy.pilot.states import Limits, Request, State
+from egovcp_deploy.robots.bridge import BridgeConfig
+from egovcp_deploy.robots.fake import FakeBridge, Faults, Ports
+from egovcp_deploy.robots.fake.command import Pace
+from egovcp_deploy.robots.wire import Garbled, decode_command
+from egovcp_deploy.robots.zmq_eye import ZmqEyeConfig
+
+Array = NDArray[np.float64]
+Answer = Callable[[Report], list[list[bytes]]]
+
+LIMITS: Final = Limits(stand_s=0.1, recover_s=0.2)
+_START_S: Final = 60.0
+_STARTS: Final = 5
+_PRIORITY: Final = -10
+_REPORT_S: Final = 0.1  # for the report that says why
+_FORKSERVER: Final = multiprocessing.get_context("forkserver")
+_FORKSERVER.set_forkserver_preload(["egovcp_deploy.live.process", "egovcp.robot.controllers"])
+_NS: Final = 1e9
+
+
+def _serve_control(setup: ControlSetup) -> None:
+    """Body of the control process; its parent is the fork server."""
+    control_process(replace(setup, parent=os.getppid()))
+
+
+@dataclass(frozen=True)
+class Command:
+    """One message on the command port."""
+
+    time_ns: int
+    position: Array | None
+    """(29,) rad; None: it was no command."""
+    damped: bool
+    """Whether no motor is told to hold anything."""
+    sound: bool
+    """Whether it is finite and within the bounds of the joints' targets."""
+
+
+@dataclass
+class Observed:
+    """What happened since a fault began."""
+
+    modes: list[tuple[int, str]] = field(default_factory=list)
+    """(time, state) of each report."""
+    events: list[str] = field(default_factory=list)
+    commands: list[Command] = field(default_factory=list)
+    onset_ns: int = 0
+    """When the fault began."""
+    last_good_ns: int = 0
+    """When the last state before it was sent."""
+
+    @property
+    def states(self) -> set[str]:
+        """States of the state machine that were reported."""
+        return {mode for _, mode in self.modes}
+
+    @property
+    def damped_ns(self) -> int | None:
+        """When the first command that damps arrived; None: none did."""
+        return next((c.time_ns for c in self.commands if c.damped), None)
+
+    @property
+    def held_ns(self) -> int | None:
+        """When the first report from HOLD was made, to 40 ms; None: none was."""
+        return next((t for t, mode in self.modes if mode == State.HOLD), None)
+
+    @property
+    def greatest_change(self) -> float:
+        """Greatest change of a target between two commands, rad."""
+        following = [c.position for c in self.commands if not c.damped and c.position is not None]
+        if len(following) < 2:
+            return 0.0
+        return float(np.abs(np.diff(np.stack(following), axis=0)).max())
+
+
+def steady(report: Report, level: float = 0.3) -> Reply:
+    """A plan that reaches a little, with the pelvis at its neutral height."""
+    plan = np.full((1, 4, ACTION_DIM), level, np.float32)
+    plan[..., -1] = 0.0
+    none = np.zeros(0, np.float32)
+    return Reply(report.tick, PolicyStep(plan[:, 0], plan, none, none, none, none, 1), 1.0)
+
+
+def answer_steadily(report: Report) -> list[list[bytes]]:
+    """What a planner without faults sends for a report."""
+    return [encode_reply(steady(report))]
+
+
+class FaultRig:
+    """Starts runs and lets things go wrong in them. Close it afterwards."""
+
+    def __init__(self) -> None:
+        with suppress(OSError):  # needs a privilege; a robot has computers of its own
+            os.setpriority(os.PRIO_PROCESS, 0, _PRIORITY)
+        quiet = EpisodeConfig(ticks=10**6, event_ticks=(10**6 - 1,) * 2, empty_probability=1.0)
+        self._robot = LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
+        self._robot.start(Scenario("ball", 0, 0))
+        free = Ports(command_port=0, state_port=0, camera_port=0)
+        self.fake = FakeBridge(self._robot, free)
+        self.fake.on_command = self._record
+        self.proxy = Proxy(self.fake.ports.state_port)
+        self.answer: Answer = answer_steadily
+        """The planner: messages to send for a report."""
+        self._tasks: deque[tuple[Callable[[], None], threading.Event]] = deque()
+        self._outbox: deque[list[bytes]] = deque()
+        self._observed = Observed()
+        self._sent_ns = 0
+        self._mode = ""
+        self._session: ExitStack | None = None
+        self._ending = False
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._simulate, daemon=True)
+        gc.freeze()  # a long collection would stop the robot
+        self._thread.start()
+
+    # --- the robot's thread --------------------------------------------------------------
+    def _simulate(self) -> None:
+        pace = Pace(MonotonicClock())
+        while not self._closing.is_set():
+            for _ in range(pace.due()):
+                while self._tasks:
+                    task, done = self._tasks.popleft()
+                    task()
+                    done.set()
+                self.fake.step()
+                self._sent_ns = time.monotonic_ns()
+
+    def in_robot(self, task: Callable[[], None]) -> None:
+        """Run ``task`` between two steps of the robot, and wait for it."""
+        done = threading.Event()
+        self._tasks.append((task, done))
+        if not done.wait(_START_S):
+            raise RuntimeError("the simulated robot does not step")
+
+    def _record(self, message: bytes) -> None:
+        now = time.monotonic_ns()
+        try:
+            motors = decode_command(message).motors
+        except Garbled:
+            self._observed.commands.append(Command(now, None, damped=False, sound=False))
+            return
+        inside = (motors.position >= TARGET_LOW - 1e-6) & (motors.position <= TARGET_HIGH + 1e-6)
+        damped = not motors.stiffness.any()
+        self._observed.commands.append(Command(now, motors.position, damped, bool(inside.all())))
+
+    # --- the planner's thread ------------------------------------------------------------
+    def _plan(self, link: Link, ending: threading.Event) -> None:
+        while not ending.is_set():
+            while self._outbox:
+                link.send(self._outbox.popleft())
+            for parts in link.receive(0.01):
+                report = decode_report(parts)
+                if report is None:
+                    continue
+                self._mode = report.mode
+                self._observed.modes.append((report.time_ns, report.mode))
+                self._observed.events += report.events
+                for message in self.answer(report):
+                    link.send(message)
+
+    # --- a run ---------------------------------------------------------------------------
+    @property
+    def mode(self) -> str:
+        """State of the state machine as reported last; empty: nothing was reported."""
+        return self._mode
+
+    @property
+    def running(self) -> bool:
+        """Whether a run is in RUN."""
+        return self._session is not None and self._mode == State.RUN and self.process.is_alive()
+
+    def ensure_running(self) -> None:
+        """From wherever the run is, to RUN, on the robot's own feet."""
+        if self.running and self._robot.robot.pelvis_height > 0.6:
+            return None
+        for attempt in range(_STARTS):
+            self.end_run()
+            self.heal()
+            self.in_robot(self._hang_up)
+            self._session = ExitStack()
+            try:
+                return self._start(self._session)
+            except RuntimeError:  # a machine that is busy starting things
+                if attempt == _STARTS - 1:
+                    raise
+            except BaseException:
+                self.end_run()
+                raise
+        return None
+
+    def _hang_up(self) -> None:
+        self._robot.start(Scenario("ball", 0, 0))
+        self._robot.drive(LIMP)
+        self.fake.next_episode()
+
+    def _start(self, stack: ExitStack) -> None:
+        ports, fov = self.fake.ports, self._robot.config.camera.vertical_fov
+        bridge = BridgeConfig(state_port=self.proxy.port, command_port=ports.command_port)
+        eye = ZmqEyeConfig(port=ports.camera_port, vertical_fov=fov)
+        hardware = HardwareOptions(bridge, replace(CameraOptions(), server=eye))
+        address = f"ipc://{stack.enter_context(run_folder())}/link"
+        link = Link(address, serve=True)
+        stack.callback(link.close)
+        self._outbox.clear()
+        spare = stack.enter_context(spare_body(bridge))
+        setup = ControlSetup(address, hardware, "stance", LIMITS, os.getpid())
+        self._mode, self._ending = "", False
+        self.process: BaseProcess = _FORKSERVER.Process(target=_serve_control, args=(setup,))
+        self.process.start()
+        stack.callback(self._end_process)
+        guard = Guard(self.process, spare, lambda: self._ending)
+        stack.callback(guard.join_if_acting)
+        ending = threading.Event()
+        planner = threading.Thread(target=self._plan, args=(link, ending), daemon=True)
+        planner.start()
+        stack.callback(planner.join)
+        stack.callback(ending.set)
+        for request, target in (
+            (Request.STAND, State.STAND),
+            (Request.ARM, State.ARMED),
+            (Request.RUN, State.RUN),
+        ):
+            self._reach(request, target)
+            if target is State.ARMED:
+                self.in_robot(self._robot.release)
+                time.sleep(0.15)
+
+    def _reach(self, request: Request, target: State) -> None:
+        deadline = time.monotonic() + _START_S
+        ask = 0.0
+        while self._mode != target:
+            now = time.monotonic()
+            if now > deadline or (self._mode == State.DAMP and target is not State.DAMP):
+                raise RuntimeError(f"{self._mode or 'silent'}: {self._observed.events[-3:]}")
+            if self._mode and now > ask:
+                self.order(Order(request))
+                ask = now + 0.04
+            time.sleep(0.005)
+
+    def _end_process(self) -> None:
+        self._ending = True
+        if self.process.is_alive() and self.process.pid is not None:
+            os.kill(self.process.pid, signal.SIGCONT)
+            self.process.kill()
+        self.process.join()
+
+    def order(self, order: Order) -> None:
+        """What the operator says."""
+        self.send(encode_order(order))
+
+    def send(self, *messages: list[bytes]) -> None:
+        """Messages from the planner's process."""
+        self._outbox += messages
+
+    def heal(self) -> None:
+        """End every fault."""
+        self.proxy.stream = Stream.PASS
+        self.answer = answer_steadily
+        self.in_robot(self._heal_robot)
+
+    def _heal_robot(self) -> None:
+        self.fake.faults = Faults()
+        self.fake.pressed = frozenset()
+        self.fake.tamper_state = self.fake.tamper_picture = lambda message: (message,)
+
+    def observe(self, begin: Callable[[], None], over: Callable[[Observed], bool]) -> Observed:
+        """Let ``begin`` start a fault, between two steps of the robot, until ``over``."""
+        observed = Observed()
+
+        def start() -> None:
+            observed.last_good_ns, observed.onset_ns = self._sent_ns, time.monotonic_ns()
+            self._observed = observed
+            begin()
+
+        self.in_robot(start)
+        while not over(observed):
+            time.sleep(0.005)
+        time.sleep(_REPORT_S)
+        self._observed = Observed()
+        return observed
+
+    def end_run(self) -> None:
+        """End the control process, if there is one."""
+        if self._session is not None:
+            self._session.close()
+            self._session = None
+        self._mode = ""
+
+    def close(self) -> None:
+        """End everything."""
+        self.end_run()
+        self._closing.set()
+        self._thread.join()
+        self.proxy.close()
+        self.fake.close()

@@ -1,0 +1,83 @@
+"""Where a dataset may be written.
+
+A dataset folder is replaced as a whole, by renaming folders beside it. The checks here find out
+before any work starts whether that is possible.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Final
+
+from egovcp.errors import EnvironmentFailure, UsageError
+
+_MOUNTS: Final = Path("/proc/self/mountinfo")
+_MOUNT_POINT_FIELD: Final = 4  # proc_pid_mountinfo(5), counted from 0
+
+
+def resolve_root(root: str | Path) -> Path:
+    """The absolute path of a dataset folder without symbolic links; it need not exist.
+
+    Locks, staging folders and renames must use this path: through a link they would replace the
+    link, and two writers that use different names would not see each other.
+
+    Raises:
+        UsageError: the links form a loop.
+    """
+    try:
+        return Path(root).expanduser().resolve()
+    except (OSError, RuntimeError) as error:
+        raise UsageError(f"{root} is a symbolic link that leads nowhere; remove it") from error
+
+
+def is_vacant(root: Path) -> bool:
+    """Whether a dataset can appear at ``root``: nothing is there, or an empty folder."""
+    if not root.is_dir():
+        return not os.path.lexists(root)
+    with os.scandir(root) as entries:
+        return next(entries, None) is None
+
+
+def require_new(root: Path) -> None:
+    """Raise `UsageError` if there is something at ``root``; nothing is ever overwritten."""
+    if not is_vacant(root):
+        raise UsageError(
+            f"output folder {root} exists already and is not empty; choose another or remove it"
+        )
+
+
+def require_replaceable(root: Path) -> None:
+    """Raise `EnvironmentFailure` if ``root`` is a mount point: it cannot be renamed."""
+    if is_mount_point(root):
+        raise EnvironmentFailure(
+            f"{root} is a mount point; a dataset is replaced as a whole folder, which a mount "
+            f"point does not allow: use a folder inside it, such as {root / 'dataset'}"
+        )
+
+
+def is_mount_point(folder: Path) -> bool:
+    """Whether a file system is mounted at ``folder``, a bind mount of the same one included."""
+    return os.path.ismount(folder) or str(folder) in _mount_points()
+
+
+def _mount_points() -> set[str]:
+    try:
+        lines = _MOUNTS.read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    except OSError:  # not Linux
+        return set()
+    fields = (line.split(" ")[_MOUNT_POINT_FIELD] for line in lines)
+    return {re.sub(r"\\(\d{3})", lambda octal: chr(int(octal[1], 8)), field) for field in fields}
+
+
+def make_parent(root: Path) -> None:
+    """Make the folder that will hold ``root``.
+
+    Raises:
+        UsageError: it would lie below a file.
+    """
+    try:
+        root.parent.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise UsageError(f"output folder {root} would lie below a file; choose another") from error

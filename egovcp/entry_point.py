@@ -1,0 +1,157 @@
+"""Console entry points: everything that has to be in place before heavy modules are imported.
+
+A distribution declares its commands in a module that imports nothing else::
+
+    collect = EntryPoint("egovcp-collect", "egovcp_collect.collect")
+
+and names them in its ``pyproject.toml``: ``egovcp-collect = "egovcp_collect.commands:collect"``.
+
+Exit codes beyond those of `egovcp.errors`: 130 after Ctrl-C, 141 if the reader of the output has
+gone (``| head -1``), 1 with a traceback for a bug.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+
+from egovcp import interrupts
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:  # these take as long as all the rest that is imported before SIGINT is handled
+    from collections.abc import Callable, Sequence
+    from typing import Any
+
+BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell reports a program which that signal ended
+
+
+class EntryPoint:
+    """A command whose module is imported when it is called."""
+
+    def __init__(self, prog: str, module: str) -> None:
+        """Describe a command; nothing is imported.
+
+        Args:
+            prog: its name.
+            module: the module with its function ``main(argv) -> int``.
+        """
+        self.prog, self.module = prog, module
+
+    def __call__(self, argv: Sequence[str] | None = None) -> int:
+        """Run the command on ``argv``, or on ``sys.argv``, and return its exit code."""
+        interrupts.exit_on_sigint(self.prog)
+        prepare_process()
+        from egovcp.errors import EnvironmentFailure
+        from egovcp.terminal import discard_output, reader_is_gone
+
+        try:
+            return self._run(argv)
+        except KeyboardInterrupt:
+            return interrupts.EXIT_CODE
+        except BrokenPipeError:
+            if reader_is_gone():
+                discard_output()
+                return BROKEN_PIPE
+            return _report_bug()
+        except OSError as error:
+            if error.filename is not None:
+                return _report_bug()
+            _print_last(f"{self.prog}: error: cannot write the output: {error}\n")
+            return EnvironmentFailure.exit_code
+        except Exception:  # noqa: BLE001 - a bug: as Python itself does, but with text escaped
+            return _report_bug()
+        finally:
+            interrupts.exit_on_sigint(self.prog)  # while the interpreter ends
+
+    def _run(self, argv: Sequence[str] | None) -> int:
+        from importlib import import_module
+
+        try:
+            main: Callable[[Sequence[str] | None], int] = import_module(self.module).main
+            code = main(argv)
+        except ModuleNotFoundError as error:
+            return self._missing(error)
+        except SystemExit as end:  # argparse, after --help
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        return code
+
+    def _missing(self, error: ModuleNotFoundError) -> int:
+        from egovcp.packages import missing_package
+        from egovcp.terminal import echo
+
+        missing = missing_package(error, self.module, self.prog)
+        if missing is None:
+            raise error
+        echo(f"{self.prog}: error: {missing}", error=True)
+        return missing.exit_code
+
+
+def prepare_process() -> None:
+    """Make standard streams, user name and home folder usable, whatever started the process."""
+    _open_standard_streams()
+    _name_user()
+    _escape_log_messages()
+
+
+def _open_standard_streams() -> None:
+    """Replace closed streams by the null device, and make any text printable in any encoding."""
+    for descriptor in (0, 1, 2):
+        try:
+            os.fstat(descriptor)
+        except OSError:  # otherwise the next file that is opened would become stdout
+            os.open(os.devnull, os.O_RDWR)
+    sys.stdout = sys.stdout or open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+    sys.stderr = sys.stderr or open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115
+    for stream in (sys.stdout, sys.stderr):
+        reconfigure: Callable[..., Any] | None = getattr(stream, "reconfigure", None)
+        if reconfigure is not None:
+            reconfigure(errors="backslashreplace")
+
+
+def _name_user() -> None:
+    """Name a user and a home folder where the system knows none, as in `docker run --user 12345`.
+
+    Libraries look both up, some while they are imported, and raise KeyError or RuntimeError.
+    """
+    import pwd
+
+    names = ("LOGNAME", "USER", "LNAME", "USERNAME")  # in which getpass.getuser() looks
+    try:
+        pwd.getpwuid(os.getuid())
+    except KeyError:
+        if not any(os.environ.get(name) for name in names):
+            os.environ["USER"] = f"user-{os.getuid()}"
+    if os.path.expanduser("~") == "~":
+        os.environ["HOME"] = "/"  # as Docker sets it for a user without an entry
+
+
+def _escape_log_messages() -> None:
+    """Log records quote answers of servers."""
+    import logging
+
+    from egovcp.terminal import printable
+
+    class PrintableRecord(logging.LogRecord):
+        def getMessage(self) -> str:  # noqa: N802 - the name of the base class
+            return printable(super().getMessage())
+
+    logging.setLogRecordFactory(PrintableRecord)
+
+
+def _report_bug() -> int:
+    import traceback
+
+    _print_last(traceback.format_exc())
+    return 1
+
+
+def _print_last(text: str) -> None:
+    from contextlib import suppress
+
+    from egovcp.terminal import discard_output, echo
+
+    with suppress(OSError):  # stderr may be closed as well
+        echo(text, error=True, end="")
+    discard_output()

@@ -1,0 +1,114 @@
+"""Loads the weights of a world model from a safetensors file that somebody else wrote.
+
+The configuration says which tensors there must be. They are compared with the header of the file
+before any network is allocated, and their numbers before the model is returned.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Final
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.model.config import WorldModelConfig
+from egovcp.model.world_model import WorldModel
+from egovcp.safe_files import UnsafeFileError
+from egovcp.tensor_file import HEADER_LIMIT_BYTES, TensorFile
+
+MAX_WEIGHT_BYTES: Final = 512 << 20
+"""Most that the weights of a model may take, float32."""
+DTYPES: Final = ("F32", "F16", "BF16")
+"""Of a tensor in the file; all are loaded as float32."""
+
+_OPTIONAL: Final = ("discount",)  # absent from files of earlier versions
+_POSITIVE: Final = ("state_std", "return_std")
+_BYTES: Final = 4  # of a float32
+
+
+def tensor_shapes(config: WorldModelConfig) -> dict[str, tuple[int, ...]]:
+    """Name and shape of every tensor of a model's state; nothing is allocated.
+
+    Raises:
+        ValueError: the model has more than `MAX_WEIGHT_BYTES`.
+    """
+    with torch.device("meta"):
+        state = WorldModel(config).state_dict()
+    size = sum(tensor.numel() for tensor in state.values()) * _BYTES
+    if size > MAX_WEIGHT_BYTES:
+        raise ValueError(
+            f"world_model describes networks of {size / 1e6:.0f} MB, expected at most "
+            f"{MAX_WEIGHT_BYTES / 1e6:.0f} MB"
+        )
+    return {name: tuple(tensor.shape) for name, tensor in state.items()}
+
+
+def size_limit(shapes: Mapping[str, tuple[int, ...]]) -> int:
+    """Largest size of a file of these tensors, bytes."""
+    return HEADER_LIMIT_BYTES + _BYTES * sum(math.prod(shape) for shape in shapes.values())
+
+
+def load_model(
+    config: WorldModelConfig, shapes: Mapping[str, tuple[int, ...]], content: bytes
+) -> WorldModel:
+    """A model in evaluation mode with the weights of a file.
+
+    Args:
+        config: of the model.
+        shapes: its `tensor_shapes`.
+        content: the file.
+
+    Raises:
+        UnsafeFileError: its tensors are not those of the configuration, a number is not finite, or
+            the model answers an ordinary observation with something that is not finite.
+    """
+    file = TensorFile.parse(content)
+    file.require(shapes, DTYPES, _OPTIONAL)
+    try:
+        weights = {name: tensor.float() for name, tensor in load(content).items()}
+    except SafetensorError as error:
+        raise UnsafeFileError(f"not a safetensors file: {error}") from error
+    _check_numbers(weights)
+    model = WorldModel(config)
+    model.load_state_dict(weights)
+    model.eval()
+    _check_answer(model)
+    return model
+
+
+def _check_numbers(weights: Mapping[str, Tensor]) -> None:
+    for name, tensor in weights.items():
+        if not tensor.isfinite().all():
+            raise UnsafeFileError(f"tensor {name} holds NaN or infinite numbers")
+    for name in _POSITIVE:
+        if not (weights[name] > 0).all():
+            raise UnsafeFileError(f"tensor {name} holds numbers that are not positive")
+    discount = weights.get("discount")
+    if discount is not None and not 0 <= float(discount) <= 1:
+        raise UnsafeFileError(f"tensor discount is {float(discount):g}, expected 0 to 1")
+
+
+@torch.inference_mode()
+def _check_answer(model: WorldModel) -> None:
+    """Finite weights may still overflow: filter an empty image and judge the neutral action."""
+    action = torch.zeros(1, spec.ACTION_DIM)
+    depth = torch.zeros(1, spec.DEPTH_ROWS, spec.DEPTH_COLS, dtype=torch.int32)
+    first = torch.ones(1, dtype=torch.bool)
+    carry = model.observe(model.initial(1), action, depth, model.state_mean[None], first)
+    carry = model.imagine(carry, action)
+    answers = {
+        "state": carry.h,
+        "latent": carry.z,
+        "value": model.value(carry, action),
+        "termination": model.termination(carry),
+    }
+    for name, answer in answers.items():
+        if not answer.isfinite().all():
+            raise UnsafeFileError(
+                f"its weights overflow: the {name} after an empty image is not finite"
+            )

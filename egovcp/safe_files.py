@@ -1,0 +1,205 @@
+"""Reads files that somebody else wrote: regular files of bounded size, JSON of bounded depth.
+
+A downloaded dataset or policy may hold a FIFO that never ends, a link to a device, gigabytes of
+JSON, or JSON nested so deeply that the parser overflows. The functions here refuse them with
+`UnsafeFileError`, whose message says what was found and what was expected but not the path: the
+caller turns it into its own error, which names the file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import os
+import re
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any, Final, NoReturn
+
+import numpy as np
+
+JSON_LIMIT_BYTES: Final = 4 << 20
+"""Default size limit of a JSON file. Parsed JSON takes up to about 30 times as much memory."""
+JSON_LIMIT_DEPTH: Final = 32
+"""Default limit of how deeply lists and objects are nested."""
+
+_KINDS: Final[Mapping[int, str]] = {
+    stat.S_IFDIR: "a folder",
+    stat.S_IFIFO: "a FIFO",
+    stat.S_IFCHR: "a device",
+    stat.S_IFBLK: "a device",
+    stat.S_IFSOCK: "a socket",
+}
+_CHUNK_BYTES: Final = 1 << 20
+_STRING: Final = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"', re.DOTALL)
+_DEPTH_CHANGE: Final = np.zeros(256, dtype=np.int8)  # by character
+_DEPTH_CHANGE[list(b"[{")] = 1
+_DEPTH_CHANGE[list(b"]}")] = -1
+
+
+class UnsafeFileError(ValueError):
+    """A file is not regular, too large, or holds JSON that must not be parsed or used."""
+
+
+def require_regular(path: Path, limit_bytes: int | None = None) -> os.stat_result:
+    """Raise unless ``path`` is a regular file of bounded size; links are followed.
+
+    For libraries that open the file themselves. The file is not opened.
+
+    Args:
+        path: the file.
+        limit_bytes: largest size; None: any.
+
+    Raises:
+        UnsafeFileError: it is not a regular file, or larger.
+        OSError: it is missing, or cannot be looked at.
+    """
+    found = path.stat()
+    _check(found, limit_bytes)
+    return found
+
+
+def open_regular(path: Path, limit_bytes: int | None = None) -> IO[bytes]:
+    """Open a regular file of bounded size for reading; never blocks on a FIFO or a device.
+
+    Raises:
+        UnsafeFileError: it is not a regular file, or larger than ``limit_bytes``.
+        OSError: it is missing, or cannot be read.
+    """
+    require_regular(path, limit_bytes)  # before opening: opening a device can have effects
+    file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC), "rb")
+    try:
+        _check(os.fstat(file.fileno()), limit_bytes)  # it may have been replaced in between
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def read_bytes(path: Path, limit_bytes: int) -> bytes:
+    """The content of a regular file of at most ``limit_bytes``.
+
+    Raises:
+        UnsafeFileError: it is not a regular file, or larger.
+        OSError: it is missing, or cannot be read.
+    """
+    with open_regular(path, limit_bytes) as file:
+        content = file.read(limit_bytes + 1)  # a file of /proc says that its size is 0
+    if len(content) > limit_bytes:
+        raise UnsafeFileError(_too_large("more", limit_bytes))
+    return content
+
+
+def read_text(path: Path, limit_bytes: int) -> str:
+    """The content of a UTF-8 text file; see `read_bytes`.
+
+    Raises:
+        UnsafeFileError: it is not a regular file, larger, or not UTF-8.
+        OSError: it is missing, or cannot be read.
+    """
+    try:
+        return read_bytes(path, limit_bytes).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise UnsafeFileError(f"byte {error.start} is not UTF-8") from error
+
+
+def read_json(
+    path: Path,
+    limit_bytes: int = JSON_LIMIT_BYTES,
+    limit_depth: int = JSON_LIMIT_DEPTH,
+    allow_nan: bool = False,
+) -> Any:
+    """The content of a JSON file.
+
+    Args:
+        path: a regular file.
+        limit_bytes: largest size.
+        limit_depth: deepest nesting of lists and objects.
+        allow_nan: whether a number may be NaN or infinite.
+
+    Raises:
+        UnsafeFileError: it is not a regular file, larger, not UTF-8, not JSON, nested more deeply,
+            or holds a number that is not finite or a string that is not valid Unicode.
+        OSError: it is missing, or cannot be read.
+    """
+    return parse_json(read_text(path, limit_bytes), limit_depth, allow_nan)
+
+
+def parse_json(text: str, limit_depth: int = JSON_LIMIT_DEPTH, allow_nan: bool = False) -> Any:
+    """The value of a JSON text that somebody else wrote; see `read_json`.
+
+    Raises:
+        UnsafeFileError: it is not JSON, nested more deeply than ``limit_depth``, or holds a number
+            that is not finite or a string that is not valid Unicode.
+    """
+    hooks: dict[str, Any] = (
+        {} if allow_nan else {"parse_float": _finite, "parse_constant": _refuse_constant}
+    )
+    _check_depth(text, limit_depth)
+    try:
+        content = json.loads(text, **hooks)
+    except UnsafeFileError:
+        raise
+    except RecursionError as error:
+        raise UnsafeFileError(_too_deep(limit_depth)) from error
+    except ValueError as error:  # JSONDecodeError, or an integer of more than 4300 digits
+        raise UnsafeFileError(f"not JSON: {error}") from error
+    if "\\ud" in text.lower():  # escapes of surrogates: only pairs are valid
+        try:
+            json.dumps(content, ensure_ascii=False).encode()
+        except UnicodeEncodeError as error:
+            raise UnsafeFileError("holds a string that is not valid Unicode") from error
+    return content
+
+
+def sha256(path: Path, limit_bytes: int | None = None) -> str:
+    """Hexadecimal SHA-256 of a regular file.
+
+    Raises:
+        UnsafeFileError: it is not a regular file, or larger than ``limit_bytes``.
+        OSError: it is missing, or cannot be read.
+    """
+    digest, total = hashlib.sha256(), 0
+    with open_regular(path, limit_bytes) as file:
+        while chunk := file.read(_CHUNK_BYTES):
+            digest.update(chunk)
+            total += len(chunk)
+            if limit_bytes is not None and total > limit_bytes:
+                raise UnsafeFileError(_too_large("more", limit_bytes))
+    return digest.hexdigest()
+
+
+def _check(found: os.stat_result, limit_bytes: int | None) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        kind = _KINDS.get(stat.S_IFMT(found.st_mode), "no regular file")
+        raise UnsafeFileError(f"{kind}, expected a regular file")
+    if limit_bytes is not None and found.st_size > limit_bytes:
+        raise UnsafeFileError(_too_large(f"{found.st_size}", limit_bytes))
+
+
+def _too_large(found: str, limit_bytes: int) -> str:
+    return f"too large: {found} bytes, expected at most {limit_bytes}"
+
+
+def _too_deep(limit: int) -> str:
+    return f"nested more than {limit} levels deep"
+
+
+def _check_depth(text: str, limit: int) -> None:
+    """Counts the brackets outside strings; much faster than a walk over the parsed value."""
+    bare = np.frombuffer(_STRING.sub("", text).encode("utf-8", "replace"), dtype=np.uint8)
+    if len(bare) and _DEPTH_CHANGE[bare].cumsum(dtype=np.int32).max() > limit:
+        raise UnsafeFileError(_too_deep(limit))
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if math.isinf(value):
+        raise UnsafeFileError(f"holds the number {text[:20]}, which is infinite")
+    return value
+
+
+def _refuse_constant(name: str) -> NoReturn:
+    raise UnsafeFileError(f"holds {name}, expected finite numbers")

@@ -1,0 +1,212 @@
+"""Mutations of the JSON files: options, encoding, nesting, size."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any, Final
+
+from egovcp.artefact import CONFIG, WEIGHTS
+from egovcp.processors import PROCESSORS
+from egovcp.testing.mutations.editing import (
+    JSON_FILES,
+    MARKER,
+    Json,
+    Mutate,
+    Random,
+    edit_json,
+    pick,
+    write_json,
+)
+
+
+def _options(content: Json) -> list[tuple[Json, str]]:
+    """(object, key) of every option of the networks and of the planner, at any depth."""
+    found: list[tuple[Json, str]] = []
+    waiting = [content["world_model"], content["planner"]]
+    while waiting:
+        group = waiting.pop()
+        for key, value in group.items():
+            if isinstance(value, dict):
+                waiting.append(value)
+            found.append((group, key))
+    return found
+
+
+def _give_an_option_another_type(folder: Path, rng: Random) -> str:
+    def change(content: Json) -> None:
+        group, key = pick(rng, _options(content))
+        wrong: list[Any] = ["wide", [], {"a": 1}, [[[]]], "1e30", [None], {}]
+        wrong += [None] if not isinstance(group[key], dict) else [3]
+        wrong += [True, "256"] if not isinstance(group[key], bool) else [1, "true"]
+        wrong = [v for v in wrong if not (v == {} and isinstance(group[key], dict))]
+        wrong = [v for v in wrong if not (v == [] and isinstance(group[key], list))]
+        group[key] = pick(rng, wrong)
+
+    return edit_json(folder, CONFIG, change)
+
+
+def _give_a_size_an_absurd_number(folder: Path, rng: Random) -> str:
+    sizes = ["hidden", "latent", "units", "q_heads", "channels", "motion_ahead", "value_units"]
+
+    def change(content: Json) -> None:
+        name = pick(rng, [*sizes, "value_state"])
+        number = pick(rng, [10**6, 20_000, 10**9, 10**30, 10**400, -1, 1e30, 1.5, None])
+        network = content["world_model"]
+        if name in ("channels", "motion_ahead"):
+            long = name == "motion_ahead" and rng.random() < 0.5
+            network[name] = list(range(100_000)) if long else [number, 8, 8]
+        else:
+            network[name] = number
+
+    return edit_json(folder, CONFIG, change)
+
+
+def _give_a_size_another_number(folder: Path, rng: Random) -> str:
+    """Within its bounds, but not that of the weights."""
+
+    def change(content: Json) -> None:
+        changes: dict[str, Any] = {
+            "hidden": 8192,
+            "units": 8192,
+            "latent": 9,
+            "q_heads": 64,
+            "value_units": 1024,
+        }
+        changes |= {"channels": [1024, 1024, 1024], "motion_ahead": [0, 1], "value_state": 0}
+        for name in rng.permutation(list(changes))[: int(rng.integers(1, 4))]:
+            content["world_model"][str(name)] = changes[name]
+
+    edit_json(folder, CONFIG, change)
+    return f"{WEIGHTS}|{CONFIG}"
+
+
+def _ask_for_a_huge_plan(folder: Path, rng: Random) -> str:
+    def change(content: Json) -> None:
+        name = pick(rng, ["samples", "horizon", "iterations"])
+        content["planner"][name] = pick(rng, [10**6, 10**7, 10**9, 10**18, 10**300, 10**400, 1e9])
+
+    return edit_json(folder, CONFIG, change)
+
+
+def _misplace_the_camera(folder: Path, rng: Random) -> str:
+    changes: list[tuple[str, Any]] = [
+        ("vertical_fov", 1e-9),
+        ("vertical_fov", 3.14159),
+        ("vertical_fov", -1.0),
+        ("pitch", 1e6),
+        ("position", [0.0, 0.0, 1e9]),
+        ("position", [0.0, 0.0]),
+        ("picture_ages", [0.02, 0.04, 0.06, 1e9]),
+        ("picture_ages", [-0.02, 0.0, 0.0, 0.0]),
+        ("picture_ages", [0.0] * 100),
+        ("age_deviation", 0.0),
+        ("age_memory", 2.0),
+        ("plane", -1.0),
+        ("prior", [[0.0, 0.0, 1.0, 5.0, 1.0]] * 3),
+        ("aim", [[0.0, 0.0], [0.0, -1.0]]),
+    ]
+
+    def change(content: Json) -> None:
+        name, value = pick(rng, changes)
+        flight = content["world_model"]["flight"]
+        (flight["camera"] if name in flight["camera"] else flight)[name] = value
+
+    return edit_json(folder, CONFIG, change)
+
+
+def _drop_or_add_an_option(folder: Path, rng: Random) -> str:
+    def change(content: Json) -> None:
+        match int(rng.integers(4)):
+            case 0:
+                del content[pick(rng, ["world_model", "planner", "type"])]
+            case 1:
+                content[pick(rng, ["world_model", "planner"])]["surprise"] = 1
+            case 2:
+                content["type"] = pick(rng, ["act", "", 7, None, "EGOVCP"])
+            case 3:
+                content["world_model"]["flight"]["__class__"] = "os.system"
+
+    return edit_json(folder, CONFIG, change)
+
+
+def _write_a_constant_that_is_no_json(folder: Path, rng: Random) -> str:
+    name = pick(rng, JSON_FILES)
+    text = (folder / name).read_text()
+    constant = pick(rng, ["NaN", "Infinity", "-Infinity", "1e999", "-1e400"])
+    write_json(folder, name, text.replace("{", f'{{"extra": {constant},', 1))
+    return str(name)
+
+
+def _nest_json(folder: Path, rng: Random) -> str:
+    name = pick(rng, JSON_FILES)
+    depth = int(rng.integers(1000, 1_000_000))
+    opening, closing = pick(rng, [("[", "]"), ('{"a":', "}")])
+    nested = opening * depth + "1" + closing * depth
+    text = (folder / name).read_text()
+    write_json(folder, name, text.replace("{", f'{{"extra": {nested},', 1))
+    return str(name)
+
+
+def _make_json_huge(folder: Path, rng: Random) -> str:
+    name = pick(rng, JSON_FILES)
+    os.truncate(folder / name, 200 << 20)
+    return str(name)
+
+
+def _write_many_values(folder: Path, rng: Random) -> str:
+    name = pick(rng, JSON_FILES)
+    text = (folder / name).read_text()
+    values = ",".join(["[]"] * 2_000_000)
+    write_json(folder, name, text.replace("{", f'{{"extra": [{values}],', 1))
+    return str(name)
+
+
+def _write_json_in_another_encoding(folder: Path, rng: Random) -> str:
+    name = pick(rng, JSON_FILES)
+    text = (folder / name).read_text()
+    kinds = [
+        text.encode("utf-16"),
+        text.encode().replace(b"e", b"\xff", 1),
+        text.replace("{", '{"\\ud800": 1,', 1).encode(),
+        text.encode() + b"\0",
+        b"",
+    ]
+    write_json(folder, name, pick(rng, kinds))
+    return str(name)
+
+
+def _write_something_else_than_an_object(folder: Path, rng: Random) -> str:
+    name = pick(rng, JSON_FILES)
+    write_json(folder, name, pick(rng, ["[]", "3", "null", '"text"', "true", "{}", "[{}]"]))
+    return str(name)
+
+
+def _name_a_class_to_import(folder: Path, rng: Random) -> str:
+    name = pick(rng, list(PROCESSORS))
+
+    def change(content: Json) -> None:
+        step = {"class": "malicious.Step", "config": {}}
+        content["steps"] = pick(
+            rng, [[step], [{**content["steps"][0], **step}], "steps", [3], None]
+        )
+
+    (folder / "malicious.py").write_text(f"open({str(folder / MARKER)!r}, 'w')\n")
+    return edit_json(folder, name, change)
+
+
+TEXT_MUTATIONS: Final[tuple[Mutate, ...]] = (
+    _give_an_option_another_type,
+    _give_a_size_an_absurd_number,
+    _give_a_size_another_number,
+    _ask_for_a_huge_plan,
+    _misplace_the_camera,
+    _drop_or_add_an_option,
+    _write_a_constant_that_is_no_json,
+    _nest_json,
+    _make_json_huge,
+    _write_many_values,
+    _write_json_in_another_encoding,
+    _write_something_else_than_an_object,
+    _name_a_class_to_import,
+)

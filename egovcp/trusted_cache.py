@@ -1,0 +1,203 @@
+"""A cache folder whose files may be loaded as code, because nobody else can have written them.
+
+Ownership and permissions are checked as OpenSSH checks ``~/.ssh``. Each file has its SHA-256
+beside it, as ``NAME.sha256`` in the format of ``sha256sum``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import hashlib
+import os
+import secrets
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, Self
+
+from egovcp.errors import EnvironmentFailure
+
+_WRITABLE_BY_OTHERS: Final = stat.S_IWGRP | stat.S_IWOTH
+_LARGEST_FILE: Final = 64 << 20
+_loaded_descriptors: list[int] = []
+
+
+def user_cache_folder() -> Path | None:
+    """``$XDG_CACHE_HOME/egovcp``, else ``~/.cache/egovcp``; None if the user has no home folder.
+
+    A user id without an account and without ``$HOME`` has none (``docker run --user 12345``).
+    """
+    root = os.environ.get("XDG_CACHE_HOME", "")
+    if os.path.isabs(root):
+        return Path(root) / "egovcp"
+    try:
+        return Path.home() / ".cache" / "egovcp"
+    except RuntimeError:
+        return None
+
+
+class TrustedCache:
+    """An open cache folder, created with mode 0700 if it is missing.
+
+    Raises:
+        EnvironmentFailure: another user owns it or can write to it, or it is a symbolic link.
+        OSError: it cannot be created or opened.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        _make_private(folder)
+        if folder.is_symlink():
+            raise EnvironmentFailure(
+                f"the cache folder {folder} is a symbolic link, expected a folder; remove it, or "
+                "set XDG_CACHE_HOME to another folder"
+            )
+        for ancestor in _ancestors(folder):
+            _require_trusted(ancestor, ancestor.stat(), sticky=True)
+        flags = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+        self._descriptor = os.open(folder, flags)
+        try:
+            _require_trusted(folder, os.fstat(self._descriptor), sticky=False)
+        except EnvironmentFailure:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the folder."""
+        os.close(self._descriptor)
+
+    def read(self, name: str) -> bytes | None:
+        """Content of a file; None if it is missing, not trusted, or differs from its digest."""
+        content, digest = self._read(name), self._read(_digest_name(name))
+        if content is None or digest is None or digest != _digest_line(name, content):
+            return None
+        return content
+
+    def write(self, name: str, content: bytes) -> None:
+        """Store a file and its digest durably; each replaces an older one in one step.
+
+        Raises:
+            OSError: it cannot be written.
+        """
+        self._write(name, content)
+        self._write(_digest_name(name), _digest_line(name, content))
+        os.fsync(self._descriptor)
+
+    def _read(self, name: str) -> bytes | None:
+        flags = os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+        try:
+            descriptor = os.open(name, flags, dir_fd=self._descriptor)
+        except OSError:
+            return None
+        with os.fdopen(descriptor, "rb") as file:
+            status = os.fstat(descriptor)
+            trusted = stat.S_ISREG(status.st_mode) and not _distrust(status)
+            if not trusted or status.st_size > _LARGEST_FILE:
+                return None
+            return file.read()
+
+    def _write(self, name: str, content: bytes) -> None:
+        temporary = f".{name}.{secrets.token_hex(8)}"
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        descriptor = os.open(temporary, flags, 0o600, dir_fd=self._descriptor)
+        try:
+            with os.fdopen(descriptor, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(descriptor)
+            os.rename(temporary, name, src_dir_fd=self._descriptor, dst_dir_fd=self._descriptor)
+        except BaseException:
+            with suppress(OSError):
+                os.unlink(temporary, dir_fd=self._descriptor)
+            raise
+
+
+def load_library(content: bytes, name: str) -> ctypes.CDLL:
+    """Load a shared library from memory, so that no file can be exchanged after its check.
+
+    Args:
+        content: the library.
+        name: shown by debuggers and profilers.
+
+    Raises:
+        OSError: it is not a library for this machine.
+    """
+    if hasattr(os, "memfd_create"):
+        descriptor = os.memfd_create(name, os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+        try:
+            with os.fdopen(descriptor, "wb", closefd=False) as file:
+                file.write(content)
+            seals = fcntl.F_SEAL_WRITE | fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
+            fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
+            library = ctypes.CDLL(f"/proc/self/fd/{descriptor}")
+        except OSError:
+            os.close(descriptor)  # no /proc, or no executable memory files: use a private file
+        else:
+            # The loader knows libraries by path: the number must not be used again.
+            _loaded_descriptors.append(descriptor)
+            return library
+    with tempfile.TemporaryDirectory(prefix="egovcp-") as folder:
+        path = Path(folder) / name
+        path.write_bytes(content)
+        return ctypes.CDLL(str(path))
+
+
+def _make_private(folder: Path) -> None:
+    """Create a folder and its missing parents, all with mode 0700."""
+    if not folder.parent.exists():
+        _make_private(folder.parent)
+    with suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+
+
+def _ancestors(folder: Path) -> Iterator[Path]:
+    """The folders above one, links resolved, up to the home folder or the root."""
+    try:
+        home: Path | None = Path.home().resolve()
+    except RuntimeError:
+        home = None
+    for ancestor in folder.resolve().parents:
+        yield ancestor
+        if ancestor == home:
+            return
+
+
+def _distrust(status: os.stat_result, sticky: bool = False) -> str:
+    """Why another user may have changed a file or folder; empty if none can.
+
+    Args:
+        sticky: whether a folder that others can write to is safe if they cannot replace what
+            is in it, as in ``/tmp``.
+    """
+    if status.st_uid not in (0, os.geteuid()):
+        return f"belongs to user id {status.st_uid}, expected {os.geteuid()}"
+    mode = stat.S_IMODE(status.st_mode)
+    if mode & _WRITABLE_BY_OTHERS and not (sticky and mode & stat.S_ISVTX):
+        return f"can be written by other users (mode {mode:04o})"
+    return ""
+
+
+def _require_trusted(path: Path, status: os.stat_result, sticky: bool) -> None:
+    if reason := _distrust(status, sticky):
+        remedy = f"chmod go-w {path}, or " if "written" in reason else ""
+        raise EnvironmentFailure(
+            f"the cache folder is not safe to load code from: {path} {reason}; {remedy}set "
+            "XDG_CACHE_HOME to a folder of your own"
+        )
+
+
+def _digest_name(name: str) -> str:
+    return f"{name}.sha256"
+
+
+def _digest_line(name: str, content: bytes) -> bytes:
+    return f"{hashlib.sha256(content).hexdigest()}  {name}\n".encode()

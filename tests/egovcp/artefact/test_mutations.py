@@ -1,0 +1,54 @@
+"""Policies that a seed has damaged are refused within limits, or load exactly what they hold."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+import torch
+from safetensors.torch import load
+
+from egovcp.artefact import WEIGHTS, load_artefact
+from egovcp.errors import ArtefactError
+from egovcp.testing.limited import run_limited
+from egovcp.testing.mutations import ANY_FILE, MARKER, mutate_policy
+
+from .conftest import PLANNER
+
+POLICIES = 300
+_DIFFERENT = 99  # exit code: a policy loaded something else than what its files hold
+
+
+def _load_and_compare(folder: Path) -> int:
+    try:
+        loaded = load_artefact(str(folder))
+    except ArtefactError as error:
+        print(error)
+        return error.exit_code
+    held = load((folder / WEIGHTS).read_bytes())
+    state = loaded.world_model.state_dict()
+    same = all(torch.equal(state[name], tensor.float()) for name, tensor in held.items())
+    return 0 if same and loaded.planner == PLANNER else _DIFFERENT
+
+
+@pytest.mark.parametrize("part", range(10))
+def test_mutated_policies_are_refused_within_limits(
+    original: Path, tmp_path: Path, part: int
+) -> None:
+    count = POLICIES // 10
+    for seed in range(part * count, (part + 1) * count):
+        folder = Path(shutil.copytree(original, tmp_path / str(seed)))
+        mutation = mutate_policy(folder, seed)
+        found = run_limited(lambda folder=folder: _load_and_compare(folder))
+        case = f"seed {seed}, {mutation}: {found}"
+        assert not found.timed_out, case
+        assert not found.has_traceback, case
+        assert not (folder / MARKER).exists(), case
+        assert "\x1b" not in found.output, case
+        assert len(found.output) < 1000, case
+        if mutation.culprit is None:
+            assert found.exit_code == 0, case
+        elif mutation.culprit == ANY_FILE:
+            assert found.exit_code in (0, 4), case
+        else:
+            assert found.exit_code == 4, case
+            assert any(name in found.output for name in mutation.culprit.split("|")), case

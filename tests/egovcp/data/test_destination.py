@@ -1,0 +1,260 @@
+"""Symbolic links, empty folders and mount points as the root of a dataset."""
+
+from __future__ import annotations
+
+import errno
+import os
+import subprocess
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from egovcp.data import (
+    DatasetConfig,
+    DatasetReader,
+    DatasetWriter,
+    Episode,
+    Provenance,
+    destination,
+    files,
+)
+from egovcp.data.committer import committing, work_folder
+from egovcp.data.encoded import encode
+from egovcp.data.spool import SealedEpisode
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.testing.limited import run_limited
+
+_RUN = Provenance("stance-1", seed=0, command="collect")
+
+
+def _write(root: Path, episodes: list[Episode]) -> None:
+    with DatasetWriter(root, _RUN) as writer:
+        for episode in episodes:
+            writer.add(episode)
+
+
+def _collect(root: Path, episodes: list[Episode], resume: bool = False) -> None:
+    """Add those episodes that the dataset does not have yet."""
+    with committing(root, _RUN, 2, (lambda provenance: None) if resume else None) as committer:
+        for number in committer.missing(len(episodes)):
+            committer.spool.put(SealedEpisode.of(number, encode(episodes[number])))
+            committer.note(number)
+        committer.commit()
+
+
+def _size(root: Path) -> int:
+    return len(DatasetReader.open(DatasetConfig(root=str(root))))
+
+
+def test_resume_through_a_link_extends_the_real_dataset(
+    tmp_path: Path, episodes: list[Episode]
+) -> None:
+    real, link = tmp_path / "real", tmp_path / "elsewhere" / "link"
+    link.parent.mkdir()
+    link.symlink_to(real)
+    _collect(real, episodes[:2])
+    for count in (3, 5):  # an incomplete shard first, so that the second resume reads it back
+        _collect(link, episodes[:count], resume=True)
+    assert link.is_symlink()
+    assert _size(real) == 5
+    assert [path.name for path in link.parent.iterdir()] == ["link"]
+    assert {path.name for path in tmp_path.iterdir()} == {"real", "elsewhere"}
+
+
+@pytest.mark.parametrize(("first", "second"), [("real", "link"), ("link", "real")])
+def test_a_link_and_its_target_share_one_lock(
+    tmp_path: Path, episodes: list[Episode], first: str, second: str
+) -> None:
+    (tmp_path / "link").symlink_to("real")
+    _collect(tmp_path / "real", episodes[:1])
+
+    def agree(provenance: Provenance) -> None:
+        """Nothing to compare."""
+
+    with (
+        committing(tmp_path / first, _RUN, 2, agree),
+        pytest.raises(EnvironmentFailure, match="real is being written by process"),
+        committing(tmp_path / second, _RUN, 2, agree),
+    ):
+        pass
+    assert work_folder(tmp_path / "link") == work_folder(tmp_path / "real")
+
+
+@pytest.mark.parametrize("write", [_write, _collect])
+def test_a_link_to_a_folder_that_is_not_there_yet(
+    tmp_path: Path, episodes: list[Episode], write: Callable[[Path, list[Episode]], None]
+) -> None:
+    (tmp_path / "link").symlink_to("disk/real")
+    write(tmp_path / "link", episodes[:2])
+    assert (tmp_path / "link").is_symlink()
+    assert _size(tmp_path / "disk" / "real") == 2
+
+
+def test_a_loop_of_links_is_refused(tmp_path: Path, episodes: list[Episode]) -> None:
+    (tmp_path / "a").symlink_to("b")
+    (tmp_path / "b").symlink_to("a")
+    with pytest.raises(UsageError, match="symbolic link that leads nowhere"):
+        _write(tmp_path / "a", episodes[:1])
+
+
+@pytest.mark.parametrize("write", [_write, _collect])
+def test_an_empty_folder_is_a_root(
+    tmp_path: Path, episodes: list[Episode], write: Callable[[Path, list[Episode]], None]
+) -> None:
+    root = tmp_path / "d"
+    root.mkdir()
+    write(root, episodes[:2])
+    assert _size(root) == 2
+    assert [path.name for path in tmp_path.iterdir()] == ["d"]
+
+
+def test_resume_in_an_empty_folder_begins(tmp_path: Path, episodes: list[Episode]) -> None:
+    (tmp_path / "d").mkdir()
+    _collect(tmp_path / "d", episodes[:2], resume=True)
+    assert _size(tmp_path / "d") == 2
+
+
+def test_a_folder_that_holds_something_is_refused(tmp_path: Path, episodes: list[Episode]) -> None:
+    (tmp_path / "d").mkdir()
+    (tmp_path / "d" / "notes.txt").write_text("mine")
+    for write in (_write, _collect):
+        with pytest.raises(UsageError, match="exists already"):
+            write(tmp_path / "d", episodes[:1])
+    assert [path.name for path in (tmp_path / "d").iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize("write", [_write, _collect])
+def test_what_another_program_wrote_meanwhile_stays(
+    tmp_path: Path,
+    episodes: list[Episode],
+    write: Callable[[Path, list[Episode]], None],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    root, rename = tmp_path / "d", files.rename
+
+    def write_first(source: Path, target: Path) -> None:
+        if target == root:
+            root.mkdir()
+            (root / "notes.txt").write_text("mine")
+        rename(source, target)
+
+    monkeypatch.setattr(files, "rename", write_first)
+    with pytest.raises(UsageError, match="not empty any more"):
+        write(root, episodes[:1])
+    assert [path.name for path in root.iterdir()] == ["notes.txt"]
+
+
+# mount points
+
+
+@contextmanager
+def _mounted(root: Path, kind: str) -> Iterator[None]:
+    """A mount at ``root``, for this process alone; raises OSError where that is not permitted."""
+    os.unshare(os.CLONE_NEWNS)
+    subprocess.run(["mount", "--make-rprivate", "/"], check=True)
+    what = ["--bind", str(root)] if kind == "bind" else ["-t", "tmpfs", "none"]
+    subprocess.run(["mount", *what, str(root)], check=True)
+    yield
+
+
+_NOT_PERMITTED = 99
+
+
+def _in_mount(root: Path, kind: str, function: Callable[[], None]) -> None:
+    """Call the function in a child that has a mount at ``root``, or skip the test."""
+
+    def child() -> int:
+        try:
+            with _mounted(root, kind):
+                function()
+        except (PermissionError, FileNotFoundError, subprocess.CalledProcessError):
+            return _NOT_PERMITTED
+        return 0
+
+    result = run_limited(child, seconds=60)
+    if result.exit_code == _NOT_PERMITTED:
+        pytest.skip("mounting is not permitted here")
+    assert result.exit_code == 0, result.output
+
+
+@pytest.mark.parametrize("write", [_write, _collect])
+@pytest.mark.parametrize("kind", ["tmpfs", "bind"])
+def test_an_empty_mount_point_is_refused_before_anything_is_written(
+    tmp_path: Path,
+    episodes: list[Episode],
+    kind: str,
+    write: Callable[[Path, list[Episode]], None],
+) -> None:
+    root = tmp_path / "mnt"
+    root.mkdir()
+
+    def refused() -> None:
+        with pytest.raises(EnvironmentFailure, match=r"is a mount point; .*mnt/dataset"):
+            write(root, episodes[:1])
+        write(root / "dataset", episodes[:1])
+        assert _size(root / "dataset") == 1
+
+    _in_mount(root, kind, refused)
+    assert [path.name for path in tmp_path.iterdir()] == ["mnt"]
+
+
+def test_resume_in_a_mount_point_is_refused_at_once(
+    tmp_path: Path, episodes: list[Episode]
+) -> None:
+    root = tmp_path / "mnt"
+    _collect(root, episodes[:1])
+
+    def refused() -> None:
+        with pytest.raises(EnvironmentFailure, match="is a mount point"):
+            _collect(root, episodes[:2], resume=True)
+        assert _size(root) == 1
+
+    _in_mount(root, "bind", refused)
+    assert [path.name for path in tmp_path.iterdir()] == ["mnt"]
+
+
+def test_mount_points_are_found_without_mounting(
+    tmp_path: Path, episodes: list[Episode], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root, table = tmp_path / "with space", tmp_path / "mountinfo"
+    root.mkdir()
+    table.write_text(f"1 2 254:0 / {str(root).replace(' ', chr(92) + '040')} rw - ext4 /dev/x rw\n")
+    monkeypatch.setattr(destination, "_MOUNTS", table)
+    for write in (_write, _collect):
+        with pytest.raises(EnvironmentFailure, match="is a mount point"):
+            write(root, episodes[:1])
+    assert {path.name for path in tmp_path.iterdir()} == {root.name, table.name}
+
+
+@pytest.mark.parametrize("number", [errno.EBUSY, errno.EXDEV])
+def test_a_root_that_cannot_be_renamed_loses_nothing(
+    tmp_path: Path, episodes: list[Episode], monkeypatch: pytest.MonkeyPatch, number: int
+) -> None:
+    def busy(one: Path, other: Path) -> None:
+        raise OSError(number, os.strerror(number), str(one))
+
+    root = tmp_path / "d"
+    _collect(root, episodes[:1])
+    with monkeypatch.context() as patch:
+        patch.setattr(files, "exchange", busy)
+        with pytest.raises(EnvironmentFailure, match=f"{root} cannot be renamed"):
+            _collect(root, episodes[:2], resume=True)
+    assert _size(root) == 1
+    with committing(root, _RUN, 2, lambda provenance: None) as committer:
+        assert committer.missing(2) == []  # what was simulated is still sealed
+        committer.commit()
+    assert _size(root) == 2
+
+
+def test_hard_links_across_file_systems_become_copies(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def other_device(source: Path, target: Path) -> None:
+        raise OSError(errno.EXDEV, os.strerror(errno.EXDEV))
+
+    (tmp_path / "a").write_text("content")
+    monkeypatch.setattr(os, "link", other_device)
+    files.link(tmp_path / "a", tmp_path / "b")
+    assert (tmp_path / "b").read_text() == "content"

@@ -1,0 +1,254 @@
+"""The compiled planner: cached safely, and if it cannot be used, float32 with the reason."""
+
+import os
+import pwd
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.plan import PlannerConfig
+from egovcp.plan.backends import judge_of_model, library
+from egovcp.plan.backends.judges import FloatJudge, IntegerJudge
+from egovcp.plan.config import BackendName
+from egovcp.testing import toy_model
+from egovcp.testing.limited import run_limited
+
+needs_compiler = pytest.mark.skipif(library.compiler() is None, reason="no C compiler")
+needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+OTHER_USER = 12345
+
+
+def _forget() -> None:
+    for cached in (library.library, library.library_if_possible, library.warn_float32):
+        cached.cache_clear()
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty cache folder; the processor counts as fast at int8, and a compile is quick."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(library, "processor_is_fast", lambda: True)
+    monkeypatch.setattr(library, "FLAGS", ("-O0", "-shared", "-fPIC", "-std=gnu11"))
+    _forget()
+    yield tmp_path / "cache" / "egovcp"
+    _forget()
+
+
+def _judge(backend: BackendName) -> object:
+    """What computes the plans in a process that has just started."""
+    _forget()
+    return judge_of_model(toy_model(), PlannerConfig(backend=backend))
+
+
+def _compiled(cache: Path) -> Path:
+    (path,) = cache.glob("planner-*.so")
+    return path
+
+
+@pytest.fixture
+def compilations(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
+    """One entry for each run of the compiler."""
+    runs: list[Path] = []
+    run = subprocess.run
+
+    def record(*args: object, **options: object) -> object:
+        runs.append(Path())
+        return run(*args, **options)  # type: ignore[call-overload]
+
+    monkeypatch.setattr(subprocess, "run", record)
+    return runs
+
+
+# --- the cache ----------------------------------------------------------------------------
+@needs_compiler
+def test_the_kernel_is_compiled_once_into_a_private_folder(
+    cache: Path, compilations: list[Path]
+) -> None:
+    for _ in range(2):
+        assert isinstance(_judge("int8"), IntegerJudge)
+    assert len(compilations) == 1
+    assert cache.stat().st_mode & 0o777 == cache.parent.stat().st_mode & 0o777 == 0o700
+    digest = f"{_compiled(cache)}.sha256"
+    subprocess.run(["sha256sum", "--check", "--quiet", digest], cwd=cache, check=True)
+    assert len(list(cache.iterdir())) == 2, "temporary files were left"
+
+
+@needs_compiler
+def test_a_truncated_library_is_compiled_again(cache: Path, compilations: list[Path]) -> None:
+    _judge("int8")
+    for size in (0, 5000):
+        with _compiled(cache).open("r+b") as file:
+            file.truncate(size)
+        assert isinstance(_judge("int8"), IntegerJudge)
+    assert len(compilations) == 3
+    assert _compiled(cache).stat().st_size > 5000
+
+
+# --- a cache folder that others can write to ----------------------------------------------
+@pytest.fixture
+def planted(cache: Path, tmp_path: Path) -> Path:
+    """Plant a library, with its digest, that creates a file when it is loaded; the file."""
+    _judge("int8")
+    marker, source = tmp_path / "executed", tmp_path / "planted.c"
+    source.write_text(
+        "#include <fcntl.h>\n__attribute__((constructor)) static void run(void) "
+        f'{{ open("{marker}", O_CREAT | O_WRONLY, 0600); }}\n'
+    )
+    target, command = _compiled(cache), library.compiler()
+    assert command is not None
+    subprocess.run([command, "-shared", "-fPIC", str(source), "-o", str(target)], check=True)
+    digest = subprocess.run(
+        ["sha256sum", target.name], cwd=cache, check=True, capture_output=True
+    ).stdout
+    Path(f"{target}.sha256").write_bytes(digest)
+    for file in cache.iterdir():
+        file.chmod(0o600)
+    return marker
+
+
+def _open_to_all(cache: Path) -> None:
+    cache.chmod(0o777)
+
+
+def _open_parent(cache: Path) -> None:
+    cache.parent.chmod(0o775)
+
+
+def _linked(cache: Path) -> None:
+    cache.rename(cache.parent / "real")
+    cache.symlink_to(cache.parent / "real")
+
+
+def _foreign(cache: Path) -> None:
+    os.chown(cache, OTHER_USER, OTHER_USER)
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("open_up", "reason"),
+    [
+        (_open_to_all, "can be written by other users (mode 0777); chmod go-w"),
+        (_open_parent, "can be written by other users (mode 0775); chmod go-w"),
+        (_linked, "is a symbolic link"),
+        pytest.param(_foreign, "belongs to user id 12345, expected 0", marks=needs_root),
+    ],
+)
+def test_a_library_planted_by_another_user_is_not_executed(
+    open_up: object,
+    reason: str,
+    cache: Path,
+    planted: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert callable(open_up)
+    open_up(cache)
+    _forget()
+    for _ in range(2):
+        assert isinstance(judge_of_model(toy_model(), PlannerConfig()), FloatJudge)
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert reason in told
+    assert "XDG_CACHE_HOME" in told
+    with pytest.raises(EnvironmentFailure, match=r"--planner\.backend=float32") as caught:
+        _judge("int8")
+    assert reason in str(caught.value)
+    assert not planted.exists()
+
+
+@needs_compiler
+def test_the_planted_library_would_be_executed(cache: Path, planted: Path) -> None:
+    """Else the test above could not fail."""
+    with pytest.raises(AttributeError):
+        _judge("int8")
+    assert planted.exists()
+
+
+# --- no cache folder, no compiler ---------------------------------------------------------
+@needs_compiler
+def test_a_user_without_account_and_home_plans_in_int8(
+    cache: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def unknown(uid: int) -> None:
+        raise KeyError(f"getpwuid(): uid not found: {uid}")
+
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.delenv("HOME", raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    assert isinstance(_judge("auto"), IntegerJudge)
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert "the user has no home folder" in told
+    assert "set XDG_CACHE_HOME" in told
+
+
+@needs_compiler
+@needs_root
+@pytest.mark.parametrize("home", ["", "/"])
+def test_an_unknown_user_id_plans_in_int8(home: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As under ``docker run --user 12345``."""
+    monkeypatch.delenv("XDG_CACHE_HOME")
+    monkeypatch.setenv("TMPDIR", "/tmp")
+
+    def run() -> int:
+        os.environ.pop("HOME", None)
+        if home:
+            os.environ["HOME"] = home
+        os.setgid(OTHER_USER)
+        os.setuid(OTHER_USER)
+        import tempfile
+
+        tempfile.tempdir = None
+        print(type(_judge("auto")).__name__)
+        return 0
+
+    result = run_limited(run, seconds=60.0)
+    assert not result.has_traceback, result.output
+    assert "IntegerJudge" in result.output
+    assert result.output.count("warning:") == 1
+
+
+@pytest.mark.parametrize("backend", ["auto", "int8"])
+def test_without_a_compiler(
+    backend: BackendName, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(library, "compiler", lambda: None)
+    _expect_float32(backend, "there is no C compiler (cc, gcc or clang, or $CC); install", capsys)
+
+
+@pytest.mark.parametrize("backend", ["auto", "int8"])
+def test_a_compiler_that_fails(
+    backend: BackendName,
+    cache: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setenv("CC", "false")
+    _expect_float32(backend, "false cannot compile", capsys)
+    assert not list(cache.iterdir())
+
+
+@needs_compiler
+def test_what_the_compiler_says_is_quoted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(library, "FLAGS", ("--no-such-flag",))
+    with pytest.raises(EnvironmentFailure, match="no-such-flag"):
+        _judge("int8")
+
+
+def _expect_float32(backend: BackendName, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """One line that says why; int8 itself is refused."""
+    if backend == "int8":
+        with pytest.raises(EnvironmentFailure) as caught:
+            _judge(backend)
+        told = str(caught.value)
+    else:
+        for _ in range(2):
+            assert isinstance(judge_of_model(toy_model(), PlannerConfig()), FloatJudge)
+        told = capsys.readouterr().err
+        assert told.startswith("egovcp: warning: ")
+        assert told.count("\n") == 1
+        assert "Planning in float32" in told
+    assert reason in told
+    assert "--planner.backend=float32" in told
