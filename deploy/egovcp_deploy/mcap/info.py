@@ -128,7 +128,7 @@ def run(config: InfoConfig) -> None:
 
 
 def summarise(path: Path) -> Summary:
-    """Read the whole recording once.
+    """Read the whole recording once. Depth images and plans are not decoded.
 
     Raises:
         DataError: not a recording of ours, or one with a damaged message.

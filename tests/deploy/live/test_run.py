@@ -23,7 +23,6 @@ from egovcp.log.mcap_reader import read_recording
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
-from egovcp_deploy.mcap.cli import main as mcap
 from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.fake import FakeBridge, Ports
 from egovcp_deploy.robots.fake.running import Running, eventually
@@ -242,38 +241,6 @@ def test_a_robot_that_goes_silent_is_damped_and_the_run_is_a_safety_stop(
     words = stand.end()
     assert stand.program.returncode == 6, words
     assert "no new proprioception" in words
-
-
-def test_a_recording_says_why_the_robot_was_held_and_damped(
-    drive: Callable[..., Stand], capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Nothing but the MCAP file is read: not the terminal, not deploy.json."""
-    stand = drive()
-    stand.await_run()
-    stand.fake.faults.obey("hot_motor left_ankle_roll 125")
-    assert eventually(lambda: State.HOLD in stand.modes())
-    stand.fake.faults.obey("dropped_motor left_knee")
-    assert eventually(lambda: not stand.holds)
-    stand.program.communicate(timeout=120)
-    assert stand.program.returncode == 6
-    assert mcap(["info", str(stand.folder / "rollout-0.mcap"), "--json=-"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    states = [(change["before"], change["after"]) for change in report["states"]]
-    assert states[:3] == [("init", "stand"), ("stand", "armed"), ("armed", "run")]
-    held, damped = report["states"][-2:]
-    assert (held["after"], damped["after"]) == ("hold", "damp")
-    assert "left_ankle_roll_joint is too hot: 80 deg C; let the robot down" in held["reason"]
-    assert "motor of left_knee_joint does not" in damped["reason"]
-    assert report["last_event"] == "end of the run: the motors are damped"
-    hottest = report["joint_maxima"]["left_ankle_roll_joint"]
-    assert hottest["temperature_deg_c"] == pytest.approx(80.0)
-    assert 5.0 < report["joint_maxima"]["right_knee_joint"]["torque_nm"] < 150.0
-    ticks = read_recording(stand.folder / "rollout-0.mcap").ticks
-    assert {"mode_machine", "state_lost", "state_jitter_ms", "image_age_ms"} <= ticks[
-        -1
-    ].link.keys()
-    off = [event for tick in ticks for event in tick.events if "checks that are off" in event]
-    assert len(off) == 1, "what LeRobot's bridge does not report is said once"
 
 
 def test_no_robot_there_is_said_at_once(artefact_dir: Path, tmp_path: Path) -> None:

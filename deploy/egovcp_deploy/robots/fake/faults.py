@@ -37,18 +37,18 @@ class Faults:
     """Another program holds every joint where it is, and nothing tells of it."""
     mode: int | None = None
     """The robot reports another mode machine."""
-    gyroscope: float = 0.0
-    """The gyroscope's x axis reports this rate, rad/s, whatever the robot does."""
-    joint_speed: float = 0.0
-    """The left knee reports this speed, rad/s, whatever it does."""
-    flood: int = 0
-    """Messages of 2 kB of garbage on the state port, for each state."""
     hot_motor: tuple[int, float] | None = None
     """A joint's motor reports this temperature, deg C (of its winding, where it reports two)."""
     dropped_motor: int | None = None
     """A joint's motor no longer obeys: no torque. Without detailed states nothing tells of it."""
     no_temperature: bool = False
     """States carry no temperatures, as from older firmware."""
+    gyroscope: float = 0.0
+    """The gyroscope's x axis reports this rate, rad/s, whatever the robot does."""
+    joint_speed: float = 0.0
+    """The left knee reports this speed, rad/s, whatever it does."""
+    flood: int = 0
+    """Messages of 2 kB of garbage on the state port, for each state."""
     push: tuple[float, float] | None = None
     """Change of the base's velocity, m/s, world x and y; happens once."""
     release: bool = False
