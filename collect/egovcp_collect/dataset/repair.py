@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,8 +13,8 @@ from tqdm import tqdm
 
 from egovcp.checks.dataset import command_problems
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode
-from egovcp.data.duplicates import Duplicate, DuplicateFinder
-from egovcp.data.origin import ScenarioKey, ScenarioKeys
+from egovcp.data.duplicates import DuplicateFinder
+from egovcp.data.origin import ScenarioKeys
 from egovcp.data.source import Source, local_root, require_folder
 from egovcp.errors import DataError
 from egovcp.terminal import echo, one_line
@@ -115,8 +115,7 @@ def _sound_episodes(root: Path, book: Book, dropped: list[DataError]) -> Iterato
         record = book.find(digest, found.number)
         problems = list(_problems(found, record))
         if not problems and record is not None:
-            scenario = scenarios.key(record["task"], record.get("metadata", {}))
-            problems = list(_repetition(finder.add(found.number, digest, scenario), scenario))
+            problems = list(_repetition(found.number, digest, record, scenarios, finder))
         if problems or record is None:
             frame, problem = problems[0]
             dropped.append(DataError.at(found.file, problem, found.number, frame))
@@ -127,8 +126,19 @@ def _sound_episodes(root: Path, book: Book, dropped: list[DataError]) -> Iterato
 
 
 def _repetition(
-    found: Duplicate[int] | None, scenario: ScenarioKey | None
+    number: int,
+    digest: str,
+    record: Mapping[str, Any],
+    scenarios: ScenarioKeys,
+    finder: DuplicateFinder[int],
 ) -> Iterator[tuple[int | None, str]]:
+    """The problem of an episode that repeats an earlier one, or names no collection."""
+    try:
+        scenario = scenarios.key(record["task"], record.get("metadata", {}))
+    except DataError as error:
+        yield None, error.problem
+        return
+    found = finder.add(number, digest, scenario)
     if found is not None and found.equal:
         yield None, f"the same as episode {found.place}"
     elif found is not None:
