@@ -16,10 +16,12 @@ import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final
 
 import draccus
 
+from egovcp.atomic import write_text
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
 from egovcp.flags import HELP, flag_values, flags_of, merged, split_flags
@@ -179,5 +181,4 @@ def _without_token(text: str) -> str:
 
 def save_config(config: Any, path: str) -> None:
     """Write the resolved config as YAML, so that a run can be repeated with ``--config_path``."""
-    with open(path, "w", encoding="utf-8") as file:
-        draccus.dump(config, file)
+    write_text(Path(path), str(draccus.dump(config)))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import platform
 import shlex
 from collections.abc import Mapping
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.artefact import Artefact, load_artefact
+from egovcp.atomic import write_text
 from egovcp_train.curves import draw_curves
 
 CARD: Final = "README.md"
@@ -52,9 +52,7 @@ def write_card(folder: Path, run: Path, repo_id: str) -> None:
         repo_id: id on the Hub that the examples name; empty: they name the folder.
     """
     draw_curves(run, folder / CURVES)
-    partial = folder / f".{CARD}.partial"
-    partial.write_text(card_text(load_artefact(str(folder)), repo_id), encoding="utf-8")
-    os.replace(partial, folder / CARD)
+    write_text(folder / CARD, card_text(load_artefact(str(folder)), repo_id))
 
 
 def card_text(artefact: Artefact, repo_id: str) -> str:

@@ -17,7 +17,7 @@ from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.data.ahead import Ahead
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.errors import UsageError
 from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
 from egovcp.model.weights import tensor_shapes
@@ -31,6 +31,7 @@ from egovcp_train.checkpoint import (
     checkpoint_dir,
     finish_checkpoint,
     load_training_state,
+    restoring,
 )
 from egovcp_train.closed_loop import ClosedLoop, require_simulator
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
@@ -69,7 +70,7 @@ def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
     Raises:
         UsageError: a config file, which says everything itself, would hide the preset.
     """
-    if options := resumed_options(argv):
+    if options := resumed_options(TrainConfig, argv):
         return options
     given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
     if "preset" in given and "config_path" in given:
@@ -341,17 +342,11 @@ def _restore(output: Path, learner: Learner, stream: Ahead) -> float:
         UsageError: the windows or the processes are others.
     """
     state = load_training_state(output)
-    try:
+    with restoring(output):
         learner.load_state_dict(state["learner"])
         streams = state.get("streams") or [state["stream"]]
         stream.load_state_dict(streams[min(learner.ranks.rank, len(streams) - 1)])
         return float(state.get("seconds", 0.0))
-    except (KeyError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ArtefactError(
-            f"{output}: its checkpoint does not fit the --policy options given ({reason}); resume "
-            "without them, or start a new run"
-        ) from error
 
 
 def _provenance(material: Material) -> dict[str, Any]:

@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,7 +16,6 @@ import torch
 
 from egovcp.bounds import bounded
 from egovcp.cli import run_command, save_config
-from egovcp.errors import ArtefactError
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.walk_onnx import export_onnx
 from egovcp.robot.walking import WalkConfig
@@ -26,6 +26,7 @@ from egovcp_train.checkpoint import (
     checkpoint_dir,
     finish_checkpoint,
     load_training_state,
+    restoring,
 )
 from egovcp_train.iterations import run_iterations
 from egovcp_train.loop import Budget
@@ -89,7 +90,13 @@ class LowLevelTrainConfig:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return run_command(LowLevelTrainConfig, train, argv, prog=PROG, defaults=resumed_options)
+    return run_command(
+        LowLevelTrainConfig,
+        train,
+        argv,
+        prog=PROG,
+        defaults=partial(resumed_options, LowLevelTrainConfig),
+    )
 
 
 def train(config: LowLevelTrainConfig) -> None:
@@ -133,14 +140,8 @@ def _build(config: LowLevelTrainConfig, threads: int) -> Any:
 
 def _restore(output: Path, learner: Any) -> None:
     state = load_training_state(output)
-    try:
+    with restoring(output):
         learner.load_state_dict(state)
-    except (KeyError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ArtefactError(
-            f"{output}: its checkpoint does not fit the options given ({reason}); resume "
-            "without them, or start a new run"
-        ) from error
 
 
 class _Run:

@@ -7,7 +7,6 @@ the velocity and how still the pelvis is.
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import time
@@ -20,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
+from egovcp.atomic import write_json
 from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.packages import SIMULATOR_MODULES, require_packages
@@ -194,9 +194,7 @@ def _quality(rate: Array, motion: Array, command: Array) -> Array:
 
 def _save(path: Path, gait: GaitConfig, generation: int) -> None:
     content = {"gait": asdict(gait), "generations": generation, "command": [PROG, *sys.argv[1:]]}
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(content, indent=2))
-    partial.replace(path)
+    write_json(path, content)
 
 
 if __name__ == "__main__":

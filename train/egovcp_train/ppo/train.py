@@ -6,6 +6,7 @@ import dataclasses
 import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ import draccus
 import torch
 
 from egovcp.cli import run_command, save_config
-from egovcp.errors import ArtefactError
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import (
@@ -21,6 +21,7 @@ from egovcp_train.checkpoint import (
     checkpoint_dir,
     finish_checkpoint,
     load_training_state,
+    restoring,
 )
 from egovcp_train.iterations import run_iterations
 from egovcp_train.loop import Budget
@@ -34,7 +35,9 @@ POLICY_FILE = "ppo.safetensors"
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return run_command(PpoTrainConfig, train, argv, prog=PROG, defaults=resumed_options)
+    return run_command(
+        PpoTrainConfig, train, argv, prog=PROG, defaults=partial(resumed_options, PpoTrainConfig)
+    )
 
 
 def train(config: PpoTrainConfig) -> None:
@@ -50,7 +53,8 @@ def train(config: PpoTrainConfig) -> None:
     learner = _build(config, int(state.get("episodes", 0)))
     try:
         if config.resume:
-            _restore(output, learner, state)
+            with restoring(output):
+                learner.load_state_dict(state)
         output.mkdir(parents=True, exist_ok=True)
         save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
         _run(config, output, learner, float(state.get("seconds", 0.0)))
@@ -64,17 +68,6 @@ def _build(config: PpoTrainConfig, first: int) -> Any:
     from egovcp_train.ppo.learn import ContactLearner
 
     return ContactLearner(config, first)
-
-
-def _restore(output: Path, learner: Any, state: dict[str, Any]) -> None:
-    try:
-        learner.load_state_dict(state)
-    except (KeyError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ArtefactError(
-            f"{output}: its checkpoint does not fit the options given ({reason}); resume "
-            "without them, or start a new run"
-        ) from error
 
 
 def _run(config: PpoTrainConfig, output: Path, learner: Any, spent: float) -> None:
