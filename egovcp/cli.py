@@ -12,7 +12,6 @@ after an interrupt. A traceback is printed only with ``--debug``.
 from __future__ import annotations
 
 import errno
-import io
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -183,6 +182,4 @@ def _without_token(text: str) -> str:
 
 def save_config(config: Any, path: str) -> None:
     """Write the resolved config as YAML, so that a run can be repeated with ``--config_path``."""
-    text = io.StringIO()
-    draccus.dump(config, text)
-    write_text(Path(path), text.getvalue())
+    write_text(Path(path), str(draccus.dump(config)))

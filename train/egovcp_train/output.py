@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from draccus import cfgparsing
-
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.flags import read_config
+from egovcp.values import build
 from egovcp_train.checkpoint import load_training_state
 
 CONFIG_FILE = "train_config.yaml"
+_LOST = "restore this file, or remove it and give all options of the run as flags"
 
 
-def resumed_options(argv: Sequence[str]) -> dict[str, Any]:
-    """What stands where no flag says otherwise: the options of the run that is resumed.
+def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
+    """The options of the run that is resumed, which apply where no flag says otherwise.
+
+    Args:
+        config_class: of the command.
+        argv: its flags, ``--name=value`` each.
 
     Raises:
-        UsageError: a config file, which says everything itself, would hide them.
+        UsageError: a config file is given as well.
+        ArtefactError: the run's own file cannot be read, or holds other options.
     """
     given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
     saved = Path(given.get("output_dir", "")) / CONFIG_FILE
@@ -30,15 +37,25 @@ def resumed_options(argv: Sequence[str]) -> dict[str, Any]:
             f"--config_path={given['config_path']} says others; drop it, and give what is to "
             "change as flags of their own"
         )
-    return saved_options(saved.parent) if resume else {}
+    return saved_options(config_class, saved.parent) if resume else {}
 
 
-def saved_options(output: Path) -> dict[str, Any]:
-    """The options that the run in a folder has kept; empty if it has kept none."""
+def saved_options(config_class: type, output: Path) -> dict[str, Any]:
+    """The options that a run has stored in its folder; empty if it has stored none.
+
+    Raises:
+        ArtefactError: they cannot be read, or are not those of ``config_class``.
+    """
     saved = output / CONFIG_FILE
-    if not saved.is_file():
+    if not os.path.lexists(saved):
         return {}
-    options: dict[str, Any] = cfgparsing.load_config(saved.read_text("utf-8"), file=saved)
+    try:
+        options = read_config(saved)
+        build(config_class, options, "--")
+    except OSError as error:
+        raise ArtefactError(f"{saved}: cannot be read: {error.strerror}; {_LOST}") from error
+    except (UsageError, ValueError) as error:
+        raise ArtefactError(f"{saved}: {error}; {_LOST}") from error
     return options
 
 

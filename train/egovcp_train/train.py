@@ -16,7 +16,7 @@ from tqdm import tqdm
 from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.errors import UsageError
 from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
@@ -27,7 +27,12 @@ from egovcp.terminal import echo, one_line
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
 from egovcp_train.card import versions, write_card
-from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
+from egovcp_train.checkpoint import (
+    checkpoint_dir,
+    load_training_state,
+    new_checkpoint,
+    restoring,
+)
 from egovcp_train.closed_loop import ClosedLoop, require_simulator
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
 from egovcp_train.datasets import (
@@ -78,7 +83,7 @@ def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
     Raises:
         UsageError: a config file, which says everything itself, would hide the preset.
     """
-    if options := resumed_options(argv):
+    if options := resumed_options(TrainConfig, argv):
         return options
     given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
     if "preset" in given and "config_path" in given:
@@ -331,7 +336,7 @@ def _prepare_output(config: TrainConfig, ranks: Ranks) -> Path:
         return Path(config.output_dir)
     output = prepare_output(config.output_dir, config.resume)
     if config.resume:
-        require_datasets(config, saved_options(output))
+        require_datasets(config, saved_options(TrainConfig, output))
     return output
 
 
@@ -365,17 +370,11 @@ def _restore(output: Path, learner: Learner, material: Material) -> float:
     state, stream = load_training_state(output), material.stream
     if "datasets" in state:  # not in checkpoints of earlier versions
         require_same_content(material.readers, state["datasets"])
-    try:
+    with restoring(output):
         learner.load_state_dict(state["learner"])
         streams = state.get("streams") or [state["stream"]]
         stream.load_state_dict(streams[min(learner.ranks.rank, len(streams) - 1)])
         return float(state.get("seconds", 0.0))
-    except (KeyError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ArtefactError(
-            f"{output}: its checkpoint does not fit the --policy options given ({reason}); resume "
-            "without them, or start a new run"
-        ) from error
 
 
 def _provenance(material: Material) -> dict[str, Any]:

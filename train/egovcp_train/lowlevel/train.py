@@ -6,6 +6,7 @@ import dataclasses
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -14,7 +15,6 @@ import torch
 
 from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import run_command, save_config
-from egovcp.errors import ArtefactError
 from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.walk_onnx import export_onnx
@@ -22,7 +22,12 @@ from egovcp.robot.walking import WalkConfig
 from egovcp.sim.capacity import require_robots
 from egovcp.sim.config import SensorConfig
 from egovcp.terminal import echo
-from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
+from egovcp_train.checkpoint import (
+    checkpoint_dir,
+    load_training_state,
+    new_checkpoint,
+    restoring,
+)
 from egovcp_train.iterations import run_iterations
 from egovcp_train.loop import Budget
 from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig, PpoConfig
@@ -85,7 +90,13 @@ class LowLevelTrainConfig:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return run_command(LowLevelTrainConfig, train, argv, prog=PROG, defaults=resumed_options)
+    return run_command(
+        LowLevelTrainConfig,
+        train,
+        argv,
+        prog=PROG,
+        defaults=partial(resumed_options, LowLevelTrainConfig),
+    )
 
 
 def train(config: LowLevelTrainConfig) -> None:
@@ -131,14 +142,8 @@ def _build(config: LowLevelTrainConfig, threads: int) -> Any:
 
 def _restore(output: Path, learner: Any) -> None:
     state = load_training_state(output)
-    try:
+    with restoring(output):
         learner.load_state_dict(state)
-    except (KeyError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ArtefactError(
-            f"{output}: its checkpoint does not fit the options given ({reason}); resume "
-            "without them, or start a new run"
-        ) from error
 
 
 class _Run:
