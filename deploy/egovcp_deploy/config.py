@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import draccus
 
 from egovcp.bounds import bounded
 from egovcp.policy_options import PlannerOptions, PolicyOptions
+from egovcp.robot.controllers import absolute_controller
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp_deploy.live.gamepad import GamepadOptions
 from egovcp_deploy.live.hardware import CameraOptions
-from egovcp_deploy.options import PLANNER
+from egovcp_deploy.options import PLANNER, absolute_path
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.recording import LogOptions
 from egovcp_deploy.robots.bridge import BridgeConfig
@@ -89,3 +93,19 @@ class DeployConfig:
     all."""
     env: EnvConfig = field(default_factory=eventful)
     """Scenes, sensors, delays and randomisation of the simulated robot."""
+
+    def encoded(self) -> dict[str, Any]:
+        """The options as they are recorded: JSON values, with absolute paths."""
+        robot = replace(
+            self.robot,
+            recordings=absolute_path(self.robot.recordings),
+            controller=absolute_controller(self.robot.controller),
+        )
+        config = replace(
+            self,
+            policy=replace(self.policy, path=absolute_path(self.policy.path)),
+            robot=robot,
+            output_dir=absolute_path(self.output_dir),
+        )
+        options: dict[str, Any] = draccus.encode(config)
+        return options

@@ -1,12 +1,9 @@
-"""Where a run writes, and how it is asked to stop; shared by all training commands."""
+"""Where a run writes; shared by all training commands."""
 
 from __future__ import annotations
 
-import contextlib
-import signal
 import tempfile
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,7 +30,13 @@ def resumed_options(argv: Sequence[str]) -> dict[str, Any]:
             f"--config_path={given['config_path']} says others; drop it, and give what is to "
             "change as flags of their own"
         )
-    if not (resume and saved.is_file()):
+    return saved_options(saved.parent) if resume else {}
+
+
+def saved_options(output: Path) -> dict[str, Any]:
+    """The options that the run in a folder has kept; empty if it has kept none."""
+    saved = output / CONFIG_FILE
+    if not saved.is_file():
         return {}
     options: dict[str, Any] = cfgparsing.load_config(saved.read_text("utf-8"), file=saved)
     return options
@@ -72,30 +75,3 @@ def require_writable(folder: Path) -> None:
             pass
     except OSError as error:
         raise EnvironmentFailure(f"cannot write to {parent}: {error.strerror}") from error
-
-
-@contextlib.contextmanager
-def stop_on_signal(echo_s: float = 0.0) -> Iterator[list[int]]:
-    """A list that fills when SIGINT or SIGTERM asks for the end; a second one is obeyed at once.
-
-    Args:
-        echo_s: seconds during which a second one is taken for the first: a launcher hands on to
-            its processes the Ctrl-C that the terminal has already sent them.
-    """
-    received: list[int] = []
-    ignored_until = 0.0
-
-    def note(number: int, frame: object) -> None:
-        nonlocal ignored_until
-        if not received:
-            received.append(number)
-            ignored_until = time.monotonic() + echo_s
-        elif time.monotonic() >= ignored_until:
-            raise KeyboardInterrupt
-
-    previous = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

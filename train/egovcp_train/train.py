@@ -16,13 +16,13 @@ from tqdm import tqdm
 from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
-from egovcp.data.ahead import Ahead
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
 from egovcp.model.weights import tensor_shapes
 from egovcp.plan.backends import judge_of_model
+from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo, one_line
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
@@ -30,7 +30,14 @@ from egovcp_train.card import versions, write_card
 from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
 from egovcp_train.closed_loop import ClosedLoop, require_simulator
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
-from egovcp_train.datasets import EVALUATION_EPISODES, FRAME_BYTES, Material, prepare
+from egovcp_train.datasets import (
+    EVALUATION_EPISODES,
+    FRAME_BYTES,
+    Material,
+    prepare,
+    require_datasets,
+    require_same_content,
+)
 from egovcp_train.device import choose_bf16, choose_device
 from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
@@ -38,7 +45,12 @@ from egovcp_train.heldout.recording import record
 from egovcp_train.heldout.report import Report, measure, scalars
 from egovcp_train.heldout.table import table
 from egovcp_train.loop import Budget, Learner
-from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options, stop_on_signal
+from egovcp_train.output import (
+    CONFIG_FILE,
+    prepare_output,
+    resumed_options,
+    saved_options,
+)
 from egovcp_train.publish import publish_trained, reserve_policy
 from egovcp_train.ranks import Ranks, join
 from egovcp_train.records import Everywhere, Recorder, Records
@@ -97,7 +109,7 @@ def train(config: TrainConfig) -> None:
     material = prepare(config, model, ranks)
     config = material.config
     learner = Learner(model.to(device), config.optimizer, config.seed, ranks, bf16)
-    spent = _restore(output, learner, material.stream) if config.resume else 0.0
+    spent = _restore(output, learner, material) if config.resume else 0.0
     provenance = _provenance(material)
     if ranks.is_first:
         simulation = _simulation(config, provenance, learner.model)
@@ -269,7 +281,9 @@ class Run:
         found = {"heldout": self.metrics, "heldout_tasks": self.tasks, "closed_loop": self.played}
         provenance = self.provenance | {"step": self.learner.step, **finite_or_null(found)}
         spent = {"seconds": self.budget.spent}
-        state = {"learner": self.learner.state_dict(), "streams": streams, **spent}
+        digests = [reader.content_digest for reader in self.material.readers]
+        learned = {"learner": self.learner.state_dict(), "streams": streams}
+        state = {**learned, "datasets": digests, **spent}
         with new_checkpoint(self.output, self.learner.step, state) as folder:
             save_artefact(folder, model, self.config.planner, provenance)
 
@@ -313,8 +327,12 @@ def _prepare_output(config: TrainConfig, ranks: Ranks) -> Path:
     _require_loadable(config)
     if config.eval_closed_loop:
         require_simulator()
-    output = Path(config.output_dir)
-    return prepare_output(config.output_dir, config.resume) if ranks.is_first else output
+    if not ranks.is_first:
+        return Path(config.output_dir)
+    output = prepare_output(config.output_dir, config.resume)
+    if config.resume:
+        require_datasets(config, saved_options(output))
+    return output
 
 
 def _simulation(
@@ -336,7 +354,7 @@ def _records(config: TrainConfig, output: Path) -> Everywhere:
     return Everywhere(found)
 
 
-def _restore(output: Path, learner: Learner, stream: Ahead) -> float:
+def _restore(output: Path, learner: Learner, material: Material) -> float:
     """Continue from the last checkpoint; returns the seconds that the run has taken so far.
 
     Raises:
@@ -344,7 +362,9 @@ def _restore(output: Path, learner: Learner, stream: Ahead) -> float:
         DataError: the dataset is another one.
         UsageError: the windows or the processes are others.
     """
-    state = load_training_state(output)
+    state, stream = load_training_state(output), material.stream
+    if "datasets" in state:  # not in checkpoints of earlier versions
+        require_same_content(material.readers, state["datasets"])
     try:
         learner.load_state_dict(state["learner"])
         streams = state.get("streams") or [state["stream"]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 from collections.abc import Iterator
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from egovcp.checks.dataset import command_problems
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode
 from egovcp.data.duplicates import Duplicate, DuplicateFinder
 from egovcp.data.origin import ScenarioKey, ScenarioKeys
-from egovcp.data.source import Source, local_root
+from egovcp.data.source import Source, local_root, require_folder
 from egovcp.errors import DataError
 from egovcp.terminal import echo, one_line
 from egovcp_collect.dataset.book import Book, open_book
@@ -55,10 +56,9 @@ def run(config: RepairConfig) -> None:
         DataError: nothing can be kept, or nobody knows where the episodes came from.
     """
     root = local_root(config.dataset)
-    if not root.is_dir():
-        raise DataError(f"no dataset at {root}: there is no such folder")
+    require_folder(root)
     output = new_folder(config.output_dir, [root])
-    originals = [Path(name).expanduser().absolute() for name in config.records.split(",") if name]
+    originals = _originals(config)
     book = open_book(root, originals, _command(config))
     dropped: list[DataError] = []
     with tqdm(unit="ep", delay=1) as bar:
@@ -74,9 +74,14 @@ def run(config: RepairConfig) -> None:
 
 
 def _command(config: RepairConfig) -> str:
-    root, records = local_root(config.dataset), config.records
+    root, records = local_root(config.dataset), ",".join(map(str, _originals(config)))
     flags = [f"--records={records}"] if records else []
     return shlex.join(["egovcp-dataset", "repair", str(root), *flags])
+
+
+def _originals(config: RepairConfig) -> list[Path]:
+    named = [os.path.expanduser(name) for name in config.records.split(",") if name]
+    return [Path(name).absolute() for name in named]
 
 
 def _rebuild(

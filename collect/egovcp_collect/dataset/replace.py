@@ -20,7 +20,7 @@ def write_report(file: str, content: Any) -> None:
     if not file:
         return
     try:
-        replace_json(Path(file).expanduser(), content)
+        replace_json(Path(os.path.expanduser(file)), content)
     except (FileExistsError, IsADirectoryError, NotADirectoryError) as error:
         raise UsageError(f"--json={file} cannot be a file: {error.strerror}") from error
 

@@ -58,6 +58,14 @@ def test_the_schema_is_complete(text: str) -> None:
         assert f"| `{name}` |" in text
 
 
+def test_it_says_which_versions_read_the_files(text: str) -> None:
+    metadata = schema.arrow_schema().metadata[b"huggingface"].decode()
+    assert '"_type": "List"' in metadata  # which `datasets` knows since 4.0
+    for words in (text, (HOUSE / "docs" / "data.md").read_text(encoding="utf-8")):
+        assert "`datasets` 4.0 or newer" in words
+        assert "LeRobot 0.6 or newer" in words
+
+
 def test_how_it_was_collected_is_told(text: str) -> None:
     assert SETTINGS.command in text
     assert "mujoco 3.11.0" in text

@@ -15,6 +15,7 @@ from egovcp.cli import run_command, save_config
 from egovcp.errors import ArtefactError
 from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
+from egovcp.robot.controllers import absolute_controller
 from egovcp.sim.capacity import require_robots
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
@@ -41,6 +42,8 @@ def train(config: PpoTrainConfig) -> None:
     """
     require_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)
+    controller = absolute_controller(config.env.controller)  # resumed from any working directory
+    config = dataclasses.replace(config, env=dataclasses.replace(config.env, controller=controller))
     torch.set_num_threads(config.threads or available_cores())
     torch.manual_seed(config.seed)
     state = load_training_state(output) if config.resume else {}
