@@ -141,8 +141,8 @@ def test_more_threads_or_processes_than_cores_can_share_are_refused(
     monkeypatch.setattr("egovcp.bounds.available_cores", lambda: CORES)
     monkeypatch.chdir(tmp_path)
     flag = f"--{'.'.join(path)}"
-    assert _run(command, f"{flag}=100000") == 2
-    expected = f"{flag}=100000: expected at most 24, 8 for each of {CORES} processor cores"
+    assert _run(command, f"{flag}=1000") == 2
+    expected = f"{flag}=1000: expected at most 24, 8 for each of {CORES} processor cores"
     assert expected in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
     check_cores(_replaced(_default(command), path, 24))

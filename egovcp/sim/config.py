@@ -289,7 +289,7 @@ class EnvConfig:
     """Latency of action and image."""
     randomise: RandomisationConfig = RandomisationConfig()
     """Physical parameters."""
-    threads: int = bounded(1, least=1, per_core=MOST_PER_CORE)
+    threads: int = bounded(1, least=1, most=1024, per_core=MOST_PER_CORE)
     """Threads that step physics and cast rays; results do not depend on it."""
 
     def __post_init__(self) -> None:
