@@ -82,7 +82,7 @@ class EvalConfig:
     task: str = "ball"
     """ball, wall, arch, all (these three), or sequence: several in one episode, by default an arch
     and then a throw (--env.sequence.parts)."""
-    episodes: int = bounded(80, least=1)
+    episodes: int = bounded(80, least=1, most=1_000_000)
     """Scenarios per task."""
     seed: int = bounded(0, least=0)
     """Which held-out scenarios."""
@@ -95,9 +95,9 @@ class EvalConfig:
     """The baseline `ppo`."""
     output_dir: str = ""
     """New folder for the results."""
-    num_envs: int = bounded(8, least=1)
+    num_envs: int = bounded(8, least=1, most=65_536)
     """Robots that each process plays side by side."""
-    num_workers: int = bounded(0, least=0)
+    num_workers: int = bounded(0, least=0, most=65_536)
     """Processes; 0: one per processor core."""
     env: EnvConfig = field(default_factory=eventful)
     """Scenes, sensors, delays and randomisation."""

@@ -37,9 +37,9 @@ def _check_ranges(where: str, part: object) -> None:
 class EpisodeConfig:
     """Length of an episode and the time of its event, in planner ticks of 40 ms."""
 
-    ticks: int = bounded(150, least=1)
+    ticks: int = bounded(150, least=1, most=100_000)
     """Time limit, planner ticks; reaching it truncates the episode."""
-    event_ticks: tuple[int, int] = bounded((20, 60), least=0)
+    event_ticks: tuple[int, int] = bounded((20, 60), least=0, most=100_000)
     """First and last tick at which the throw, the push or the arch may start."""
     empty_probability: float = bounded(0.1, least=0, most=1)
     """Share of episodes in which nothing happens, so that doing nothing is learned too."""
@@ -173,7 +173,7 @@ class SequenceConfig:
     parts: tuple[str, ...] = ("arch", "ball")
     """Its tasks in their order, each at most once. The wall can only be the last: it would stand in
     the way of what comes next, and the robot leans on it."""
-    pause_ticks: int = bounded(25, least=0)
+    pause_ticks: int = bounded(25, least=0, most=100_000)
     """Planner ticks from the moment that decides a part (arch passed, ball on the floor) until its
     object is taken away and the next part begins; a part that remains undecided ends after the
     ticks of its own episodes."""
@@ -229,7 +229,7 @@ class SensorConfig:
 class DelayConfig:
     """Delays, drawn per episode, in whole controller ticks of 20 ms."""
 
-    action_ticks: tuple[int, int] = bounded((0, 2), least=0)
+    action_ticks: tuple[int, int] = bounded((0, 2), least=0, most=1000)
     """Controller ticks from an action to its effect."""
     image_age: Range = bounded((0.02, 0.08), least=0)
     """Age of the picture in an observation, s; rounded to controller ticks."""
@@ -284,7 +284,7 @@ class EnvConfig:
     """Latency of action and image."""
     randomise: RandomisationConfig = RandomisationConfig()
     """Physical parameters."""
-    threads: int = bounded(1, least=1)
+    threads: int = bounded(1, least=1, most=1024)
     """Threads that step physics and cast rays; results do not depend on it."""
 
     def __post_init__(self) -> None:

@@ -75,7 +75,7 @@ class DisturbanceConfig:
     """Factor on the damping of every servo."""
     delay: Range = bounded((0.0, 0.02), least=0)
     """s from a measurement to the new targets' effect, in physics steps."""
-    models: int = bounded(64, least=1)
+    models: int = bounded(64, least=1, most=65_536)
     """Robots of different physical parameters."""
 
     def __post_init__(self) -> None:

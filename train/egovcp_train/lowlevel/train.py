@@ -67,7 +67,7 @@ class LowLevelTrainConfig:
     """Proximal policy optimisation."""
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     """When the task becomes harder."""
-    robots: int = bounded(512, least=1)
+    robots: int = bounded(512, least=1, most=65_536)
     """Robots simulated side by side."""
     feet: Literal["points", "stock"] = "points"
     """Foot collision model; four points are twice as fast."""
@@ -77,7 +77,7 @@ class LowLevelTrainConfig:
     """Wall-clock limit in minutes; 0: none."""
     seed: int = bounded(0, least=0)
     """Seed of networks, commands, disturbances and noise."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, most=1024)
     """CPU threads; 0: all cores."""
     resume: bool = False
     """Continue the run in output_dir from its last checkpoint, with its options unless given."""

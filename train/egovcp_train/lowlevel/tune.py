@@ -60,7 +60,7 @@ class TuneConfig:
     """Where to start from."""
     minutes: float = bounded(15.0, above=0)
     """Wall-clock limit."""
-    population: int = bounded(28, least=4)
+    population: int = bounded(28, least=4, most=65_536)
     """Candidates per generation."""
     seconds: float = bounded(6.0, above=0)
     """Length of a walk, s."""
@@ -68,7 +68,7 @@ class TuneConfig:
     """Pelvis height, m."""
     seed: int = bounded(0, least=0)
     """Seed of candidates, physics and noise."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, most=1024)
     """CPU threads; 0: all cores."""
 
 

@@ -15,6 +15,7 @@ from typing import Final
 import numpy as np
 import zmq
 
+from egovcp.bounds import bounded
 from egovcp.errors import EnvironmentFailure
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.sim.live import LIMP, LiveRobot, Phase, Servos
@@ -49,11 +50,11 @@ class Ports:
 
     host: str = "127.0.0.1"
     """Interface; the loopback lets nobody else in."""
-    command_port: int = COMMAND_PORT
+    command_port: int = bounded(COMMAND_PORT, least=0, most=65535)
     """Commands."""
-    state_port: int = STATE_PORT
+    state_port: int = bounded(STATE_PORT, least=0, most=65535)
     """States."""
-    camera_port: int = CAMERA_PORT
+    camera_port: int = bounded(CAMERA_PORT, least=0, most=65535)
     """Depth pictures, in our own format."""
 
 
