@@ -182,20 +182,31 @@ def _numbers(value: object, name: str) -> Iterator[float]:
 
 def shown(value: object) -> str:
     """A value as it is written on a command line, shortened if it is long."""
-    text = _yaml(value)
-    if len(text) <= _SHOWN_LENGTH:
-        return text
-    return f"{text[: _SHOWN_LENGTH // 2]}... ({len(text)} characters)"
+    text = ""
+    for part in _yaml(value):  # may be endless: a YAML alias can name the list that it is in
+        text += part
+        if len(text) > _SHOWN_LENGTH:
+            return f"{text[:_SHOWN_LENGTH]}..."
+    return text
 
 
-def _yaml(value: object) -> str:
+def _yaml(value: object) -> Iterator[str]:
     match value:
         case None | bool():
-            return {None: "null", True: "true", False: "false"}[value]
+            yield {None: "null", True: "true", False: "false"}[value]
         case int():
-            return f"{value:d}" if abs(value) < _LARGE else f"{value:#x}"  # decimal is limited
+            yield f"{value:d}" if abs(value) < _LARGE else f"{value:#x}"  # decimal is limited
         case Mapping():
-            return "{" + ", ".join(f"{_yaml(k)}: {_yaml(v)}" for k, v in value.items()) + "}"
+            yield "{"
+            for index, (key, inner) in enumerate(value.items()):
+                yield f"{', ' if index else ''}{key}: "
+                yield from _yaml(inner)
+            yield "}"
         case tuple() | list():
-            return "[" + ", ".join(map(_yaml, value)) + "]"
-    return str(value)
+            yield "["
+            for index, inner in enumerate(value):
+                yield ", " if index else ""
+                yield from _yaml(inner)
+            yield "]"
+        case _:
+            yield str(value)

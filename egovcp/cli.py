@@ -61,7 +61,7 @@ class WeightedDatasetConfig(SelectedDatasetConfig):
     weight: float | None = bounded(None, least=0)
     """Share of the windows, relative to the other datasets; null, and then for all: in proportion
     to the frames."""
-    return_steps: int | None = bounded(None, least=1)
+    return_steps: int | None = bounded(None, least=1, most=100_000)
     """Horizon K of the returns of its rows, planner ticks; null: --returns.steps."""
 
 
@@ -135,6 +135,7 @@ def run_command[C](
     return 0
 
 
+_MESSAGE_LIMIT: Final = 2000
 #: What a path on the command line can be wrong in.
 _PATH_ERRNOS: Final = {
     *(errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.ENOENT),
@@ -166,7 +167,10 @@ def report_error(prog: str, error: EgovcpError, debug: bool = False) -> int:
     """Print the error as one line, with ``debug`` after its traceback; return its exit code."""
     if debug:
         echo(_without_token(traceback.format_exc()), end="", error=True)
-    echo(f"{prog}: error: {one_line(error)}", error=True)
+    message = one_line(error)
+    if len(message) > _MESSAGE_LIMIT:  # it quotes a long value
+        message = f"{message[:_MESSAGE_LIMIT]}..."
+    echo(f"{prog}: error: {message}", error=True)
     return error.exit_code
 
 

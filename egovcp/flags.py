@@ -6,13 +6,20 @@ import dataclasses
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, get_type_hints
+from typing import Any, Final
 
 from draccus.utils import CONFIG_ARG
 
 from egovcp.errors import UsageError, suggest
 from egovcp.safe_files import UnsafeFileError, read_text, require_bounded
-from egovcp.values import WrongValue, convert, is_collection, is_dataclass_type, parse_collection
+from egovcp.values import (
+    WrongValue,
+    convert,
+    is_collection,
+    is_dataclass_type,
+    option_types,
+    parse_collection,
+)
 
 CONFIG_FILE: Final = f"--{CONFIG_ARG}"
 HELP: Final = ("-h", "--help")
@@ -25,7 +32,7 @@ def flags_of(config_class: type) -> dict[str, Any]:
 
 
 def _flags(config_class: type, prefix: str) -> Iterator[tuple[str, Any]]:
-    kinds = get_type_hints(config_class)
+    kinds = option_types(config_class)
     for field in dataclasses.fields(config_class):
         kind = kinds[field.name]
         yield f"{prefix}{field.name}", kind

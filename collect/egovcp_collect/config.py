@@ -46,23 +46,23 @@ class CollectConfig:
     """Number of episodes, those that --resume finds included."""
     resume: bool = False
     """Go on with the collection that is there, if any; with more episodes, extend the dataset."""
-    shard_episodes: int = bounded(SHARD_EPISODES, least=1)
+    shard_episodes: int = bounded(SHARD_EPISODES, least=1, most=1_000_000)
     """Episodes per data file; the dataset grows by one such shard at a time."""
     seed: int = bounded(0, least=0)
     """Episode i is a function of (seed, i) alone, whatever the number of workers."""
     backend: Literal["local", "ray"] = "local"
     """Where the workers run: as processes of this machine, or on a Ray cluster (RAY_ADDRESS; needs
     egovcp-collect[ray])."""
-    num_workers: int = bounded(0, least=0)
+    num_workers: int = bounded(0, least=0, most=65_536)
     """Processes that simulate; 0: one per processor core, of the cluster under --backend=ray."""
     worker_timeout: float = bounded(120.0, least=1)
     """A worker that reports nothing for so long is replaced, s."""
-    num_envs: int = bounded(16, least=1)
+    num_envs: int = bounded(16, least=1, most=65_536)
     """Robots that each process simulates side by side."""
     eta: float = bounded(ACTION_ETA, above=0, most=2)
     """Largest step of the random walk, action box units; what exceeds the rate limit of 0.32 per
     planner tick (40 ms) is sent as a ramp."""
-    step_ticks: tuple[int, int] = bounded((1, 1), least=1)
+    step_ticks: tuple[int, int] = bounded((1, 1), least=1, most=100_000)
     """Shortest and longest time from one step of the walk to the next, planner ticks; (1, 1) is
     the paper's walk."""
     boundary: Literal["reflect", "clip"] = "reflect"

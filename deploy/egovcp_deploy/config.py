@@ -80,7 +80,7 @@ class DeployConfig:
     task: str = "ball"
     """Scene of the simulated robot: ball, wall, arch, or sequence (several in one episode,
     --env.sequence.parts). The policy is not told."""
-    episodes: int = bounded(3, least=1)
+    episodes: int = bounded(3, least=1, most=1_000_000)
     """Number of rollouts."""
     seed: int = bounded(0, least=0)
     """Which held-out scenarios."""
@@ -88,7 +88,7 @@ class DeployConfig:
     """New folder for recordings and summary."""
     log: LogOptions = field(default_factory=LogOptions)
     """What is recorded, and shown live."""
-    imagine: int = bounded(16, least=0)
+    imagine: int = bounded(16, least=0, most=1000)
     """How far ahead the world model imagines depth for the recordings, ticks of 40 ms; 0: not at
     all."""
     env: EnvConfig = field(default_factory=eventful)

@@ -100,7 +100,7 @@ class EvalConfig:
     """The baseline `ppo`."""
     output_dir: str = ""
     """New folder for the results."""
-    num_envs: int = bounded(8, least=1)
+    num_envs: int = bounded(8, least=1, most=65_536)
     """Robots that each process plays side by side."""
     num_workers: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """Processes; 0: one per processor core."""

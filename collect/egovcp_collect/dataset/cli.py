@@ -1,4 +1,4 @@
-"""`egovcp-dataset SUBCOMMAND [ROOT] [--flags]`: everything one does with a finished dataset.
+"""`egovcp-dataset SUBCOMMAND [ROOT] [--NAME=VALUE ...]`: work with a finished dataset.
 
 A subcommand is a module with
 
@@ -99,7 +99,7 @@ def _help() -> str:
     lines = [f"  {name:{width}}  {entry.summary}" for name, entry in SUBCOMMANDS.items()]
     return "\n".join(
         [
-            f"usage: {PROG} SUBCOMMAND [ROOT] [--flags]",
+            f"usage: {PROG} SUBCOMMAND [ROOT] [--NAME=VALUE ...]",
             "",
             "Look at, check, mend, join and share datasets in LeRobot's format.",
             "",

@@ -32,11 +32,11 @@ class RealSenseEyeConfig:
     serial: str = ""
     """Serial number, or name if there is only one of it; lerobot-find-cameras realsense lists
     them."""
-    width: int = bounded(848, least=1)
+    width: int = bounded(848, least=1, most=8192)
     """Columns of its depth; the stereo of a D435i is best at 848 x 480."""
-    height: int = bounded(480, least=1)
+    height: int = bounded(480, least=1, most=8192)
     """Rows of its depth."""
-    fps: int = bounded(60, least=1)
+    fps: int = bounded(60, least=1, most=1000)
     """Pictures per second."""
     vertical_fov: float = bounded(CameraConfig.vertical_fov, above=0, below=math.pi)
     """Field of view that the policy knows, rad; the camera's own must not be much smaller."""

@@ -52,12 +52,12 @@ class HeldoutConfig:
     """Policy to measure."""
     dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
     """Dataset with the episodes."""
-    return_steps: int | None = bounded(None, least=1)
+    return_steps: int | None = bounded(None, least=1, most=100_000)
     """Horizon of the returns that Q is compared with, ticks; null: that of the training, if its
     datasets had but one."""
     split: str = "heldout"
     """heldout, train or all; episodes are held out by a hash, the same ones in each training."""
-    episodes: int = bounded(64, least=0)
+    episodes: int = bounded(64, least=0, most=1_000_000)
     """At most this many episodes of each task, evenly spread over the split; 0: all."""
     stride: int = bounded(4, least=1)
     """Rows between the starts of open-loop predictions; 1: from each row."""

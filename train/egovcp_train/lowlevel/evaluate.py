@@ -59,7 +59,7 @@ class LowLevelEvalConfig:
     """stance, walk (which the package ships), or the walk.safetensors of egovcp-train-lowlevel."""
     skills: str = ",".join(skill.name for skill in SKILLS)
     """Which skills, separated by commas."""
-    episodes: int = bounded(400, least=1)
+    episodes: int = bounded(400, least=1, most=1_000_000)
     """Robots per skill."""
     disturbances: DisturbanceConfig = field(default_factory=lambda: DisturbanceConfig(models=400))
     """Ranges of the physical parameters and of the delay."""

@@ -68,7 +68,7 @@ class LowLevelTrainConfig:
     """Proximal policy optimisation."""
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     """When the task becomes harder."""
-    robots: int = bounded(512, least=1)
+    robots: int = bounded(512, least=1, most=65_536)
     """Robots simulated side by side."""
     feet: Literal["points", "stock"] = "points"
     """Foot collision model; four points are twice as fast."""

@@ -61,7 +61,7 @@ class TuneConfig:
     """Where to start from."""
     minutes: float = bounded(15.0, above=0)
     """Wall-clock limit."""
-    population: int = bounded(28, least=4)
+    population: int = bounded(28, least=4, most=65_536)
     """Candidates per generation."""
     seconds: float = bounded(6.0, above=0)
     """Length of a walk, s."""

@@ -19,11 +19,11 @@ ALL: Final = "all"
 class ContactPpoConfig:
     """Proximal policy optimisation; the names are rsl-rl's."""
 
-    num_steps_per_env: int = bounded(50, least=1)
+    num_steps_per_env: int = bounded(50, least=1, most=100_000)
     """Ticks per robot and iteration."""
-    num_learning_epochs: int = bounded(4, least=1)
+    num_learning_epochs: int = bounded(4, least=1, most=10_000)
     """Passes over the data of an iteration."""
-    num_mini_batches: int = bounded(4, least=1)
+    num_mini_batches: int = bounded(4, least=1, most=65_536)
     """Mini-batches per pass."""
     learning_rate: float = bounded(1e-3, above=0)
     """At the start; then it follows desired_kl."""
@@ -61,7 +61,7 @@ class PpoTrainConfig:
     """Standard deviation of the actions at the start, box units."""
     ppo: ContactPpoConfig = field(default_factory=ContactPpoConfig)
     """Proximal policy optimisation."""
-    robots: int = bounded(32, least=1)
+    robots: int = bounded(32, least=1, most=65_536)
     """Robots simulated side by side."""
     steps: int = bounded(1_000_000, least=1)
     """Planner ticks of 40 ms, over all robots: transitions."""

@@ -16,6 +16,7 @@ import numpy as np
 import zmq
 from numpy.typing import NDArray
 
+from egovcp.bounds import bounded
 from egovcp.errors import EnvironmentFailure
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import DAMPING, STIFFNESS
@@ -53,11 +54,11 @@ class Ports:
 
     host: str = "127.0.0.1"
     """Interface; the loopback lets nobody else in."""
-    command_port: int = COMMAND_PORT
+    command_port: int = bounded(COMMAND_PORT, least=0, most=65535)
     """Commands."""
-    state_port: int = STATE_PORT
+    state_port: int = bounded(STATE_PORT, least=0, most=65535)
     """States."""
-    camera_port: int = CAMERA_PORT
+    camera_port: int = bounded(CAMERA_PORT, least=0, most=65535)
     """Depth pictures, in our own format."""
 
 

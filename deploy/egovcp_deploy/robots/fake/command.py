@@ -52,7 +52,7 @@ class FakeConfig:
     """Which held-out scenarios, the same that egovcp-eval plays."""
     episode: int = bounded(0, least=0)
     """Number of the first."""
-    episodes: int = bounded(0, least=0)
+    episodes: int = bounded(0, least=0, most=1_000_000)
     """How many; 0: until interrupted."""
     gantry: float | None = bounded(3.0, least=0)
     """How long the motors must have been told to hold something, without a break, before the crane
