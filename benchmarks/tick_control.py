@@ -7,6 +7,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -63,11 +64,10 @@ def control_figures(rounds: int) -> dict[str, object]:
     late: dict[str, list[float]] = {"checked": [], "unchecked": []}
     interval: dict[str, list[float]] = {"checked": [], "unchecked": []}
     sys.setswitchinterval(0.001)  # as the control process does
-    with (
-        tempfile.TemporaryDirectory() as folder,
-        simulated(config, Path(folder) / "outcomes.json") as options,
-    ):
-        with raised_priority(RECEIVING):
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        with raised_priority(RECEIVING):  # for the robot too, which has computers of its own
+            options = stack.enter_context(simulated(config, folder / "outcomes.json"))
             hardware = open_hardware(options)
         granted = raise_priority(CONTROL)
         try:
