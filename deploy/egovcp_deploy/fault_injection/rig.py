@@ -312,6 +312,7 @@ class FaultRig:
 
     def end_run(self) -> None:
         """End the control process, if there is one."""
+        self._ending = True
         if self._session is not None:
             self._session.close()
             self._session = None

@@ -12,6 +12,7 @@ from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import ACTION_BOX, COMMAND_SLICE, STATE_SLICES
 from egovcp_deploy.pilot.states import Request, State
 from egovcp_deploy.robots.body import MotorCommand
+from egovcp_deploy.robots.wire import encode_command
 
 from .conftest import Rig
 
@@ -211,6 +212,33 @@ def test_a_controller_without_numbers_damps_in_the_same_tick(
     assert rig.loop.state is State.DAMP
     assert all(limp(command) for command in rig.body.commands[before:])
     assert_sane(rig.body.commands)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_target_beyond_its_bounds_leaves_whatever_the_networks_give(
+    make_rig: Make, monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    rig = make_rig()
+    rig.go()
+    before = len(rig.body.commands)
+
+    def wild(state: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The policy in the controller, and now and then a number that is none."""
+        target = rng.normal(0, 10.0 ** rng.integers(-1, 6), (1, 29))
+        if rng.random() < 0.05:
+            target[0, rng.integers(29)] = rng.choice([np.nan, np.inf, -np.inf, 1e300])
+        return target
+
+    def plan(tick: int) -> None:
+        rig.policy.level = float(rng.choice([np.nan, np.inf, 1e30, -1e30, rng.normal()]))
+
+    monkeypatch.setattr(rig.controller, "step", wild)
+    rig.run(1.0, each=plan)
+    assert len(rig.body.commands) == before + 50
+    assert_sane(rig.body.commands)
+    for command in rig.body.commands:
+        encode_command(command)  # refuses what is beyond the bounds
 
 
 def test_it_is_not_armed_while_somebody_else_drives(make_rig: Make) -> None:
