@@ -18,6 +18,9 @@ from report import parser, publish
 from egovcp_deploy.fault_injection.kinds import FAULTS, FaultKind, Outcome
 from egovcp_deploy.fault_injection.rig import FaultRig
 from egovcp_deploy.fault_injection.table import DAMP_LIMIT_MS, Row, markdown, percentile, run_fault
+from egovcp_deploy.live.priority import raise_priority
+
+RIG_PRIORITY = 5
 
 
 def burn() -> None:
@@ -98,6 +101,7 @@ def main() -> None:
     args = p.parse_args()
     kinds = [kind for kind in FAULTS if args.only in kind.name]
     with loaded(args.load):
+        raise_priority(RIG_PRIORITY)  # what waits for the fake robot must not be what is measured
         rows = run_all(kinds, args.repetitions)
     table = markdown(rows)
     print(table)

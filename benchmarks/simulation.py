@@ -23,6 +23,7 @@ from unittest import mock
 import mujoco
 from report import parser, publish
 
+from egovcp.hardware import available_cores
 from egovcp.robot import arms
 from egovcp.sim.camera import DepthCamera, DepthNoise
 from egovcp.sim.config import EnvConfig
@@ -149,7 +150,7 @@ def main() -> None:
     p.add_argument("--controller", default=EnvConfig().controller, help="walk or stance")
     p.add_argument("--groups", type=int, default=8, help="groups of 16 episodes per process")
     args = p.parse_args()
-    cores = len(os.sched_getaffinity(0))
+    cores = available_cores()
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     bare: list[float] = []
     collected: list[float] = []

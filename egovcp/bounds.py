@@ -19,6 +19,10 @@ from functools import partial
 from typing import Any, Final
 
 from egovcp.errors import UsageError
+from egovcp.hardware import available_cores
+
+MOST_PER_CORE: Final = 8
+"""Threads or processes that a processor core may be shared by."""
 
 _KEY: Final = "bounds"
 _FINITE: Final = "a finite number"
@@ -36,6 +40,8 @@ class Bounds:
     below: float | None = None
     longest: int | None = None
     """Most numbers of a list."""
+    per_core: int | None = None
+    """Largest number for each processor core of this machine, see `check_cores`."""
 
     def hold(self, value: float) -> bool:
         """Whether a number lies within."""
@@ -56,6 +62,8 @@ class Bounds:
             "less than": self.below,
         }
         said = [f"{word} {value:g}" for word, value in words.items() if value is not None]
+        if self.per_core is not None:
+            said.append(f"at most {self.per_core} per processor core")
         return " and ".join(said) or _FINITE
 
 
@@ -70,10 +78,11 @@ def bounded[T](
     above: float | None = None,
     below: float | None = None,
     longest: int | None = None,
+    per_core: int | None = None,
 ) -> T:
     """A dataclass field with this default whose value, or each number in it, has bounds; None,
     where the type allows it, stands for no number."""
-    metadata = {_KEY: Bounds(least, most, above, below, longest)}
+    metadata = {_KEY: Bounds(least, most, above, below, longest, per_core)}
     if isinstance(default, dict):
         return field(default_factory=partial(copy, default), metadata=metadata)
     return field(default=default, metadata=metadata)
@@ -122,6 +131,30 @@ def check_bounds(config: Any, prefix: str = "") -> None:
                 raise OutOfBounds(name, value, expected)
 
 
+def check_cores(config: Any, prefix: str = "") -> None:
+    """Hold the numbers of threads and processes in a dataclass against the processor cores here.
+
+    It is not part of `check_bounds`, because a config may describe work on another machine.
+
+    Raises:
+        OutOfBounds: there are too many.
+    """
+    for option in dataclasses.fields(config):
+        name, value = f"{prefix}{option.name}", getattr(config, option.name)
+        if dataclasses.is_dataclass(value):
+            check_cores(value, f"{name}.")
+        elif (bounds := bounds_of(option)) and bounds.per_core is not None:
+            require_cores(name, value, bounds.per_core)
+
+
+def require_cores(option: str, count: int, per_core: int = MOST_PER_CORE) -> None:
+    """Raise `OutOfBounds` for more threads or processes than ``per_core`` on each core here."""
+    cores = available_cores()
+    if count > per_core * cores:
+        expected = f"at most {per_core * cores}, {per_core} for each of {cores} processor cores"
+        raise OutOfBounds(option, count, expected)
+
+
 def _is_finite(number: float) -> bool:
     try:
         return math.isfinite(number)
@@ -149,20 +182,31 @@ def _numbers(value: object, name: str) -> Iterator[float]:
 
 def shown(value: object) -> str:
     """A value as it is written on a command line, shortened if it is long."""
-    text = _yaml(value)
-    if len(text) <= _SHOWN_LENGTH:
-        return text
-    return f"{text[: _SHOWN_LENGTH // 2]}... ({len(text)} characters)"
+    text = ""
+    for part in _yaml(value):  # may be endless: a YAML alias can name the list that it is in
+        text += part
+        if len(text) > _SHOWN_LENGTH:
+            return f"{text[:_SHOWN_LENGTH]}..."
+    return text
 
 
-def _yaml(value: object) -> str:
+def _yaml(value: object) -> Iterator[str]:
     match value:
         case None | bool():
-            return {None: "null", True: "true", False: "false"}[value]
+            yield {None: "null", True: "true", False: "false"}[value]
         case int():
-            return f"{value:d}" if abs(value) < _LARGE else f"{value:#x}"  # decimal is limited
+            yield f"{value:d}" if abs(value) < _LARGE else f"{value:#x}"  # decimal is limited
         case Mapping():
-            return "{" + ", ".join(f"{_yaml(k)}: {_yaml(v)}" for k, v in value.items()) + "}"
+            yield "{"
+            for index, (key, inner) in enumerate(value.items()):
+                yield f"{', ' if index else ''}{key}: "
+                yield from _yaml(inner)
+            yield "}"
         case tuple() | list():
-            return "[" + ", ".join(map(_yaml, value)) + "]"
-    return str(value)
+            yield "["
+            for index, inner in enumerate(value):
+                yield ", " if index else ""
+                yield from _yaml(inner)
+            yield "]"
+        case _:
+            yield str(value)

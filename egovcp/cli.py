@@ -12,7 +12,6 @@ after an interrupt. A traceback is printed only with ``--debug``.
 from __future__ import annotations
 
 import errno
-import io
 import sys
 import traceback
 from collections.abc import Callable, Mapping, Sequence
@@ -23,7 +22,7 @@ from typing import Any, Final
 import draccus
 
 from egovcp.atomic import write_text
-from egovcp.bounds import bounded, check_bounds
+from egovcp.bounds import bounded, check_bounds, check_cores
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
 from egovcp.flags import HELP, flag_values, flags_of, merged, split_flags
 from egovcp.help_text import print_help
@@ -62,7 +61,7 @@ class WeightedDatasetConfig(SelectedDatasetConfig):
     weight: float | None = bounded(None, least=0)
     """Share of the windows, relative to the other datasets; null, and then for all: in proportion
     to the frames."""
-    return_steps: int | None = bounded(None, least=1)
+    return_steps: int | None = bounded(None, least=1, most=100_000)
     """Horizon K of the returns of its rows, planner ticks; null: --returns.steps."""
 
 
@@ -93,6 +92,7 @@ def parse_config[C](
     except WrongValue as error:
         raise UsageError(f"{error}; see {prog} --help") from None
     check_bounds(config, "--")
+    check_cores(config, "--")
     return config
 
 
@@ -135,6 +135,7 @@ def run_command[C](
     return 0
 
 
+_MESSAGE_LIMIT: Final = 2000
 #: What a path on the command line can be wrong in.
 _PATH_ERRNOS: Final = {
     *(errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.ENOENT),
@@ -166,7 +167,10 @@ def report_error(prog: str, error: EgovcpError, debug: bool = False) -> int:
     """Print the error as one line, with ``debug`` after its traceback; return its exit code."""
     if debug:
         echo(_without_token(traceback.format_exc()), end="", error=True)
-    echo(f"{prog}: error: {one_line(error)}", error=True)
+    message = one_line(error)
+    if len(message) > _MESSAGE_LIMIT:  # it quotes a long value
+        message = f"{message[:_MESSAGE_LIMIT]}..."
+    echo(f"{prog}: error: {message}", error=True)
     return error.exit_code
 
 
@@ -182,6 +186,4 @@ def _without_token(text: str) -> str:
 
 def save_config(config: Any, path: str) -> None:
     """Write the resolved config as YAML, so that a run can be repeated with ``--config_path``."""
-    text = io.StringIO()
-    draccus.dump(config, text)
-    write_text(Path(path), text.getvalue())
+    write_text(Path(path), str(draccus.dump(config)))

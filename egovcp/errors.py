@@ -85,3 +85,15 @@ def suggest(name: str, valid: Iterable[str]) -> str:
     near = difflib.get_close_matches(name, choices, n=1)
     hint = f" did you mean {near[0]!r}?" if near else ""
     return f";{hint} choose from: {', '.join(choices)}"
+
+
+def suggest_path(path: str | os.PathLike[str]) -> str:
+    """``"; did you mean data/ball?"`` for a path that does not exist; empty: nothing is near."""
+    known, missing = os.path.split(os.fspath(path).rstrip("/"))
+    while known and not os.path.lexists(known):
+        known, missing = os.path.split(known)
+    try:
+        near = difflib.get_close_matches(missing, os.listdir(known or "."), n=1)
+    except OSError:
+        return ""
+    return f"; did you mean {os.path.join(known, near[0])}?" if near else ""

@@ -6,17 +6,24 @@ import dataclasses
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Final, get_type_hints
+from typing import Any, Final
 
 from draccus.utils import CONFIG_ARG
 
 from egovcp.errors import UsageError, suggest
-from egovcp.safe_files import UnsafeFileError, read_text
-from egovcp.values import WrongValue, convert, is_collection, is_dataclass_type, parse_collection
+from egovcp.safe_files import UnsafeFileError, read_text, require_bounded
+from egovcp.values import (
+    WrongValue,
+    convert,
+    is_collection,
+    is_dataclass_type,
+    option_types,
+    parse_collection,
+)
 
 CONFIG_FILE: Final = f"--{CONFIG_ARG}"
 HELP: Final = ("-h", "--help")
-_FILE_LIMIT_BYTES: Final = 4 << 20
+_FILE_LIMIT_BYTES: Final = 64 << 10  # YAML is parsed at about 50 kB/s
 
 
 def flags_of(config_class: type) -> dict[str, Any]:
@@ -25,7 +32,7 @@ def flags_of(config_class: type) -> dict[str, Any]:
 
 
 def _flags(config_class: type, prefix: str) -> Iterator[tuple[str, Any]]:
-    kinds = get_type_hints(config_class)
+    kinds = option_types(config_class)
     for field in dataclasses.fields(config_class):
         kind = kinds[field.name]
         yield f"{prefix}{field.name}", kind
@@ -84,7 +91,7 @@ def flag_values(args: Sequence[str], flags: Mapping[str, Any]) -> dict[str, Any]
             for part in reversed(flag.removeprefix("--").split(".")):
                 value = {part: value}
             given = merged(given, value)
-    return merged(_read_file(file), given) if file else given
+    return merged(_config_file(file), given) if file else given
 
 
 def _value(flag: str, text: str, kind: Any) -> Any:
@@ -112,18 +119,31 @@ def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
     return out
 
 
-def _read_file(file: str) -> dict[str, Any]:
-    """The options that a YAML, JSON or TOML file holds."""
+def _config_file(file: str) -> dict[str, Any]:
     try:
-        text = read_text(Path(file), _FILE_LIMIT_BYTES)
-        found: Any = tomllib.loads(text) if file.endswith(".toml") else parse_collection(text)
+        return read_config(Path(file))
     except OSError as error:
         raise UsageError(f"{CONFIG_FILE}: cannot read {file}: {error.strerror}") from error
     except UnsafeFileError as error:
         raise UsageError(f"{CONFIG_FILE}: cannot read {file}: {error}") from error
     except ValueError as error:
-        raise UsageError(f"{CONFIG_FILE}: {file} holds no options: {error}") from error
+        raise UsageError(f"{CONFIG_FILE}: {file} {error}") from error
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """The options in a YAML, JSON or TOML file, nested by group.
+
+    Raises:
+        UnsafeFileError: it is not a regular file, too large, or not UTF-8.
+        ValueError: it holds something else.
+        OSError: it is missing, or cannot be read.
+    """
+    text = read_text(path, _FILE_LIMIT_BYTES)
+    try:
+        found: Any = tomllib.loads(text) if path.suffix == ".toml" else parse_collection(text)
+        require_bounded(found)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"holds no options: {error}") from error
     if not isinstance(found or {}, dict):
-        kind = type(found).__name__
-        raise UsageError(f"{CONFIG_FILE}: {file} holds a {kind}; expected options, name: value")
+        raise ValueError(f"holds a {type(found).__name__}; expected options, name: value")
     return found or {}

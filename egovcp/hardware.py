@@ -1,10 +1,62 @@
-"""The machine in words that mean something to somebody else."""
+"""What the machine has: processor cores, memory, and its description."""
 
 from __future__ import annotations
 
 import os
 import platform
 from pathlib import Path
+from typing import Final
+
+from egovcp.errors import UsageError
+
+_MEMINFO: Final = Path("/proc/meminfo")
+_CGROUP: Final = Path("/sys/fs/cgroup")
+
+
+def available_cores() -> int:
+    """Processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def require_memory(option: str, needed: int) -> None:
+    """Raise `UsageError`, which names the option, unless ``needed`` bytes of memory are free.
+
+    Args:
+        option: as it was given, ``--num_envs=8``.
+        needed: a lower estimate; what would have worked must not be refused.
+    """
+    free = available_bytes()
+    if needed > free:
+        raise UsageError(
+            f"{option} takes at least {needed / 1e9:,.1f} GB of memory, {free / 1e9:,.1f} GB are "
+            "free; lower it"
+        )
+
+
+def available_bytes() -> int:
+    """Memory that this process can take without the system swapping, or its container ending it."""
+    return min(_of_the_system(), _of_the_container())
+
+
+def _of_the_system() -> int:
+    if _MEMINFO.exists():
+        for line in _MEMINFO.read_text(encoding="ascii").splitlines():
+            name, _, value = line.partition(":")
+            if name == "MemAvailable":
+                return int(value.split()[0]) * 1024
+    return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2
+
+
+def _of_the_container() -> int:
+    """What is left below the limit of control group v2; the system's memory where it has none."""
+    try:
+        limit = (_CGROUP / "memory.max").read_text(encoding="ascii").strip()
+        used = int((_CGROUP / "memory.current").read_text(encoding="ascii"))
+        return int(limit) - used
+    except (OSError, ValueError):  # no such group, or its limit is "max"
+        return _of_the_system()
 
 
 def hardware() -> dict[str, object]:

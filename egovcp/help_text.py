@@ -9,11 +9,11 @@ import inspect
 import textwrap
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import Any, Final, get_type_hints
+from typing import Any, Final
 
 from egovcp.bounds import bounds_of, shown
 from egovcp.terminal import echo
-from egovcp.values import default_of, is_dataclass_type, type_name
+from egovcp.values import default_of, is_dataclass_type, option_types, type_name
 
 _SYNTAX: Final = (
     "A list is written [a, b] or (a, b), a group of options {name: value}; quote both for the "
@@ -49,7 +49,7 @@ def _add_options(
     Args:
         config: an instance that has the defaults; None: those of the class.
     """
-    kinds, documents = get_type_hints(config_class), dict(_documents(config_class))
+    kinds, documents = option_types(config_class), dict(_documents(config_class))
     nested: list[tuple[str, Any, Any]] = []
     for field in dataclasses.fields(config_class):
         flag, kind = f"{prefix}{field.name}", kinds[field.name]

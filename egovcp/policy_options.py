@@ -33,16 +33,16 @@ class PolicyOptions:
 class PlannerOptions:
     """Changes to the artefact's own planner; what is not given stays as it is there."""
 
-    samples: int | None = bounded(None, least=1)
+    samples: int | None = bounded(None, least=1, most=2**20)
     """M, candidate plans per iteration."""
-    horizon: int | None = bounded(None, least=1)
+    horizon: int | None = bounded(None, least=1, most=1000)
     """N, planner ticks of 40 ms."""
     objective: Objective | None = None
     """J of a plan: value (mean of Q), reward (sum of predicted rewards), td (the same and Q at the
     end). The last two need a model trained with loss.reward, and compute step by step."""
-    iterations: int | None = bounded(None, least=1)
+    iterations: int | None = bounded(None, least=1, most=10_000)
     """Rounds of the search."""
-    elites: int | None = bounded(None, least=1)
+    elites: int | None = bounded(None, least=1, most=2**20)
     """Best candidates that the next round is fitted to."""
     min_std: float | None = bounded(None, least=0)
     """Floor of the deviation that candidates are drawn with, in steps of the action process."""
@@ -53,7 +53,7 @@ class PlannerOptions:
     """What moving costs a plan: so much return times its mean squared step."""
     process: Process | None = None
     """What candidates are made of: walk (a step in every tick), or ramp (to a place to rest at, as
-    in data collected with longer --step_ticks)."""
+    in data of a longer `egovcp-collect --step_ticks`)."""
     termination_rule: TerminationRule | None = None
     """What a failed plan's later values are: paper (0), shift (the data's worst return), survival
     (weighted with the probability of being alive)."""

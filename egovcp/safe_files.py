@@ -154,6 +154,36 @@ def parse_json(text: str, limit_depth: int = JSON_LIMIT_DEPTH, allow_nan: bool =
     return content
 
 
+def require_bounded(
+    value: object, limit_depth: int = JSON_LIMIT_DEPTH, limit_items: int = 100_000
+) -> None:
+    """Raise unless a parsed value has a bounded depth and a bounded number of items.
+
+    The aliases of YAML repeat a value: 1 kB of text can stand for 10^9 items.
+
+    Raises:
+        UnsafeFileError: it has more.
+    """
+    sizes: dict[int, int] = {}  # by identity: each value is visited once, but counted each time
+
+    def size(item: object, depth: int) -> int:
+        if depth > limit_depth:
+            raise UnsafeFileError(_too_deep(limit_depth))
+        if id(item) not in sizes:
+            match item:
+                case Mapping():
+                    inner = list(item.values())
+                case list() | tuple():
+                    inner = list(item)
+                case _:
+                    return 1
+            sizes[id(item)] = 1 + sum(size(part, depth + 1) for part in inner)
+        return sizes[id(item)]
+
+    if size(value, 0) > limit_items:
+        raise UnsafeFileError(f"more than {limit_items} values, counting each time one is repeated")
+
+
 def sha256(path: Path, limit_bytes: int | None = None) -> str:
     """Hexadecimal SHA-256 of a regular file.
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
 from types import NoneType, UnionType
 from typing import Any, Final, Literal, Union, get_args, get_origin, get_type_hints
 
@@ -30,6 +31,7 @@ _INT_LIMIT: Final = 2**63
 _MAIN_OPTIONS: Final = ("root", "path", "type")
 """Of a group such as ``--dataset``: what its name alone is likely to stand for."""
 _SHOWN_OPTIONS: Final = 6
+_NESTING_LIMIT: Final = 32
 
 
 class WrongValue(UsageError):
@@ -58,6 +60,12 @@ def type_name(kind: Any) -> str:
         return " or ".join(type_name(part) for part in args)
     names = {str: "text", NoneType: "null", Ellipsis: "..."}
     return names.get(kind) or str(kind.__name__)
+
+
+@cache
+def option_types(config_class: type) -> Mapping[str, Any]:
+    """Option -> type, of a dataclass."""
+    return get_type_hints(config_class)
 
 
 def is_dataclass_type(kind: Any) -> bool:
@@ -99,7 +107,7 @@ def build[C](
         WrongValue: an option is unknown, lacking without a default, or not of its type.
         EgovcpError: what the dataclass itself raises; bounds name the flag.
     """
-    kinds = get_type_hints(config_class)
+    kinds = option_types(config_class)  # type: ignore[arg-type]
     options = {field.name: field for field in dataclasses.fields(config_class)}  # type: ignore[arg-type]
     for key in values:
         if key not in options:
@@ -251,7 +259,11 @@ def default_of(field: dataclasses.Field[Any]) -> Any:
 
 
 def _with_brackets(text: str) -> str:
-    """The text with the parentheses of lists replaced by brackets; others are left alone."""
+    """The text with the parentheses of lists replaced by brackets; others are left alone.
+
+    Raises:
+        ValueError: it is nested too deeply, for which a parser would take long.
+    """
     out: list[str] = []
     opened: list[str] = []
     quote, before = "", ","  # the quote that is open; the last character that is not a space
@@ -264,6 +276,8 @@ def _with_brackets(text: str) -> str:
             quote = character
         elif character in "[{" or (starts and character == "("):
             opened.append(character)
+            if len(opened) > _NESTING_LIMIT:
+                raise ValueError(f"nested more than {_NESTING_LIMIT} deep")
             written = "[" if character == "(" else character
         elif opened and character == {"[": "]", "{": "}", "(": ")"}[opened[-1]]:
             written = "]" if opened.pop() == "(" else character

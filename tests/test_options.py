@@ -12,7 +12,8 @@ from typing import Any
 
 import pytest
 
-from egovcp.bounds import check_bounds
+from egovcp.bounds import check_bounds, check_cores
+from egovcp.entry_point import EntryPoint
 from egovcp.errors import UsageError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -104,3 +105,92 @@ def test_counts_and_seeds_do_not_go_below_zero(command: str) -> None:
     for path in found:
         with pytest.raises(UsageError, match=r"expected (at least|more than)"):
             check_bounds(_replaced(config, path, -1))
+
+
+# --- what the machine can use ---------------------------------------------------------------
+CORES = 3
+#: Options whose number is one of threads or processes.
+SHARING_CORES = {"threads", "num_workers", "jobs"}
+
+
+def _run(command: str, *flags: str) -> int:
+    """The exit code of a command, called in this process."""
+    part = CONFIGS[command].split(".")[0]
+    commands = vars(importlib.import_module(f"{part}.commands")).values()
+    (entry,) = [c for c in commands if isinstance(c, EntryPoint) and c.prog == command]
+    needs = {f.name for f in dataclasses.fields(_default(command))}
+    argv = ["planners"] if command == "egovcp-experiment" else []
+    argv += ["--output_dir=x"] if "output_dir" in needs else []
+    code: int = importlib.import_module(entry.module).main([*argv, *flags])
+    return code
+
+
+def _sharing_cores() -> list[tuple[str, tuple[str, ...]]]:
+    paths = [(command, path) for command in CONFIGS for path in _numbers(_default(command))]
+    return [(command, path) for command, path in paths if path[-1] in SHARING_CORES]
+
+
+@pytest.mark.parametrize(("command", "path"), _sharing_cores())
+def test_more_threads_or_processes_than_cores_can_share_are_refused(
+    command: str,
+    path: tuple[str, ...],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("egovcp.bounds.available_cores", lambda: CORES)
+    monkeypatch.chdir(tmp_path)
+    flag = f"--{'.'.join(path)}"
+    assert _run(command, f"{flag}=1000") == 2
+    expected = f"{flag}=1000: expected at most 24, 8 for each of {CORES} processor cores"
+    assert expected in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+    check_cores(_replaced(_default(command), path, 24))
+
+
+def test_a_cluster_has_other_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("egovcp.bounds.available_cores", lambda: 1)
+    for command, path in (("egovcp-collect", "num_workers"), ("egovcp-experiment", "jobs")):
+        changes = {"backend": "ray", path: 1000}
+        if command == "egovcp-experiment":
+            changes["output_dir"] = "x"
+        config = dataclasses.replace(_default(command), **changes)
+        check_cores(config)
+        config.check()
+
+
+@pytest.mark.parametrize(
+    ("command", "flags"),
+    [
+        ("egovcp-collect", ["--num_envs=100000", "--episodes=200000"]),
+        ("egovcp-eval", ["--num_envs=100000", "--episodes=200000", "--controllers=hold"]),
+        ("egovcp-train", ["--batch_size=1000000"]),
+        ("egovcp-train", ["--sampling.length=1000000", "--batch_size=2"]),
+        ("egovcp-train-ppo", ["--robots=100000"]),
+        ("egovcp-train-lowlevel", ["--robots=100000"]),
+        ("egovcp-tune-gait", ["--population=100000"]),
+    ],
+)
+def test_more_than_the_memory_holds_is_refused(
+    command: str,
+    flags: list[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr("egovcp.hardware.available_bytes", lambda: 10**10)
+    monkeypatch.chdir(tmp_path)
+    assert _run(command, *flags) == 2
+    told = capsys.readouterr().err
+    assert flags[0] in told
+    assert "10.0 GB are free" in told
+    assert not list(tmp_path.iterdir())
+
+
+def test_robots_that_no_episode_is_left_for_need_no_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("egovcp.hardware.available_bytes", lambda: 10**8)
+    config = _default("egovcp-eval")
+    names = {"num_envs": 100_000, "controllers": "hold", "output_dir": str(tmp_path / "x")}
+    dataclasses.replace(config, **names, episodes=20).check()

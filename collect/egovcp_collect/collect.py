@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import shlex
-import signal
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Final
@@ -20,6 +18,7 @@ from egovcp.data.source import local_root
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.env import decided
 from egovcp.sim.scenario import Scenario
+from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
 from egovcp_collect.backend import Backend
 from egovcp_collect.config import SHAPING, CollectConfig
@@ -106,7 +105,7 @@ def _collect(
     backend = _backend(config, committer)
     workers = config.num_workers or backend.cores
     with (
-        _stop_on_signal() as stopped,
+        stop_on_signal() as stopped,
         Crew(backend, workers, scenarios, config.num_envs, config.worker_timeout) as crew,
     ):
         while not crew.over and not stopped:
@@ -130,24 +129,6 @@ def _backend(config: CollectConfig, committer: Committer) -> Backend:
     from egovcp_collect.local import LocalBackend
 
     return LocalBackend(config, committer.spool.folder)
-
-
-@contextmanager
-def _stop_on_signal() -> Iterator[list[int]]:
-    """The first SIGINT or SIGTERM fills the list; the second interrupts at once."""
-    received: list[int] = []
-
-    def request(number: int, frame: object) -> None:
-        if received:
-            raise KeyboardInterrupt
-        received.append(number)
-
-    previous = {s: signal.signal(s, request) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _disk_bytes(committer: Committer) -> int:

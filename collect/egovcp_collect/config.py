@@ -5,10 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from egovcp.bounds import bounded, check_bounds
+from egovcp.bounds import bounded, check_bounds, require_cores
 from egovcp.data import DatasetConfig
 from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
+from egovcp.hardware import available_cores
+from egovcp.sim.capacity import require_robots
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT, TASKS
@@ -40,27 +42,27 @@ class CollectConfig:
     """Task to collect: ball, wall, arch, or all of them in turn."""
     mix: MixConfig = field(default_factory=MixConfig)
     """Shares of the tasks under --task=all."""
-    episodes: int = bounded(200, least=1)
+    episodes: int = bounded(200, least=1, most=10**6)
     """Number of episodes, those that --resume finds included."""
     resume: bool = False
     """Go on with the collection that is there, if any; with more episodes, extend the dataset."""
-    shard_episodes: int = bounded(SHARD_EPISODES, least=1)
+    shard_episodes: int = bounded(SHARD_EPISODES, least=1, most=1_000_000)
     """Episodes per data file; the dataset grows by one such shard at a time."""
     seed: int = bounded(0, least=0)
     """Episode i is a function of (seed, i) alone, whatever the number of workers."""
     backend: Literal["local", "ray"] = "local"
     """Where the workers run: as processes of this machine, or on a Ray cluster (RAY_ADDRESS; needs
     egovcp-collect[ray])."""
-    num_workers: int = bounded(0, least=0)
+    num_workers: int = bounded(0, least=0, most=65_536)
     """Processes that simulate; 0: one per processor core, of the cluster under --backend=ray."""
     worker_timeout: float = bounded(120.0, least=1)
     """A worker that reports nothing for so long is replaced, s."""
-    num_envs: int = bounded(16, least=1)
+    num_envs: int = bounded(16, least=1, most=65_536)
     """Robots that each process simulates side by side."""
     eta: float = bounded(ACTION_ETA, above=0, most=2)
     """Largest step of the random walk, action box units; what exceeds the rate limit of 0.32 per
     planner tick (40 ms) is sent as a ramp."""
-    step_ticks: tuple[int, int] = bounded((1, 1), least=1)
+    step_ticks: tuple[int, int] = bounded((1, 1), least=1, most=100_000)
     """Shortest and longest time from one step of the walk to the next, planner ticks; (1, 1) is
     the paper's walk."""
     boundary: Literal["reflect", "clip"] = "reflect"
@@ -71,6 +73,10 @@ class CollectConfig:
     def check(self) -> None:
         """Raise `UsageError` for values that make no sense."""
         check_bounds(self, "--")
+        if self.backend == "local":  # a cluster has other cores and other memory
+            require_cores("--num_workers", self.num_workers)
+            workers = self.num_workers or available_cores()
+            require_robots("--num_envs", self.num_envs, min(self.num_envs * workers, self.episodes))
         choices = (*TASKS, ALL_TASKS)
         if self.task not in choices:
             raise UsageError(f"unknown task --task={self.task}{suggest(self.task, choices)}")

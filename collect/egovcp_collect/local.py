@@ -15,6 +15,7 @@ from typing import Final
 
 from egovcp.data import Episode
 from egovcp.data.spool import SealedEpisode, Spool
+from egovcp.hardware import available_cores
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
 from egovcp_collect.backend import Brief, Report, encode_numbered, portable
@@ -78,7 +79,7 @@ class LocalBackend:
     @property
     def cores(self) -> int:
         """Processor cores that this process may use."""
-        return len(os.sched_getaffinity(0))
+        return available_cores()
 
     def start(self) -> LocalWorker:
         """A new process."""

@@ -14,6 +14,7 @@ from egovcp.terminal import echo
 from egovcp_deploy.report import aligned
 from egovcp_deploy.scores import (
     EpisodeScore,
+    paired,
     reward_gain,
     reward_per_step,
     success_gain,
@@ -29,7 +30,7 @@ _EPILOG: Final = (
     "Differences are RUN - OTHER, and their 95 % intervals come from drawing scenarios again, each "
     "with both of its episodes, so that how hard it is does not count. An interval without 0 is a "
     "difference that chance hardly explains. Options in which the runs differ are listed first: "
-    "with other --env.* the scenes are not the same. With one run, compare two of its controllers: "
+    "with other `egovcp-eval --env.*` the scenes are not the same. With one run, compare two of its controllers: "
     "--other_controller=hold."
 )
 _HEAD: Final = (
@@ -68,6 +69,8 @@ class Evaluation:
     """Options of egovcp-eval."""
     episodes: Mapping[str, Mapping[str, Sequence[EpisodeScore]]]
     """Task -> controller -> episodes."""
+    complete: bool = True
+    """Whether all episodes that were asked for were played."""
 
     def played_by(self, task: str, controller: str) -> dict[int, EpisodeScore]:
         """Number of the scenario -> episode.
@@ -112,6 +115,8 @@ def compare(config: CompareConfig) -> None:
         for task in tasks
     ]
     echo(f"{config.controller} of {run.folder} beside {theirs} of {other.folder}")
+    for each in dict.fromkeys(e.folder for e in (run, other) if not e.complete):
+        echo(f"{each} is incomplete: egovcp-eval was interrupted")
     for name, ours, others in _differences(run.config, other.config):
         if name not in _PLACES:
             echo(f"--{name}={ours}, of the other {others}")
@@ -132,7 +137,8 @@ def load_evaluation(folder: Path) -> Evaluation:
             for task, row in content["episodes"].items()
         }
         config = dict(content["config"])
-        return Evaluation(str(folder), config | {"seed": int(config["seed"])}, episodes)
+        complete = bool(content.get("complete", True))
+        return Evaluation(str(folder), config | {"seed": int(config["seed"])}, episodes, complete)
     except OSError as error:
         raise DataError(
             f"cannot read {path}: {error.strerror}; expected a folder that egovcp-eval wrote"
@@ -149,15 +155,14 @@ def _score(entry: Mapping[str, Any]) -> EpisodeScore:
 def _line(
     task: str, ours: Mapping[int, EpisodeScore], theirs: Mapping[int, EpisodeScore]
 ) -> tuple[str, ...]:
-    common = sorted(ours.keys() & theirs.keys())
-    if not common:
+    a, b = paired(tuple(ours.values()), tuple(theirs.values()))
+    if not a:
         raise UsageError(f"no scenario of {task} was played by both")
-    a, b = [ours[i] for i in common], [theirs[i] for i in common]
     low, high = success_gain(a, b)
     least, most = reward_gain(a, b)
     return (
         task,
-        str(len(common)),
+        str(len(a)),
         f"{success_rate(a):.1%}",
         f"{success_rate(b):.1%}",
         f"{100 * (success_rate(a) - success_rate(b)):+.1f}",

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import draccus
 
 from egovcp.bounds import bounded
 from egovcp.policy_options import PlannerOptions, PolicyOptions
+from egovcp.robot.controllers import absolute_controller
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp_deploy.live.gamepad import GamepadOptions
 from egovcp_deploy.live.hardware import CameraOptions
-from egovcp_deploy.options import PLANNER
+from egovcp_deploy.options import PLANNER, absolute_path
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.recording import LogOptions
 from egovcp_deploy.robots.bridge import BridgeConfig
@@ -76,7 +80,7 @@ class DeployConfig:
     task: str = "ball"
     """Scene of the simulated robot: ball, wall, arch, or sequence (several in one episode,
     --env.sequence.parts). The policy is not told."""
-    episodes: int = bounded(3, least=1)
+    episodes: int = bounded(3, least=1, most=1_000_000)
     """Number of rollouts."""
     seed: int = bounded(0, least=0)
     """Which held-out scenarios."""
@@ -84,8 +88,24 @@ class DeployConfig:
     """New folder for recordings and summary."""
     log: LogOptions = field(default_factory=LogOptions)
     """What is recorded, and shown live."""
-    imagine: int = bounded(16, least=0)
+    imagine: int = bounded(16, least=0, most=1000)
     """How far ahead the world model imagines depth for the recordings, ticks of 40 ms; 0: not at
     all."""
     env: EnvConfig = field(default_factory=eventful)
     """Scenes, sensors, delays and randomisation of the simulated robot."""
+
+    def encoded(self) -> dict[str, Any]:
+        """The options as they are recorded: JSON values, with absolute paths."""
+        robot = replace(
+            self.robot,
+            recordings=absolute_path(self.robot.recordings),
+            controller=absolute_controller(self.robot.controller),
+        )
+        config = replace(
+            self,
+            policy=replace(self.policy, path=absolute_path(self.policy.path)),
+            robot=robot,
+            output_dir=absolute_path(self.output_dir),
+        )
+        options: dict[str, Any] = draccus.encode(config)
+        return options

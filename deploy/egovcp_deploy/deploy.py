@@ -14,7 +14,8 @@ from egovcp.policy_options import load_policy
 from egovcp.sim.scenario import PLAYABLE
 from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.drive import check_live, drive, drive_simulated, examine_hardware
+from egovcp_deploy.live.drive import check_live, drive, drive_simulated
+from egovcp_deploy.live.preflight import examine_hardware
 from egovcp_deploy.options import (
     PLANNER,
     REFERENCES,

@@ -16,16 +16,12 @@ from egovcp.errors import EgovcpError, EnvironmentFailure
 from egovcp.plan import blank_observation, until
 from egovcp_deploy.pilot.effort import BUDGET_S
 from egovcp_deploy.policy import RolloutPolicy, backend_of
-from egovcp_deploy.robots.body import Body, Eye
 
 FREE_BYTES: Final = 1_000_000_000  # an hour of recording is about 0.6 GB
 PLAN_BUDGET_MS: Final = 36.0
-STATE_HZ: Final = 100.0
-PICTURE_HZ: Final = 15.0
 _PLANS: Final = 50
 _WARM_UP: Final = 5
 _PLANNING_S: Final = 5.0  # a slow machine is told so sooner
-_LISTEN_S: Final = 1.0
 _DISK_BYTES: Final = 4_000_000
 _DISK_MS: Final = 200.0
 
@@ -135,36 +131,3 @@ def plan_time(policy: RolloutPolicy) -> str:
         f"{p50:.1f} ms per plan, p99 {p99:.1f}, with {mean:.1f} iterations, computed by "
         f"{backend_of(policy)}"
     )
-
-
-def state_rate(body: Body) -> str:
-    """How often proprioception brings something new.
-
-    Raises:
-        EnvironmentFailure: too rarely.
-    """
-    return _rate(lambda: None if (r := body.read()) is None else r.time_ns, STATE_HZ, "states")
-
-
-def picture_rate(eye: Eye) -> str:
-    """How often the camera brings something new.
-
-    Raises:
-        EnvironmentFailure: too rarely.
-    """
-    return _rate(lambda: None if (p := eye.read()) is None else p.time_ns, PICTURE_HZ, "pictures")
-
-
-def _rate(stamp: Callable[[], int | None], least: float, what: str) -> str:
-    stamps: set[int | None] = set()
-    end = time.monotonic() + _LISTEN_S
-    while time.monotonic() < end:
-        stamps.add(stamp())
-        time.sleep(0.001)
-    hz = len(stamps - {None}) / _LISTEN_S
-    if hz < least:
-        raise EnvironmentFailure(
-            f"{hz:.0f} {what} per second, expected at least {least:.0f}; is the connection good, "
-            "and is the other end busy?"
-        )
-    return f"{hz:.0f} {what} per second"

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import multiprocessing
-import os
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from multiprocessing.synchronize import Event
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 import torch
@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from egovcp.artefact import Artefact
 from egovcp.errors import EnvironmentFailure
+from egovcp.hardware import available_cores
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork, ReactivePolicy
 from egovcp.sim.config import EnvConfig
@@ -29,6 +30,8 @@ from egovcp_deploy.options import PLANNER
 from egovcp_deploy.policy import RolloutPolicy
 from egovcp_deploy.safety import SafetyFilter
 from egovcp_deploy.scores import EpisodeScore
+
+_POLL_S: Final = 0.2
 
 
 @dataclass(frozen=True)
@@ -54,10 +57,6 @@ class Group:
     """For ``constant``: one action per scenario."""
 
 
-class Stopped(Exception):
-    """The evaluation was asked to stop."""
-
-
 class Player:
     """Plays groups in this process; environments and the artefact are kept between groups."""
 
@@ -68,7 +67,9 @@ class Player:
         self._planned: dict[tuple[str, int], Planned] = {}
 
     def play(self, group: Group, stopped: Callable[[], bool] = lambda: False) -> list[EpisodeScore]:
-        """Scores in the order of the group's scenarios; raises `Stopped` when asked to."""
+        """Scores in the order of the group's scenarios; see `play`."""
+        if stopped():
+            return []
         size = len(group.scenarios)
         if size not in self._envs:
             self._envs[size] = VectorEnv(self._setup.env, size)
@@ -100,14 +101,16 @@ def play(
     scenarios: Sequence[Scenario],
     stopped: Callable[[], bool] = lambda: False,
 ) -> list[EpisodeScore]:
-    """One episode per row of ``env``, to the end of all of them."""
+    """One episode per row of ``env``, to the end of all of them.
+
+    Returns:
+        The scores of the episodes that ended: all of them, unless ``stopped`` became true.
+    """
     observation = env.reset(scenarios)
     controller.reset(env, scenarios)
     safety = SafetyFilter(env.num_envs)
     tally = _Tally(env.num_envs)
-    while not env.done.all():
-        if stopped():
-            raise Stopped
+    while not env.done.all() and not stopped():
         live = ~env.done
         begin = time.perf_counter()
         planned = controller.act(env, observation)
@@ -121,7 +124,7 @@ def play(
         tally.success, tally.terminated = result.success, result.terminated
         tally.parts = result.parts
         observation = result.observation
-    return tally.scores(scenarios)
+    return [score for score, done in zip(tally.scores(scenarios), env.done, strict=True) if done]
 
 
 class _Tally:
@@ -160,33 +163,54 @@ class Stage:
         setup: what all groups share.
         num_workers: processes; 1 plays in this process, 0 takes one per processor core.
         artefact: what `load_policy` makes of the setup; spares this process loading it again.
+        stopped: once it returns true, the episodes that are being played are given up.
     """
 
     def __init__(
-        self, setup: Setup, num_workers: int = 0, artefact: Artefact | None = None
+        self,
+        setup: Setup,
+        num_workers: int = 0,
+        artefact: Artefact | None = None,
+        stopped: Callable[[], bool] = lambda: False,
     ) -> None:
-        self._workers = num_workers or len(os.sched_getaffinity(0))
+        self._workers = num_workers or available_cores()
         self._player = Player(setup, artefact)
         self._setup = setup
+        self._stopped = stopped
         self._executor: ProcessPoolExecutor | None = None
 
     def play(self, groups: Sequence[Group]) -> Iterator[tuple[int, list[EpisodeScore]]]:
         """Play ``groups``; yields (index of a group, its scores) as they finish.
 
+        When it is stopped, it yields the scores of the episodes that have ended, and no more.
+
         Raises:
             EnvironmentFailure: a worker was killed.
         """
         if self._workers == 1:
-            yield from ((i, self._player.play(group)) for i, group in enumerate(groups))
+            for i, group in enumerate(groups):
+                if self._stopped():
+                    return
+                yield i, self._player.play(group, self._stopped)
             return
         try:
-            futures = self._submit(groups)
-            for future in as_completed(futures):
-                yield futures[future], future.result()
+            yield from self._results(self._submit(groups))
         except BrokenProcessPool as error:
             raise EnvironmentFailure(
                 "a worker process was killed (out of memory?); try fewer --num_workers"
             ) from error
+
+    def _results(
+        self, groups: dict[Future[list[EpisodeScore]], int]
+    ) -> Iterator[tuple[int, list[EpisodeScore]]]:
+        waiting = set(groups)
+        while waiting:
+            if self._stopped() and not self._stop.is_set():
+                self._stop.set()
+                waiting = {future for future in waiting if not future.cancel()}
+            ended, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
+            for future in ended:
+                yield groups[future], future.result()
 
     def _submit(self, groups: Sequence[Group]) -> dict[Future[list[EpisodeScore]], int]:
         with inherited_by_workers():

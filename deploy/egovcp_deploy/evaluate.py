@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from itertools import batched
@@ -14,21 +14,25 @@ from tqdm import tqdm
 
 from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
-from egovcp.bounds import bounded, check_bounds
+from egovcp.bounds import MOST_PER_CORE, bounded, check_bounds
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
+from egovcp.hardware import available_cores
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork
 from egovcp.robot.controllers import make_controller
+from egovcp.sim.capacity import require_robots
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.env import decided
 from egovcp.sim.scenario import PLAYABLE, Scenario
 from egovcp.spec import TASKS
+from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
 from egovcp_deploy.constant_search import Action, BestConstant, load_constants, search_constant
 from egovcp_deploy.controllers import CONTROLLERS, PPO
 from egovcp_deploy.episodes import Group, Setup, Stage
 from egovcp_deploy.options import (
+    absolute_path,
     check_choice,
     check_output_dir,
     make_output_dir,
@@ -49,7 +53,8 @@ _EPILOG: Final = (
     "beneath. 'constant' is the best fixed action of a grid, "
     "chosen on scenarios of its own. plan_ms is the time per robot when num_envs robots are "
     "planned together; --num_envs=1 --num_workers=1 gives the latency of one. Writes eval.json "
-    "(figures), eval_run.json (config and every episode) and constant.json."
+    "(figures), eval_run.json (config and every episode) and constant.json. Ctrl-C writes what was "
+    "played so far, marked as incomplete."
 )
 
 type Scores = dict[str, dict[str, list[EpisodeScore]]]
@@ -82,7 +87,7 @@ class EvalConfig:
     task: str = "ball"
     """ball, wall, arch, all (these three), or sequence: several in one episode, by default an arch
     and then a throw (--env.sequence.parts)."""
-    episodes: int = bounded(80, least=1)
+    episodes: int = bounded(80, least=1, most=10**6)
     """Scenarios per task."""
     seed: int = bounded(0, least=0)
     """Which held-out scenarios."""
@@ -95,9 +100,9 @@ class EvalConfig:
     """The baseline `ppo`."""
     output_dir: str = ""
     """New folder for the results."""
-    num_envs: int = bounded(8, least=1)
+    num_envs: int = bounded(8, least=1, most=65_536)
     """Robots that each process plays side by side."""
-    num_workers: int = bounded(0, least=0)
+    num_workers: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """Processes; 0: one per processor core."""
     env: EnvConfig = field(default_factory=eventful)
     """Scenes, sensors, delays and randomisation."""
@@ -119,6 +124,9 @@ class EvalConfig:
         for name in self.players:
             check_choice("--controllers", name, (*CONTROLLERS, PPO))
         check_bounds(self, "--")
+        workers = self.num_workers or available_cores()
+        robots = min(self.num_envs * workers, self.episodes * len(self.tasks))
+        require_robots("--num_envs", self.num_envs, robots)
         held_out(self.tasks[0], self.seed, 0)
         if "planner" in self.players:
             self.policy.require("leave planner out of --controllers")
@@ -138,12 +146,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 def evaluate(config: EvalConfig) -> None:
     """Check everything, play, print the table and write the files.
 
+    Whatever ends it early, the episodes that have ended are written, marked as incomplete.
+
     Raises:
         UsageError: an option makes no sense, or the folder holds results.
         DataError: ``--constant.path`` cannot be used.
         ArtefactError: the artefact, or the policy of --ppo.path, is missing, damaged, or of another
             low-level controller.
-        EnvironmentFailure: the backend of the planner cannot be used here.
+        EnvironmentFailure: the backend of the planner cannot be used here, or a worker was killed.
+        KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     config.check()
     config = replace(config, env=decided(config.env))
@@ -153,21 +164,71 @@ def evaluate(config: EvalConfig) -> None:
     backend = _prepare_planner(artefact, config.seed)
     folder = make_output_dir(config.output_dir)
     setup = Setup(config.env, config.policy, config.planner, config.seed, config.ppo.path)
-    with closing(Stage(setup, config.num_workers, artefact)) as stage:
-        if "constant" in config.players:
-            constants = _find_constants(config, stage, constants)
-            write_json(folder / "constant.json", {k: asdict(v) for k, v in constants.items()})
-        scores = _play(config, stage, constants)
-    figures = summary(scores)
-    record = _record(config, artefact, ppo, constants, scores)
-    write_json(folder / "eval_run.json", {"backend": backend, **record})
+    scores: Scores = {task: {name: [] for name in config.players} for task in config.tasks}
+    try:
+        with (
+            stop_on_signal() as received,
+            closing(Stage(setup, config.num_workers, artefact, lambda: bool(received))) as stage,
+        ):
+            if "constant" in config.players:
+                constants = _find_constants(config, stage, constants)
+                _require_going_on(received)
+                found = {task: asdict(best) for task, best in constants.items()}
+                write_json(folder / "constant.json", found)
+            _play(config, stage, constants, scores)
+            _require_going_on(received)
+    finally:
+        if played := _with_episodes(scores):
+            record = _record(config, artefact, ppo, constants, played)
+            _report(folder, config, {"backend": backend, **record}, played)
+
+
+def _require_going_on(received: Sequence[int]) -> None:
+    """Raise KeyboardInterrupt if a signal has asked for the end."""
+    if received:
+        raise KeyboardInterrupt
+
+
+def _with_episodes(scores: Scores) -> Scores:
+    """Without controllers and tasks of which no episode has ended, the episodes in order."""
+    rows = {
+        task: {
+            name: sorted(played, key=lambda score: score.episode)
+            for name, played in row.items()
+            if played
+        }
+        for task, row in scores.items()
+    }
+    return {task: row for task, row in rows.items() if row}
+
+
+def _report(folder: Path, config: EvalConfig, record: Mapping[str, Any], scores: Scores) -> None:
+    """Write the files and print the table, also of an evaluation that ended early."""
+    figures = summary(scores, config.episodes)
+    write_json(folder / "eval_run.json", record)
     write_json(folder / "eval.json", figures)
     echo(table(figures))
-    if backend:
+    if backend := record["backend"]:
         echo(f"plans computed by {backend}")
     if skipped := sum(s.skipped for row in scores.values() for each in row.values() for s in each):
         echo(f"{skipped} observations were not finite and were skipped; see eval_run.json")
+    if not record["complete"]:
+        echo(f"INCOMPLETE: {_counts(config, scores)} episodes played")
     echo(f"figures: {folder / 'eval.json'}")
+
+
+def _counts(config: EvalConfig, scores: Scores) -> str:
+    """``ball planner 12 of 80, ball hold 0 of 80``."""
+    return ", ".join(
+        f"{task} {name} {len(scores.get(task, {}).get(name, ()))} of {config.episodes}"
+        for task in config.tasks
+        for name in config.players
+    )
+
+
+def _is_complete(config: EvalConfig, scores: Scores) -> bool:
+    count = sum(len(played) for row in scores.values() for played in row.values())
+    return count == len(config.tasks) * len(config.players) * config.episodes
 
 
 def _load_policy(config: EvalConfig) -> Artefact | None:
@@ -210,7 +271,10 @@ def _find_constants(
                     Group("constant", tuple(s for _, s in part), tuple(a for a, _ in part))
                     for part in batched(zip(actions, scenarios, strict=True), config.num_envs)
                 ]
-                return _in_order(stage, groups, bar)
+                scores = _in_order(stage, groups, bar)
+                if len(scores) < len(scenarios):
+                    raise KeyboardInterrupt
+                return scores
 
             found[task] = known.get(task) or search_constant(task, config.seed, play)
     return found
@@ -225,10 +289,11 @@ def _in_order(stage: Stage, groups: Sequence[Group], bar: Any) -> list[EpisodeSc
     return [score for i in sorted(parts) for score in parts[i]]
 
 
-def _play(config: EvalConfig, stage: Stage, constants: dict[str, BestConstant]) -> Scores:
-    """Every controller on every task; progress shows the success rates so far."""
+def _play(
+    config: EvalConfig, stage: Stage, constants: dict[str, BestConstant], scores: Scores
+) -> None:
+    """Every controller on every task, into ``scores``; progress shows the success rates so far."""
     groups = list(_groups(config, constants))
-    scores: Scores = {task: {name: [] for name in config.players} for task in config.tasks}
     total = sum(len(group.scenarios) for group in groups)
     with tqdm(total=total, unit="ep", desc="evaluate") as bar:
         for i, part in stage.play(groups):
@@ -236,10 +301,6 @@ def _play(config: EvalConfig, stage: Stage, constants: dict[str, BestConstant]) 
             scores[group.scenarios[0].task][group.controller] += part
             bar.set_postfix_str(_so_far(scores), refresh=False)
             bar.update(len(part))
-    for task in scores.values():
-        for played in task.values():
-            played.sort(key=lambda score: score.episode)
-    return scores
 
 
 def _groups(config: EvalConfig, constants: dict[str, BestConstant]) -> Iterable[Group]:
@@ -273,7 +334,8 @@ def _record(
 ) -> dict[str, Any]:
     """Content of ``eval_run.json``: what the figures came from."""
     return {
-        "config": draccus.encode(config),
+        "complete": _is_complete(config, scores),
+        "config": draccus.encode(_with_absolute_paths(config)),
         "artefact": artefact.manifest if artefact else None,
         "ppo": dict(ppo.provenance) if ppo else None,
         "low_level_controller": make_controller(config.env.controller).id,
@@ -285,6 +347,16 @@ def _record(
             for task, row in scores.items()
         },
     }
+
+
+def _with_absolute_paths(config: EvalConfig) -> EvalConfig:
+    return replace(
+        config,
+        policy=replace(config.policy, path=absolute_path(config.policy.path)),
+        constant=replace(config.constant, path=absolute_path(config.constant.path)),
+        ppo=replace(config.ppo, path=absolute_path(config.ppo.path)),
+        output_dir=absolute_path(config.output_dir),
+    )
 
 
 def _brief(score: EpisodeScore) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from egovcp.errors import EnvironmentFailure, UsageError, suggest
+from egovcp.hub import is_local_path
 
 PLANNER: Final = "planner"
 REFERENCES: Final = ("hold", "random", "oracle")
@@ -62,6 +63,14 @@ def make_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
     if not os.access(folder, os.W_OK | os.X_OK):
         raise EnvironmentFailure(f"cannot write to {path}: permission denied")
     return folder
+
+
+def absolute_path(path: str) -> str:
+    """A file or folder as it is recorded: found again from any working directory.
+
+    An empty path stays empty, an id on the Hub is none.
+    """
+    return str(Path(path).expanduser().absolute()) if path and is_local_path(path) else path
 
 
 def versions() -> dict[str, str]:

@@ -6,33 +6,43 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from egovcp.terminal import one_line
-from egovcp_deploy.scores import EpisodeScore, success_gain, success_rate, summarise
+from egovcp_deploy.scores import EpisodeScore, paired, success_gain, success_rate, summarise
 
 type Played = Mapping[str, Mapping[str, Sequence[EpisodeScore]]]
 
 _HEAD: Final = ("task", "controller", "success", "95 %", "reward/step", "95 %", "plan ms", "p99")
 
 
-def summary(scores: Played) -> dict[str, dict[str, dict[str, Any]]]:
-    """``{task: {controller: figures}}``, the content of ``eval.json``."""
+def summary(scores: Played, requested: int) -> dict[str, dict[str, dict[str, Any]]]:
+    """``{task: {controller: figures}}``, the content of ``eval.json``.
+
+    Where fewer than ``requested`` episodes were played, the figures say so: ``incomplete`` is true,
+    and ``episodes_requested`` is there beside ``episodes``.
+    """
+
+    def figures(played: Sequence[EpisodeScore]) -> dict[str, Any]:
+        missing = {"incomplete": True, "episodes_requested": requested}
+        return summarise(played) | (missing if len(played) < requested else {})
+
     return {
-        task: {name: summarise(played) for name, played in row.items()}
+        task: {name: figures(played) for name, played in row.items()}
         for task, row in scores.items()
     }
 
 
 def gains(scores: Played) -> dict[str, dict[str, Any]]:
-    """Task -> reference -> planner's success rate minus the reference's, paired by scenario."""
+    """Task -> reference -> planner's success rate minus the reference's, paired by scenario; over
+    the scenarios that both have played."""
     out: dict[str, dict[str, Any]] = {}
     for task, row in scores.items():
-        others = [name for name in row if name != "planner"] if "planner" in row else []
-        out[task] = {
-            name: {
-                "gain": success_rate(row["planner"]) - success_rate(row[name]),
-                "ci95": list(success_gain(row["planner"], row[name])),
-            }
-            for name in others
-        }
+        out[task] = {}
+        for name in row:
+            ours, others = paired(row.get("planner", ()), row[name])
+            if name != "planner" and ours:
+                out[task][name] = {
+                    "gain": success_rate(ours) - success_rate(others),
+                    "ci95": list(success_gain(ours, others)),
+                }
     return out
 
 

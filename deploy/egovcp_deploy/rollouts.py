@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import draccus
 import numpy as np
 from tqdm import tqdm
 
@@ -111,7 +110,7 @@ def _info(
         config.seed,
         episode,
         robot.camera,
-        draccus.encode(config),
+        config.encoded(),
         robot.controller_id,
         artefact,
         backend,
@@ -137,7 +136,7 @@ def _report(
         "seed": config.seed,
         "success_rate": float(np.mean([summary.success for summary in summaries])),
         "rollouts": [_row(i, summary) for i, summary in enumerate(summaries)],
-        "config": draccus.encode(config),
+        "config": config.encoded(),
         "artefact": artefact.manifest["files"] if artefact else None,
         "low_level_controller": robot.controller_id,
         "backend": backend,

@@ -32,6 +32,15 @@ class EpisodeScore:
     """Success of each part of a sequence of tasks; of a single task, nothing."""
 
 
+def paired(
+    scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]
+) -> tuple[list[EpisodeScore], list[EpisodeScore]]:
+    """The episodes of the scenarios that are in both, in the order of the scenarios."""
+    ours, theirs = ({s.episode: s for s in each} for each in (scores, others))
+    common = sorted(ours.keys() & theirs.keys())
+    return [ours[i] for i in common], [theirs[i] for i in common]
+
+
 def success_rate(scores: Sequence[EpisodeScore]) -> float:
     """Share of the episodes that succeeded."""
     return sum(score.success for score in scores) / len(scores)

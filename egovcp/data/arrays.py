@@ -14,6 +14,7 @@ or episode by episode, read when it is asked for::
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -26,21 +27,21 @@ from egovcp.cli import DatasetConfig
 from egovcp.data import schema
 from egovcp.data.reader import DatasetReader
 from egovcp.errors import DataError, suggest
+from egovcp.hub import is_local_path
 
 
 def open_dataset(where: str | Path, revision: str = "") -> DatasetReader:
     """Open a dataset, a folder or an id on the Hub, for reading episode by episode.
 
     Args:
-        where: a folder that exists, or ``user/name``.
+        where: a folder, or ``user/name``.
         revision: branch, tag or commit SHA, of a dataset on the Hub.
 
     Raises:
-        UsageError: neither a folder nor a well-formed id.
-        DataError: it is damaged, or not one of this specification.
+        DataError: there is no such folder, it is damaged, or not one of this specification.
         EnvironmentFailure: the Hub cannot be reached.
     """
-    if Path(where).expanduser().is_dir():
+    if not isinstance(where, str) or is_local_path(os.path.expanduser(where)):
         return DatasetReader.open(DatasetConfig(root=str(where), revision=revision))
     return DatasetReader.open(DatasetConfig(repo_id=str(where), revision=revision))
 

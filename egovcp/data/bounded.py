@@ -38,7 +38,7 @@ _LABELS_KEPT: Final = 20_000  # 60 MB; what is beyond is made again
 class ShuffleConfig:
     """The episodes in memory."""
 
-    episodes: int = bounded(128, least=1)
+    episodes: int = bounded(128, least=1, most=1_000_000)
     """Episodes that are in memory at a time, about 1 MB each."""
     reuse: float = bounded(1.0, above=0)
     """How often the rows of an episode are used, on average, before the next one is read."""

@@ -27,7 +27,7 @@ def resolve_root(root: str | Path) -> Path:
         UsageError: the links form a loop.
     """
     try:
-        return Path(root).expanduser().resolve()
+        return Path(os.path.expanduser(root)).resolve()
     except (OSError, RuntimeError) as error:
         raise UsageError(f"{root} is a symbolic link that leads nowhere; remove it") from error
 

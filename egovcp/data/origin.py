@@ -74,6 +74,15 @@ class ScenarioKey:
         return f"{self.task}/{self.seed}/{self.number} (task/seed/number)"
 
 
+def _shaping(origin: Provenance) -> dict[str, Any]:
+    """What a scenario depends on besides task, seed and number."""
+    settings = asdict(replace(origin, command="", seed=None))
+    env = settings["config"].get("env")
+    if isinstance(env, dict):  # the controller may be named by a path; its id says which it is
+        settings["config"]["env"] = {k: v for k, v in env.items() if k != "controller"}
+    return settings
+
+
 class ScenarioKeys:
     """Makes the `ScenarioKey` of the episodes of a dataset."""
 
@@ -84,10 +93,7 @@ class ScenarioKeys:
             DataError: it is damaged.
         """
         self._parts = parts_of(origin)
-        self._texts = [
-            json.dumps(asdict(replace(part, command="", seed=None)), sort_keys=True)
-            for part in self._parts
-        ]
+        self._texts = [json.dumps(_shaping(part), sort_keys=True) for part in self._parts]
 
     def key(self, task: str, facts: Mapping[str, Any]) -> ScenarioKey | None:
         """The key of an episode; None if it was not collected by number: a recorded rollout.

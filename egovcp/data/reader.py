@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
@@ -188,6 +189,13 @@ class DatasetReader:
     def digest(self, index: int) -> str:
         """`Episode.digest` as it was when the episode was written; empty if not recorded."""
         return str(self._collection["episodes"][index].get("sha256", ""))
+
+    @property
+    def content_digest(self) -> str:
+        """Hash of the recorded digests of the episodes that are asked for, in order: equal for
+        copies of a dataset, wherever they lie."""
+        digests = "\n".join(self.digest(index) for index in self.chosen.tolist())
+        return hashlib.sha256(digests.encode()).hexdigest()
 
     def identity(self, index: int) -> str:
         """What the episode is, whatever dataset holds it: task, seed and episode number."""

@@ -17,7 +17,7 @@ class ReturnConfig:
 
     gamma: float = bounded(spec.GAMMA, least=0, most=1)
     """Discount per planner tick."""
-    steps: int = bounded(spec.RETURN_STEPS, least=1)
+    steps: int = bounded(spec.RETURN_STEPS, least=1, most=100_000)
     """Horizon K, planner ticks."""
     keep_truncated: bool = False
     """Train on returns that the time limit cuts short, too (the paper's choice)."""

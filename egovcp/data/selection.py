@@ -13,9 +13,7 @@ from egovcp.errors import UsageError
 _PART = re.compile(r"(\d{1,18})|(\d{0,18}):(\d{0,18})", re.ASCII)
 
 
-def select_episodes(
-    text: str, count: int, flag: str = "--dataset.episodes"
-) -> NDArray[np.int64]:
+def select_episodes(text: str, count: int, flag: str = "--dataset.episodes") -> NDArray[np.int64]:
     """The numbers that ``text`` names, in ascending order, each once; all of them if it is empty.
 
     A lone number needs its brackets: YAML reads the range ``1:30`` as the number 90 where it is not

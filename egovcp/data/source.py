@@ -9,7 +9,7 @@ from pathlib import Path
 from egovcp.cli import DatasetConfig
 from egovcp.data import schema
 from egovcp.data.files import write_json
-from egovcp.errors import DataError, UsageError
+from egovcp.errors import DataError, UsageError, suggest_path
 from egovcp.hub import RetryPolicy, Shelf, is_repo_id, snapshot
 from egovcp.safe_files import read_json
 
@@ -29,7 +29,7 @@ def lerobot_home() -> Path:
     """``$HF_LEROBOT_HOME``, the folder in which LeRobot keeps datasets by id."""
     from huggingface_hub.constants import HF_HOME
 
-    return Path(os.environ.get("HF_LEROBOT_HOME", Path(HF_HOME) / "lerobot")).expanduser()
+    return Path(os.path.expanduser(os.environ.get("HF_LEROBOT_HOME", f"{HF_HOME}/lerobot")))
 
 
 def local_root(config: DatasetConfig) -> Path:
@@ -39,7 +39,7 @@ def local_root(config: DatasetConfig) -> Path:
         UsageError: neither root nor a well-formed repo id is given.
     """
     if config.root:
-        return Path(config.root).expanduser().absolute()
+        return Path(os.path.abspath(os.path.expanduser(config.root)))
     _require_repo_id(config.repo_id)
     return lerobot_home() / config.repo_id
 
@@ -63,10 +63,17 @@ def locate(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Source:
     if (root / schema.INFO_PATH).is_file() and not config.revision:
         return recorded(root, config.repo_id)
     if config.root:
-        raise DataError(
-            f"no dataset at {root}: {schema.INFO_PATH} is missing; check --dataset.root"
-        )
+        require_folder(root)
+        raise DataError(f"no dataset at {root}: {schema.INFO_PATH} is missing")
     return _download(config, retry)
+
+
+def require_folder(root: Path) -> None:
+    """Raise `DataError`, which suggests the nearest existing name, unless there is a folder."""
+    if not os.path.lexists(root):
+        raise DataError(f"no such folder: {root}{suggest_path(root)}")
+    if not root.is_dir():
+        raise DataError(f"{root} is not a folder; expected the folder of a dataset")
 
 
 def is_local(config: DatasetConfig) -> bool:

@@ -13,10 +13,16 @@ from egovcp.log.paths import (
     EVENTS,
     IMAGINED,
     INFO,
+    LINK,
+    MOTOR_FAULTS,
+    MOTOR_LOST,
+    MOTOR_TEMPERATURE,
+    MOTOR_TORQUE,
     OUTCOME,
     PLAN,
     RECONSTRUCTED,
     REWARD,
+    RUNNER,
     STATE,
     TIMING,
     VALUE_MAP,
@@ -25,16 +31,22 @@ from egovcp.log.paths import (
 
 
 def blueprint(imagined: tuple[int, ...] = ()) -> rrb.Blueprint:
-    """3D view over value maps and events at the left; at the right depth over the time series.
+    """Two tabs. The first: 3D view over value maps and events at the left; at the right depth over
+    the time series. The second: motors, connection and state of a robot that is not simulated.
 
     Args:
         imagined: horizons of the imagined depth images, ticks ahead; none leaves them out.
     """
     return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(_scene(), _below_scene(), row_shares=[5, 2]),
-            rrb.Vertical(*_pictures(imagined), *_curves(), row_shares=_shares(imagined)),
-            column_shares=[3, 2],
+        rrb.Tabs(
+            rrb.Horizontal(
+                rrb.Vertical(_scene(), _below_scene(), row_shares=[5, 2]),
+                rrb.Vertical(*_pictures(imagined), *_curves(), row_shares=_shares(imagined)),
+                column_shares=[3, 2],
+                name="plan",
+            ),
+            _robot_tab(),
+            active_tab=0,
         ),
         _time_panel(),
         collapse_panels=True,
@@ -52,6 +64,26 @@ def signals_blueprint() -> rrb.Blueprint:
         ),
         _time_panel(),
         collapse_panels=True,
+    )
+
+
+def _robot_tab() -> rrb.Container:
+    """What a motor that overheats or drops out, or a bad connection, looks like."""
+    return rrb.Vertical(
+        rrb.Horizontal(
+            rrb.TimeSeriesView(name="motor temperature (deg C)", origin=MOTOR_TEMPERATURE),
+            rrb.TimeSeriesView(name="motor torque (N m)", origin=MOTOR_TORQUE),
+        ),
+        rrb.Horizontal(
+            rrb.TimeSeriesView(name="motor faults (status bits)", origin=MOTOR_FAULTS),
+            rrb.TimeSeriesView(name="packets lost by motors", origin=MOTOR_LOST),
+        ),
+        rrb.Horizontal(
+            rrb.TimeSeriesView(name="connection, image age, mode machine", origin=LINK),
+            rrb.TimeSeriesView(name="state of the runner", origin=RUNNER),
+            rrb.TextLogView(name="events", origin=EVENTS),
+        ),
+        name="robot",
     )
 
 

@@ -28,7 +28,7 @@ from egovcp.log.info import RunInfo
 from egovcp.log.mcap import METADATA_NAME, Line, checksum_matches, without_checksum
 from egovcp.log.mcap_records import MAGIC, Damage, RecordFile
 from egovcp.log.messages import VALUE_MAPS, Topic
-from egovcp.log.tick import BasePose, Candidates, SceneObject, Tick, ValueMap
+from egovcp.log.tick import BasePose, Candidates, MotorReadings, SceneObject, Tick, ValueMap
 from egovcp.rate import NS_PER_S
 from egovcp.spec import DEPTH_COLS
 
@@ -39,6 +39,7 @@ ROW_TOPICS: Final = frozenset(
 )
 #: What every tick has.
 REQUIRED_TOPICS: Final = frozenset({Topic.DEPTH, Topic.STATE, Topic.ACTION, Topic.REWARD})
+_MOTOR_TOPICS: Final = frozenset({Topic.JOINTS, Topic.MOTOR_TEMPERATURE, Topic.MOTOR_STATUS})
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,32 @@ class Moment:
     def text(self, topic: str) -> str:
         """The words on ``topic``, a log; empty where there are none."""
         return str(self._decode(topic).msg) if topic in self.messages else ""
+
+    def mode(self) -> str:
+        """`Tick.mode`.
+
+        Raises:
+            DataError: the message is damaged.
+        """
+        return _mode(self._decoded({Topic.MODE}).get(Topic.MODE))
+
+    def motors(self) -> MotorReadings | None:
+        """`Tick.motors`.
+
+        Raises:
+            DataError: a message is damaged.
+        """
+        try:
+            return motor_readings(self._decoded(_MOTOR_TOPICS))
+        except (ValueError, IndexError, AttributeError) as error:
+            raise DataError(f"tick {self.index} is damaged: {error}") from error
+
+    def _decoded(self, topics: Collection[str]) -> dict[str, Any]:
+        """Topic -> decoded message, of those of ``topics`` that the tick has."""
+        try:
+            return {name: self._decode(name) for name in self.messages.keys() & set(topics)}
+        except (struct.error, ValueError, IndexError, AttributeError) as error:
+            raise DataError(f"tick {self.index} is damaged: {error}") from error
 
     def _decode(self, topic: str) -> Any:
         line = self.lines[topic]
@@ -356,10 +383,40 @@ def _tick(index: int, time_ns: int, messages: Mapping[str, Any]) -> Tick:
         scene=_scene(messages.get(Topic.SCENE)),
         events=tuple(log.msg.split("\n")) if log else (),
         mode=_mode(messages.get(Topic.MODE)),
+        motors=motor_readings(messages),
+        link=_scalars(messages.get(Topic.LINK)),
         terminated=flags["terminated"],
         truncated=flags["truncated"],
         success=flags["success"],
     )
+
+
+def motor_readings(messages: Mapping[str, Any]) -> MotorReadings | None:
+    """From the decoded messages of a tick, topic -> message; None: no torque was recorded."""
+    joints = messages.get(Topic.JOINTS)
+    if joints is None or not len(joints.effort):
+        return None
+    temperature = messages.get(Topic.MOTOR_TEMPERATURE)
+    status = _rows(messages.get(Topic.MOTOR_STATUS))
+    return MotorReadings(
+        torque=np.array(joints.effort, np.float64),
+        temperature=None if temperature is None else _array(temperature).T,
+        faults=_integers(status.get("faults")),
+        lost=_integers(status.get("lost")),
+        enabled=None if "enabled" not in status else status["enabled"] != 0.0,
+    )
+
+
+def _rows(message: Any) -> dict[str, NDArray[np.float64]]:
+    """Label -> row of a matrix."""
+    if message is None:
+        return {}
+    names = message.layout.dim[0].label.split(",")
+    return dict(zip(names, _array(message), strict=True))
+
+
+def _integers(row: NDArray[np.float64] | None) -> NDArray[np.int64] | None:
+    return None if row is None else row.astype(np.int64)
 
 
 def _array(message: Any) -> NDArray[np.float64]:

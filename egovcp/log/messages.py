@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from egovcp.log import ros2
 from egovcp.log.info import CameraView
 from egovcp.log.pose import RobotPose, robot_pose
-from egovcp.log.tick import MODES, Candidates, Hand, Tick, ValueMap
+from egovcp.log.tick import MODES, Candidates, Hand, MotorReadings, Tick, ValueMap
 from egovcp.robot.kinematics import LINK_NAMES, quaternion
 from egovcp.spec import ACTION_NAMES, JOINT_NAMES, STATE_NAMES, STATE_SLICES
 
@@ -26,6 +26,9 @@ _FRAMES: Final = (
     "right_hand_target",
 )
 CANDIDATE_FIELDS: Final = ("x", "y", "z", "value")
+#: Number of temperatures per motor -> their names.
+TEMPERATURE_SENSORS: Final = {1: ("motor",), 2: ("casing", "winding")}
+MOTOR_STATUS_ROWS: Final = ("faults", "lost", "enabled")
 
 
 class Topic(StrEnum):
@@ -38,6 +41,8 @@ class Topic(StrEnum):
     TF = "/tf"
     BASE = "/robot/base_pose"  # simulator truth
     JOINTS = "/robot/joint_states"
+    MOTOR_TEMPERATURE = "/robot/motor_temperature"  # rows: casing and winding, or one value
+    MOTOR_STATUS = "/robot/motor_status"  # rows: those of faults, lost, enabled that are reported
     STATE = "/policy/state"
     ACTION = "/policy/action"  # as sent
     ACTION_PLANNED = "/policy/action_planned"
@@ -49,6 +54,7 @@ class Topic(StrEnum):
     REWARD = "/reward"
     TIMING = "/timing"
     MODE = "/runner/state"  # 1 at the state that the runner is in
+    LINK = "/runner/link"  # rate, jitter, loss and age of the robot's messages
     SCENE = "/scene/objects"
     LOG = "/rosout"
 
@@ -118,12 +124,15 @@ def _transform_tree(tick: Tick, pose: RobotPose, view: CameraView) -> bytes:
 def _robot_messages(tick: Tick) -> dict[Topic, bytes]:
     position = tick.state[STATE_SLICES["joint_position"]]
     velocity = tick.state[STATE_SLICES["joint_velocity"]]
+    effort = () if tick.motors is None else tick.motors.torque
     messages = {
-        Topic.JOINTS: ros2.joint_state(tick.time_ns, JOINT_NAMES, position, velocity),
+        Topic.JOINTS: ros2.joint_state(tick.time_ns, JOINT_NAMES, position, velocity, effort),
         Topic.STATE: ros2.multi_array(tick.state, [_STATES]),
         Topic.ACTION: ros2.multi_array(tick.action_sent, [_ACTIONS]),
         Topic.ACTION_PLANNED: ros2.multi_array(tick.action_planned, [_ACTIONS]),
     }
+    if tick.motors is not None:
+        messages |= _motor_messages(tick.motors)
     if tick.base is not None:
         messages[Topic.BASE] = ros2.pose_stamped(
             tick.time_ns, tick.base.position_w, tick.base.quaternion_w
@@ -131,6 +140,22 @@ def _robot_messages(tick: Tick) -> dict[Topic, bytes]:
     return messages
 
 
+def _motor_messages(motors: MotorReadings) -> dict[Topic, bytes]:
+    messages = {}
+    if motors.temperature is not None:
+        sensors = TEMPERATURE_SENSORS[motors.temperature.shape[1]]
+        messages[Topic.MOTOR_TEMPERATURE] = ros2.multi_array(
+            motors.temperature.T, [",".join(sensors), _JOINTS]
+        )
+    rows = {name: getattr(motors, name) for name in MOTOR_STATUS_ROWS}
+    known = {name: row for name, row in rows.items() if row is not None}
+    if known:
+        labels = [",".join(known), _JOINTS]
+        messages[Topic.MOTOR_STATUS] = ros2.multi_array(np.stack(list(known.values())), labels)
+    return messages
+
+
+_JOINTS: Final = ",".join(JOINT_NAMES)
 _ACTIONS: Final = ",".join(ACTION_NAMES)
 _STATES: Final = ",".join(STATE_NAMES)
 
@@ -161,6 +186,8 @@ def _outcome_messages(tick: Tick) -> dict[Topic, bytes]:
     messages = {Topic.REWARD: _named(reward | dict(tick.reward_terms))}
     if tick.mode:
         messages[Topic.MODE] = _named({mode: float(mode == tick.mode) for mode in MODES})
+    if tick.link:
+        messages[Topic.LINK] = _named(dict(tick.link))
     if tick.timing_ms:
         messages[Topic.TIMING] = _named(dict(tick.timing_ms))
     if tick.scene:

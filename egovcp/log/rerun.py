@@ -22,6 +22,7 @@ from egovcp.log.colour import BALL, LEFT, OBSTACLE, RIGHT
 from egovcp.log.destination import Destination, RrdFile
 from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.meshes import LinkMesh, link_meshes
+from egovcp.log.motor_columns import log_motor_styles, motor_columns
 from egovcp.log.pose import robot_poses
 from egovcp.log.rerun_columns import Columns, Frame, all_columns, skeleton_columns
 from egovcp.log.signals import log_styles, signal_columns
@@ -91,6 +92,7 @@ class RerunSink:
             log_styles(stream)
         else:
             log_value_map_styles(stream)
+            log_motor_styles(stream)
         self._meshes = link_meshes() if self._wants_meshes else {}
         for link, mesh in self._meshes.items():
             surface = rr.Mesh3D(
@@ -143,6 +145,8 @@ class RerunSink:
             groups.append(skeleton_columns(frames))
         if self._signals:
             groups += signal_columns(self._batch)
+        else:
+            groups += motor_columns(self._batch)
         for path, ticks, columns in groups:
             if ticks:
                 self._stream.send_columns(path, _times(ticks), columns)

@@ -178,11 +178,13 @@ def _scalars(ticks: Sequence[Tick]) -> Iterator[Columns]:
         known = [tick for tick in ticks if getattr(tick, name) is not None]
         values = [float(getattr(tick, name)) for tick in known]
         yield Columns(f"{paths.PLAN}/{name}", known, rr.Scalars.columns(scalars=values))
-    yield from _named(paths.REWARD, ticks, lambda t: {"total": t.reward} | dict(t.reward_terms))
-    yield from _named(paths.TIMING, ticks, lambda tick: tick.timing_ms)
+    yield from named_columns(
+        paths.REWARD, ticks, lambda t: {"total": t.reward} | dict(t.reward_terms)
+    )
+    yield from named_columns(paths.TIMING, ticks, lambda tick: tick.timing_ms)
 
 
-def _named(
+def named_columns(
     path: str, ticks: Sequence[Tick], scalars: Callable[[Tick], Mapping[str, float]]
 ) -> Iterator[Columns]:
     """One entity per name, so that every curve has its own legend entry."""

@@ -149,10 +149,14 @@ def _pose_rows(positions: ArrayLike, quaternions: ArrayLike) -> NDArray[np.float
 
 
 def joint_state(
-    time_ns: int, names: tuple[str, ...], position: ArrayLike, velocity: ArrayLike
+    time_ns: int,
+    names: tuple[str, ...],
+    position: ArrayLike,
+    velocity: ArrayLike,
+    effort: ArrayLike = (),
 ) -> bytes:
-    """``sensor_msgs/JointState``: rad and rad/s; effort is not measured."""
-    return _header(time_ns, "").strings(names).f64s(position).f64s(velocity).f64s([]).done()
+    """``sensor_msgs/JointState``: rad, rad/s and N m; no effort: it is not measured."""
+    return _header(time_ns, "").strings(names).f64s(position).f64s(velocity).f64s(effort).done()
 
 
 def multi_array(values: ArrayLike, labels: Sequence[str]) -> bytes:

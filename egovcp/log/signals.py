@@ -22,7 +22,7 @@ from egovcp.spec import ACTION_BOX, ACTION_NAMES, JOINT_NAMES, STATE_NAMES, STAT
 _LEG_JOINTS: Final = ("hip", "knee", "ankle")
 _AXES: Final = {"x": (224, 80, 72), "y": (98, 184, 92), "z": (82, 138, 230)}
 _COLOURS: Final = _AXES | {"done": LEFT, "success": (98, 184, 92)}
-_LIMBS: Final = ("left_leg", "right_leg", "waist", "left_arm", "right_arm")
+LIMBS: Final = ("left_leg", "right_leg", "waist", "left_arm", "right_arm")
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ def _states() -> Iterator[Signal]:
             yield _state(group, group, range(part.start, part.stop))
     for group in ("joint_position", "joint_velocity"):
         first = STATE_SLICES[group].start
-        for name in _LIMBS:
+        for name in LIMBS:
             joints = [i for i, joint in enumerate(JOINT_NAMES) if limb(joint) == name]
             yield _state(f"{group}/{name}", "", [first + i for i in joints])
 

@@ -42,6 +42,26 @@ class BasePose:
 
 
 @dataclass(frozen=True)
+class MotorReadings:
+    """What the motors report besides position and velocity, (29,) in ``spec.JOINT_NAMES`` order.
+
+    Only the torque is always there: what a robot or its bridge does not report is None.
+    """
+
+    torque: Array
+    """(29,) N m, as the motors estimate it."""
+    temperature: Array | None = None
+    """(29, 1) or (29, 2) deg C: one value, or casing and winding; not-a-number where a motor
+    reports none."""
+    faults: NDArray[np.integer] | None = None
+    """(29,) status bits of each motor, 0 without a fault."""
+    lost: NDArray[np.integer] | None = None
+    """(29,) packets to or from each motor that were lost since it was switched on."""
+    enabled: NDArray[np.bool_] | None = None
+    """(29,) whether each motor is in the mode that obeys commands."""
+
+
+@dataclass(frozen=True)
 class Candidates:
     """Some of the plans that the planner weighed, drawn as paths of both hands."""
 
@@ -115,3 +135,8 @@ class Tick:
     """Human-readable lines: throws, contacts, faults."""
     mode: str = ""
     """State of the runner's state machine, one of `MODES`; empty: there is none."""
+    motors: MotorReadings | None = None
+    """None: the robot is simulated in lock-step, or nothing was read yet."""
+    link: Mapping[str, float] = field(default_factory=dict)
+    """Rate, jitter, loss and age of the robot's messages, and its mode machine; the names carry
+    their units."""

@@ -21,17 +21,17 @@ BackendName = Literal["auto", "eager", "float32", "bfloat16", "int8", "compile"]
 class PlannerConfig:
     """The sampling MPC; the defaults are the paper's, 25 Hz."""
 
-    samples: int = bounded(1024, least=1)
+    samples: int = bounded(1024, least=1, most=2**20)
     """M, candidate plans per iteration."""
-    horizon: int = bounded(4, least=1)
+    horizon: int = bounded(4, least=1, most=1000)
     """N, planner ticks."""
     objective: Objective = "value"
     """J of a candidate. value: the mean of Q over its N ticks, the paper's; reward: the sum of the
     N predicted rewards, discounted (Rew-MPC); td: the same and gamma^N Q after them, of one more
     action (TD-MPC). The last two need a model trained with loss.reward."""
-    iterations: int = bounded(3, least=1)
+    iterations: int = bounded(3, least=1, most=10_000)
     """Rounds of the search; fewer where a deadline comes first."""
-    elites: int = bounded(64, least=1)
+    elites: int = bounded(64, least=1, most=2**20)
     """Best candidates that the next round is fitted to."""
     min_std: float = bounded(0.1, least=0, most=10)
     """Floor of the sampling deviation, in units of delta."""
@@ -46,7 +46,7 @@ class PlannerConfig:
     process: Process = "walk"
     """What candidates are made of. walk: a step of its own in every tick, as the paper's data;
     ramp: the steps drawn add up to one place, to which it goes by eta a tick and where it rests, as
-    data collected with longer --step_ticks. Its first action is found with fewer candidates."""
+    data of a longer `egovcp-collect --step_ticks`. Its first action is found with fewer candidates."""
     termination_threshold: float = bounded(0.9, least=0, most=1)
     """A candidate whose termination probability exceeds this loses its later values."""
     termination_rule: TerminationRule = "shift"

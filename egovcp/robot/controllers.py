@@ -18,6 +18,16 @@ WALK: Final = "walk"
 _SHIPPED: Final = "g1_walk.safetensors"
 
 
+def is_controller_file(which: str) -> bool:
+    """Whether a controller is named by a file, not as ``stance`` or ``walk``."""
+    return which.endswith((".safetensors", ".onnx"))
+
+
+def absolute_controller(which: str) -> str:
+    """The name of a controller that means the same in any working directory."""
+    return str(Path(which).expanduser().absolute()) if is_controller_file(which) else which
+
+
 def make_controller(which: str) -> LowLevelController:
     """``stance``, ``walk``, or the path of a ``walk.safetensors`` or of its export to ONNX.
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
 from egovcp.robot.controller import LowLevelController
-from egovcp.robot.controllers import make_controller
+from egovcp.robot.controllers import absolute_controller, make_controller
 from egovcp.sim.camera import DepthCamera
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.lane import Lane
@@ -72,8 +72,10 @@ class StepResult:
 
 def decided(config: EnvConfig) -> EnvConfig:
     """``config`` with what it leaves to its low-level controller (see
-    `EnvConfig.for_controller`); what a command checks, hands on and records."""
-    return config.for_controller(make_controller(config.controller).walks)
+    `EnvConfig.for_controller`); what a command checks, hands on and records. The file of a
+    controller is named by its absolute path."""
+    config = config.for_controller(make_controller(config.controller).walks)
+    return replace(config, controller=absolute_controller(config.controller))
 
 
 class VectorEnv:

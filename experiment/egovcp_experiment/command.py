@@ -1,4 +1,4 @@
-"""`egovcp-experiment NAME --output_dir=... [--flags]`: one of the paper's experiments."""
+"""`egovcp-experiment NAME --output_dir=... [--NAME=VALUE ...]`: one of the paper's experiments."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def _help() -> str:
     lines = [f"  {name:{width}}  {entry.summary}" for name, entry in EXPERIMENTS.items()]
     return "\n".join(
         [
-            f"usage: {PROG} NAME --output_dir=... [--scale=smoke|small|paper] [--flags]",
+            f"usage: {PROG} NAME --output_dir=... [--scale=smoke|small|paper] [--NAME=VALUE ...]",
             "",
             "Run one of the paper's experiments, cell by cell, and write its report.",
             "",

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from egovcp.bounds import bounded, check_bounds
+from egovcp.bounds import bounded, check_bounds, require_cores
 from egovcp.errors import UsageError, suggest
 from egovcp.spec import TASKS
 
@@ -16,11 +16,11 @@ Scale = Literal["smoke", "small", "paper"]
 class EpisodesConfig:
     """A number of episodes for each task."""
 
-    ball: int = bounded(1334, least=1)
+    ball: int = bounded(1334, least=1, most=1_000_000)
     """Of the ball task, 150 ticks each where no flag says otherwise."""
-    wall: int = bounded(1334, least=1)
+    wall: int = bounded(1334, least=1, most=1_000_000)
     """Of the wall task, likewise."""
-    arch: int = bounded(870, least=1)
+    arch: int = bounded(870, least=1, most=1_000_000)
     """Of the arch task, 230 ticks each."""
 
 
@@ -63,9 +63,9 @@ class TrainingConfig:
     task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Flags after those for the models of one task (all: of the multi-task model), '{wall:
     [--sampling.event_fraction=0.7]}'; a task that is not named keeps what the scale says of it."""
-    return_steps: dict[str, int] = bounded({}, least=1)
+    return_steps: dict[str, int] = bounded({}, least=1, most=100_000)
     """Task -> horizon of the returns of its data, ticks, in its own model and in the multi-task
-    one, '{arch: 50}'; where a task is not named, --returns.steps."""
+    one, '{arch: 50}'; where a task is not named, that of `egovcp-train --returns.steps`."""
 
     @property
     def budget(self) -> str:
@@ -79,11 +79,11 @@ class TrainingConfig:
 class PlayConfig:
     """The closed-loop episodes."""
 
-    episodes: int = bounded(100, least=1)
+    episodes: int = bounded(100, least=1, most=1_000_000)
     """Scenarios of each task; all variants play the same."""
     seed: int = bounded(0, least=0)
     """Which held-out scenarios."""
-    branches: int = bounded(12, least=2)
+    branches: int = bounded(12, least=2, most=10_000)
     """Random walks from each step of a plan, whose mean return is what the step is worth."""
     budget_ms: float = bounded(40.0, above=0)
     """Time for a plan, where searches are compared on equal time, ms."""
@@ -102,12 +102,12 @@ class PpoConfig:
     steps: int = bounded(200_000, least=0)
     """Transitions of a training, rounded to whole updates between policies; 0: no PPO in
     sample-efficiency."""
-    policies: int = bounded(4, least=1)
+    policies: int = bounded(4, least=1, most=10_000)
     """Policies along a training that are played, equally far apart; the last is that of its
     end."""
-    robots: int = bounded(32, least=1)
+    robots: int = bounded(32, least=1, most=65_536)
     """Robots simulated side by side."""
-    ticks: int = bounded(50, least=1)
+    ticks: int = bounded(50, least=1, most=100_000)
     """Ticks of each robot from one update to the next."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-train-ppo, '[--ppo.entropy_coef=0.01]'."""
@@ -142,7 +142,8 @@ class RayConfig:
 
     cpus: float = bounded(1.0, above=0)
     """Processor cores that are set aside for it. Commands see all cores of their node none the
-    less: tell them with '--data.flags=[--num_workers=8]', '--train.flags=[--threads=8]'."""
+    less: tell `egovcp-collect --num_workers` and `egovcp-train --threads` with
+    '--data.flags=[--num_workers=8]', '--train.flags=[--threads=8]'."""
     gpus: float = bounded(0.0, least=0)
     """GPUs that are set aside for a training; other cells get none."""
 
@@ -163,7 +164,7 @@ class ExperimentConfig:
     backend: Literal["local", "ray"] = "local"
     """Where cells run: processes of this machine; or the Ray cluster of RAY_ADDRESS, all of whose
     nodes must have --output_dir under the same path."""
-    jobs: int = bounded(1, least=1)
+    jobs: int = bounded(1, least=1, most=1024)
     """Cells that run side by side; here each on its share of the processor cores."""
     ray: RayConfig = field(default_factory=RayConfig)
     """Each cell's share of a Ray cluster."""
@@ -174,7 +175,7 @@ class ExperimentConfig:
     most: int = bounded(0, least=0)
     """Of all, only so many variants; 0: no limit."""
     scenes: tuple[str, ...] = ()
-    """--env.* flags of both collection and play, '[--env.controller=stance]'."""
+    """Flags of both collection and play, of `egovcp-collect --env.*`, '[--env.controller=stance]'."""
     data: DataConfig = field(default_factory=DataConfig)
     """Data."""
     train: TrainingConfig = field(default_factory=TrainingConfig)
@@ -189,6 +190,8 @@ class ExperimentConfig:
         if not self.output_dir:
             raise UsageError("--output_dir is missing; name the folder of cells and reports")
         check_bounds(self, "--")
+        if self.backend == "local":
+            require_cores("--jobs", self.jobs)
         models = (*TASKS, "all")
         for option, given, known in (
             ("tasks", self.tasks, TASKS),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -145,7 +146,7 @@ def given_digest(path: str) -> str:
 
     Something on the Hub is known by its name alone.
     """
-    folder = Path(path).expanduser()
+    folder = Path(os.path.expanduser(path))
     if (folder / MANIFEST).is_file():
         return artefact_digest(folder)
     if (folder / HASHES_PATH).is_file():

@@ -31,6 +31,14 @@ def test_an_option_newer_than_the_dataset_was_made_with_its_default() -> None:
         require_same(replace(now, config=other), replace(now, config=older))
 
 
+def test_a_controller_may_lie_elsewhere_if_it_is_the_same() -> None:
+    before, now = made(), copy.deepcopy(made())
+    now.config["env"]["controller"] = "/elsewhere/walk.safetensors"
+    require_same(now, before)
+    with pytest.raises(UsageError, match="low-level controller was walk, is stance"):
+        require_same(replace(now, controller_id="stance"), before)
+
+
 @pytest.mark.parametrize("task", ["wall", "all"])
 def test_no_wall_of_before_gets_rows_in_which_a_guard_has_a_price(task: str) -> None:
     now = made(task)

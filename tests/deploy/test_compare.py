@@ -42,6 +42,16 @@ def test_what_is_paired_is_not_blurred_by_how_hard_scenarios_are(
     assert (gain, low, high) == ("+0.01000", "+0.01000", "+0.01000")
 
 
+def test_an_interrupted_run_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run, other = (write(tmp_path / name, [0.1, -0.1]) for name in ("run", "other"))
+    path = Path(run) / "eval_run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"complete": False}))
+    assert main([f"--run={run}", f"--other={other}"]) == 0
+    printed = capsys.readouterr().out
+    assert f"{run} is incomplete: egovcp-eval was interrupted" in printed
+    assert f"{other} is incomplete" not in printed
+
+
 def test_two_controllers_of_one_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """From end to end: what egovcp-eval writes is what is read."""
     out = tmp_path / "out"

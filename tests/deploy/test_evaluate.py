@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import signal
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from egovcp.errors import SimulationDiverged
 from egovcp.plan.backends import library
 from egovcp.robot.stance import StanceController
 from egovcp.sim import robot
+from egovcp.sim.config import EnvConfig, EpisodeConfig
+from egovcp.sim.env import VectorEnv
+from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
 from egovcp.testing import toy_reactive
+from egovcp_deploy import episodes
+from egovcp_deploy.controllers import reference
 from egovcp_deploy.deploy import main as deploy
+from egovcp_deploy.episodes import Group, Setup, Stage
 from egovcp_deploy.evaluate import EvalConfig, main
+from egovcp_deploy.scores import EpisodeScore
 
 KEYS = {
     "episodes",
@@ -33,6 +44,13 @@ def run(out: Path, *flags: str) -> int:
 
 def played(out: Path) -> Any:
     return json.loads((out / "eval_run.json").read_text())["episodes"]
+
+
+@pytest.fixture(scope="module")
+def config() -> EnvConfig:
+    """Short ball episodes."""
+    brief = EpisodeConfig(ticks=60, event_ticks=(50, 50), empty_probability=0.0)
+    return EnvConfig(controller="stance", ball_episode=brief)
 
 
 @pytest.fixture
@@ -261,3 +279,104 @@ def test_int8_is_refused_before_any_work_where_it_cannot_be_used(
     assert "there is no C compiler" in told
     assert "plan with --planner.backend=float32" in told
     assert not out.exists()
+
+
+def test_recorded_paths_are_absolute(
+    tmp_path: Path, artefact_dir: Path, short: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(artefact_dir.parent)
+    flags = [f"--policy.path={artefact_dir.name}", "--controllers=planner", "--episodes=1"]
+    assert run(tmp_path / "out", *flags, *short) == 0
+    config = json.loads((tmp_path / "out" / "eval_run.json").read_text())["config"]
+    assert config["policy"]["path"] == str(artefact_dir)
+
+
+def _interrupt_at_group(monkeypatch: pytest.MonkeyPatch, number: int, signals: int = 1) -> None:
+    """Send this process SIGINT when that group of episodes begins."""
+    original, groups = episodes.play, itertools.count(1)
+
+    def play(*args: Any) -> list[EpisodeScore]:
+        if next(groups) == number:
+            for _ in range(signals):
+                signal.raise_signal(signal.SIGINT)
+        return original(*args)
+
+    monkeypatch.setattr(episodes, "play", play)
+
+
+@pytest.mark.parametrize("signals", [1, 2])
+def test_an_interrupted_evaluation_keeps_what_was_played(
+    signals: int,
+    tmp_path: Path,
+    short: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    _interrupt_at_group(monkeypatch, 3, signals)
+    out = tmp_path / "out"
+    flags = ["--controllers=hold,random", "--episodes=6", "--num_envs=2", *short]
+    before = signal.getsignal(signal.SIGINT)
+    assert run(out, *flags) == 130
+    assert signal.getsignal(signal.SIGINT) == before
+    figures = json.loads((out / "eval.json").read_text())
+    assert set(figures) == {"ball"}
+    assert set(figures["ball"]) == {"hold"}
+    row = figures["ball"]["hold"]
+    assert (row["incomplete"], row["episodes"], row["episodes_requested"]) == (True, 4, 6)
+    record = json.loads((out / "eval_run.json").read_text())
+    assert record["complete"] is False
+    assert [score["episode"] for score in record["episodes"]["ball"]["hold"]] == [0, 1, 2, 3]
+    printed = capsys.readouterr().out
+    assert "ball  hold" in printed
+    assert "INCOMPLETE: ball hold 4 of 6, ball random 0 of 6 episodes played" in printed
+
+
+def test_an_evaluation_interrupted_at_its_start_writes_no_figures(
+    tmp_path: Path, short: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _interrupt_at_group(monkeypatch, 1)
+    assert run(tmp_path / "out", "--controllers=hold", "--episodes=2", *short) == 130
+    assert list((tmp_path / "out").iterdir()) == []
+
+
+def test_an_error_keeps_what_was_played_before_it(
+    tmp_path: Path, short: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original, groups = episodes.play, itertools.count(1)
+
+    def play(*args: Any) -> list[EpisodeScore]:
+        if next(groups) == 2:
+            raise SimulationDiverged("the simulation diverged")
+        return original(*args)
+
+    monkeypatch.setattr(episodes, "play", play)
+    out = tmp_path / "out"
+    assert run(out, "--controllers=hold", "--episodes=4", "--num_envs=2", *short) == 3
+    row = json.loads((out / "eval.json").read_text())["ball"]["hold"]
+    assert (row["incomplete"], row["episodes"], row["episodes_requested"]) == (True, 2, 4)
+
+
+def test_episodes_that_have_ended_in_an_interrupted_group_count(config: EnvConfig) -> None:
+    env, ticks = VectorEnv(config, 2, pictures=False), itertools.count()
+    scenarios = [Scenario("ball", 0, number) for number in range(2)]
+    toppled = reference("hold")
+    advance = toppled.advance
+
+    def push(sent: Any) -> None:
+        env.lanes[1].robot.data.qvel[0] = 5.0
+        advance(sent)
+
+    toppled.advance = push  # type: ignore[method-assign]
+    (score,) = episodes.play(env, toppled, scenarios, lambda: next(ticks) > 30)
+    assert (score.episode, score.terminated) == (1, True)
+
+
+def test_workers_that_are_stopped_give_up_what_they_play(config: EnvConfig) -> None:
+    received: list[int] = []
+    groups = [Group("hold", (Scenario("ball", 0, number),)) for number in range(40)]
+    with closing(Stage(Setup(config), 2, stopped=lambda: bool(received))) as stage:
+        played = []
+        for _, scores in stage.play(groups):
+            played += scores
+            received.append(1)
+    assert 1 <= len(played) < 40

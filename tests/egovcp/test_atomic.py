@@ -1,12 +1,16 @@
-"""Nothing half written."""
+"""Files are complete or absent, and others may read them if the umask says so."""
 
 import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from egovcp.artefact import FILES, save_artefact
 from egovcp.atomic import removed_on_error, write_bytes, write_json
+from egovcp.plan import PlannerConfig
+from egovcp.testing import toy_model
 
 
 def test_json_is_complete_or_absent(tmp_path: Path) -> None:
@@ -51,3 +55,26 @@ def test_temporary_file_folder_or_link_is_removed_and_nothing_else(tmp_path: Pat
             _interrupt(tmp_path / name)
     assert list(tmp_path.iterdir()) == [kept]
     assert (kept / "file").exists()
+
+
+def _write_policy(folder: Path) -> None:
+    save_artefact(folder / "policy", toy_model(), PlannerConfig(), {"controller_id": "a"})
+    assert {path.name for path in (folder / "policy").iterdir()} == set(FILES)
+
+
+@pytest.mark.parametrize("umask", [0o022, 0o002, 0o077])
+@pytest.mark.parametrize(
+    "write",
+    [
+        _write_policy,
+        lambda folder: write_json(folder / "a.json", {}),
+    ],
+)
+def test_modes_follow_the_umask(tmp_path: Path, write: Callable[[Path], None], umask: int) -> None:
+    previous = os.umask(umask)
+    try:
+        write(tmp_path)
+    finally:
+        os.umask(previous)
+    modes = {path.stat().st_mode & 0o777 for path in tmp_path.rglob("*") if path.is_file()}
+    assert modes == {0o666 & ~umask}

@@ -116,3 +116,19 @@ def test_other_encodings_are_refused(tmp_path: Path) -> None:
     path.write_bytes(b'{"a": "\xff"}')
     with pytest.raises(UnsafeFileError, match="byte 7 is not UTF-8"):
         safe_files.read_json(path)
+
+
+def test_values_are_counted_each_time_they_are_repeated() -> None:
+    value: list[object] = [0] * 10
+    safe_files.require_bounded(value, limit_items=11)
+    for _ in range(8):
+        value = [value] * 10  # 10^9 numbers, as the aliases of YAML can write them in 500 bytes
+    with pytest.raises(UnsafeFileError, match="more than 100000 values"):
+        safe_files.require_bounded(value)
+
+
+def test_a_value_that_holds_itself_is_refused() -> None:
+    value: list[object] = []
+    value.append({"inner": value})
+    with pytest.raises(UnsafeFileError, match="nested more than 32 levels"):
+        safe_files.require_bounded(value)

@@ -93,7 +93,7 @@ def test_a_run_that_kept_no_slow_heads_cannot_go_on_with_them(
 ) -> None:
     argv = [f"--output_dir={plain}", "--resume", "--steps=8", "--policy.loss.q_target=td"]
     assert main(argv) == 4
-    assert "does not fit the --policy options" in capsys.readouterr().err
+    assert "does not fit the options" in capsys.readouterr().err
 
 
 def test_the_final_fit_under_td_differs_from_that_to_returns(

@@ -2,9 +2,11 @@
 
 import contextlib
 import os
+import re
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,7 @@ import pytest
 import torch
 
 from egovcp.artefact import load_artefact
-from egovcp.errors import ArtefactError
+from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Provenance
 from egovcp.model import Batch
 from egovcp_train import checkpoint
 from egovcp_train.checkpoint import load_training_state, new_checkpoint
@@ -114,6 +116,75 @@ def test_a_signal_in_the_last_step_or_the_final_fit_loses_nothing(
         assert (output / weights).read_bytes() == (finished / weights).read_bytes()
 
 
+# --- other places -----------------------------------------------------------------------------
+@pytest.fixture
+def begun(
+    arguments: Arguments, dataset_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Path:
+    """A run of three steps whose dataset was named relative to the working directory."""
+    shutil.copytree(dataset_root, tmp_path / "data" / "small")
+    monkeypatch.chdir(tmp_path / "data")
+    output = tmp_path / "run"
+    assert main(arguments(output, dataset__root="small", steps=3)) == 0
+    monkeypatch.chdir(tmp_path)
+    return output
+
+
+def test_a_run_is_resumed_from_another_working_directory(begun: Path, tmp_path: Path) -> None:
+    options = (begun / "train_config.yaml").read_text()
+    assert f"root: {tmp_path / 'data' / 'small'}" in options
+    assert main(["--output_dir=run", "--resume", "--steps=6"]) == 0
+    assert _state(begun)["learner"]["step"] == 6
+
+
+def test_a_moved_dataset_is_named_with_the_flag_and_its_new_place_is_accepted(
+    begun: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "data").rename(tmp_path / "moved")
+    assert main(["--output_dir=run", "--resume", "--steps=6"]) == 3
+    message = capsys.readouterr().err.strip()
+    assert len(message.splitlines()) == 1
+    assert f"no dataset at {tmp_path / 'data' / 'small'}" in message
+    assert "resume with --dataset.root=FOLDER" in message
+    moved = "--dataset.root=moved/small"
+    assert main(["--output_dir=run", "--resume", "--steps=6", moved]) == 0
+    assert _state(begun)["learner"]["step"] == 6
+    assert f"root: {tmp_path / 'moved' / 'small'}" in (begun / "train_config.yaml").read_text()
+
+
+def test_another_dataset_of_the_same_scenarios_does_not_continue_a_run(
+    begun: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    reader = DatasetReader.open(DatasetConfig(root=str(tmp_path / "data" / "small")))
+    with DatasetWriter(tmp_path / "other", Provenance(reader.controller_id, seed=0)) as writer:
+        for episode in reader:
+            writer.add(replace(episode, reward=episode.reward + 1))
+    flags = ["--output_dir=run", "--resume", "--steps=6", "--dataset.root=other"]
+    assert main(flags) == 3
+    assert "its episodes are not those that the run was started with" in capsys.readouterr().err
+
+
+def test_a_moved_one_of_several_datasets_is_named_with_the_whole_flag(
+    arguments: Arguments,
+    dataset_root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    for name in ("a", "b"):
+        shutil.copytree(dataset_root, tmp_path / name)
+    output = tmp_path / "run"
+    both = f"[{{root: {tmp_path / 'a'}, weight: 2}}, {{root: {tmp_path / 'b'}, weight: 1}}]"
+    assert main(arguments(output, dataset__root=None, datasets=both, steps=3)) == 0
+    (tmp_path / "b").rename(tmp_path / "c")
+    assert main([f"--output_dir={output}", "--resume", "--steps=6"]) == 3
+    message = capsys.readouterr().err.strip().splitlines()[-1]
+    assert f"no dataset at {tmp_path / 'b'}" in message
+    flag = re.search(r"--datasets='(.*)' with", message)
+    assert flag is not None
+    given = flag[1].replace(str(tmp_path / "b"), str(tmp_path / "c"))
+    assert main([f"--output_dir={output}", "--resume", "--steps=6", f"--datasets={given}"]) == 0
+
+
 def test_a_second_signal_is_obeyed_at_once(
     arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -197,7 +268,7 @@ def test_a_damaged_checkpoint_is_named(
 @pytest.mark.parametrize(
     ("flag", "code", "message"),
     [
-        ("--policy.hidden=48", 4, "does not fit the --policy options"),
+        ("--policy.hidden=48", 4, "does not fit the options"),
         ("--sampling.length=5", 2, "length 6 -> 5"),
         ("--dataset.root=/absent", 3, "no dataset at /absent"),
     ],
@@ -318,15 +389,3 @@ def test_a_checkpoint_left_over_by_a_killed_run_is_written_again(tmp_path: Path)
     assert _complete(tmp_path) == 1
     _write(tmp_path, 2)
     assert _complete(tmp_path) == 2
-
-
-def test_the_training_state_is_read_without_executing_code(tmp_path: Path) -> None:
-    class Bomb:
-        def __reduce__(self) -> tuple[Callable[..., object], tuple[str]]:
-            return (pytest.fail, ("a pickle was executed",))
-
-    _write(tmp_path, 1)
-    path = tmp_path / "checkpoints" / "last" / "training_state" / checkpoint.STATE_FILE
-    torch.save({"step": Bomb()}, path)
-    with pytest.raises(ArtefactError, match="cannot be read"):
-        load_training_state(tmp_path)

@@ -1,26 +1,34 @@
 """Checkpoints in LeRobot's layout, complete or absent, never half-written.
 
 checkpoints/000500/pretrained_model/   the policy artefact (averaged weights)
-checkpoints/000500/training_state/     raw weights, optimiser, random streams, data position
+checkpoints/000500/training_state/     raw weights, optimiser, random streams, data position, and
+                                       their SHA-256
 checkpoints/last -> 000500
 """
 
 from __future__ import annotations
 
-import pickle
+import contextlib
+import os
 import shutil
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Final
 
 import torch
 
 from egovcp.atomic import removed_on_error
 from egovcp.data.files import sync, sync_tree
 from egovcp.errors import ArtefactError
+from egovcp.model.weights import MAX_WEIGHT_BYTES
+from egovcp.safe_files import UnsafeFileError, open_regular, read_text, sha256
 
 STATE_FILE = "state.pt"
+DIGEST_FILE = "state.pt.sha256"
+"""As ``sha256sum`` writes it; checkpoints of earlier versions have none."""
+_LIMIT_BYTES: Final = 5 * MAX_WEIGHT_BYTES + (1 << 30)  # weights, averages and moments; positions
 
 
 def checkpoint_dir(output_dir: Path, step: int) -> Path:
@@ -54,6 +62,7 @@ def _finish(partial: Path, state: dict[str, Any]) -> None:
     folder.mkdir(parents=True)
     with (folder / STATE_FILE).open("wb") as file:
         torch.save(state, file)
+    (folder / DIGEST_FILE).write_text(f"{sha256(folder / STATE_FILE)}  {STATE_FILE}\n")
     sync_tree(partial)  # on the disk before it gets its name
     final = partial.with_suffix("")
     shutil.rmtree(final, ignore_errors=True)
@@ -72,17 +81,60 @@ def load_training_state(output_dir: Path) -> dict[str, Any]:
         ArtefactError: there is none, or it cannot be read.
     """
     path = output_dir / "checkpoints" / "last" / "training_state" / STATE_FILE
-    if not path.is_file():
+    if not os.path.lexists(path):
         raise ArtefactError(
             f"{output_dir}: no checkpoint to resume from (expected "
             f"{path.relative_to(output_dir)}); start without --resume in a new folder"
         )
     try:
-        state: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    except (EOFError, OSError, RuntimeError, pickle.UnpicklingError) as error:
-        reason = (str(error) or type(error).__name__).splitlines()[0]
+        _require_digest(path)
+        with open_regular(path, _LIMIT_BYTES) as file:
+            state: dict[str, Any] = _load(file)
+        return state
+    except (OSError, UnsafeFileError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
         raise ArtefactError(
             f"{path}: cannot be read ({reason}); point {output_dir}/checkpoints/last at an older "
             "checkpoint, or start again"
         ) from error
+
+
+@contextlib.contextmanager
+def restoring(output_dir: Path) -> Iterator[None]:
+    """Around the code that takes a training state.
+
+    Raises:
+        ArtefactError: the state is not that of the options.
+    """
+    try:
+        yield
+    except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ArtefactError(
+            f"{output_dir}: its checkpoint does not fit the options given ({reason}); resume "
+            "without them, or start a new run"
+        ) from error
+
+
+def _require_digest(path: Path) -> None:
+    """Raise unless the SHA-256 of the state is the one beside it."""
+    beside = path.with_name(DIGEST_FILE)
+    if not os.path.lexists(beside):
+        return
+    expected = read_text(beside, 1024).split(" ")[0]
+    found = sha256(path, _LIMIT_BYTES)
+    if found != expected:
+        raise UnsafeFileError(f"its SHA-256 is not the one in {DIGEST_FILE}; it is damaged")
+
+
+def _load(file: IO[bytes]) -> dict[str, Any]:
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            state = torch.load(file, map_location="cpu", weights_only=True)
+    except MemoryError:
+        raise
+    except Exception as error:  # the unpickler raises whatever the bytes make it do
+        raise UnsafeFileError("not a training state") from error
+    if not isinstance(state, dict):
+        raise UnsafeFileError("not a training state")
     return state

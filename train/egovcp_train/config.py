@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal
 
-from egovcp.bounds import bounded
+from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
 from egovcp.data import MixedReturnConfig, ReturnConfig, ShuffleConfig
 from egovcp.errors import UsageError
@@ -39,9 +39,9 @@ class OptimizerConfig:
 class SamplingConfig:
     """Which windows of which episodes make a batch."""
 
-    length: int = bounded(20, least=1)
+    length: int = bounded(20, least=1, most=100_000)
     """Ticks per window."""
-    burn_in: int = bounded(0, least=0)
+    burn_in: int = bounded(0, least=0, most=100_000)
     """Leading ticks of a window that only fill the memory and are not trained on."""
     event_fraction: float = bounded(0.0, least=0, most=1)
     """Share of windows that are placed around events instead of anywhere."""
@@ -62,7 +62,7 @@ class LoadingConfig:
     takes at most half of the free memory."""
     shuffle: ShuffleConfig = field(default_factory=ShuffleConfig)
     """Shuffle window of mode stream."""
-    sample_files: int = bounded(16, least=1)
+    sample_files: int = bounded(16, least=1, most=65_536)
     """Files of each task that are fetched before the first step where the data comes from the Hub:
     the episodes in them give the scale of the returns, are evaluated on, and Q is fitted to."""
     network: RetryPolicy = field(default_factory=RetryPolicy)
@@ -84,7 +84,8 @@ class PolicyConfig(WorldModelConfig):
         super().__post_init__()
         if self.push_to_hub and not is_repo_id(self.repo_id):
             raise UsageError(
-                f"--policy.repo_id={self.repo_id!r}: expected user/name, where to publish"
+                f"--policy.repo_id={self.repo_id!r}: expected user/name, where "
+                "--policy.push_to_hub publishes"
             )
         if self.repo_id and not self.push_to_hub:
             raise UsageError(
@@ -139,7 +140,7 @@ class TrainConfig:
     """Wall-clock limit in minutes after which the run ends early, its learning rate decayed on
     the clock; 0: none. A resumed run has what was left. A run under a limit is not repeatable
     step for step."""
-    batch_size: int = bounded(16, least=1)
+    batch_size: int = bounded(16, least=1, most=65_536)
     """Windows per gradient step and process; under accelerate launch all processes together make
     one step of batch_size * num_processes windows."""
     seed: int = bounded(0, least=0)
@@ -150,11 +151,11 @@ class TrainConfig:
     """Steps between TensorBoard records."""
     eval_freq: int = bounded(500, least=0)
     """Steps between evaluations on held-out episodes; 0: only at the end."""
-    eval_closed_loop: int = bounded(0, least=0)
+    eval_closed_loop: int = bounded(0, least=0, most=1_000_000)
     """Scenarios of each task that are played in simulation at every evaluation; 0: none."""
     save_freq: int = bounded(1000, least=1)
     """Steps between checkpoints; one is always written at the end."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """CPU threads; 0: all cores."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -28,10 +29,11 @@ from egovcp.data import (
     survey_sample,
 )
 from egovcp.data.ahead import Ahead
-from egovcp.data.memory import available_bytes
 from egovcp.data.order import Shard
-from egovcp.data.source import is_local
+from egovcp.data.schema import INFO_PATH
+from egovcp.data.source import is_local, local_root
 from egovcp.errors import DataError, UsageError
+from egovcp.hardware import available_bytes
 from egovcp.model import Batch, WorldModel
 from egovcp_train.batches import (
     EPISODES_AT_ONCE,
@@ -42,6 +44,7 @@ from egovcp_train.batches import (
 )
 from egovcp_train.config import TrainConfig
 from egovcp_train.labels.passing import label, label_episode
+from egovcp_train.output import CONFIG_FILE
 from egovcp_train.ranks import ALONE, Ranks
 from egovcp_train.return_scale import ReturnScale, on_task_scales, task_scales
 from egovcp_train.value_fit import Mirrored
@@ -152,18 +155,67 @@ def _open(dataset: DatasetConfig, config: TrainConfig) -> DatasetReader:
 
 
 def pinned(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:
-    """The options with the commit that each dataset of the Hub is, so that a resumed run keeps
-    it, whatever is pushed meanwhile."""
+    """The options with the absolute path of each folder, and the commit of each dataset of the
+    Hub, so that a resumed run finds the same data from any working directory, whatever is pushed
+    meanwhile."""
     if not config.datasets:
-        return dataclasses.replace(config, dataset=_at_commit(config.dataset, readers[0]))
+        return dataclasses.replace(config, dataset=_pinned(config.dataset, readers[0]))
     both = zip(config.datasets, readers, strict=True)
-    return dataclasses.replace(config, datasets=tuple(_at_commit(d, r) for d, r in both))
+    return dataclasses.replace(config, datasets=tuple(_pinned(d, r) for d, r in both))
 
 
-def _at_commit[D: DatasetConfig](config: D, reader: DatasetReader) -> D:
+def _pinned[D: DatasetConfig](config: D, reader: DatasetReader) -> D:
+    if config.root:
+        return dataclasses.replace(config, root=str(local_root(config)))
     if is_local(config):
         return config
     return dataclasses.replace(config, revision=reader.source.commit)
+
+
+def require_datasets(config: TrainConfig, saved: Mapping[str, Any]) -> None:
+    """See that the dataset folders of a resumed run are there.
+
+    Args:
+        config: the options.
+        saved: those that the run has kept.
+
+    Raises:
+        DataError: one is not; the message says where the run had it and which flag says where it
+            is now.
+    """
+    folders = [d for d in config.datasets or (config.dataset,) if d.root]
+    missing = [local_root(d) for d in folders if not (local_root(d) / INFO_PATH).is_file()]
+    if not missing:
+        return
+    before = saved.get("datasets") or [saved.get("dataset", {})]
+    stored = [str(entry["root"]) for entry in before if entry.get("root")]
+    flag = "--dataset.root=FOLDER"
+    if config.datasets:
+        entries = [{k: v for k, v in entry.items() if v not in (None, "")} for entry in before]
+        flag = f"--datasets='{json.dumps(entries)}' with the new folders"
+    raise DataError(
+        f"no dataset at {missing[0]}; {config.output_dir}/{CONFIG_FILE} has {', '.join(stored)}: "
+        f"if the data was moved, resume with {flag}"
+    )
+
+
+def require_same_content(readers: Sequence[DatasetReader], digests: Sequence[str]) -> None:
+    """See that a resumed run goes on with its own data, wherever that lies now.
+
+    Args:
+        readers: the datasets.
+        digests: `DatasetReader.content_digest` of those that the run was started with.
+
+    Raises:
+        DataError: a dataset is another one.
+    """
+    found = [reader.content_digest for reader in readers]
+    for number, reader in enumerate(readers):
+        if found[number : number + 1] != list(digests[number : number + 1]):
+            raise DataError(
+                f"cannot resume with {reader.root}: its episodes are not those that the run was "
+                "started with; give the same data (an unchanged copy will do), or start a new run"
+            )
 
 
 def mix_of(config: TrainConfig) -> Mix:

@@ -7,8 +7,8 @@ from typing import Protocol
 
 from tqdm import tqdm
 
+from egovcp.stop_signals import stop_on_signal
 from egovcp_train.loop import Budget
-from egovcp_train.output import stop_on_signal
 from egovcp_train.records import Records
 
 

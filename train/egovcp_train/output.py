@@ -1,28 +1,32 @@
-"""Where a run writes, and how it is asked to stop; shared by all training commands."""
+"""Where a run writes; shared by all training commands."""
 
 from __future__ import annotations
 
-import contextlib
-import signal
+import os
 import tempfile
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from draccus import cfgparsing
-
-from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.flags import read_config
+from egovcp.values import build
 from egovcp_train.checkpoint import load_training_state
 
 CONFIG_FILE = "train_config.yaml"
+_LOST = "restore this file, or remove it and give all options of the run as flags"
 
 
-def resumed_options(argv: Sequence[str]) -> dict[str, Any]:
-    """What stands where no flag says otherwise: the options of the run that is resumed.
+def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
+    """The options of the run that is resumed, which apply where no flag says otherwise.
+
+    Args:
+        config_class: of the command.
+        argv: its flags, ``--name=value`` each.
 
     Raises:
-        UsageError: a config file, which says everything itself, would hide them.
+        UsageError: a config file is given as well.
+        ArtefactError: the run's own file cannot be read, or holds other options.
     """
     given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
     saved = Path(given.get("output_dir", "")) / CONFIG_FILE
@@ -33,9 +37,25 @@ def resumed_options(argv: Sequence[str]) -> dict[str, Any]:
             f"--config_path={given['config_path']} says others; drop it, and give what is to "
             "change as flags of their own"
         )
-    if not (resume and saved.is_file()):
+    return saved_options(config_class, saved.parent) if resume else {}
+
+
+def saved_options(config_class: type, output: Path) -> dict[str, Any]:
+    """The options that a run has stored in its folder; empty if it has stored none.
+
+    Raises:
+        ArtefactError: they cannot be read, or are not those of ``config_class``.
+    """
+    saved = output / CONFIG_FILE
+    if not os.path.lexists(saved):
         return {}
-    options: dict[str, Any] = cfgparsing.load_config(saved.read_text("utf-8"), file=saved)
+    try:
+        options = read_config(saved)
+        build(config_class, options, "--")
+    except OSError as error:
+        raise ArtefactError(f"{saved}: cannot be read: {error.strerror}; {_LOST}") from error
+    except (UsageError, ValueError) as error:
+        raise ArtefactError(f"{saved}: {error}; {_LOST}") from error
     return options
 
 
@@ -72,30 +92,3 @@ def require_writable(folder: Path) -> None:
             pass
     except OSError as error:
         raise EnvironmentFailure(f"cannot write to {parent}: {error.strerror}") from error
-
-
-@contextlib.contextmanager
-def stop_on_signal(echo_s: float = 0.0) -> Iterator[list[int]]:
-    """A list that fills when SIGINT or SIGTERM asks for the end; a second one is obeyed at once.
-
-    Args:
-        echo_s: seconds during which a second one is taken for the first: a launcher hands on to
-            its processes the Ctrl-C that the terminal has already sent them.
-    """
-    received: list[int] = []
-    ignored_until = 0.0
-
-    def note(number: int, frame: object) -> None:
-        nonlocal ignored_until
-        if not received:
-            received.append(number)
-            ignored_until = time.monotonic() + echo_s
-        elif time.monotonic() >= ignored_until:
-            raise KeyboardInterrupt
-
-    previous = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)

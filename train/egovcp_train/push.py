@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -67,4 +68,4 @@ def push(config: PushConfig) -> None:
     if config.json:
         facts = {"repo_id": config.repo_id, "branch": config.branch, "tag": config.tag}
         text = json.dumps({**facts, **asdict(published)}, indent=1) + "\n"
-        write_text(Path(config.json).expanduser(), text)
+        write_text(Path(os.path.expanduser(config.json)), text)

@@ -7,7 +7,7 @@ import dataclasses
 import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import draccus
 import torch
@@ -16,20 +16,33 @@ from tqdm import tqdm
 from egovcp.artefact import save_artefact
 from egovcp.cli import run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
-from egovcp.data.ahead import Ahead
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.errors import UsageError
+from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, Batch, WorldModel
 from egovcp.model.weights import tensor_shapes
 from egovcp.plan.backends import judge_of_model
+from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo, one_line
 from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import to_tensors
 from egovcp_train.card import versions, write_card
-from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
+from egovcp_train.checkpoint import (
+    checkpoint_dir,
+    load_training_state,
+    new_checkpoint,
+    restoring,
+)
 from egovcp_train.closed_loop import ClosedLoop, require_simulator
 from egovcp_train.config import TRAINING_PRESETS, TrainConfig
-from egovcp_train.datasets import EVALUATION_EPISODES, Material, prepare
+from egovcp_train.datasets import (
+    EVALUATION_EPISODES,
+    FRAME_BYTES,
+    Material,
+    prepare,
+    require_datasets,
+    require_same_content,
+)
 from egovcp_train.device import choose_bf16, choose_device
 from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
@@ -37,7 +50,12 @@ from egovcp_train.heldout.recording import record
 from egovcp_train.heldout.report import Report, measure, scalars
 from egovcp_train.heldout.table import table
 from egovcp_train.loop import Budget, Learner
-from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options, stop_on_signal
+from egovcp_train.output import (
+    CONFIG_FILE,
+    prepare_output,
+    resumed_options,
+    saved_options,
+)
 from egovcp_train.publish import publish_trained, reserve_policy
 from egovcp_train.ranks import Ranks, join
 from egovcp_train.records import Everywhere, Recorder, Records
@@ -46,6 +64,7 @@ from egovcp_train.wandb_records import WandbRecorder, require_wandb
 
 PROG = "egovcp-train"
 LAUNCHER_ECHO_S = 5.0
+_BATCH_COPIES: Final = 4  # of a batch, as float32 and with what gradients need of it; at least
 _UNRECORDED = (
     f"{PROG}: steps are right but many times slower than this GPU could make them, because they "
     "cannot be recorded as a CUDA graph ({reason}); --device=cpu may be as fast; please report it"
@@ -64,7 +83,7 @@ def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
     Raises:
         UsageError: a config file, which says everything itself, would hide the preset.
     """
-    if options := resumed_options(argv):
+    if options := resumed_options(TrainConfig, argv):
         return options
     given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
     if "preset" in given and "config_path" in given:
@@ -86,6 +105,7 @@ def train(config: TrainConfig) -> None:
     ranks = join(cpu=config.device == "cpu")  # first: it says which GPU is this process' own
     device = choose_device(config.device)
     bf16 = choose_bf16(config.mixed_precision, device)
+    _require_batch_memory(config, ranks)
     output = _prepare_output(config, ranks)
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
@@ -94,7 +114,7 @@ def train(config: TrainConfig) -> None:
     material = prepare(config, model, ranks)
     config = material.config
     learner = Learner(model.to(device), config.optimizer, config.seed, ranks, bf16)
-    spent = _restore(output, learner, material.stream) if config.resume else 0.0
+    spent = _restore(output, learner, material) if config.resume else 0.0
     provenance = _provenance(material)
     if ranks.is_first:
         simulation = _simulation(config, provenance, learner.model)
@@ -105,6 +125,13 @@ def train(config: TrainConfig) -> None:
         simulation = None
     run = Run(config, output, learner, material, device, provenance, simulation, spent)
     run.execute()
+
+
+def _require_batch_memory(config: TrainConfig, ranks: Ranks) -> None:
+    """Raise `UsageError` for a batch that is too large for this machine."""
+    size, length = config.batch_size, config.sampling.length
+    option = f"--batch_size={size} with --sampling.length={length}"
+    require_memory(option, size * length * ranks.local * _BATCH_COPIES * FRAME_BYTES)
 
 
 class Run:
@@ -259,7 +286,9 @@ class Run:
         found = {"heldout": self.metrics, "heldout_tasks": self.tasks, "closed_loop": self.played}
         provenance = self.provenance | {"step": self.learner.step, **finite_or_null(found)}
         spent = {"seconds": self.budget.spent}
-        state = {"learner": self.learner.state_dict(), "streams": streams, **spent}
+        digests = [reader.content_digest for reader in self.material.readers]
+        learned = {"learner": self.learner.state_dict(), "streams": streams}
+        state = {**learned, "datasets": digests, **spent}
         with new_checkpoint(self.output, self.learner.step, state) as folder:
             save_artefact(folder, model, self.config.planner, provenance)
 
@@ -303,8 +332,12 @@ def _prepare_output(config: TrainConfig, ranks: Ranks) -> Path:
     _require_loadable(config)
     if config.eval_closed_loop:
         require_simulator()
-    output = Path(config.output_dir)
-    return prepare_output(config.output_dir, config.resume) if ranks.is_first else output
+    if not ranks.is_first:
+        return Path(config.output_dir)
+    output = prepare_output(config.output_dir, config.resume)
+    if config.resume:
+        require_datasets(config, saved_options(TrainConfig, output))
+    return output
 
 
 def _simulation(
@@ -326,7 +359,7 @@ def _records(config: TrainConfig, output: Path) -> Everywhere:
     return Everywhere(found)
 
 
-def _restore(output: Path, learner: Learner, stream: Ahead) -> float:
+def _restore(output: Path, learner: Learner, material: Material) -> float:
     """Continue from the last checkpoint; returns the seconds that the run has taken so far.
 
     Raises:
@@ -334,18 +367,14 @@ def _restore(output: Path, learner: Learner, stream: Ahead) -> float:
         DataError: the dataset is another one.
         UsageError: the windows or the processes are others.
     """
-    state = load_training_state(output)
-    try:
+    state, stream = load_training_state(output), material.stream
+    if "datasets" in state:  # not in checkpoints of earlier versions
+        require_same_content(material.readers, state["datasets"])
+    with restoring(output):
         learner.load_state_dict(state["learner"])
         streams = state.get("streams") or [state["stream"]]
         stream.load_state_dict(streams[min(learner.ranks.rank, len(streams) - 1)])
         return float(state.get("seconds", 0.0))
-    except (KeyError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ArtefactError(
-            f"{output}: its checkpoint does not fit the --policy options given ({reason}); resume "
-            "without them, or start a new run"
-        ) from error
 
 
 def _provenance(material: Material) -> dict[str, Any]:

@@ -44,9 +44,9 @@ class ValueFitConfig:
     """Whose mirror images the fit goes over as well, if windows are mirrored (--sampling.mirror).
     flights: those of episodes in which something flies, whose rows are few beside others' where
     tasks are mixed."""
-    imagined_steps: int = bounded(3, least=0)
+    imagined_steps: int = bounded(3, least=0, most=1000)
     """States are imagined 0 to this many ticks ahead, as far as the planner looks."""
-    rows: int = bounded(1024, least=1)
+    rows: int = bounded(1024, least=1, most=1_000_000)
     """States per step."""
     lr: float = bounded(1e-3, above=0)
     """Peak learning rate; one cycle."""
@@ -59,7 +59,7 @@ class ValueFitConfig:
     """Rows that that part judges. coming: those on which something is on its way, and elsewhere it
     learns to say nothing: where tasks are mixed, what followed on actions like one in all states
     of all tasks misleads the wall."""
-    told_rows: int = bounded(2048, least=1)
+    told_rows: int = bounded(2048, least=1, most=1_000_000)
     """States per step of that part."""
     told_lr: float = bounded(2e-3, above=0)
     """Peak learning rate of that part."""

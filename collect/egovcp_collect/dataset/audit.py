@@ -57,7 +57,7 @@ def run(config: AuditConfig) -> None:
 
 def _chosen(config: AuditConfig, total: int) -> list[int]:
     if config.episodes:
-        return select_episodes(config.episodes, total, "--episodes").tolist()
+        return [int(index) for index in select_episodes(config.episodes, total, "--episodes")]
     spread = np.linspace(0, total - 1, min(config.count, total)).round().astype(int)
     return sorted(set(spread.tolist()))
 

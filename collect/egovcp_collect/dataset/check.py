@@ -14,6 +14,7 @@ from tqdm import tqdm
 from egovcp.bounds import bounded
 from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetConfig, metadata
+from egovcp.data.paths import hidden_files
 from egovcp.data.source import local_root, locate
 from egovcp.errors import DataError
 from egovcp.terminal import echo, one_line
@@ -43,9 +44,9 @@ def run(config: CheckConfig) -> None:
     Raises:
         DataError: something is wrong.
     """
-    root = local_root(config.dataset) if config.dataset.root else locate(config.dataset).root
-    if not root.is_dir():
-        raise DataError(f"no dataset at {root}: there is no such folder")
+    root = local_root(config.dataset)
+    if not (config.dataset.root and root.is_dir()):  # of a damaged one every problem is listed
+        root = locate(config.dataset).root
     with _progress() as progress:
         found = list(islice(dataset_problems(root, progress), config.max_problems))
     episodes, frames = _size(root)
@@ -54,6 +55,11 @@ def run(config: CheckConfig) -> None:
     write_report(config.json, content)
     for error in found:
         echo(one_line(error))
+    if hidden := hidden_files(root / "data") + hidden_files(root / "meta"):
+        echo(
+            f"ignored {hidden} hidden files such as ._NAME of macOS, which LeRobot would read; "
+            f"remove them: find {root} -type f -name '.*' -delete"
+        )
     if found:
         raise DataError(_verdict(found, root, config.max_problems))
     echo(f"{root}: {episodes} episodes, {frames} frames, nothing wrong")

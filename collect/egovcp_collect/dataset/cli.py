@@ -1,4 +1,4 @@
-"""`egovcp-dataset SUBCOMMAND [ROOT] [--flags]`: everything one does with a finished dataset.
+"""`egovcp-dataset SUBCOMMAND [ROOT] [--NAME=VALUE ...]`: work with a finished dataset.
 
 A subcommand is a module with
 
@@ -16,13 +16,12 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final, get_type_hints
 
 from egovcp.cli import report_error, run_command
 from egovcp.errors import UsageError, suggest
-from egovcp.hub import is_repo_id
+from egovcp.hub import is_local_path
 from egovcp.terminal import echo
 
 PROG: Final = "egovcp-dataset"
@@ -100,7 +99,7 @@ def _help() -> str:
     lines = [f"  {name:{width}}  {entry.summary}" for name, entry in SUBCOMMANDS.items()]
     return "\n".join(
         [
-            f"usage: {PROG} SUBCOMMAND [ROOT] [--flags]",
+            f"usage: {PROG} SUBCOMMAND [ROOT] [--NAME=VALUE ...]",
             "",
             "Look at, check, mend, join and share datasets in LeRobot's format.",
             "",
@@ -149,9 +148,8 @@ def _switches(config_class: type[Any]) -> set[str]:
 
 
 def _dataset_flag(argument: str) -> str:
-    """A folder if there is one of this name, or if it cannot be an id of the Hub."""
-    folder = Path(argument).expanduser().exists() or not is_repo_id(argument)
-    return f"--dataset.root={argument}" if folder else f"--dataset.repo_id={argument}"
+    option = "root" if is_local_path(argument) else "repo_id"
+    return f"--dataset.{option}={argument}"
 
 
 if __name__ == "__main__":

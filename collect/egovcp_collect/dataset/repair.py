@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ from tqdm import tqdm
 
 from egovcp.checks.dataset import command_problems
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode
-from egovcp.data.duplicates import Duplicate, DuplicateFinder
-from egovcp.data.origin import ScenarioKey, ScenarioKeys
-from egovcp.data.source import Source, local_root
+from egovcp.data.duplicates import DuplicateFinder
+from egovcp.data.origin import ScenarioKeys
+from egovcp.data.source import Source, local_root, require_folder
 from egovcp.errors import DataError
 from egovcp.terminal import echo, one_line
 from egovcp_collect.dataset.book import Book, open_book
@@ -55,10 +56,9 @@ def run(config: RepairConfig) -> None:
         DataError: nothing can be kept, or nobody knows where the episodes came from.
     """
     root = local_root(config.dataset)
-    if not root.is_dir():
-        raise DataError(f"no dataset at {root}: there is no such folder")
+    require_folder(root)
     output = new_folder(config.output_dir, [root])
-    originals = [Path(name).expanduser().absolute() for name in config.records.split(",") if name]
+    originals = _originals(config)
     book = open_book(root, originals, _command(config))
     dropped: list[DataError] = []
     with tqdm(unit="ep", delay=1) as bar:
@@ -74,9 +74,14 @@ def run(config: RepairConfig) -> None:
 
 
 def _command(config: RepairConfig) -> str:
-    root, records = local_root(config.dataset), config.records
+    root, records = local_root(config.dataset), ",".join(map(str, _originals(config)))
     flags = [f"--records={records}"] if records else []
     return shlex.join(["egovcp-dataset", "repair", str(root), *flags])
+
+
+def _originals(config: RepairConfig) -> list[Path]:
+    named = [os.path.expanduser(name) for name in config.records.split(",") if name]
+    return [Path(name).absolute() for name in named]
 
 
 def _rebuild(
@@ -110,8 +115,7 @@ def _sound_episodes(root: Path, book: Book, dropped: list[DataError]) -> Iterato
         record = book.find(digest, found.number)
         problems = list(_problems(found, record))
         if not problems and record is not None:
-            scenario = scenarios.key(record["task"], record.get("metadata", {}))
-            problems = list(_repetition(finder.add(found.number, digest, scenario), scenario))
+            problems = list(_repetition(found.number, digest, record, scenarios, finder))
         if problems or record is None:
             frame, problem = problems[0]
             dropped.append(DataError.at(found.file, problem, found.number, frame))
@@ -122,8 +126,19 @@ def _sound_episodes(root: Path, book: Book, dropped: list[DataError]) -> Iterato
 
 
 def _repetition(
-    found: Duplicate[int] | None, scenario: ScenarioKey | None
+    number: int,
+    digest: str,
+    record: Mapping[str, Any],
+    scenarios: ScenarioKeys,
+    finder: DuplicateFinder[int],
 ) -> Iterator[tuple[int | None, str]]:
+    """The problem of an episode that repeats an earlier one, or names no collection."""
+    try:
+        scenario = scenarios.key(record["task"], record.get("metadata", {}))
+    except DataError as error:
+        yield None, error.problem
+        return
+    found = finder.add(number, digest, scenario)
     if found is not None and found.equal:
         yield None, f"the same as episode {found.place}"
     elif found is not None:

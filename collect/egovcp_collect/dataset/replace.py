@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
+from egovcp.atomic import write_text
 from egovcp.errors import UsageError
 
 
@@ -20,7 +20,7 @@ def write_report(file: str, content: Any) -> None:
     if not file:
         return
     try:
-        replace_json(Path(file).expanduser(), content)
+        replace_json(Path(os.path.expanduser(file)), content)
     except (FileExistsError, IsADirectoryError, NotADirectoryError) as error:
         raise UsageError(f"--json={file} cannot be a file: {error.strerror}") from error
 
@@ -36,14 +36,4 @@ def replace_text(path: Path, text: str) -> None:
     Never writes through a link, so that an older version of the dataset keeps its own.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    number, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    try:
-        with os.fdopen(number, "w", encoding="utf-8") as file:
-            os.fchmod(number, 0o644)
-            file.write(text)
-            file.flush()
-            os.fsync(number)
-        os.replace(name, path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    write_text(path, text)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import time
 import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -73,6 +74,11 @@ def _states(tamper: Tamper) -> Begin:
     return lambda rig: setattr(rig.fake, "tamper_state", tamper)
 
 
+def _states_anew(make: Callable[[], Tamper]) -> Begin:
+    """Likewise with a tamper that has a memory, made when the fault begins."""
+    return lambda rig: setattr(rig.fake, "tamper_state", make())
+
+
 def _replaced(*messages: bytes) -> Begin:
     return _states(lambda message: messages)
 
@@ -97,10 +103,16 @@ def _every(period: int, tamper: Tamper) -> Tamper:
     return lambda message: tamper(message) if next(count) % period == 0 else (message,)
 
 
-def _for_states(number: int, tamper: Tamper) -> Tamper:
-    """Only the first ``number`` states."""
-    count = iter(range(10**12))
-    return lambda message: tamper(message) if next(count) < number else (message,)
+def _for_seconds(duration: float, tamper: Tamper) -> Tamper:
+    """Only the states of the first ``duration`` s."""
+    begin: list[float] = []
+
+    def during(message: bytes) -> Iterable[bytes]:
+        now = time.monotonic()
+        begin.extend([now] if not begin else [])
+        return tamper(message) if now - begin[0] < duration else (message,)
+
+    return during
 
 
 def _nothing(message: bytes) -> Iterable[bytes]:
@@ -218,8 +230,8 @@ _R, _H, _D, _ANY = Outcome.RUN, Outcome.HOLD, Outcome.DAMP, Outcome.ANY
 
 _STATES: Final = (
     FaultKind("state: silent", _D, _fault("mute_state")),
-    FaultKind("state: silent for 60 ms", _R, _states(_for_states(12, _nothing))),
-    FaultKind("state: silent for 150 ms", _H, _states(_for_states(30, _nothing))),
+    FaultKind("state: silent for 60 ms", _R, _states_anew(lambda: _for_seconds(0.06, _nothing))),
+    FaultKind("state: silent for 150 ms", _H, _states_anew(lambda: _for_seconds(0.15, _nothing))),
     FaultKind("state: frozen", _D, _fault("freeze_state")),
     FaultKind("state: every second torn", _R, _fault("garble_state")),
     FaultKind("state: all torn", _D, _states(lambda m: (m[: len(m) // 2],))),
@@ -261,12 +273,12 @@ _speed: Final = _edited(_motor(_KNEE, "dq", lambda v: 190.0))
 _jump: Final = _edited(_motor(_KNEE, "q", lambda q: q + 0.5))
 _IMPLAUSIBLE: Final = (
     FaultKind("gyroscope: 150 rad/s", _D, _fault("gyroscope", 150.0)),
-    FaultKind("gyroscope: 150 rad/s once", _R, _states(_once(_gyro))),
-    FaultKind("gyroscope: 150 rad/s at 50 Hz", _R, _states(_every(4, _gyro))),
+    FaultKind("gyroscope: 150 rad/s once", _R, _states_anew(lambda: _once(_gyro))),
+    FaultKind("gyroscope: 150 rad/s at 50 Hz", _R, _states_anew(lambda: _every(4, _gyro))),
     FaultKind("gyroscope: 20 rad/s", _D, _fault("gyroscope", 20.0)),
     FaultKind("joint speed: 190 rad/s", _D, _fault("joint_speed", 190.0)),
-    FaultKind("joint speed: 190 rad/s once", _R, _states(_once(_speed))),
-    FaultKind("joint speed: 190 rad/s at 50 Hz", _R, _states(_every(4, _speed))),
+    FaultKind("joint speed: 190 rad/s once", _R, _states_anew(lambda: _once(_speed))),
+    FaultKind("joint speed: 190 rad/s at 50 Hz", _R, _states_anew(lambda: _every(4, _speed))),
     FaultKind("joint speed: 25 rad/s", _D, _fault("joint_speed", 25.0)),
     FaultKind(
         "joint speed: all +-190 rad/s",
@@ -275,24 +287,26 @@ _IMPLAUSIBLE: Final = (
     ),
     FaultKind("joint position: 9 rad", _D, _states(_edited(_motor(_KNEE, "q", lambda q: 9.0)))),
     FaultKind("joint position: jumps by 0.5 rad", _D, _states(_jump)),
-    FaultKind("joint position: jumps by 0.5 rad once", _R, _states(_once(_jump))),
+    FaultKind("joint position: jumps by 0.5 rad once", _R, _states_anew(lambda: _once(_jump))),
     FaultKind("joint position: all zero", _D, _states(_edited(_all_motors("q", lambda i, q: 0.0)))),
     FaultKind("joints: random within bounds", _D, _states(_edited(_wild))),
     FaultKind("torque: 900 N m", _D, _states(_edited(_motor(_KNEE, "tau_est", lambda t: 900.0)))),
     FaultKind(
         "torque: 900 N m once",
         _R,
-        _states(_once(_edited(_motor(_KNEE, "tau_est", lambda t: 900.0)))),
+        _states_anew(lambda: _once(_edited(_motor(_KNEE, "tau_est", lambda t: 900.0)))),
     ),
     FaultKind("orientation: jumps by 0.8 rad", _D, _states(_edited(_imu("quaternion", _rolled)))),
     FaultKind(
         "orientation: jumps by 0.8 rad once",
         _R,
-        _states(_once(_edited(_imu("quaternion", _rolled)))),
+        _states_anew(lambda: _once(_edited(_imu("quaternion", _rolled)))),
     ),
     FaultKind("mode machine: 5 to 6", _D, _fault("mode", 6)),
     FaultKind("mode machine: 5 to 4", _D, _fault("mode", 4)),
-    FaultKind("mode machine: 0 once", _R, _states(_once(_edited(_set("mode_machine", 0))))),
+    FaultKind(
+        "mode machine: 0 once", _R, _states_anew(lambda: _once(_edited(_set("mode_machine", 0))))
+    ),
 )
 _FLOODS: Final = (
     FaultKind("flood: 2 kB garbage, 40 per 10 ms", _R, _states(_with(lambda: _garbage(20)))),
@@ -302,7 +316,7 @@ _FLOODS: Final = (
         "flood: the same without states, full rate", _D, _instead(lambda: _garbage(_FULL_RATE))
     ),
     FaultKind("flood: 30 kB of valid JSON without states", _D, _instead(lambda: _valid_json(5))),
-    FaultKind("flood: one state repeated", _D, _states(_repeats())),
+    FaultKind("flood: one state repeated", _D, _states_anew(lambda: _repeats())),
     FaultKind("flood: oversized messages", Outcome.LATER, _states(_with(lambda: [b"x" * 200_000]))),
     FaultKind("flood: oversized without states", _D, _replaced(*[b"x" * 200_000] * 4)),
     FaultKind("flood: garbage in split packets", _D, _stream(Stream.SPLIT, lambda m: _garbage(4))),
@@ -345,6 +359,11 @@ _PICTURES: Final = (
 # --- planner and operator ----------------------------------------------------------------
 def _planner(answer: Callable[[Report], list[list[bytes]]]) -> Begin:
     return lambda rig: setattr(rig, "answer", answer)
+
+
+def _planner_anew(make: Callable[[], Callable[[Report], list[list[bytes]]]]) -> Begin:
+    """Likewise with an answer that has a memory, made when the fault begins."""
+    return lambda rig: setattr(rig, "answer", make())
 
 
 def _plan_of(value: float) -> Callable[[Report], list[list[bytes]]]:
@@ -400,7 +419,7 @@ def _other(name: str, outcome: Outcome, begin: Begin, duration_s: float = 0.5) -
 
 _OTHERS: Final = (
     _other("planner: silent", _H, _planner(lambda report: [])),
-    _other("planner: 200 ms late", _H, _planner(_late(5))),
+    _other("planner: 200 ms late", _H, _planner_anew(lambda: _late(5))),
     _other("planner: plans NaN", _H, _planner(_plan_of(np.nan)), 0.6),
     _other("planner: plans Infinity", _H, _planner(_plan_of(np.inf)), 0.6),
     _other("planner: plans 1e30", _R, _planner(_plan_of(1e30))),

@@ -7,16 +7,14 @@ wall clock, its planner answers every report, and every command that it sends is
 from __future__ import annotations
 
 import gc
-import multiprocessing
 import os
 import signal
 import threading
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
-from multiprocessing.process import BaseProcess
 from typing import Final
 
 import numpy as np
@@ -29,11 +27,13 @@ from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LIMP, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
+from egovcp_deploy.fault_injection.forked import start_control_process
 from egovcp_deploy.fault_injection.proxy import Proxy, Stream
 from egovcp_deploy.live.guard import Guard, spare_body
 from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions
 from egovcp_deploy.live.link import Link, Order, decode_report, encode_order, encode_reply
-from egovcp_deploy.live.process import ControlSetup, control_process
+from egovcp_deploy.live.priority import RECEIVING, raised_priority
+from egovcp_deploy.live.process import ControlSetup
 from egovcp_deploy.live.run_folder import run_folder
 from egovcp_deploy.pilot.desk import Reply, Report
 from egovcp_deploy.pilot.states import Limits, Request, State
@@ -49,16 +49,8 @@ Answer = Callable[[Report], list[list[bytes]]]
 LIMITS: Final = Limits(stand_s=0.1, recover_s=0.2)
 _START_S: Final = 60.0
 _STARTS: Final = 5
-_PRIORITY: Final = -10
 _REPORT_S: Final = 0.1  # for the report that says why
-_FORKSERVER: Final = multiprocessing.get_context("forkserver")
-_FORKSERVER.set_forkserver_preload(["egovcp_deploy.live.process", "egovcp.robot.controllers"])
 _NS: Final = 1e9
-
-
-def _serve_control(setup: ControlSetup) -> None:
-    """Body of the control process; its parent is the fork server."""
-    control_process(replace(setup, parent=os.getppid()))
 
 
 @dataclass(frozen=True)
@@ -128,15 +120,14 @@ class FaultRig:
     """Starts runs and lets things go wrong in them. Close it afterwards."""
 
     def __init__(self) -> None:
-        with suppress(OSError):  # needs a privilege; a robot has computers of its own
-            os.setpriority(os.PRIO_PROCESS, 0, _PRIORITY)
         quiet = EpisodeConfig(ticks=10**6, event_ticks=(10**6 - 1,) * 2, empty_probability=1.0)
         self._robot = LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
         self._robot.start(Scenario("ball", 0, 0))
         free = Ports(command_port=0, state_port=0, camera_port=0)
-        self.fake = FakeBridge(self._robot, free)
+        with raised_priority(RECEIVING):  # a robot has computers of its own
+            self.fake = FakeBridge(self._robot, free)
+            self.proxy = Proxy(self.fake.ports.state_port)
         self.fake.on_command = self._record
-        self.proxy = Proxy(self.fake.ports.state_port)
         self.answer: Answer = answer_steadily
         """The planner: messages to send for a report."""
         self._tasks: deque[tuple[Callable[[], None], threading.Event]] = deque()
@@ -149,7 +140,8 @@ class FaultRig:
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._simulate, daemon=True)
         gc.freeze()  # a long collection would stop the robot
-        self._thread.start()
+        with raised_priority(RECEIVING):
+            self._thread.start()
 
     # --- the robot's thread --------------------------------------------------------------
     def _simulate(self) -> None:
@@ -237,20 +229,21 @@ class FaultRig:
         eye = ZmqEyeConfig(port=ports.camera_port, vertical_fov=fov)
         hardware = HardwareOptions(bridge, replace(CameraOptions(), server=eye))
         address = f"ipc://{stack.enter_context(run_folder())}/link"
-        link = Link(address, serve=True)
+        with raised_priority(RECEIVING):
+            link = Link(address, serve=True)
         stack.callback(link.close)
         self._outbox.clear()
         spare = stack.enter_context(spare_body(bridge))
         setup = ControlSetup(address, hardware, "stance", LIMITS, os.getpid())
         self._mode, self._ending = "", False
-        self.process: BaseProcess = _FORKSERVER.Process(target=_serve_control, args=(setup,))
-        self.process.start()
+        self.process = start_control_process(setup)
         stack.callback(self._end_process)
         guard = Guard(self.process, spare, lambda: self._ending)
         stack.callback(guard.join_if_acting)
         ending = threading.Event()
         planner = threading.Thread(target=self._plan, args=(link, ending), daemon=True)
-        planner.start()
+        with raised_priority(RECEIVING):
+            planner.start()
         stack.callback(planner.join)
         stack.callback(ending.set)
         for request, target in (
@@ -319,6 +312,7 @@ class FaultRig:
 
     def end_run(self) -> None:
         """End the control process, if there is one."""
+        self._ending = True
         if self._session is not None:
             self._session.close()
             self._session = None

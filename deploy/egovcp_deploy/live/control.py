@@ -7,7 +7,7 @@ ticks after its observation, as it did in the data.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from egovcp.robot.controller import LowLevelController
 from egovcp.spec import ACTION_BOX, CONTROLLER_TICKS_PER_PLAN
 from egovcp_deploy.live import motors
+from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Request, State
 from egovcp_deploy.pilot.velocity import VelocityCommand
@@ -50,6 +51,7 @@ class ControlLoop:
         refusal: why the robot must not be armed; asked at every tick, empty: nothing.
         fault: why the motors must be damped, likewise.
         skipped: what was wrong with the readings since the newest that was used, likewise.
+        link: figures about the connection for the log, `Tick.link`; asked at every planner tick.
     """
 
     def __init__(
@@ -62,12 +64,16 @@ class ControlLoop:
         refusal: Callable[[], str] = lambda: "",
         fault: Callable[[], str] = lambda: "",
         skipped: Callable[[], str] = lambda: "",
+        link: Callable[[int], Mapping[str, float]] = lambda now_ns: {},
     ) -> None:
         self._body, self._eye = body, eye
         self._controller = controller
         self.pilot = pilot
         self._velocity = velocity or VelocityCommand()
         self._refusal, self._fault, self._skipped = refusal, fault, skipped
+        self._link = link
+        self._motor_watch = MotorWatch()
+        self._command: MotorCommand | None = None  # the last one written
         self._count = 0
         self._open = False  # o_t is out, a_t is not decided
         self._reading: BodyState | None = None
@@ -91,20 +97,34 @@ class ControlLoop:
         depth_ns = None if picture is None else picture.time_ns
         self.pilot.sense(now_ns, state, depth, state_ns, depth_ns)
         before = self.state
-        self.pilot.judge(
-            now_ns,
-            wishes.request,
-            refusal=self._refusal(),
-            damp=self._fault(),
-            skipped=self._skipped(),
-        )
+        self._judge(now_ns, wishes.request, reading)
         if state is not None and self._count % CONTROLLER_TICKS_PER_PLAN == 0:
             seen = _BLIND if depth is None else depth
             events = self.pilot.events()
-            self.pilot.report(now_ns, seen, state.astype(np.float32), events)
+            motors = None if reading is None else reading.motors
+            self.pilot.report(
+                now_ns, seen, state.astype(np.float32), events, motors, self._link(now_ns)
+            )
             self._open = True
-        self._body.write(self._motors(now_ns, before, reading, state))
+        self._command = self._motors(now_ns, before, reading, state)
+        self._body.write(self._command)
         self._count += 1
+
+    def _judge(self, now_ns: int, request: Request | None, reading: BodyState | None) -> None:
+        """Move the state machine on by what the motors report and the operator wants."""
+        verdict = MotorVerdict()
+        if reading is not None:
+            standing = self.state not in (State.INIT, State.DAMP)
+            verdict = self._motor_watch.update(reading, self._command, standing)
+        self.pilot.note(verdict.events)
+        self.pilot.judge(
+            now_ns,
+            request,
+            refusal=self._refusal() or verdict.refusal,
+            hold=verdict.hold,
+            damp=self._fault() or verdict.damp,
+            skipped=self._skipped(),
+        )
 
     def _read(self) -> BodyState | None:
         """The newest reading that is all numbers; a broken one would poison the controller."""

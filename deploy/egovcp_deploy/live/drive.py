@@ -3,26 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
-import draccus
 import numpy as np
 import torch
 from tqdm import tqdm
 
 from egovcp.artefact import Artefact
 from egovcp.atomic import write_json
-from egovcp.errors import EgovcpError, EnvironmentFailure, SafetyStop, UsageError
+from egovcp.errors import EgovcpError, SafetyStop, UsageError
+from egovcp.hardware import available_cores
 from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.tick import Tick
 from egovcp.robot.controllers import make_controller
 from egovcp.terminal import echo, one_line
-from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.hardware import CAMERAS, REALSENSE, HardwareOptions, open_eye
+from egovcp_deploy.live.hardware import CAMERAS, REALSENSE, HardwareOptions
 from egovcp_deploy.live.operators import OPERATORS, operator
 from egovcp_deploy.live.planner import LiveSummary, failure_words
 from egovcp_deploy.live.run import LiveSetup, run_live
@@ -32,7 +30,6 @@ from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.policy import backend_of
 from egovcp_deploy.recording import missing_ticks, recording, run_info
-from egovcp_deploy.robots.bridge import BridgeBody
 from egovcp_deploy.robots.realsense_eye import require_realsense
 
 SIMULATED_S: Final = 15.0  # in RUN: the crane lets go, the robot settles, the episode
@@ -105,7 +102,7 @@ def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetu
         config.seed,
         0,
         CameraView(),
-        draccus.encode(config),
+        config.encoded(),
         controller_id,
         artefact,
         backend_of(policy),
@@ -160,7 +157,7 @@ def _leave_a_core() -> None:
     """Plan on all cores but one, which the control process and the logs need: threads that wait
     for one that was put aside plan slower than fewer threads."""
     if "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(max(1, len(os.sched_getaffinity(0)) - 1))
+        torch.set_num_threads(max(1, available_cores() - 1))
 
 
 def _show(bar: Any, tick: Tick) -> None:
@@ -190,7 +187,7 @@ def _report(
         "damped": summary.damped,
         "failure": "" if summary.failure is None else failure_words(summary.failure),
         "events": summary.events,
-        "config": draccus.encode(config),
+        "config": config.encoded(),
         "artefact": artefact.manifest["files"],
         "low_level_controller": info.hashes["low_level_controller"],
         "backend": info.backend,
@@ -212,45 +209,3 @@ def _print(summary: LiveSummary, backend: str, folder: Path) -> None:
         + (f"; {summary.skipped} observations skipped" if summary.skipped else "")
     )
     echo(f"look at it:  rerun {folder / 'rollout-0.rrd'}")
-
-
-def examine_hardware(config: DeployConfig, artefact: Artefact | None) -> Iterator[dry_run.Finding]:
-    """Controller, robot and camera."""
-
-    def controller() -> str:
-        found = make_controller(config.robot.controller).id
-        if artefact is not None:
-            artefact.require_controller(found)
-        return found
-
-    yield dry_run.examine("controller", controller)
-    body = BridgeBody(config.robot.bridge)
-    connected = dry_run.examine("robot", lambda: _connect(body))
-    yield connected
-    if connected.error is None:
-        yield dry_run.examine("robot's states", lambda: dry_run.state_rate(body))
-        yield dry_run.examine("other publishers", lambda: _alone(body))
-        body.close()
-    yield dry_run.examine("camera", lambda: _camera(config))
-
-
-def _connect(body: BridgeBody) -> str:
-    body.connect()
-    reading = body.read()
-    assert reading is not None, "connect waits for a reading"
-    found = f"answers at {body.config.host}, mode machine {reading.mode}"
-    return f"{found}; warning: {body.warning}" if body.warning else found
-
-
-def _alone(body: BridgeBody) -> str:
-    if body.trouble:
-        raise EnvironmentFailure(body.trouble)
-    return "none noticed"
-
-
-def _camera(config: DeployConfig) -> str:
-    eye = open_eye(config.robot.camera)
-    try:
-        return dry_run.picture_rate(eye)
-    finally:
-        eye.close()

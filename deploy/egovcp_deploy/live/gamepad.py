@@ -16,6 +16,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, fields
 from typing import Final
 
+from egovcp.bounds import bounded
 from egovcp.errors import EnvironmentFailure
 from egovcp.terminal import echo
 from egovcp_deploy.live.buttons import Buttons
@@ -39,17 +40,17 @@ GAMEPAD_HELP: Final = (
 class GamepadButtons:
     """The driver's number of each button."""
 
-    A: int = 0
+    A: int = bounded(0, least=0, most=255)
     """Arm."""
-    B: int = 1
+    B: int = bounded(1, least=0, most=255)
     """Hold."""
-    Y: int = 3
+    Y: int = bounded(3, least=0, most=255)
     """Stand up."""
-    L1: int = 4
+    L1: int = bounded(4, least=0, most=255)
     """Held with B: emergency stop; with select: damp and quit."""
-    select: int = 6
+    select: int = bounded(6, least=0, most=255)
     """With L1: damp and quit."""
-    start: int = 7
+    start: int = bounded(7, least=0, most=255)
     """Run."""
 
 
@@ -57,11 +58,11 @@ class GamepadButtons:
 class GamepadAxes:
     """The driver's number of each axis; sticks read negative to the left and forward."""
 
-    lx: int = 0
+    lx: int = bounded(0, least=0, most=255)
     """Left stick, sideways: walk sideways."""
-    ly: int = 1
+    ly: int = bounded(1, least=0, most=255)
     """Left stick: walk forward and back."""
-    rx: int = 3
+    rx: int = bounded(3, least=0, most=255)
     """Right stick, sideways: turn."""
 
 

@@ -66,5 +66,5 @@ class Guard:
 
     def join_if_acting(self) -> None:
         """Wait until a robot that has to be damped from here has been."""
-        if self.acted:
+        if not self._process.is_alive():  # the thread may not have noticed yet
             self.join()

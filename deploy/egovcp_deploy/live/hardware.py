@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Final
 
-from egovcp_deploy.robots.body import Eye
 from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
 from egovcp_deploy.robots.realsense_eye import RealSenseEye, RealSenseEyeConfig
 from egovcp_deploy.robots.zmq_eye import ZmqEye, ZmqEyeConfig
@@ -42,7 +41,20 @@ class Hardware:
     """What the control loop reads and writes."""
 
     body: BridgeBody
-    eye: Eye
+    eye: ZmqEye | RealSenseEye
+
+    def link(self, now_ns: int) -> dict[str, float]:
+        """How the messages of the last second arrived, for the log: `Tick.link`."""
+        states, images = self.body.arrivals.stats(now_ns), self.eye.arrivals.stats(now_ns)
+        reading, picture = self.body.read(), self.eye.read()
+        found = {
+            "mode_machine": 0.0 if reading is None else float(reading.mode),
+            **{f"state_{name}": value for name, value in asdict(states).items()},
+            **{f"image_{name}": value for name, value in asdict(images).items()},
+        }
+        if picture is not None and picture.taken_ns is not None:
+            found["image_age_ms"] = (now_ns - picture.taken_ns) / 1e6
+        return found
 
     def close(self) -> None:
         """Let go of both."""
@@ -65,7 +77,7 @@ def open_hardware(options: HardwareOptions) -> Hardware:
         raise
 
 
-def open_eye(options: CameraOptions) -> Eye:
+def open_eye(options: CameraOptions) -> ZmqEye | RealSenseEye:
     """Connect to the camera.
 
     Raises:

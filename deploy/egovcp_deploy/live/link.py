@@ -8,18 +8,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Final
 
 import numpy as np
 import zmq
+from numpy.typing import NDArray
 
+from egovcp.log.tick import MotorReadings
 from egovcp.plan import PolicyStep
-from egovcp.spec import ACTION_DIM, DEPTH_COLS, DEPTH_ROWS, STATE_DIM
+from egovcp.spec import ACTION_DIM, DEPTH_COLS, DEPTH_ROWS, NUM_JOINTS, STATE_DIM
 from egovcp_deploy.pilot.desk import BACKLOG, Reply, Report
 from egovcp_deploy.pilot.states import Request
 
-_REPORT_PARTS: Final = 4
 _REPLY_PARTS: Final = 2
 _MOST_RECEIVED: Final = 4 * BACKLOG  # messages per call
 _NONE: Final = np.zeros(0, np.float32)
@@ -43,11 +44,17 @@ def encode_report(report: Report) -> list[bytes]:
         "first": report.first,
         "mode": report.mode,
         "events": report.events,
+        "link": dict(report.link),
+        "motors": None,
     }
+    motors: NDArray[np.float64] = np.zeros(0)
+    if report.motors is not None:
+        header["motors"], motors = _pack_motors(report.motors)
     arrays = (
         np.ascontiguousarray(report.depth, "<u2"),
         np.ascontiguousarray(report.state, "<f4"),
         np.ascontiguousarray(report.sent, "<f8"),
+        np.ascontiguousarray(motors, "<f8"),
     )
     return [json.dumps(header).encode(), *(array.tobytes() for array in arrays)]
 
@@ -55,7 +62,7 @@ def encode_report(report: Report) -> list[bytes]:
 def decode_report(parts: Sequence[bytes]) -> Report | None:
     """The inverse; None for anything else."""
     try:
-        raw, depth, state, sent = parts
+        raw, depth, state, sent, motors = parts
         header = json.loads(raw)
         return Report(
             tick=int(header["tick"]),
@@ -66,9 +73,42 @@ def decode_report(parts: Sequence[bytes]) -> Report | None:
             first=bool(header["first"]),
             mode=str(header["mode"]),
             events=tuple(map(str, header["events"])),
+            motors=_unpack_motors(header["motors"], np.frombuffer(motors, "<f8")),
+            link={str(name): float(value) for name, value in header["link"].items()},
         )
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, AttributeError):
         return None
+
+
+def _pack_motors(motors: MotorReadings) -> tuple[dict[str, int], NDArray[np.float64]]:
+    """Field -> number of its rows, and all rows (n, 29) in that order."""
+    values = {f.name: getattr(motors, f.name) for f in fields(motors)}
+    blocks = {
+        k: np.asarray(v, np.float64).T.reshape(-1, NUM_JOINTS)
+        for k, v in values.items()
+        if v is not None
+    }
+    return {name: len(block) for name, block in blocks.items()}, np.concatenate([*blocks.values()])
+
+
+def _unpack_motors(
+    rows: Mapping[str, int] | None, values: NDArray[np.float64]
+) -> MotorReadings | None:
+    """The inverse."""
+    if rows is None:
+        return None
+    ends = np.cumsum(list(rows.values()))
+    blocks = dict(zip(rows, np.split(values.reshape(-1, NUM_JOINTS), ends[:-1]), strict=True))
+    whole = {
+        name: blocks[name][0].astype(np.int64) for name in ("faults", "lost") if name in blocks
+    }
+    return MotorReadings(
+        torque=blocks["torque"][0],
+        temperature=blocks["temperature"].T if "temperature" in blocks else None,
+        faults=whole.get("faults"),
+        lost=whole.get("lost"),
+        enabled=blocks["enabled"][0] != 0.0 if "enabled" in blocks else None,
+    )
 
 
 def encode_reply(reply: Reply) -> list[bytes]:

@@ -97,6 +97,7 @@ class PlannerLoop:
         """Whether the control process has been told to end."""
         self._mode = ""
         self._told: list[str] = []  # events of this side, for the next tick
+        self._ending = ""  # why the run ended
         self._begin_ns: int | None = None
         self._decoding_ns = 0
         self._pending: tuple[Report, Reply | None] | None = None
@@ -114,6 +115,8 @@ class PlannerLoop:
             except Exception as error:  # noqa: BLE001 - whatever it is, the robot must not fall
                 self._fail(error)
                 self._stand_by(on_tick)
+        with suppress(Exception):  # a log that fails must not hide what the run was ended by
+            self._finish(on_tick)
         return self.summary
 
     def _plan(self, on_tick: Callable[[Tick], None]) -> None:
@@ -193,6 +196,17 @@ class PlannerLoop:
             self._damped_ns = report.time_ns
             self.summary.damped = _reason(report.events)
 
+    def _finish(self, on_tick: Callable[[Tick], None]) -> None:
+        """Record the last tick, which no report follows, with why the run ended. Its action is
+        not known; that of the tick before stands for it."""
+        if self._pending is None:
+            return
+        (report, reply), self._pending = self._pending, None
+        self._told.append(f"end of the run: {self._ending or 'the control process is gone'}")
+        tick = self._tick(report, reply, report)
+        self._sink.write(tick)
+        on_tick(tick)
+
     def _tick(self, report: Report, reply: Reply | None, following: Report) -> Tick:
         assert self._begin_ns is not None
         events = (*report.events, *(reply.events if reply else ()), *self._told)
@@ -207,6 +221,8 @@ class PlannerLoop:
             timing_ms={} if reply is None else {"plan": reply.plan_ms},
             events=events,
             mode=report.mode,
+            motors=report.motors,
+            link=report.link,
             **thoughts(reply),
         )
 
@@ -233,16 +249,23 @@ class PlannerLoop:
                     self._log(report, None, on_tick)
             self._obey(self._clock.now_ns())
             if self._mode in ("", State.INIT):
-                self._quit()  # nothing stands yet
+                self._quit("the planner failed before the robot stood")
 
     # --- the end -------------------------------------------------------------------------
     def _obey(self, now_ns: int) -> None:
         interrupted = self._interrupted(now_ns)
-        for order in (*self._ordered(now_ns), *interrupted):
-            self._link.send(encode_order(order))
-            self.quitting |= order.quit
+        for order in self._ordered(now_ns):
+            self._order(order, "by the operator")
+        for order in interrupted:
+            self._order(order, "interrupted" if self.interrupts.count else "the planner failed")
         if self._damped_ns is not None and now_ns - self._damped_ns > _AFTERMATH_S * _NS:
-            self._quit()
+            self._quit("the motors are damped")
+
+    def _order(self, order: Order, ending: str) -> None:
+        """Pass on an order; ``ending`` is why the run ends if it is the last."""
+        self._link.send(encode_order(order))
+        if order.quit:
+            self.quitting, self._ending = True, ending
 
     def _ordered(self, now_ns: int) -> Sequence[Order]:
         """What the operator wants; a second failure, of the operator, is nobody's business."""
@@ -264,9 +287,8 @@ class PlannerLoop:
             return []
         return [Order(Request.HOLD, quit=not self._stays)]
 
-    def _quit(self) -> None:
-        self._link.send(encode_order(Order(quit=True)))
-        self.quitting = True
+    def _quit(self, why: str) -> None:
+        self._order(Order(quit=True), why)
 
 
 def _reason(events: Sequence[str]) -> str:

@@ -24,6 +24,7 @@ from egovcp_deploy.live.buttons import Buttons
 from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
 from egovcp_deploy.live.hardware import Hardware, HardwareOptions, open_hardware
 from egovcp_deploy.live.link import Link, Order, RemoteDesk
+from egovcp_deploy.live.priority import CONTROL, RECEIVING, raise_priority
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Limits, Request, State
 from egovcp_deploy.robots.body import Body
@@ -31,7 +32,6 @@ from egovcp_deploy.robots.remote import Remote
 
 _ORPHAN_TICKS: Final = 100  # a damped robot without a planner is left after 2 s
 _LAST_WORDS: Final = 10  # how often the motors are told to damp at the end
-_PRIORITY: Final = -10  # of the process, where the system grants it
 _SWITCH_S: Final = 0.001  # longest wait of the loop for a thread that receives
 
 
@@ -56,7 +56,9 @@ def control_process(setup: ControlSetup) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the planner's process to judge
     quitting = Flag()
     signal.signal(signal.SIGTERM, lambda number, frame: quitting.set())
-    _prefer_punctuality()
+    sys.setswitchinterval(_SWITCH_S)
+    # before there are threads: one that holds the interpreter's lock must not be put aside either
+    raise_priority(RECEIVING)
     try:
         hardware = open_hardware(setup.hardware)
     except EgovcpError as error:
@@ -66,20 +68,13 @@ def control_process(setup: ControlSetup) -> None:
     link = Link(setup.address, serve=False)
     try:
         control = ControlProcess(setup, hardware, link)
+        raise_priority(CONTROL)
         gc.freeze()  # what the imports brought is not searched for garbage again
         control.run(quitting)
     finally:
         last_words(hardware.body)
         hardware.close()
         link.close()
-
-
-def _prefer_punctuality() -> None:
-    """Do what this process may so that its ticks are on time; before it has threads, which inherit
-    the priority: one that holds the interpreter's lock must not be put aside either."""
-    sys.setswitchinterval(_SWITCH_S)
-    with suppress(OSError):  # needs a privilege
-        os.setpriority(os.PRIO_PROCESS, 0, _PRIORITY)
 
 
 class Flag:
@@ -108,6 +103,7 @@ class ControlProcess:
             refusal=lambda: hardware.body.trouble,
             fault=lambda: hardware.body.fault,
             skipped=lambda: hardware.body.skipped,
+            link=hardware.link,
         )
         self._remote = RemoteKeys()
         self._orphaned = 0

@@ -84,7 +84,7 @@ def _help() -> str:
     lines = [f"  {entry.usage:{width}}  {entry.summary}" for entry in SUBCOMMANDS.values()]
     return "\n".join(
         [
-            f"usage: {PROG} SUBCOMMAND [FILES] [--flags]",
+            f"usage: {PROG} SUBCOMMAND [FILES] [--NAME=VALUE ...]",
             "",
             "Look at recorded runs (MCAP), save torn ones, turn them into datasets and back.",
             "",

@@ -15,12 +15,14 @@ from egovcp.log.mcap_reader import Moment, RecordingReader
 from egovcp.log.messages import Topic
 from egovcp.rate import NS_PER_S
 from egovcp.terminal import echo, echo_lines
+from egovcp_deploy.mcap.history import History, history_words
 
 
 @dataclass(frozen=True)
 class InfoConfig:
-    """Say what is in a recording: the run, its ticks and rates, its topics, what is missing, and
-    whether the file is complete."""
+    """Say what is in a recording: the run, its ticks and rates, its topics, what is missing,
+    every change of the runner's state with its reason, maxima per joint, and whether the file is
+    complete."""
 
     file: str = ""
     """The recording, an MCAP file."""
@@ -64,6 +66,7 @@ class Summary:
     """Lines in the log."""
     messages: Counter[str] = field(default_factory=Counter)
     types: dict[str, str] = field(default_factory=dict)
+    history: History = field(default_factory=History)
 
     @property
     def missing(self) -> int:
@@ -89,6 +92,9 @@ class Summary:
             "missing": self.missing,
             "gaps": [asdict(gap) for gap in self.gaps],
             "events": self.events,
+            "last_event": self.history.ending,
+            "states": [asdict(change) for change in self.history.changes],
+            "joint_maxima": None if self.history.joints is None else self.history.joints.to_json(),
             "topics": {
                 topic: {
                     "type": self.types[topic],
@@ -122,7 +128,11 @@ def run(config: InfoConfig) -> None:
 
 
 def summarise(path: Path) -> Summary:
-    """Read the whole recording once, without decoding its messages."""
+    """Read the whole recording once. Depth images and plans are not decoded.
+
+    Raises:
+        DataError: not a recording of ours, or one with a damaged message.
+    """
     return _summarise(path, RecordingReader(path))
 
 
@@ -138,6 +148,7 @@ def _summarise(path: Path, reader: RecordingReader) -> Summary:
         last = moment
         summary.ticks += 1
         summary.messages.update(moment.messages.keys())
+        summary.history.add(moment)
         summary.events += len(moment.text(Topic.LOG).splitlines())
     if last is not None:
         summary.duration_s = (last.time_ns - first_ns + period_ns) / NS_PER_S
@@ -167,6 +178,7 @@ def text(summary: Summary) -> list[str]:
         *(f"hash      {name} {value}" for name, value in info.hashes.items()),
         f"versions  {', '.join(f'{name} {v}' for name, v in info.versions.items())}",
         *([f"planner   computed by {info.backend}"] if info.backend else []),
+        *history_words(summary.history),
         "topics",
     ]
     width = max(map(len, summary.messages), default=0)

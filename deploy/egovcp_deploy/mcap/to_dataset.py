@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import shlex
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -63,7 +64,7 @@ def run(config: ToDatasetConfig) -> None:
     from egovcp.data.destination import require_new, require_replaceable, resolve_root
     from egovcp.data.source import local_root
 
-    paths = [Path(file).expanduser() for file in config.files]
+    paths = [Path(os.path.expanduser(file)) for file in config.files]
     root = resolve_root(local_root(config.dataset))
     require_new(root)
     require_replaceable(root)
@@ -97,7 +98,7 @@ def provenance(paths: Sequence[Path]) -> Provenance:
                 f"{paths[0]} with {ids[paths[0]]}; make a dataset of each"
             )
     first = infos[paths[0]]
-    command = shlex.join(["egovcp-mcap", "to-dataset", *map(str, paths)])
+    command = shlex.join(["egovcp-mcap", "to-dataset", *(str(path.absolute()) for path in paths)])
     return Provenance(
         controller_id=ids[paths[0]],
         command=command,

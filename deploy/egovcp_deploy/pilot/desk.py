@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.tick import ValueMap
+from egovcp.log.tick import MotorReadings, ValueMap
 from egovcp.plan import Policy, PolicyStep, blank_observation
 from egovcp.rate import Clock
 from egovcp.spec import ACTION_DIM
@@ -49,6 +49,10 @@ class Report:
     """State of the robot's state machine now."""
     events: tuple[str, ...] = ()
     """What happened since the last report, for the log."""
+    motors: MotorReadings | None = None
+    """Of the newest reading, for the log."""
+    link: Mapping[str, float] = field(default_factory=dict)
+    """`Tick.link`, for the log."""
 
 
 class Decoded(NamedTuple):

@@ -11,12 +11,14 @@ simulation all of it happens at once. Nothing here blocks, sleeps or does I/O of
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.log.tick import MotorReadings
 from egovcp.spec import COMMAND_SLICE
 from egovcp_deploy.pilot.desk import Desk, Reply, Report
 from egovcp_deploy.pilot.freshness import Freshness
@@ -112,6 +114,10 @@ class Pilot:
             self._book.reset()
         return self.supervisor.state
 
+    def note(self, events: Iterable[str]) -> None:
+        """Add lines to the events."""
+        self._events += events
+
     def _facts(self, now_ns: int, controller_ok: bool) -> Facts:
         silence = (now_ns - self._unanswered[0].time_ns) / 1e9 if self._unanswered else 0.0
         return Facts(
@@ -133,13 +139,17 @@ class Pilot:
         depth: NDArray[np.uint16],
         state: NDArray[np.float32],
         events: tuple[str, ...] = (),
+        motors: MotorReadings | None = None,
+        link: Mapping[str, float] | None = None,
     ) -> None:
-        """Hand o_t to the planner, and ``events`` with it for its log."""
+        """Hand o_t to the planner, and with it ``events``, ``motors`` and ``link`` for its log."""
         mode = self.supervisor.state
         sent = self.sent.copy()
         if self._first:
             self._began = self.tick
-        report = Report(self.tick, now_ns, depth, state, sent, self._first, mode, events)
+        report = Report(
+            self.tick, now_ns, depth, state, sent, self._first, mode, events, motors, link or {}
+        )
         self._first = False
         self._unanswered.append(report)
         self._desk.submit(report)

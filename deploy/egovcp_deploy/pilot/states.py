@@ -56,7 +56,7 @@ class Limits:
     """HOLD when the picture is older than this, s."""
     planner_hold_s: float = bounded(0.14, above=0)
     """HOLD when the planner has not answered for so long, s."""
-    misses_hold: int = bounded(5, least=0)
+    misses_hold: int = bounded(5, least=0, most=10_000)
     """HOLD after more than so many ticks in a row without a plan in time."""
     tilt_damp: float = bounded(1.0, above=0, most=math.pi / 2)
     """DAMP beyond this angle between pelvis and vertical, rad."""

@@ -12,6 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.log.tick import MotorReadings
+
 Array = NDArray[np.float64]
 
 
@@ -33,6 +35,8 @@ class BodyState:
     """The robot's mode machine, which every command must repeat."""
     remote: bytes = b""
     """The operator's remote control as the robot relays it; empty: the robot has none."""
+    motors: MotorReadings | None = None
+    """Torque, temperature and status of the motors; None: the body does not report them."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +61,9 @@ class Picture:
     """When it arrived, on the monotonic clock of this machine."""
     depth: NDArray[np.uint16]
     """(48, 64) planar depth, mm, 0 invalid."""
+    taken_ns: int | None = None
+    """When the camera's driver received it, on the same clock; the time of a network is not in it.
+    None: the camera does not say."""
 
 
 class Body(Protocol):

@@ -10,10 +10,12 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
+import numpy as np
 import zmq
 
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import EnvironmentFailure
+from egovcp_deploy.robots.arrivals import Arrivals
 from egovcp_deploy.robots.body import BodyState, MotorCommand
 from egovcp_deploy.robots.listener import Listener, join, probe
 from egovcp_deploy.robots.machine import objection, warning
@@ -85,6 +87,8 @@ class BridgeBody:
         self.config = config or BridgeConfig()
         self.traffic = Traffic()
         self.watch = PublisherWatch()
+        self.arrivals = Arrivals()
+        """Of usable readings; messages that are not usable count as lost."""
         self._filter = PlausibilityFilter(self.config.consistency)
         self._newest: BodyState | None = None
         self._payload = b""
@@ -141,20 +145,22 @@ class BridgeBody:
             state = decode_state(payload, time_ns)
         except Garbled as error:
             self.traffic.garbled += 1
-            self._skip(str(error))
+            self._skip(str(error), time_ns)
             return False
-        if problem := self._filter.judge(state.body, state.torque):
+        if problem := self._filter.judge(state.body, np.asarray(state.motors.torque, np.float64)):
             self.traffic.implausible += 1
-            self._skip(problem)
+            self._skip(problem, time_ns)
             return False
         self.traffic.readings += 1
+        self.arrivals.arrived(time_ns)
         self.watch.heard(state)
         self._watch_mode(state.body)
         self._newest = state.body
         self._skipped = 0
         return True
 
-    def _skip(self, problem: str) -> None:
+    def _skip(self, problem: str, time_ns: int) -> None:
+        self.arrivals.lost(time_ns)
         self._skipped += 1
         self._why_skipped = self.traffic.problem = problem
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -11,7 +13,7 @@ import zmq
 from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import EnvironmentFailure
-from egovcp.rate import FixedRate, MonotonicClock
+from egovcp.rate import NS_PER_S, FixedRate, MonotonicClock
 from egovcp.terminal import echo
 from egovcp_deploy.robots.body import Eye, Picture
 from egovcp_deploy.robots.depth_wire import WirePicture, encode_picture
@@ -74,7 +76,10 @@ class DepthServer:
             return
         self._last = picture
         self._sequence += 1
-        self._end.send(encode_picture(WirePicture(self._sequence, self._fov, picture.depth)))
+        taken_ns = picture.taken_ns
+        age = math.nan if taken_ns is None else (time.monotonic_ns() - taken_ns) / NS_PER_S
+        sent = WirePicture(self._sequence, self._fov, picture.depth, age)
+        self._end.send(encode_picture(sent))
 
     def close(self) -> None:
         """Stop listening."""

@@ -71,6 +71,17 @@ def objection(mode: int, confirmed: bool) -> str:
     return ""
 
 
+def describe(mode: int) -> str:
+    """A mode machine in words."""
+    machine = MACHINES.get(mode)
+    if machine is None:
+        return warning(mode)
+    waist = "waist locked" if machine.waist_locked else "waist free"
+    words = f"mode machine {mode}: {machine.joints} joints, {waist}"
+    note = warning(mode).partition(": ")[2]
+    return f"{words}; warning: {note}" if note else words
+
+
 def warning(mode: int) -> str:
     """What the operator should know of a robot that reports ``mode``; empty: nothing."""
     machine = MACHINES.get(mode)

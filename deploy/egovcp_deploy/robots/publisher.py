@@ -66,7 +66,7 @@ class PublisherWatch:
         if elapsed > _GAP_S:
             self._restart()
             return
-        wrong = np.abs(state.torque - self._expected(state)) > self._slack(state)
+        wrong = np.abs(state.motors.torque - self._expected(state)) > self._slack(state)
         self._astray += (wrong - self._astray) * (1.0 - math.exp(-elapsed / _MEMORY_S))
         self._listened_s += elapsed
 

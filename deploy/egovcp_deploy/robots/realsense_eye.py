@@ -17,6 +17,7 @@ from egovcp.bounds import bounded
 from egovcp.errors import EnvironmentFailure
 from egovcp.packages import require_packages
 from egovcp.sim.config import CameraConfig
+from egovcp_deploy.robots.arrivals import Arrivals
 from egovcp_deploy.robots.body import Picture
 from egovcp_deploy.robots.resample import Intrinsics, Resampler
 
@@ -31,11 +32,11 @@ class RealSenseEyeConfig:
     serial: str = ""
     """Serial number, or name if there is only one of it; lerobot-find-cameras realsense lists
     them."""
-    width: int = bounded(848, least=1)
+    width: int = bounded(848, least=1, most=8192)
     """Columns of its depth; the stereo of a D435i is best at 848 x 480."""
-    height: int = bounded(480, least=1)
+    height: int = bounded(480, least=1, most=8192)
     """Rows of its depth."""
-    fps: int = bounded(60, least=1)
+    fps: int = bounded(60, least=1, most=1000)
     """Pictures per second."""
     vertical_fov: float = bounded(CameraConfig.vertical_fov, above=0, below=math.pi)
     """Field of view that the policy knows, rad; the camera's own must not be much smaller."""
@@ -78,6 +79,8 @@ class RealSenseEye:
         self._newest: Picture | None = None
         self.problem = ""
         """Why the last `read` found nothing new, in the driver's words."""
+        self.arrivals = Arrivals()
+        """Of pictures, as they are read."""
 
     @classmethod
     def connect(cls, config: RealSenseEyeConfig) -> Self:
@@ -97,7 +100,8 @@ class RealSenseEye:
         """The newest picture, resampled once; its time is when it was first read or taken."""
         if self._camera is None:
             return self._newest
-        taken_ns = self._taken_ns()  # before the picture: it may be of the one before, not after
+        now_ns = time.monotonic_ns()
+        taken_ns = self._taken_ns(now_ns)  # before the picture: it may be of the one before
         try:
             raw = self._camera.read_latest_depth(max_age_ms=_OLDEST_MS)
         except (RuntimeError, TimeoutError, ConnectionError) as error:
@@ -105,16 +109,18 @@ class RealSenseEye:
             return self._newest
         if raw is not self._seen:
             self._seen = raw
-            self._newest = Picture(taken_ns, self._resample(raw))
+            time_ns = now_ns if taken_ns is None else taken_ns
+            self._newest = Picture(time_ns, self._resample(raw), taken_ns)
+            self.arrivals.arrived(time_ns)
         return self._newest
 
-    def _taken_ns(self) -> int:
-        """When the driver received its newest picture, if it says so; never later than now."""
-        now = time.monotonic_ns()
+    def _taken_ns(self, now_ns: int) -> int | None:
+        """When the driver received its newest picture, never later than now; None: it does not
+        say. LeRobot's driver gives no time of exposure."""
         stamp: float | None = getattr(self._camera, "latest_timestamp", None)  # perf_counter, s
         if stamp is None:
-            return now
-        return now - max(0, time.perf_counter_ns() - round(stamp * 1e9))
+            return None
+        return now_ns - max(0, time.perf_counter_ns() - round(stamp * 1e9))
 
     def close(self) -> None:
         """Stop the camera; further calls do nothing."""

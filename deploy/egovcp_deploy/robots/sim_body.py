@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Final
 
+from egovcp.log.tick import MotorReadings
 from egovcp.rate import NS_PER_S
 from egovcp.sim.live import LIMP, LiveRobot, Servos
 from egovcp.spec import PHYSICS_DT
@@ -94,6 +95,7 @@ class SimBody:
                 quaternion_w=seen.quaternion_w,
                 angular_velocity=seen.angular_velocity,
                 remote=Remote.asking_for(self._robot.velocity_wish, self.pressed).to_bytes(),
+                motors=MotorReadings(seen.torque),
             )
         return self._reading
 

@@ -5,6 +5,10 @@
     rt/lowstate  SUB <- port 6001     {"topic", "data": {motor_state: 35 x {q, dq, tau_est, ...},
                                        imu_state, wireless_remote, mode_machine}}
 
+Per motor a state may also carry ``temperature`` (deg C: one number, as LeRobot's bridge sends it,
+or casing and winding, as the robot does), ``motorstate`` (status bits), ``lost`` (packets) and
+``mode`` (1: obeys). Names and meanings are those of Unitree's ``MotorState_``.
+
 The first 29 of the 35 motors are ``spec.JOINT_NAMES`` in order; the others are not fitted. What
 arrives may be torn or hostile: everything is checked, and what is wrong is `Garbled`.
 """
@@ -19,9 +23,11 @@ from typing import Any, Final, Never
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.log.tick import MotorReadings
 from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import NUM_JOINTS
 from egovcp_deploy.robots.body import BodyState, MotorCommand
+from egovcp_deploy.robots.motor_fields import decode_motor_fields, encode_motor_fields
 
 Array = NDArray[np.float64]
 
@@ -54,11 +60,15 @@ class LowState:
     """All that we use of one ``rt/lowstate``."""
 
     body: BodyState
-    torque: Array
-    """(29,) N m, as the motors estimate it."""
     sources: int | None = None
     """Programs whose commands reached the robot in the last half second; None: not told. Our own
     addition, ``command_sources``: LeRobot's bridge does not know."""
+
+    @property
+    def motors(self) -> MotorReadings:
+        """Torque, temperature and status of the motors."""
+        assert self.body.motors is not None, "every rt/lowstate has them"
+        return self.body.motors
 
 
 @dataclass(frozen=True)
@@ -142,13 +152,14 @@ def encode_state(state: LowState, acceleration: Array) -> bytes:
         acceleration: (3,) specific force in the IMU frame, m/s^2.
     """
     body = state.body
-    rows = zip(
-        body.joint_position.tolist(),
-        body.joint_velocity.tolist(),
-        state.torque.tolist(),
-        strict=True,
-    )
-    motors = [{"q": q, "dq": dq, "tau_est": t, "temperature": 35.0} for q, dq, t in rows]
+    columns = {
+        "q": body.joint_position.tolist(),
+        "dq": body.joint_velocity.tolist(),
+        "tau_est": state.motors.torque.tolist(),
+        **encode_motor_fields(state.motors),
+    }
+    rows = zip(*columns.values(), strict=True)
+    motors = [dict(zip(columns, row, strict=True)) for row in rows]
     empty = {"q": 0.0, "dq": 0.0, "tau_est": 0.0, "temperature": 0.0}
     data = {
         "motor_state": motors + [empty] * (MOTOR_SLOTS - NUM_JOINTS),
@@ -191,9 +202,12 @@ def decode_state(payload: bytes, time_ns: int) -> LowState:
         angular_velocity=_numbers(imu.get("gyroscope"), _MOST_SPEED, "gyroscope", 3),
         mode=_mode(data, "mode_machine"),
         remote=_remote(data.get("wireless_remote", "")),
+        motors=MotorReadings(
+            _numbers([m.get("tau_est") for m in motors], _MOST_TORQUE, "tau_est"),
+            **decode_motor_fields(motors),
+        ),
     )
-    torque = _numbers([m.get("tau_est") for m in motors], _MOST_TORQUE, "tau_est")
-    return LowState(body, torque, None if sources is None else _mode(data, "command_sources"))
+    return LowState(body, None if sources is None else _mode(data, "command_sources"))
 
 
 def _data(payload: bytes, topic: str) -> dict[str, Any]:

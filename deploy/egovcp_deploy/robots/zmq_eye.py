@@ -9,12 +9,15 @@ from typing import Final
 
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import EnvironmentFailure
+from egovcp.rate import NS_PER_S
 from egovcp.sim.config import CameraConfig
+from egovcp_deploy.robots.arrivals import Arrivals
 from egovcp_deploy.robots.body import Picture
-from egovcp_deploy.robots.depth_wire import PICTURE_BYTES, decode_picture
+from egovcp_deploy.robots.depth_wire import PICTURE_BYTES, SEQUENCES, decode_picture
 from egovcp_deploy.robots.listener import Listener, probe
 from egovcp_deploy.robots.wire import CAMERA_PORT, Garbled
 
+_MOST_MISSING: Final = 1000  # pictures in a row; more is another server
 _FOV_SLACK: Final = math.radians(1.0)
 _START: Final = "start egovcp-depth-server where the camera is, or egovcp-fake-g1 without a robot"
 
@@ -42,6 +45,8 @@ class ZmqEye:
         self.pictures = self.repeated = self.garbled = 0
         self.problem = ""
         """What was wrong with the last message that was dropped."""
+        self.arrivals = Arrivals(numbered=True)
+        """Of usable pictures; missing and unusable ones count as lost."""
         self._newest: Picture | None = None
         self._sequence: int | None = None
         self._listener: Listener | None = None
@@ -74,14 +79,27 @@ class ZmqEye:
         except Garbled as error:
             self.garbled += 1
             self.problem = str(error)
+            self.arrivals.lost(time_ns)
             return False
         if picture.sequence == self._sequence:
             self.repeated += 1
             return False
         self.pictures += 1
+        self._count_missing(picture.sequence, time_ns)
         self._sequence = picture.sequence
-        self._newest = Picture(time_ns, picture.depth)
+        age = picture.age_s
+        taken_ns = None if math.isnan(age) else time_ns - round(age * NS_PER_S)
+        self._newest = Picture(time_ns, picture.depth, taken_ns)
+        self.arrivals.arrived(time_ns)
         return True
+
+    def _count_missing(self, sequence: int, time_ns: int) -> None:
+        """A server that was started again begins anew, and has lost none."""
+        if self._sequence is None:
+            return
+        missing = (sequence - self._sequence) % SEQUENCES - 1
+        if 0 < missing < _MOST_MISSING:
+            self.arrivals.lost(time_ns, missing)
 
     def read(self) -> Picture | None:
         """The newest picture; its time is that of its arrival, whenever it is read."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -118,7 +119,7 @@ def _lengths(config: ExperimentConfig) -> str:
 
 
 def _steps(policy: str) -> str:
-    folder = Path(policy).expanduser()
+    folder = Path(os.path.expanduser(policy))
     if not (folder / MANIFEST).is_file():
         return f"`{policy}`"  # on the Hub, or gone since
     return f"{read_manifest(folder).get('step', '?')} gradient steps"

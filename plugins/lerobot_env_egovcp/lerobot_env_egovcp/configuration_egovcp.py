@@ -12,6 +12,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.processor import PolicyProcessorPipeline
 
 from egovcp import spec
+from egovcp.bounds import check_cores
 from egovcp.errors import UsageError, suggest
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig as SimulationConfig
@@ -55,6 +56,7 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
     """LeRobot's names for it."""
 
     def __post_init__(self) -> None:
+        check_cores(self.simulation, "--env.simulation.")
         if self.task not in spec.TASKS:
             raise UsageError(f"no task {self.task!r}{suggest(str(self.task), spec.TASKS)}")
         if self.fps != spec.PLANNER_HZ:

@@ -58,6 +58,14 @@ def test_the_schema_is_complete(text: str) -> None:
         assert f"| `{name}` |" in text
 
 
+def test_it_says_which_versions_read_the_files(text: str) -> None:
+    metadata = schema.arrow_schema().metadata[b"huggingface"].decode()
+    assert '"_type": "List"' in metadata  # which `datasets` knows since 4.0
+    for words in (text, (HOUSE / "docs" / "data.md").read_text(encoding="utf-8")):
+        assert "`datasets` 4.0 or newer" in words
+        assert "LeRobot 0.6 or newer" in words
+
+
 def test_how_it_was_collected_is_told(text: str) -> None:
     assert SETTINGS.command in text
     assert "mujoco 3.11.0" in text
@@ -145,9 +153,13 @@ def test_a_file_that_is_replaced_is_not_written_through_its_other_name(tmp_path:
     old, other = tmp_path / "README.md", tmp_path / "older"
     old.write_text("first")
     os.link(old, other)
-    replace_text(old, "second")
+    previous = os.umask(0o002)
+    try:
+        replace_text(old, "second")
+    finally:
+        os.umask(previous)
     assert (old.read_text(), other.read_text()) == ("second", "first")
-    assert old.stat().st_mode & 0o777 == 0o644
+    assert old.stat().st_mode & 0o777 == 0o664
 
 
 def test_the_template_of_the_repository_is_the_one_that_ships() -> None:

@@ -128,3 +128,7 @@ def test_an_episode_of_no_recorded_collection_is_found(
     assert main(["check", str(merged), f"--json={report}"]) == 3
     (problem,) = json.loads(report.read_text())["problems"]
     assert (problem["file"], problem["episode"]) == (d.COLLECTION, 6)
+    new = tmp_path / "new"
+    assert main(["repair", str(merged), f"--output_dir={new}"]) == 0
+    assert main(["check", str(new), f"--json={report}"]) == 0
+    assert json.loads(report.read_text())["episodes"] == 6

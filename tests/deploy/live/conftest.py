@@ -9,15 +9,16 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from egovcp.log.tick import MotorReadings
 from egovcp.plan import PolicyStep
 from egovcp.rate import LockstepClock
 from egovcp.robot.stance import StanceController
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot, Servos
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import ACTION_DIM
+from egovcp.spec import ACTION_DIM, JOINT_NAMES
 from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
-from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.pilot.desk import InlineDesk, Report, Thinker
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Limits, Request, State
 from egovcp_deploy.robots.body import BodyState, MotorCommand, Picture
@@ -46,6 +47,13 @@ class Faults:
     silent: bool = False
     nan: bool = False
     refusal: str = ""
+    hot: float | None = None
+    """Temperature of the left knee's motor, deg C."""
+    dropped: bool = False
+    """The left knee's motor gives no torque."""
+
+
+KNEE = JOINT_NAMES.index("left_knee_joint")
 
 
 class SimBody:
@@ -67,6 +75,7 @@ class SimBody:
             m.quaternion_w,
             m.angular_velocity,
             mode=5,
+            motors=MotorReadings(m.torque, self._temperature()),
         )
         if self._faults.nan:
             return replace(reading, joint_velocity=np.full(29, np.nan))
@@ -75,7 +84,15 @@ class SimBody:
 
     def write(self, command: MotorCommand) -> None:
         self.commands.append(command)
-        self._robot.drive(Servos(command.position, command.stiffness, command.damping))
+        works = (np.arange(29) != KNEE) if self._faults.dropped else np.ones(29)
+        self._robot.drive(
+            Servos(command.position, works * command.stiffness, works * command.damping)
+        )
+
+    def _temperature(self) -> NDArray[np.float64] | None:
+        if self._faults.hot is None:
+            return None
+        return np.where(np.arange(29) == KNEE, self._faults.hot, 35.0)[:, None]
 
     def close(self) -> None:
         pass
@@ -129,6 +146,16 @@ class Reaching:
         self.sent.append(sent[0].copy())
 
 
+class EventDesk(InlineDesk):
+    """Remembers the events of all reports."""
+
+    events: list[str]
+
+    def submit(self, report: Report) -> None:
+        self.events += report.events
+        super().submit(report)
+
+
 @dataclass
 class Rig:
     """Everything, and the clock that drives it."""
@@ -140,6 +167,8 @@ class Rig:
     policy: Reaching
     controller: StanceController
     loop: ControlLoop
+    events: list[str]
+    """Of all reports so far."""
     states: list[State] = field(default_factory=list)
 
     def run(
@@ -184,7 +213,8 @@ def make_rig() -> Callable[..., Rig]:
         robot.start(Scenario("ball", 0, 0))
         clock, faults, policy = LockstepClock(time_ns=10**12), Faults(), Reaching(level)
         body = SimBody(robot, clock, faults)
-        desk = InlineDesk(Thinker(policy), clock, lambda tick: delay_ms(tick) * 1_000_000)
+        desk = EventDesk(Thinker(policy), clock, lambda tick: delay_ms(tick) * 1_000_000)
+        desk.events = []
         controller = StanceController()
         loop = ControlLoop(
             body,
@@ -193,6 +223,6 @@ def make_rig() -> Callable[..., Rig]:
             Pilot(desk, Limits()),
             refusal=lambda: faults.refusal,
         )
-        return Rig(robot, clock, faults, body, policy, controller, loop)
+        return Rig(robot, clock, faults, body, policy, controller, loop, desk.events)
 
     return make

@@ -12,6 +12,7 @@ from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import ACTION_BOX, COMMAND_SLICE, STATE_SLICES
 from egovcp_deploy.pilot.states import Request, State
 from egovcp_deploy.robots.body import MotorCommand
+from egovcp_deploy.robots.wire import encode_command
 
 from .conftest import Rig
 
@@ -213,6 +214,33 @@ def test_a_controller_without_numbers_damps_in_the_same_tick(
     assert_sane(rig.body.commands)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_no_target_beyond_its_bounds_leaves_whatever_the_networks_give(
+    make_rig: Make, monkeypatch: pytest.MonkeyPatch, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    rig = make_rig()
+    rig.go()
+    before = len(rig.body.commands)
+
+    def wild(state: NDArray[np.floating]) -> NDArray[np.float64]:
+        """The policy in the controller, and now and then a number that is none."""
+        target = rng.normal(0, 10.0 ** rng.integers(-1, 6), (1, 29))
+        if rng.random() < 0.05:
+            target[0, rng.integers(29)] = rng.choice([np.nan, np.inf, -np.inf, 1e300])
+        return target
+
+    def plan(tick: int) -> None:
+        rig.policy.level = float(rng.choice([np.nan, np.inf, 1e30, -1e30, rng.normal()]))
+
+    monkeypatch.setattr(rig.controller, "step", wild)
+    rig.run(1.0, each=plan)
+    assert len(rig.body.commands) == before + 50
+    assert_sane(rig.body.commands)
+    for command in rig.body.commands:
+        encode_command(command)  # refuses what is beyond the bounds
+
+
 def test_it_is_not_armed_while_somebody_else_drives(make_rig: Make) -> None:
     rig = make_rig()
     rig.faults.refusal = "another publisher is alive"
@@ -232,3 +260,62 @@ def test_the_operators_velocity_is_sent_only_while_running(make_rig: Make) -> No
     assert rig.policy.seen[-1][STATE_SLICES["command_velocity"]][0] == pytest.approx(0.2)
     rig.run(1.5)  # the operator has fallen silent
     assert rig.policy.seen[-1][STATE_SLICES["command_velocity"]][0] == 0.0
+
+
+def test_a_hot_motor_is_not_armed_with(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.faults.hot = 75.0
+    rig.run(0.1)
+    rig.run(3.1, Request.STAND)
+    assert rig.loop.state is State.INIT, "standing up is refused already"
+    rig.faults.hot = 60.0
+    rig.stand()
+    rig.faults.hot = 75.0
+    rig.run(0.2)
+    rig.run(0.5, Request.RUN)
+    assert rig.loop.state is State.ARMED
+    assert any("left_knee_joint is at 75 deg C" in line for line in events_of(rig))
+
+
+def test_a_motor_that_overheats_holds_the_robot_until_it_has_cooled(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.faults.hot = 40.0
+    rig.go()
+    rig.faults.hot = 85.0
+    rig.run(1.0)
+    assert rig.loop.state is State.HOLD
+    reason = rig.loop.pilot.supervisor.reason
+    assert "left_knee_joint is too hot: 85 deg C; let the robot down" in reason
+    rig.run(2.0)
+    assert rig.loop.state is State.HOLD
+    rig.faults.hot = 50.0
+    rig.run(1.5)
+    assert rig.loop.state is State.RUN
+
+
+def test_a_motor_that_drops_out_damps_the_robot_and_is_named(make_rig: Make) -> None:
+    rig = make_rig()
+    rig.go()
+    rig.faults.dropped = True
+    begin = len(rig.states)
+    rig.run(0.6)
+    assert rig.loop.state is State.DAMP
+    assert "motor of left_knee_joint does not follow" in rig.loop.pilot.supervisor.reason
+    assert rig.states.index(State.DAMP) - begin <= 15
+    assert_sane(rig.body.commands)
+
+
+def test_pushes_and_reaches_are_no_motor_faults(make_rig: Make) -> None:
+    rig = make_rig(level=0.9)
+    rig.faults.hot = 40.0
+    rig.go()
+    for push in ((0.3, 0.0), (-0.2, 0.2)):
+        rig.robot.push(np.array([*push, 0.0]))
+        rig.run(1.5)
+    assert State.DAMP not in rig.states
+    assert not any("motor of" in line for line in events_of(rig))
+
+
+def events_of(rig: Rig) -> list[str]:
+    """All that the loop has reported, and what it would report next."""
+    return [*rig.events, *rig.loop.pilot.events()]

@@ -137,7 +137,8 @@ def test_a_planner_that_raises_holds_the_robot_and_goes_on_listening_and_logging
     assert not control.alive()  # it was never told to end
     assert not loop.quitting
     assert summary.held == 194  # ticks 6 to 199
-    assert [tick.index for tick in log.ticks] == list(range(199))
+    assert [tick.index for tick in log.ticks] == list(range(200))
+    assert log.ticks[-1].events[-1] == "end of the run: the control process is gone"
     assert "the planner failed: RuntimeError: out of ideas" in log.ticks[5].events
     assert len(told) == 1
     assert told[0].startswith("the planner failed: RuntimeError: out of ideas; the robot is held")
@@ -152,11 +153,12 @@ def test_the_operator_ends_it_afterwards(
         held[0] += mode == State.HOLD
         return [Order(quit=True)] if held[0] == 20 else []
 
-    control, loop, _ = fly(operator=Person(answer))
+    control, loop, log = fly(operator=Person(answer))
     loop.run()
     assert loop.quitting
     assert control.orders[-1].quit
     assert control.alive()
+    assert log.ticks[-1].events[-1] == "end of the run: by the operator"
 
 
 def test_ctrl_c_twice_damps_afterwards(

@@ -159,7 +159,9 @@ def test_killing_the_control_process_damps_the_robot_and_ends_with_a_safety_stop
     words = stand.end()
     assert stand.program.returncode == 6, words
     assert "the control process died" in words
-    assert read_recording(stand.folder / "rollout-0.mcap").complete
+    recording = read_recording(stand.folder / "rollout-0.mcap")
+    assert recording.complete
+    assert recording.ticks[-1].events[-1] == "end of the run: the control process is gone"
 
 
 def kill(program: subprocess.Popen[str]) -> None:

@@ -234,6 +234,53 @@ def test_a_mode_that_changes_is_trouble(body: BridgeBody, running: Running) -> N
     assert eventually(lambda: "mode machine 9" in body.trouble)
 
 
+def test_a_mode_that_changes_for_long_is_a_fault(body: BridgeBody, running: Running) -> None:
+    assert eventually(lambda: body.read() is not None)
+    assert not body.fault
+    running.fake.faults.mode = 4
+    assert eventually(lambda: body.fault == f"the mode machine changed from {MODE} to 4")
+    running.fake.faults.mode = None
+    assert eventually(lambda: not body.fault)
+
+
+@pytest.mark.parametrize("mode", [4, 6, 9])
+def test_a_robot_without_29_joints_or_with_a_locked_waist_is_refused(
+    running: Running, mode: int
+) -> None:
+    running.fake.faults.mode = mode
+    with pytest.raises(EnvironmentFailure, match=f"mode machine {mode} is a G1"):
+        BridgeBody(config_of(running.fake)).connect()
+
+
+def test_a_locked_waist_is_accepted_if_it_is_named(running: Running) -> None:
+    running.fake.faults.mode = 6
+    body = BridgeBody(config_of(running.fake, mode=6))
+    body.connect()
+    assert "the waist is locked" in body.warning
+    body.close()
+
+
+@pytest.mark.parametrize(
+    ("fault", "value", "words"),
+    [
+        ("gyroscope", 150.0, "gyroscope x (rad/s) is 150.00"),
+        ("joint_speed", 190.0, "left_knee_joint speed (rad/s) is 190.00"),
+    ],
+)
+def test_false_sensors_are_skipped_and_counted(
+    body: BridgeBody, running: Running, fault: str, value: float, words: str
+) -> None:
+    assert eventually(lambda: body.read() is not None)
+    setattr(running.fake.faults, fault, value)
+    assert eventually(lambda: body.traffic.implausible > 3)
+    seen = body.read()
+    assert words in body.skipped
+    assert eventually(lambda: body.traffic.implausible > 6)
+    assert body.read() is seen
+    running.fake.faults.obey("heal")
+    assert eventually(lambda: not body.skipped)
+
+
 def test_a_robot_left_alone_may_be_armed(body: BridgeBody) -> None:
     assert "listening" in body.trouble
     assert eventually(lambda: not body.trouble)

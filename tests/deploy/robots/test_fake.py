@@ -244,13 +244,19 @@ def test_words_set_faults_and_heal_them() -> None:
     for line in ("freeze_state", "drop 0.25", "mode 3", "push 1 -0.5"):
         faults.obey(line)
     assert faults == Faults(freeze_state=True, drop=0.25, mode=3, push=(1.0, -0.5))
+    for line in ("gyroscope 150", "joint_speed -25", "flood 20"):
+        faults.obey(line)
+    assert (faults.gyroscope, faults.joint_speed, faults.flood) == (150.0, -25.0, 20)
+    assert "flood" not in faults.obey("flood off")
     faults.obey("freeze_state off")
     assert not faults.freeze_state
     assert faults.obey("heal") == "faults: none"
     assert faults == Faults()
 
 
-@pytest.mark.parametrize("line", ["frieze_state", "drop", "drop much", "push hard", "push 1"])
+@pytest.mark.parametrize(
+    "line", ["frieze_state", "drop", "drop much", "push hard", "push 1", "flood nan"]
+)
 def test_words_that_mean_nothing_are_refused(line: str) -> None:
     faults = Faults()
     with pytest.raises(UsageError):

@@ -14,6 +14,7 @@ import pytest
 from lerobot.robots.unitree_g1.g1_utils import G1_29_JointIndex
 from lerobot.robots.unitree_g1.unitree_sdk2_socket import LowStateMsg
 
+from egovcp.log.tick import MotorReadings
 from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import JOINT_NAMES
 from egovcp_deploy.robots.body import BodyState, MotorCommand
@@ -49,8 +50,9 @@ def reading(sources: int | None = None) -> LowState:
         angular_velocity=np.array([0.1, 0.2, 0.3]),
         mode=5,
         remote=Remote(ly=0.5).to_bytes(),
+        motors=MotorReadings(COUNT * 2),
     )
-    return LowState(body, COUNT * 2, sources)
+    return LowState(body, sources)
 
 
 def changed(payload: bytes, path: tuple[Any, ...], value: Any) -> bytes:
@@ -130,7 +132,7 @@ def test_we_read_what_lerobots_bridge_sends(server: Any) -> None:
     got = decode_state(payload.encode(), 11)
     np.testing.assert_array_equal(got.body.joint_position, COUNT / 10)
     np.testing.assert_array_equal(got.body.joint_velocity, -COUNT)
-    np.testing.assert_array_equal(got.torque, 2 * COUNT)
+    np.testing.assert_array_equal(got.motors.torque, 2 * COUNT)
     np.testing.assert_array_equal(got.body.angular_velocity, [1, 2, 3])
     assert (got.body.mode, got.body.time_ns, got.sources) == (5, 11, None)
     assert Remote.parse(got.body.remote) == Remote(lx=0.25)
@@ -141,7 +143,7 @@ def test_lerobots_client_reads_our_states() -> None:
     message = LowStateMsg(json.loads(encode_state(state, GRAVITY))["data"])
     assert [m.q for m in message.motor_state[:29]] == state.body.joint_position.tolist()
     assert [m.dq for m in message.motor_state[:29]] == state.body.joint_velocity.tolist()
-    assert [m.tau_est for m in message.motor_state[:29]] == state.torque.tolist()
+    assert [m.tau_est for m in message.motor_state[:29]] == state.motors.torque.tolist()
     assert len(message.motor_state) == MOTOR_SLOTS
     assert message.imu_state.quaternion == state.body.quaternion_w.tolist()
     assert message.imu_state.gyroscope == state.body.angular_velocity.tolist()
@@ -156,7 +158,7 @@ def test_states_survive_the_wire(sources: int | None) -> None:
     for name in ("joint_position", "joint_velocity", "angular_velocity"):
         np.testing.assert_array_equal(getattr(back.body, name), getattr(state.body, name))
     np.testing.assert_allclose(back.body.quaternion_w, state.body.quaternion_w, rtol=1e-12)
-    np.testing.assert_array_equal(back.torque, state.torque)
+    np.testing.assert_array_equal(back.motors.torque, state.motors.torque)
     assert (back.body.mode, back.body.remote) == (5, state.body.remote)
     assert back.sources == sources
 

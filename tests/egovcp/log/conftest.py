@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egovcp.log.tick import MODES, BasePose, Candidates, SceneObject, Tick, ValueMap
+from egovcp.log.tick import MODES, BasePose, Candidates, MotorReadings, SceneObject, Tick, ValueMap
 from egovcp.spec import STATE_DIM, STATE_SLICES
 
 MakeTick = Callable[..., Tick]
@@ -66,8 +66,22 @@ def _rest(index: int, rng: np.random.Generator) -> dict[str, object]:
             SceneObject("wall", "box", (0.9, 0.0, 1.0), (1.0, 0.0, 0.0, 0.0), (0.05, 2.0, 1.0)),
         ),
         "mode": MODES[index % len(MODES)],
+        "motors": _motors(index, rng),
+        "link": {"state_rate_hz": 200.0, "state_lost": 0.01 * index, "mode_machine": 5.0},
         "events": ("ball thrown", "second line") if index == 1 else (),
     }
+
+
+def _motors(index: int, rng: np.random.Generator) -> MotorReadings:
+    faults = np.zeros(29, np.int64)
+    faults[4] = 0x80000000
+    return MotorReadings(
+        torque=rng.normal(0, 10, 29),
+        temperature=30.0 + rng.uniform(0, 10, (29, 2)),
+        faults=faults,
+        lost=np.arange(29) * index,
+        enabled=np.arange(29) != 4,
+    )
 
 
 def _value_map(hand: Any, rng: np.random.Generator) -> ValueMap:

@@ -137,14 +137,19 @@ def test_every_schema_is_one_that_viewers_know(tmp_path: Path, make_tick: Any) -
     assert {schema.name for schema in summary.schemas.values()} == DISPLAYED
 
 
-def _panels(node: Any) -> list[str]:
-    return [node] if isinstance(node, str) else _panels(node["first"]) + _panels(node["second"])
+def _panels(node: Any, by_id: dict[str, Any]) -> list[str]:
+    """Names of the panels below a node of the layout, those within tabs included."""
+    if isinstance(node, str):
+        tabs = by_id[node].get("tabs", ())
+        return [node] + [name for tab in tabs for name in _panels(tab["layout"], by_id)]
+    return _panels(node["first"], by_id) + _panels(node["second"], by_id)
 
 
 def test_the_foxglove_layout_shows_topics_that_there_are() -> None:
     layout = json.loads((ROOT / "docs" / "foxglove_layout.json").read_text())
     panels = layout["configById"]
-    assert sorted(_panels(layout["layout"])) == sorted(panels)
+    assert sorted(_panels(layout["layout"], panels)) == sorted(panels)
+    assert [tab["title"] for tab in panels["Tab!views"]["tabs"]] == ["plan", "robot"]
     named = set(re.findall(r'"(/[a-z_/]+)', json.dumps(panels)))
     assert named <= set(Topic)
     assert panels["3D!robot"]["followTf"] in LINK_NAMES

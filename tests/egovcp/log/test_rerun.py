@@ -59,6 +59,8 @@ def test_every_part_of_a_tick_has_its_entity(tmp_path: Path, make_tick: Any) -> 
     named = [f"{paths.ROBOT}/{link}" for link in LINK_NAMES]
     named += [f"{paths.IMAGINED}/{i}" for i in range(2)] + [f"{paths.SCENE}/ball"]
     named += ["/plan/value", "/plan/termination", "/reward/block", "/timing/plan", "/events"]
+    named += ["/motors/temperature/left_leg", "/motors/torque/waist", "/link/state_lost"]
+    named += ["/motors/faults/left_ankle_pitch_joint", "/runner/init"]
     assert set(fixed + named) <= found
 
 
@@ -137,7 +139,7 @@ def test_candidates_are_paths_in_the_world_coloured_by_value(
 def test_every_view_of_the_blueprint_has_something_to_show(tmp_path: Path, make_tick: Any) -> None:
     found = entities(record(tmp_path / "a.rrd", [make_tick(i) for i in range(3)], imagined=(1, 5)))
     origins = [view.origin for view in views(blueprint((1, 5)).root_container)]
-    assert len(origins) == 13
+    assert len(origins) == 20
     for origin in origins:
         assert any(path == origin or path.startswith(f"{origin}/") for path in found), origin
 

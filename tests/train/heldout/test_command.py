@@ -2,8 +2,10 @@
 
 import json
 import shutil
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from PIL import Image
@@ -13,7 +15,9 @@ from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader
 from egovcp.plan import PlannerConfig
 from egovcp.testing import toy_model
+from egovcp_train.heldout import command, episodes
 from egovcp_train.heldout.command import main
+from egovcp_train.heldout.episodes import Recorded
 from egovcp_train.train import main as train
 
 type Arguments = Callable[..., list[str]]
@@ -53,6 +57,29 @@ def test_figures_pictures_and_a_table(
     with Image.open(output / "open_loop_ball.png") as picture:
         assert picture.width > picture.height
     assert "ball: 8 episodes" in capsys.readouterr().out
+
+
+def test_an_interrupted_evaluation_keeps_what_was_measured(
+    policy: Path,
+    dataset_root: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def interrupted(*args: Any) -> Iterator[Recorded]:
+        for group in episodes.recorded(*args):
+            yield group
+            signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(episodes, "EPISODES_AT_ONCE", 3)
+    monkeypatch.setattr(command, "recorded", interrupted)
+    assert main(_argv(policy, dataset_root, tmp_path / "out", "--split=all")) == 130
+    assert {p.name for p in (tmp_path / "out").iterdir()} == {"heldout.json"}
+    content = json.loads((tmp_path / "out" / "heldout.json").read_text("utf-8"))
+    found = content["tasks"]["ball"]
+    assert (found["incomplete"], found["episodes"], found["episodes_requested"]) == (True, 3, 8)
+    assert content["_run"]["complete"] is False
+    assert "INCOMPLETE: ball 3 of 8 episodes measured" in capsys.readouterr().out
 
 
 def test_the_figures_of_a_run_are_measured_again(

@@ -1,6 +1,7 @@
 """``egovcp-eval-lowlevel``: what is commanded, what is measured, what is written."""
 
 import json
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import ACTION_BOX, ACTION_ETA
-from egovcp_train.lowlevel import skills, trial
+from egovcp_train.lowlevel import evaluate, skills, trial
 from egovcp_train.lowlevel.evaluate import main
 from egovcp_train.lowlevel.skills import SKILLS, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
@@ -106,6 +107,45 @@ def test_it_writes_a_line_per_skill(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert figures["squat"]["stepping"] == 0.0
     assert figures["_run"]["controller"] == make_controller("stance").id
     assert "squat" in capsys.readouterr().out
+
+
+def test_an_interrupted_evaluation_keeps_the_skills_that_were_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    original = trial.play
+
+    def interrupted(controller, skill, *args):
+        if skill.name == "reach":
+            signal.raise_signal(signal.SIGINT)
+        return original(controller, skill, *args)
+
+    monkeypatch.setattr(trial, "play", interrupted)
+    flags = [f"--output_dir={tmp_path}", "--skills=push,reach", "--episodes=2", "--threads=1"]
+    assert main(flags) == 130
+    figures = json.loads((tmp_path / "lowlevel.json").read_text())
+    assert set(figures) == {"push", "_run"}
+    assert figures["push"]["episodes"] == 2
+    assert figures["_run"]["complete"] is False
+    assert "INCOMPLETE: push 2 of 2, reach 0 of 2 robots" in capsys.readouterr().out
+
+
+def test_an_interrupted_skill_counts_the_batches_that_were_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    original, seeds = trial.play, []
+
+    def interrupted(controller, skill, robots, seed, *args):
+        seeds.append(seed)
+        if len(seeds) == 2:
+            signal.raise_signal(signal.SIGINT)
+        return original(controller, skill, robots, seed, *args)
+
+    monkeypatch.setattr(trial, "play", interrupted)
+    monkeypatch.setattr(evaluate, "_BATCH", 2)
+    flags = [f"--output_dir={tmp_path}", "--skills=push", "--episodes=5", "--threads=1"]
+    assert main(flags) == 130
+    push = json.loads((tmp_path / "lowlevel.json").read_text())["push"]
+    assert (push["incomplete"], push["episodes"], push["episodes_requested"]) == (True, 2, 5)
 
 
 def test_a_diverging_simulation_is_an_error_and_writes_no_figures(

@@ -1,5 +1,7 @@
 """``egovcp-train-ppo`` on the simulator: runs, resumes, refuses."""
 
+import shutil
+from importlib import resources
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,19 @@ def test_a_run_leaves_a_policy_and_goes_on_where_it_stopped(
     assert after["episodes"] == 10  # new ones: two at the start, and two that followed
     assert after["seconds"] > before["seconds"]
     assert ReactiveNetwork.load(run / LAST).provenance["steps"] == 36
+
+
+def test_a_controller_of_a_relative_path_is_kept_with_its_absolute_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with resources.as_file(resources.files("egovcp.robot") / "g1_walk.safetensors") as shipped:
+        shutil.copyfile(shipped, tmp_path / "walk.safetensors")
+    monkeypatch.chdir(tmp_path)
+    own = [flag for flag in SMALL if "controller" not in flag]
+    controller = "--env.controller=walk.safetensors"
+    assert main(["--output_dir=run", "--steps=12", controller, *own]) == 0
+    options = (tmp_path / "run" / "train_config.yaml").read_text()
+    assert f"controller: {tmp_path / 'walk.safetensors'}" in options
 
 
 def test_another_network_does_not_continue_the_run(

@@ -6,6 +6,7 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -13,11 +14,12 @@ import torch
 
 from egovcp.artefact import Artefact, load_artefact
 from egovcp.atomic import write_text
-from egovcp.bounds import bounded
+from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.policy_options import PolicyOptions
+from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
 from egovcp.trained import returns_of, trained_with
 from egovcp_train.device import choose_device
@@ -50,18 +52,18 @@ class HeldoutConfig:
     """Policy to measure."""
     dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
     """Dataset with the episodes."""
-    return_steps: int | None = bounded(None, least=1)
+    return_steps: int | None = bounded(None, least=1, most=100_000)
     """Horizon of the returns that Q is compared with, ticks; null: that of the training, if its
     datasets had but one."""
     split: str = "heldout"
     """heldout, train or all; episodes are held out by a hash, the same ones in each training."""
-    episodes: int = bounded(64, least=0)
+    episodes: int = bounded(64, least=0, most=1_000_000)
     """At most this many episodes of each task, evenly spread over the split; 0: all."""
     stride: int = bounded(4, least=1)
     """Rows between the starts of open-loop predictions; 1: from each row."""
     pictures: bool = True
     """Write open_loop_TASK.png, value_TASK.png and open_loop.rrd."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """CPU threads; 0: all cores."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""
@@ -73,7 +75,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def evaluate(config: HeldoutConfig) -> None:
-    """Measure, print the table, write the JSON and the pictures."""
+    """Measure, print the table, write the JSON and the pictures.
+
+    After Ctrl-C the measures of the episodes so far are written, marked as incomplete.
+
+    Raises:
+        UsageError: an option makes no sense.
+        ArtefactError: the policy is damaged, or of another low-level controller.
+        DataError: the dataset is damaged.
+        EnvironmentFailure: the folder cannot be written.
+        KeyboardInterrupt: after SIGINT or SIGTERM.
+    """
     output = _check(config)
     torch.set_num_threads(config.threads or torch.get_num_threads())
     device = choose_device(config.device)
@@ -87,9 +99,22 @@ def evaluate(config: HeldoutConfig) -> None:
     if returns.scale == "per_task":
         store = on_task_scales(store, _return_scales(artefact))
     model = artefact.world_model.to(device)
-    report = measure(model, recorded(store, device), config.stride)
+    with stop_on_signal() as received:
+        stopped = partial(bool, received)
+        report = measure(model, recorded(store, device), config.stride, stopped)
+    requested = {task: store.tasks.count(task) for task in sorted(set(store.tasks))}
+    played = {task: found["episodes"] for task, found in report.tasks.items()}
+    complete = played == requested
+    for task, found in report.tasks.items():
+        if found["episodes"] < requested[task]:
+            found |= {"incomplete": True, "episodes_requested": requested[task]}
     echo(table(report.tasks))
-    _write(output, report, _run(config, artefact, reader))
+    _write(output, report, _run(config, artefact, reader) | {"complete": complete})
+    if not complete:
+        counts = [f"{task} {played.get(task, 0)} of {n}" for task, n in requested.items()]
+        echo(f"INCOMPLETE: {', '.join(counts)} episodes measured")
+        echo(f"figures: {output / RESULT}")
+        raise KeyboardInterrupt
     if config.pictures:
         _show(output, report, model.config.depth_max_m)
     echo(f"figures: {output / RESULT}")
@@ -132,7 +157,7 @@ def _return_scales(artefact: Artefact) -> dict[str, ReturnScale]:
 
 def _run(config: HeldoutConfig, artefact: Artefact, reader: DatasetReader) -> dict[str, Any]:
     return {
-        "policy": str(artefact.path),
+        "policy": str(artefact.path.absolute()),
         "step": artefact.manifest.get("step"),
         "dataset": {
             "repo_id": reader.source.repo_id,

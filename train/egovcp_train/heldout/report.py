@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import torch
@@ -86,19 +86,34 @@ class TaskReport:
 
 
 @torch.no_grad()
-def measure(model: WorldModel, episodes: Iterable[Recorded], stride: int = 4) -> Report:
+def measure(
+    model: WorldModel,
+    episodes: Iterable[Recorded],
+    stride: int = 4,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Report:
     """Filter the episodes once, as the robot does, and measure everything.
 
     Args:
+        model: the model.
+        episodes: groups of episodes.
         stride: rows between the starts of open-loop predictions.
+        stopped: once it returns true, the rest of the episodes is left out.
+
+    Raises:
+        KeyboardInterrupt: it was stopped before anything was measured.
     """
     model.eval()
     summary = Summary()
     tasks: dict[str, TaskReport] = {}
     for group in episodes:
+        if stopped():
+            break
         rollout = filter_sequence(model, group.batch, sample=False)
         summary.add(model, group.batch, rollout)
         tasks.setdefault(group.task, TaskReport(stride)).add(model, group, rollout)
+    if not tasks:
+        raise KeyboardInterrupt
     return Report(
         summary.result(),
         {task: found.result() for task, found in tasks.items()},

@@ -26,7 +26,7 @@ class PassingConfig:
     episode's pictures is the one under which its sightings best lie on a path."""
     radius: float = bounded(0.10, least=0)
     """What is added to the depth of a surface to reach the middle of the thing, m."""
-    min_sightings: int = bounded(4, least=2)
+    min_sightings: int = bounded(4, least=2, most=100_000)
     """A path needs this many sightings."""
     tolerance: float = bounded(0.05, above=0)
     """Distance of a sighting from its path, per metre of its own distance, m."""

@@ -11,9 +11,9 @@ from egovcp.bounds import bounded
 class NetworkConfig:
     """Sizes of actor and critic."""
 
-    actor: tuple[int, ...] = bounded((256, 128, 64), least=1)
+    actor: tuple[int, ...] = bounded((256, 128, 64), least=1, most=8192, longest=16)
     """Hidden layers of the policy."""
-    critic: tuple[int, ...] = bounded((256, 128, 64), least=1)
+    critic: tuple[int, ...] = bounded((256, 128, 64), least=1, most=8192, longest=16)
     """Hidden layers of the critic, which also sees what only the simulator knows."""
     activation: str = "elu"
     """Activation of both."""
@@ -25,11 +25,11 @@ class NetworkConfig:
 class PpoConfig:
     """Proximal policy optimisation; the names are rsl-rl's."""
 
-    num_steps_per_env: int = bounded(24, least=1)
+    num_steps_per_env: int = bounded(24, least=1, most=100_000)
     """Ticks per robot and iteration."""
-    num_learning_epochs: int = bounded(4, least=1)
+    num_learning_epochs: int = bounded(4, least=1, most=10_000)
     """Passes over the data of an iteration."""
-    num_mini_batches: int = bounded(4, least=1)
+    num_mini_batches: int = bounded(4, least=1, most=65_536)
     """Mini-batches per pass."""
     learning_rate: float = bounded(1e-3, above=0)
     """At the start; then it follows desired_kl."""

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -14,14 +13,16 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp.atomic import write_json
-from egovcp.bounds import bounded
+from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
+from egovcp.hardware import available_cores
 from egovcp.intervals import wilson
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import JOINT_NAMES
+from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
 from egovcp_train.lowlevel.skills import SKILLS, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
@@ -58,7 +59,7 @@ class LowLevelEvalConfig:
     """stance, walk (which the package ships), or the walk.safetensors of egovcp-train-lowlevel."""
     skills: str = ",".join(skill.name for skill in SKILLS)
     """Which skills, separated by commas."""
-    episodes: int = bounded(400, least=1)
+    episodes: int = bounded(400, least=1, most=1_000_000)
     """Robots per skill."""
     disturbances: DisturbanceConfig = field(default_factory=lambda: DisturbanceConfig(models=400))
     """Ranges of the physical parameters and of the delay."""
@@ -68,7 +69,7 @@ class LowLevelEvalConfig:
     """Foot collision model."""
     seed: int = bounded(1000, least=0)
     """Seed of robots, commands, pushes and noise."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """CPU threads; 0: all cores."""
 
 
@@ -78,23 +79,74 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def evaluate(config: LowLevelEvalConfig) -> None:
-    """Play, print the table, write the JSON."""
+    """Play, print the table, write the JSON.
+
+    Whatever ends it early, the robots that have played are written, marked as incomplete.
+
+    Raises:
+        UsageError: an option makes no sense.
+        ArtefactError: the controller's file cannot be used.
+        DataError: the simulation diverged.
+        EnvironmentFailure: a package is missing, or the folder cannot be written.
+        KeyboardInterrupt: after SIGINT or SIGTERM.
+    """
     skills = _chosen(config.skills)
     require_packages("egovcp-train", PROG, *SIMULATOR_MODULES)
     controller = make_controller(config.controller)
     output = Path(config.output_dir)
     require_writable(output)
-    figures = {}
-    with tqdm(total=len(skills) * config.episodes, unit="robot", desc="skills") as bar:
+    figures: dict[str, dict[str, Any]] = {}
+    loads: dict[str, Any] = {}
+    complete = False
+    try:
+        _play_all(config, skills, figures)
+        loads = _standing_load(config) if "rest" in figures else {}
+        complete = True
+    finally:
+        if figures:
+            run = {
+                "controller": controller.id,
+                "command": [PROG, *sys.argv[1:]],
+                "seed": config.seed,
+                "complete": complete,
+            }
+            echo(table(figures))
+            if not complete:
+                echo(f"INCOMPLETE: {_counts(config, skills, figures)} robots have played")
+            output.mkdir(parents=True, exist_ok=True)
+            write_json(output / RESULT, figures | loads | {"_run": run})
+            echo(f"figures: {output / RESULT}")
+
+
+def _play_all(
+    config: LowLevelEvalConfig, skills: Sequence[Skill], figures: dict[str, dict[str, Any]]
+) -> None:
+    """Every skill, into ``figures``.
+
+    Raises:
+        KeyboardInterrupt: after SIGINT or SIGTERM.
+    """
+    total = len(skills) * config.episodes
+    with (
+        stop_on_signal() as received,
+        tqdm(total=total, unit="robot", desc="skills") as bar,
+    ):
         for skill in skills:
             bar.set_postfix_str(skill.name)
-            figures[skill.name] = _figures(skill, _play(config, skill, bar))
-    echo(table(figures))
-    loads = _standing_load(config) if "rest" in figures else {}
-    output.mkdir(parents=True, exist_ok=True)
-    run = {"controller": controller.id, "command": [PROG, *sys.argv[1:]], "seed": config.seed}
-    write_json(output / RESULT, figures | loads | {"_run": run})
-    echo(f"figures: {output / RESULT}")
+            parts: list[Any] = []
+            try:
+                _play(config, skill, bar, parts, lambda: bool(received))
+            finally:
+                if parts:
+                    figures[skill.name] = _figures(skill, _joined(parts), config.episodes)
+
+
+def _counts(
+    config: LowLevelEvalConfig, skills: Sequence[Skill], figures: dict[str, dict[str, Any]]
+) -> str:
+    """``rest 400 of 400, squat 200 of 400``."""
+    played = {name: row["episodes"] for name, row in figures.items()}
+    return ", ".join(f"{s.name} {played.get(s.name, 0)} of {config.episodes}" for s in skills)
 
 
 def _chosen(names: str) -> list[Skill]:
@@ -105,11 +157,17 @@ def _chosen(names: str) -> list[Skill]:
     return [by_name[name] for name in names.split(",")]
 
 
-def _play(config: LowLevelEvalConfig, skill: Skill, bar: Any) -> dict[str, NDArray[Any]]:
+def _play(
+    config: LowLevelEvalConfig,
+    skill: Skill,
+    bar: Any,
+    parts: list[Any],
+    stopped: Callable[[], bool],
+) -> None:
+    """The outcomes of one batch of robots after the other, into ``parts``."""
     from egovcp_train.lowlevel.trial import play  # MuJoCo; --help needs none
 
-    threads = config.threads or len(os.sched_getaffinity(0))
-    parts: list[Any] = []
+    threads = config.threads or available_cores()
     for first in range(0, config.episodes, _BATCH):
         robots = min(_BATCH, config.episodes - first)
         parts.append(
@@ -122,14 +180,18 @@ def _play(config: LowLevelEvalConfig, skill: Skill, bar: Any) -> dict[str, NDArr
                 config.sensors,
                 config.feet,
                 threads,
+                stopped,
             )
         )
         bar.update(robots)
+
+
+def _joined(parts: Sequence[Any]) -> dict[str, NDArray[Any]]:
     names = ("survived", "torque_rms", *_FIGURES.values())
     return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
 
 
-def _figures(skill: Skill, outcome: dict[str, NDArray[Any]]) -> dict[str, Any]:
+def _figures(skill: Skill, outcome: dict[str, NDArray[Any]], requested: int) -> dict[str, Any]:
     survived = outcome["survived"]
     low, high = wilson(int(survived.sum()), len(survived))
     out: dict[str, Any] = {
@@ -138,6 +200,8 @@ def _figures(skill: Skill, outcome: dict[str, NDArray[Any]]) -> dict[str, Any]:
         "survival": float(survived.mean()),
         "survival_ci95": [low, high],
     }
+    if len(survived) < requested:
+        out |= {"incomplete": True, "episodes_requested": requested}
     for key, name in _FIGURES.items():
         known = outcome[name][np.isfinite(outcome[name])]
         out[key] = float(known.mean()) if len(known) else None

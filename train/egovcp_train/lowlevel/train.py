@@ -3,25 +3,31 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import draccus
 import torch
 
-from egovcp.bounds import bounded
+from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import run_command, save_config
-from egovcp.errors import ArtefactError
+from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.walk_onnx import export_onnx
 from egovcp.robot.walking import WalkConfig
+from egovcp.sim.capacity import require_robots
 from egovcp.sim.config import SensorConfig
 from egovcp.terminal import echo
-from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
+from egovcp_train.checkpoint import (
+    checkpoint_dir,
+    load_training_state,
+    new_checkpoint,
+    restoring,
+)
 from egovcp_train.iterations import run_iterations
 from egovcp_train.loop import Budget
 from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig, PpoConfig
@@ -62,7 +68,7 @@ class LowLevelTrainConfig:
     """Proximal policy optimisation."""
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     """When the task becomes harder."""
-    robots: int = bounded(512, least=1)
+    robots: int = bounded(512, least=1, most=65_536)
     """Robots simulated side by side."""
     feet: Literal["points", "stock"] = "points"
     """Foot collision model; four points are twice as fast."""
@@ -72,7 +78,7 @@ class LowLevelTrainConfig:
     """Wall-clock limit in minutes; 0: none."""
     seed: int = bounded(0, least=0)
     """Seed of networks, commands, disturbances and noise."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """CPU threads; 0: all cores."""
     resume: bool = False
     """Continue the run in output_dir from its last checkpoint, with its options unless given."""
@@ -84,7 +90,13 @@ class LowLevelTrainConfig:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return run_command(LowLevelTrainConfig, train, argv, prog=PROG, defaults=resumed_options)
+    return run_command(
+        LowLevelTrainConfig,
+        train,
+        argv,
+        prog=PROG,
+        defaults=partial(resumed_options, LowLevelTrainConfig),
+    )
 
 
 def train(config: LowLevelTrainConfig) -> None:
@@ -93,8 +105,9 @@ def train(config: LowLevelTrainConfig) -> None:
     Raises:
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
+    require_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)
-    threads = config.threads or len(os.sched_getaffinity(0))
+    threads = config.threads or available_cores()
     torch.set_num_threads(threads)
     torch.manual_seed(config.seed)
     learner = _build(config, threads)
@@ -129,14 +142,8 @@ def _build(config: LowLevelTrainConfig, threads: int) -> Any:
 
 def _restore(output: Path, learner: Any) -> None:
     state = load_training_state(output)
-    try:
+    with restoring(output):
         learner.load_state_dict(state)
-    except (KeyError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ArtefactError(
-            f"{output}: its checkpoint does not fit the options given ({reason}); resume "
-            "without them, or start a new run"
-        ) from error
 
 
 class _Run:

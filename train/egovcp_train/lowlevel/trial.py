@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
 from typing import Final
@@ -87,11 +88,13 @@ def play(
     sensors: SensorConfig,
     feet: FootModel = "stock",
     threads: int = 1,
+    stopped: Callable[[], bool] = lambda: False,
 ) -> Outcome:
     """Run ``skill`` once with each of ``robots`` robots of different physical parameters.
 
     Raises:
         SimulationDiverged: the physics of a robot that has not fallen is not that of a real one.
+        KeyboardInterrupt: ``stopped`` has returned true.
     """
     rng = np.random.default_rng([seed, 1])
     commands = skill.script(skill.ticks, robots, rng)
@@ -104,6 +107,8 @@ def play(
         x = physics.snapshot()
         controller.reset(measure(x, commands[0], std, rng))
         for tick, command in enumerate(commands):
+            if stopped():
+                raise KeyboardInterrupt
             if skill.push and tick == _PUSH_TICK:
                 physics.qvel[:, :2] += events.kick(skill.push, events.directions(robots, rng))
             state = measure(x, command, std, rng)

@@ -7,7 +7,6 @@ the velocity and how still the pelvis is.
 
 from __future__ import annotations
 
-import os
 import sys
 import time
 from collections.abc import Sequence
@@ -20,11 +19,13 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp.atomic import write_json
-from egovcp.bounds import bounded
+from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import run_command
+from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.gait import GaitConfig
 from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
+from egovcp.sim.capacity import require_robots
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.sensors import noise_std
 from egovcp.spec import ACTION_BOX, CONTROLLER_HZ
@@ -60,7 +61,7 @@ class TuneConfig:
     """Where to start from."""
     minutes: float = bounded(15.0, above=0)
     """Wall-clock limit."""
-    population: int = bounded(28, least=4)
+    population: int = bounded(28, least=4, most=65_536)
     """Candidates per generation."""
     seconds: float = bounded(6.0, above=0)
     """Length of a walk, s."""
@@ -68,7 +69,7 @@ class TuneConfig:
     """Pelvis height, m."""
     seed: int = bounded(0, least=0)
     """Seed of candidates, physics and noise."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """CPU threads; 0: all cores."""
 
 
@@ -84,6 +85,7 @@ def tune(config: TuneConfig) -> None:
         UsageError: an option makes no sense.
         EnvironmentFailure: the package cma is missing, or the folder cannot be written.
     """
+    require_robots("--population", config.population, config.population * len(_SPEEDS))
     require_packages("egovcp-train", PROG, "cma", *SIMULATOR_MODULES)
     import cma
 
@@ -143,7 +145,7 @@ def walk(gaits: Sequence[GaitConfig], config: TuneConfig, generation: int) -> Ar
     each = len(_SPEEDS)
     robots = each * len(gaits)
     rng = np.random.default_rng([config.seed, generation])
-    threads = config.threads or len(os.sched_getaffinity(0))
+    threads = config.threads or available_cores()
     disturbances = DisturbanceConfig(
         stiffness_scale=(0.9, 1.1), damping_scale=(0.9, 1.1), friction=(0.6, 1.0)
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final
 
-from egovcp.bounds import bounded, check_bounds
+from egovcp.bounds import MOST_PER_CORE, bounded, check_bounds
 from egovcp.errors import UsageError, suggest
 from egovcp.reactive import ReactiveConfig
 from egovcp.sim.config import EnvConfig
@@ -19,11 +19,11 @@ ALL: Final = "all"
 class ContactPpoConfig:
     """Proximal policy optimisation; the names are rsl-rl's."""
 
-    num_steps_per_env: int = bounded(50, least=1)
+    num_steps_per_env: int = bounded(50, least=1, most=100_000)
     """Ticks per robot and iteration."""
-    num_learning_epochs: int = bounded(4, least=1)
+    num_learning_epochs: int = bounded(4, least=1, most=10_000)
     """Passes over the data of an iteration."""
-    num_mini_batches: int = bounded(4, least=1)
+    num_mini_batches: int = bounded(4, least=1, most=65_536)
     """Mini-batches per pass."""
     learning_rate: float = bounded(1e-3, above=0)
     """At the start; then it follows desired_kl."""
@@ -61,7 +61,7 @@ class PpoTrainConfig:
     """Standard deviation of the actions at the start, box units."""
     ppo: ContactPpoConfig = field(default_factory=ContactPpoConfig)
     """Proximal policy optimisation."""
-    robots: int = bounded(32, least=1)
+    robots: int = bounded(32, least=1, most=65_536)
     """Robots simulated side by side."""
     steps: int = bounded(1_000_000, least=1)
     """Planner ticks of 40 ms, over all robots: transitions."""
@@ -69,7 +69,7 @@ class PpoTrainConfig:
     """Wall-clock limit in minutes, over all resumes; 0: none."""
     seed: int = bounded(0, least=0)
     """Seed of scenarios, networks and actions."""
-    threads: int = bounded(0, least=0)
+    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """CPU threads of the networks; 0: all cores. Those of the simulator are --env.threads."""
     resume: bool = False
     """Continue the run in output_dir from its last checkpoint, with its options unless given."""

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,17 @@ import draccus
 import torch
 
 from egovcp.cli import run_command, save_config
-from egovcp.errors import ArtefactError
+from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
+from egovcp.robot.controllers import absolute_controller
+from egovcp.sim.capacity import require_robots
 from egovcp.terminal import echo
-from egovcp_train.checkpoint import checkpoint_dir, load_training_state, new_checkpoint
+from egovcp_train.checkpoint import (
+    checkpoint_dir,
+    load_training_state,
+    new_checkpoint,
+    restoring,
+)
 from egovcp_train.iterations import run_iterations
 from egovcp_train.loop import Budget
 from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options
@@ -29,7 +36,9 @@ POLICY_FILE = "ppo.safetensors"
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return run_command(PpoTrainConfig, train, argv, prog=PROG, defaults=resumed_options)
+    return run_command(
+        PpoTrainConfig, train, argv, prog=PROG, defaults=partial(resumed_options, PpoTrainConfig)
+    )
 
 
 def train(config: PpoTrainConfig) -> None:
@@ -38,14 +47,18 @@ def train(config: PpoTrainConfig) -> None:
     Raises:
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
+    require_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)
-    torch.set_num_threads(config.threads or len(os.sched_getaffinity(0)))
+    controller = absolute_controller(config.env.controller)  # resumed from any working directory
+    config = dataclasses.replace(config, env=dataclasses.replace(config.env, controller=controller))
+    torch.set_num_threads(config.threads or available_cores())
     torch.manual_seed(config.seed)
     state = load_training_state(output) if config.resume else {}
     learner = _build(config, int(state.get("episodes", 0)))
     try:
         if config.resume:
-            _restore(output, learner, state)
+            with restoring(output):
+                learner.load_state_dict(state)
         output.mkdir(parents=True, exist_ok=True)
         save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
         _run(config, output, learner, float(state.get("seconds", 0.0)))
@@ -59,17 +72,6 @@ def _build(config: PpoTrainConfig, first: int) -> Any:
     from egovcp_train.ppo.learn import ContactLearner
 
     return ContactLearner(config, first)
-
-
-def _restore(output: Path, learner: Any, state: dict[str, Any]) -> None:
-    try:
-        learner.load_state_dict(state)
-    except (KeyError, RuntimeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ArtefactError(
-            f"{output}: its checkpoint does not fit the options given ({reason}); resume "
-            "without them, or start a new run"
-        ) from error
 
 
 def _run(config: PpoTrainConfig, output: Path, learner: Any, spent: float) -> None:

@@ -9,16 +9,19 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import zmq
+from numpy.typing import NDArray
 
+from egovcp.bounds import bounded
 from egovcp.errors import EnvironmentFailure
+from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.sim.live import LIMP, LiveRobot, Phase, Servos
-from egovcp.spec import JOINT_NAMES, PHYSICS_DT
+from egovcp.spec import JOINT_NAMES, NUM_JOINTS, PHYSICS_DT
 from egovcp_deploy.robots.body import BodyState
 from egovcp_deploy.robots.depth_wire import WirePicture, encode_picture
 from egovcp_deploy.robots.fake.faults import Faults
@@ -37,6 +40,8 @@ from egovcp_deploy.robots.wire import (
 
 WATCHDOG_S: Final = 0.2
 MODE: Final = 5  # what the fake reports as its mode machine
+_MOTOR_DEG_C: Final = 35.0
+_DISCONNECTED: Final = 0x80000000  # see `motor_fields.FAULTS`
 _COUNTED_S: Final = 0.5  # how long a program counts as one that sends commands
 _MOST_PER_STEP: Final = 100  # commands taken in within 5 ms; the rest waits
 _GARBAGE_BYTES: Final = 2000
@@ -49,11 +54,11 @@ class Ports:
 
     host: str = "127.0.0.1"
     """Interface; the loopback lets nobody else in."""
-    command_port: int = COMMAND_PORT
+    command_port: int = bounded(COMMAND_PORT, least=0, most=65535)
     """Commands."""
-    state_port: int = STATE_PORT
+    state_port: int = bounded(STATE_PORT, least=0, most=65535)
     """States."""
-    camera_port: int = CAMERA_PORT
+    camera_port: int = bounded(CAMERA_PORT, least=0, most=65535)
     """Depth pictures, in our own format."""
 
 
@@ -77,6 +82,8 @@ class FakeBridge:
         faults: may be changed at any time.
         announce: whether states tell how many programs send commands, which LeRobot's bridge
             does not.
+        detailed: whether states tell casing and winding temperatures, status and lost packets of
+            each motor; LeRobot's bridge sends one temperature and no status.
 
     Raises:
         EnvironmentFailure: a port is in use.
@@ -88,6 +95,7 @@ class FakeBridge:
         ports: Ports | None = None,
         faults: Faults | None = None,
         announce: bool = False,
+        detailed: bool = False,
     ) -> None:
         self._robot = robot
         self.faults = faults or Faults()
@@ -100,6 +108,7 @@ class FakeBridge:
         """Called with every message on the command port."""
         self.counts = Counts()
         self._announce = announce
+        self._detailed = detailed
         self._rng = np.random.default_rng(0)
         self._senders: dict[int, float] = {}
         self._time = 0.0  # s of simulated time since the start
@@ -157,7 +166,7 @@ class FakeBridge:
         """Let 5 ms pass."""
         self._listen()
         self._happen()
-        self.robot.drive(self._intruder() if self.faults.intruder else self._servos)
+        self.robot.drive(self._obeyed())
         self.robot.advance()
         self._time += PHYSICS_DT
         self._publish_state()
@@ -210,6 +219,37 @@ class FakeBridge:
             self.robot.release()
             faults.release = False
 
+    def _obeyed(self) -> Servos:
+        """What the motors do: what they are told, or what a fault makes them do."""
+        servos = self._intruder() if self.faults.intruder else self._servos
+        if self.faults.dropped_motor is None:
+            return servos
+        works = np.arange(NUM_JOINTS) != self.faults.dropped_motor
+        return replace(
+            servos,
+            stiffness=works * servos.stiffness,
+            damping=works * servos.damping,
+            torque=works * servos.torque,
+        )
+
+    def _motors(self, torque: NDArray[np.float64]) -> MotorReadings:
+        """What the motors report, in as much detail as this fake's states have."""
+        faults = self.faults
+        temperature = np.full((NUM_JOINTS, 2), _MOTOR_DEG_C)
+        if faults.hot_motor is not None:
+            joint, degrees = faults.hot_motor
+            temperature[joint] = _MOTOR_DEG_C, degrees
+        if not self._detailed:
+            temperature = temperature.mean(axis=1, keepdims=True)  # as LeRobot's bridge does
+        readings = MotorReadings(torque, None if faults.no_temperature else temperature)
+        if not self._detailed:
+            return readings
+        status, lost = np.zeros(NUM_JOINTS, np.int64), np.zeros(NUM_JOINTS, np.int64)
+        if faults.dropped_motor is not None:
+            status[faults.dropped_motor] = _DISCONNECTED
+            lost[faults.dropped_motor] = self.robot.steps
+        return replace(readings, faults=status, lost=lost, enabled=status == 0)
+
     def _intruder(self) -> Servos:
         """Another program, which holds every joint where it is, a little askew."""
         joints = self.robot.robot.data.qpos[self.robot.robot.index.joint_qpos]
@@ -248,8 +288,9 @@ class FakeBridge:
             angular_velocity=rate,
             mode=self._mode,
             remote=Remote.asking_for(self.robot.velocity_wish, self.pressed).to_bytes(),
+            motors=self._motors(seen.torque),
         )
-        return encode_state(LowState(body, seen.torque, self._sources()), seen.acceleration)
+        return encode_state(LowState(body, self._sources()), seen.acceleration)
 
     def _sources(self) -> int | None:
         """How many programs send commands."""
@@ -266,7 +307,8 @@ class FakeBridge:
         if not self.faults.freeze_camera:
             self._sequence += 1
             fov = self.robot.config.camera.vertical_fov
-            self._last_picture = encode_picture(WirePicture(self._sequence, fov, depth))
+            age = (self.robot.steps - taken) * PHYSICS_DT
+            self._last_picture = encode_picture(WirePicture(self._sequence, fov, depth, age))
         if self._sequence and not self._lost():
             for message in self.tamper_picture(self._last_picture):
                 self._pictures.send(message)

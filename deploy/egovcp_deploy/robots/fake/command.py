@@ -34,7 +34,8 @@ _EPILOG: Final = (
     "Speaks LeRobot's JSON over ZMQ for the motors and our own format for depth. Without a command "
     "for 0.2 s its motors damp: its own choice, not the robot's. While it runs it takes words, one "
     f"a line: Enter or release lets the crane go, quit ends it, and {', '.join(WORDS)} make "
-    "something go wrong (push 0.5 0, drop 0.3, mode 4, intruder off, heal)."
+    "something go wrong (push 0.5 0, drop 0.3, mode 4, hot_motor left_knee 125, dropped_motor "
+    "left_knee, intruder off, heal)."
 )
 
 
@@ -51,7 +52,7 @@ class FakeConfig:
     """Which held-out scenarios, the same that egovcp-eval plays."""
     episode: int = bounded(0, least=0)
     """Number of the first."""
-    episodes: int = bounded(0, least=0)
+    episodes: int = bounded(0, least=0, most=1_000_000)
     """How many; 0: until interrupted."""
     gantry: float | None = bounded(3.0, least=0)
     """How long the motors must have been told to hold something, without a break, before the crane
@@ -64,6 +65,9 @@ class FakeConfig:
     """Where to listen."""
     announce: bool = False
     """Tell in every state how many programs send commands, which LeRobot's bridge does not."""
+    detailed: bool = False
+    """Tell casing and winding temperatures, status and lost packets of each motor in every state;
+    LeRobot's bridge sends one temperature and no status."""
     json: str = ""
     """File for the outcomes, rewritten after each episode."""
     env: EnvConfig = field(default_factory=eventful)
@@ -90,7 +94,7 @@ def run(config: FakeConfig, opened: Callable[[Ports], None] = lambda ports: None
     _check(config)
     robot = LiveRobot(config.env)
     robot.start(held_out(config.task, config.seed, config.episode))
-    bridge = FakeBridge(robot, config.ports, announce=config.announce)
+    bridge = FakeBridge(robot, config.ports, announce=config.announce, detailed=config.detailed)
     schedule = Schedule(config.gantry, config.settle, config.pause)
     stage = Stage(bridge, _scenarios(config), schedule, _say)
     try:

@@ -6,8 +6,11 @@ from dataclasses import dataclass, fields
 from typing import Final
 
 from egovcp.errors import UsageError, suggest
+from egovcp.spec import JOINT_NAMES
 
 _PUSH: Final = (-2.5, 1.0)  # m/s: nothing stands that
+_WEAKEST: Final = JOINT_NAMES.index("left_ankle_roll_joint")  # overheats first on real robots
+_HOT: Final = 125.0  # deg C
 
 
 @dataclass
@@ -34,6 +37,12 @@ class Faults:
     """Another program holds every joint where it is, and nothing tells of it."""
     mode: int | None = None
     """The robot reports another mode machine."""
+    hot_motor: tuple[int, float] | None = None
+    """A joint's motor reports this temperature, deg C (of its winding, where it reports two)."""
+    dropped_motor: int | None = None
+    """A joint's motor no longer obeys: no torque. Without detailed states nothing tells of it."""
+    no_temperature: bool = False
+    """States carry no temperatures, as from older firmware."""
     gyroscope: float = 0.0
     """The gyroscope's x axis reports this rate, rad/s, whatever the robot does."""
     joint_speed: float = 0.0
@@ -50,7 +59,7 @@ class Faults:
     @property
     def active(self) -> list[str]:
         """Names of those that are on."""
-        return [f.name for f in fields(self) if getattr(self, f.name) not in (None, False, 0.0)]
+        return [f.name for f in fields(self) if getattr(self, f.name) != f.default]
 
     def obey(self, line: str) -> str:
         """Do what a line of the console says; return what to answer.
@@ -63,6 +72,8 @@ class Faults:
             self.__init__()  # type: ignore[misc]
         elif word == "push":
             self.push = _pair(rest) if rest else _PUSH
+        elif word in ("hot_motor", "dropped_motor"):
+            self._set_motor(word, rest)
         elif word in _NUMBERS:
             self._set_number(word, rest)
         elif word in _SWITCHES:
@@ -81,6 +92,30 @@ class Faults:
             setattr(self, word, kind(min(max(number, low), high)))
         except (IndexError, ValueError) as error:
             raise UsageError(f"{word} needs a number, such as {word} {example}") from error
+
+    def _set_motor(self, word: str, rest: list[str]) -> None:
+        if rest == ["off"]:
+            setattr(self, word, None)
+            return
+        joint = _joint(rest[0]) if rest else _WEAKEST
+        if word == "dropped_motor":
+            self.dropped_motor = joint
+            return
+        try:
+            self.hot_motor = joint, float(rest[1]) if len(rest) > 1 else _HOT
+        except ValueError as error:
+            raise UsageError(
+                "hot_motor takes a joint and deg C, such as hot_motor left_knee_joint 125"
+            ) from error
+
+
+def _joint(name: str) -> int:
+    """Index of a joint, whose ending ``_joint`` may be left out."""
+    names = {joint.removesuffix("_joint"): i for i, joint in enumerate(JOINT_NAMES)}
+    found = names.get(name.removesuffix("_joint"))
+    if found is None:
+        raise UsageError(f"unknown joint {name!r}{suggest(name, names)}")
+    return found
 
 
 def _pair(words: list[str]) -> tuple[float, float]:
@@ -101,4 +136,4 @@ _NUMBERS: Final[dict[str, tuple[type[int] | type[float], float, float, str]]] = 
 }
 _SWITCHES: Final = tuple(f.name for f in fields(Faults) if f.type == "bool")
 #: All that `Faults.obey` knows.
-WORDS: Final = (*_SWITCHES, *_NUMBERS, "push", "heal")
+WORDS: Final = (*_SWITCHES, *_NUMBERS, "hot_motor", "dropped_motor", "push", "heal")

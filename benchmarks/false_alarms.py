@@ -1,0 +1,48 @@
+"""Checks of the live runner on a healthy simulated robot: none may reject a reading or hold.
+
+Fails (exit code 1) if one does. The robot walks, is pushed, braces and blocks; see
+`egovcp_deploy.fault_injection.false_alarms`.
+"""
+
+from __future__ import annotations
+
+import sys
+
+from report import parser, publish
+
+from egovcp_deploy.fault_injection.false_alarms import SITUATIONS, Healthy
+
+
+def main() -> None:
+    p = parser(__doc__)
+    p.add_argument("--minutes", type=float, default=10.0, help="simulated time, all together")
+    p.add_argument("--seed", type=int, default=0, help="of the scenarios")
+    args = p.parse_args()
+    share = 60.0 * args.minutes / len(SITUATIONS)
+    figures: dict[str, object] = {}
+    total = dict.fromkeys(("seconds", "readings", "rejected", "holds", "falls"), 0.0)
+    for situation in SITUATIONS:
+        healthy, episode = Healthy(situation, args.seed), 0
+        while (alarms := healthy.alarms).seconds < share:
+            healthy.play(episode)
+            episode += 1
+        found = {
+            "seconds": alarms.seconds,
+            "readings": alarms.readings,
+            "rejected": len(alarms.rejected),
+            "holds": len(alarms.events),
+            "falls": alarms.falls,
+        }
+        name = "".join(c if c.isalnum() else "_" for c in situation.name)
+        for key, value in found.items():
+            figures[f"{name}_{key}"] = value
+            total[key] += value
+        for line in [*alarms.rejected[:5], *alarms.events[:5]]:
+            print(f"{situation.name}: {line}", file=sys.stderr)
+    publish(figures | total, args.json)
+    if total["rejected"] or total["holds"]:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

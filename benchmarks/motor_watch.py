@@ -1,0 +1,110 @@
+"""False alarms of the motor watch: simulated walking, standing, reaching and pushes.
+
+Robots of different mass, friction, gains and delay play the skills of `egovcp-eval-lowlevel` with
+sensor noise. Whatever the watch says of one that has not fallen is a false alarm. With --dropped,
+the left knee's motor gives no torque from 3 s on, and the time until it is noticed is measured.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from report import parser, publish
+
+from egovcp.log.tick import MotorReadings
+from egovcp.robot.controllers import make_controller
+from egovcp.sim.config import SensorConfig
+from egovcp.sim.sensors import noise_std
+from egovcp.spec import CONTROLLER_HZ, JOINT_NAMES, STATE_SLICES
+from egovcp_deploy.pilot.motor_watch import MotorWatch
+from egovcp_deploy.robots.body import BodyState, MotorCommand
+from egovcp_train.lowlevel import events
+from egovcp_train.lowlevel.geometry import rotation
+from egovcp_train.lowlevel.physics import Physics
+from egovcp_train.lowlevel.sensing import measure
+from egovcp_train.lowlevel.skills import SKILLS, Skill
+from egovcp_train.lowlevel.task import DisturbanceConfig
+
+_FALLEN_TILT = 0.8  # rad
+_KNEE = JOINT_NAMES.index("left_knee_joint")
+_DROPPED_TICK = 3 * CONTROLLER_HZ
+_TICK_NS = 1_000_000_000 // CONTROLLER_HZ
+
+
+def play(
+    controller_name: str, skill: Skill, robots: int, seed: int, dropped: bool
+) -> tuple[float, list[str], list[float]]:
+    """Seconds of robots that stood, what the watch said of them, and s until it noticed."""
+    rng = np.random.default_rng([seed, 1])
+    config = DisturbanceConfig()
+    physics = Physics(robots, "stock", config, 1, seed)
+    controller = make_controller(controller_name)
+    commands = skill.script(skill.ticks, robots, rng)
+    qpos = events.neutral(robots)
+    physics.place(np.arange(robots), qpos, qpos[:, 7:])
+    delay = events.delays(robots, config, rng)
+    std = noise_std(SensorConfig())
+    x = physics.snapshot()
+    controller.reset(measure(x, commands[0], std, rng))
+    watches = [MotorWatch() for _ in range(robots)]
+    standing: NDArray[np.bool_] = np.ones(robots, np.bool_)
+    seconds, alarms, noticed = 0.0, list[str](), list[float]()
+    for tick, command in enumerate(commands):
+        if skill.push and tick % CONTROLLER_HZ == CONTROLLER_HZ // 2:
+            physics.qvel[:, :2] += events.kick(skill.push, events.directions(robots, rng))
+        target = controller.step(measure(x, command, std, rng))
+        sent = target.copy()
+        if dropped and tick >= _DROPPED_TICK:
+            sent[:, _KNEE] = x.joints[:, _KNEE]  # a servo at its target gives no torque
+        physics.step(sent, delay)
+        x = physics.snapshot()
+        state = measure(x, command, std, rng)
+        standing &= (rotation(x.quaternion)[:, 2, 2] > np.cos(_FALLEN_TILT)) & ~x.broken
+        for i in np.flatnonzero(standing):
+            torque = x.torque[i].copy()
+            if dropped and tick >= _DROPPED_TICK:
+                torque[_KNEE] = 0.0
+            reading = BodyState(
+                tick * _TICK_NS,
+                state[i, STATE_SLICES["joint_position"]],
+                state[i, STATE_SLICES["joint_velocity"]],
+                x.quaternion[i],
+                np.zeros(3),
+                motors=MotorReadings(torque, np.full((29, 1), 40.0)),
+            )
+            motors = MotorCommand(target[i], controller.stiffness, controller.damping)
+            verdict = watches[i].update(reading, motors)
+            seconds += 1.0 / CONTROLLER_HZ
+            if verdict.damp or verdict.hold:
+                alarms.append(f"{skill.name} {tick / CONTROLLER_HZ:.2f} s: {verdict.damp}")
+                noticed.append((tick - _DROPPED_TICK) / CONTROLLER_HZ)
+                standing[i] = False
+    physics.close()
+    return seconds, alarms, noticed
+
+
+def main() -> None:
+    p = parser(__doc__)
+    p.add_argument("--controller", default="walk")
+    p.add_argument("--robots", type=int, default=16)
+    p.add_argument("--skills", nargs="*", default=["stand", "walk", "crouch", "push"])
+    p.add_argument("--dropped", action="store_true")
+    p.set_defaults(rounds=1)
+    args = p.parse_args()
+    total, alarms, noticed = 0.0, list[str](), list[float]()
+    for skill in (skill for skill in SKILLS if skill.name in args.skills):
+        for seed in range(args.rounds):
+            seconds, found, times = play(args.controller, skill, args.robots, seed, args.dropped)
+            print(f"{skill.name:8} {seconds:7.0f} s standing, {len(found)} alarms", flush=True)
+            total, alarms, noticed = total + seconds, alarms + found, noticed + times
+    for line in alarms[:20]:
+        print(line)
+    figures: dict[str, object] = {"seconds": total, "alarms": len(alarms)}
+    if noticed:
+        p50, p99 = np.percentile(noticed, [50, 99])
+        figures |= {"noticed_s_p50": p50, "noticed_s_p99": p99}
+    publish(figures, args.json)
+
+
+if __name__ == "__main__":
+    main()

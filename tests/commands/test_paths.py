@@ -1,0 +1,190 @@
+"""Every option that takes a file or a folder, given something else: refused before work starts."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from egovcp.artefact import save_artefact
+from egovcp.data import DatasetWriter, Provenance
+from egovcp.flags import flags_of
+from egovcp.log.info import RunInfo
+from egovcp.log.mcap import McapSink
+from egovcp.plan import PlannerConfig
+from egovcp.robot.stance import StanceController
+from egovcp.rollouts import CONTROLLER, ticks_of
+from egovcp.testing import random_episode, toy_model
+from egovcp.testing.limited import LimitedResult, run_limited
+
+from .listing import Command, all_commands
+
+SECONDS = 30.0  # on a busy machine; what hangs takes for ever
+STANCE = "--env.controller=stance"
+#: Command -> (its arguments, options that name an input, options that name an output).
+CASES = {
+    "egovcp-collect": (
+        f"--dataset.root=NEW --episodes=1 --num_workers=1 {STANCE}",
+        ("env.controller", "config_path"),
+        ("dataset.root",),
+    ),
+    "egovcp-dataset info": ("DATA", ("dataset.root",), ("json",)),
+    "egovcp-dataset check": ("DATA", ("dataset.root",), ("json",)),
+    "egovcp-dataset repair": (
+        "DATA --output_dir=NEW",
+        ("dataset.root", "records"),
+        ("output_dir", "json"),
+    ),
+    "egovcp-dataset merge": (
+        "DATA DATA --duplicates=drop --output_dir=NEW",
+        ("dataset.root", "others"),
+        ("output_dir", "json"),
+    ),
+    "egovcp-dataset audit": ("DATA", ("dataset.root",), ("json",)),
+    "egovcp-dataset coverage": ("DATA", ("dataset.root",), ("output_dir", "json")),
+    "egovcp-dataset card": ("DATA --output=NEW", ("dataset.root",), ("output", "assets")),
+    "egovcp-dataset viz": ("DATA --output=NEW", ("dataset.root",), ("output",)),
+    "egovcp-dataset push": ("DATA --repo_id=me/data", ("dataset.root",), ()),
+    "egovcp-dataset pull": ("me/data --output_dir=NEW", (), ("output_dir",)),
+    "egovcp-train": (
+        "--dataset.root=DATA --output_dir=NEW --preset=debug --steps=2 --batch_size=2",
+        ("dataset.root", "config_path"),
+        ("output_dir",),
+    ),
+    "egovcp-push": ("--policy.path=POLICY --repo_id=me/policy", ("policy.path",), ()),
+    "egovcp-export": ("--policy.path=POLICY --output_dir=NEW", ("policy.path",), ("output_dir",)),
+    "egovcp-eval-model": (
+        "--policy.path=POLICY --dataset.root=DATA --output_dir=NEW",
+        ("policy.path", "dataset.root"),
+        ("output_dir",),
+    ),
+    "egovcp-train-lowlevel": ("--output_dir=NEW --steps=10", (), ("output_dir",)),
+    "egovcp-eval-lowlevel": (
+        "--controller=stance --episodes=1 --output_dir=NEW",
+        ("controller",),
+        ("output_dir",),
+    ),
+    "egovcp-train-ppo": (
+        f"--output_dir=NEW --steps=10 {STANCE}",
+        ("env.controller",),
+        ("output_dir",),
+    ),
+    "egovcp-tune-gait": ("--output_dir=NEW --minutes=0.01", (), ("output_dir",)),
+    "egovcp-deploy": (
+        f"--policy.path=POLICY --output_dir=NEW --episodes=1 {STANCE}",
+        ("policy.path", "env.controller"),
+        ("output_dir",),
+    ),
+    "egovcp-eval": (
+        f"--policy.path=POLICY --output_dir=NEW --episodes=1 {STANCE}",
+        ("policy.path", "env.controller"),
+        ("output_dir",),
+    ),
+    "egovcp-compare": ("--run=NEW --other=NEW", ("run", "other"), ()),
+    "egovcp-fake-g1": (STANCE, ("env.controller",), ("json",)),
+    "egovcp-mcap info": ("RECORDING", ("file",), ("json",)),
+    "egovcp-mcap recover": ("RECORDING NEW", ("file",), ("output",)),
+    "egovcp-mcap to-dataset": ("RECORDING --dataset.root=NEW", ("files",), ("dataset.root",)),
+    "egovcp-mcap from-dataset": ("DATA NEW", ("dataset.root",), ("output",)),
+    "egovcp-experiment ablations": (
+        "--output_dir=NEW --scale=smoke --tasks=[ball] --only=[default]",
+        ("data.roots", "train.policies"),
+        ("output_dir",),
+    ),
+}
+INPUTS = (
+    *("absent", "fifo", "dangling", "loop", "empty", "folder", "empty/below", "/dev/null"),
+    *("x" * 300, "y/" * 3000, "\x1b[31m", "\udcff", "~nobody/x", "", "recording.mcap"),
+)
+OUTPUTS = ("loop", "empty/below", "x" * 300, "/proc/new", "/dev/null/new", "\udcff", "a\0b", "fifo")
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a dataset, a policy, a recording, and what is none of them."""
+    folder = tmp_path_factory.mktemp("places")
+    provenance = Provenance(StanceController().id, seed=0, command="collect")
+    with DatasetWriter(folder / "data", provenance) as writer:
+        for number in range(3):
+            writer.add(random_episode(number, length=30))
+    planner = PlannerConfig(samples=16, horizon=3, iterations=2, elites=4, eta=0.02)
+    save_artefact(folder / "policy", toy_model(), planner, {"controller_id": StanceController().id})
+    sink = McapSink(folder / "recording.mcap")
+    sink.open(RunInfo("ball", seed=3, episode=7, hashes={CONTROLLER: StanceController().id}))
+    for tick in ticks_of(random_episode(0, length=8)):
+        sink.write(tick)
+    sink.close()
+    os.mkfifo(folder / "fifo")
+    (folder / "dangling").symlink_to("nowhere")
+    (folder / "loop").symlink_to("loop")
+    (folder / "empty").touch()
+    (folder / "folder").mkdir()
+    return folder
+
+
+def test_every_command_with_paths_is_covered() -> None:
+    without = {"egovcp-depth-server"}
+    assert {c.prog for c in all_commands()} == CASES.keys() | without
+
+
+@pytest.mark.parametrize("prog", CASES)
+def test_a_bad_path_is_refused_before_work_starts(
+    prog: str, places: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(places)
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    command = next(c for c in all_commands() if c.prog == prog)
+    before = _contents(places)
+    problems = []
+    for flag, value in _bad_flags(prog):
+        argv = [*command.arguments, *_arguments(prog), f"{flag}={value}"]
+        found = run_limited(lambda argv=argv: command.main(argv), SECONDS)
+        if problem := _problem(command, flag, value, found):
+            problems.append(f"{prog} {flag}={value[:60]!a}: {problem}")
+        if created := _contents(places) - before:
+            problems.append(f"{prog} {flag}={value[:60]!a}: created {created}")
+            before |= created
+    assert not problems, "\n".join(problems)
+
+
+def _arguments(prog: str) -> list[str]:
+    names = {"DATA": "data", "POLICY": "policy", "RECORDING": "recording.mcap"}
+    text = CASES[prog][0]
+    for name, path in names.items():
+        text = text.replace(name, path)
+    return text.replace("NEW", "new").split()
+
+
+def _bad_flags(prog: str) -> Iterator[tuple[str, str]]:
+    _, inputs, outputs = CASES[prog]
+    for options, values in ((inputs, INPUTS), (outputs, OUTPUTS)):
+        for option in options:
+            for value in values:
+                if option in ("others", "files"):
+                    value = f'["{value}"]'
+                elif option in ("data.roots", "train.policies"):
+                    value = f'{{ball: "{value}"}}'
+                yield f"--{option}", value
+
+
+def _problem(command: Command, flag: str, value: str, found: LimitedResult) -> str:
+    output = found.output.replace("\n", "\\n")[-600:]
+    if found.timed_out:
+        return f"took more than {SECONDS} s: {output}"
+    if found.has_traceback or not 2 <= found.exit_code <= 5:
+        return f"exit code {found.exit_code}: {output}"
+    errors = [line for line in found.output.splitlines() if ": error: " in line]
+    if len(errors) != 1 or not errors[0].isprintable():
+        return f"expected one line: {output}"
+    named = {f for f in re.findall(r"(?<![\w.-])--[a-z][\w.]*", errors[0]) if "`" not in errors[0]}
+    known = {*flags_of(command.config_class), "--help", "--debug"}
+    if strange := {f for f in named if f.rstrip(".") not in known}:
+        return f"names {strange}: {output}"
+    return ""
+
+
+def _contents(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}

@@ -1,0 +1,200 @@
+"""What `--dry_run` says of a robot: one line per check, and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.robot.stance_table import standing_pose
+from egovcp.sim.config import EnvConfig, EpisodeConfig
+from egovcp.sim.live import LiveRobot
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import ACTION_BOX, JOINT_NAMES
+from egovcp_deploy.deploy import main
+from egovcp_deploy.live.preflight import arrivals, image_age, joint_offsets, posture
+from egovcp_deploy.robots.arrivals import ArrivalStats
+from egovcp_deploy.robots.fake import FakeBridge, Ports
+from egovcp_deploy.robots.fake.running import Running
+from egovcp_deploy.robots.machine import describe
+
+NEUTRAL = standing_pose(ACTION_BOX.neutral[-1]).joints
+KNEE = JOINT_NAMES.index("left_knee_joint")
+PITCH = [JOINT_NAMES.index(f"{side}_ankle_pitch_joint") for side in ("left", "right")]
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+def moved(joint: int | list[int], by: float) -> np.ndarray:
+    joints = NEUTRAL.copy()
+    joints[joint] += by
+    return joints
+
+
+def pitched(angle: float) -> np.ndarray:
+    return np.array([np.cos(angle / 2), 0.0, np.sin(angle / 2), 0.0])
+
+
+def test_joints_near_neutral_are_counted_and_the_others_named() -> None:
+    assert joint_offsets(NEUTRAL) == "29 joints within 0.1 rad of neutral"
+    words = joint_offsets(moved(KNEE, -0.5))
+    assert words == "28 joints within 0.1 rad of neutral; left_knee -0.50"
+
+
+def test_a_joint_far_from_neutral_or_outside_its_range_is_a_no_go() -> None:
+    with pytest.raises(EnvironmentFailure, match=r"left_knee_joint is \+1.80 rad from neutral"):
+        joint_offsets(moved(KNEE, 1.8))
+    with pytest.raises(EnvironmentFailure, match=r"left_knee_joint reports .* calibrate its zero"):
+        joint_offsets(moved(KNEE, -1.2))
+
+
+def test_a_pelvis_above_flat_feet_agrees_with_the_imu() -> None:
+    words = posture(NEUTRAL, UPRIGHT)
+    assert "0.00 rad from upright, pelvis 0.74 m" in words
+    assert "0.00 (left) and 0.00 rad (right)" in words
+    assert "calibrate" not in words
+
+
+def test_ankles_that_contradict_the_imu_are_pointed_out() -> None:
+    words = posture(moved(PITCH, 0.3), UPRIGHT)
+    assert "0.30 (left) and 0.30 rad (right)" in words
+    assert "hang in the air" in words
+    assert "calibrate" in posture(NEUTRAL, pitched(0.25))
+    leaning = posture(moved(PITCH, -0.25), pitched(0.25))
+    assert "0.00 (left) and 0.00 rad (right)" in leaning, "leans over feet that are flat"
+
+
+def test_a_robot_that_is_not_upright_is_a_no_go() -> None:
+    with pytest.raises(EnvironmentFailure, match=r"tilted by 0.50 rad.*hang the robot up upright"):
+        posture(NEUTRAL, pitched(0.5))
+
+
+@pytest.mark.parametrize(
+    ("stats", "expected"),
+    [
+        (ArrivalStats(60.0, 1.0, 20.0, 0.0), "at least 100 per second"),
+        (ArrivalStats(200.0, 1.0, 150.0, 0.0), "gaps of at most 100 ms"),
+        (ArrivalStats(200.0, 1.0, 20.0, 0.08), "at most 5% lost"),
+    ],
+)
+def test_a_bad_connection_is_a_no_go(stats: ArrivalStats, expected: str) -> None:
+    with pytest.raises(EnvironmentFailure, match=expected):
+        arrivals(stats, 100.0, 100.0, "states")
+
+
+def test_a_good_connection_in_figures() -> None:
+    assert arrivals(ArrivalStats(200.0, 1.2, 20.0, 0.01), 100.0, 100.0, "states") == (
+        "200 states per second, jitter 1.2 ms (p99), longest gap 20 ms, 1.0% lost"
+    )
+
+
+def test_the_age_of_images_is_measured_where_the_camera_tells() -> None:
+    assert image_age([], 80.0).startswith("not measured")
+    assert image_age([30.0, 40.0, 50.0], 80.0).startswith("40 ms when they arrive")
+    with pytest.raises(EnvironmentFailure, match="expected at most 80"):
+        image_age([90.0, 95.0], 80.0)
+
+
+def test_modes_in_words() -> None:
+    assert describe(5) == "mode machine 5: 29 joints, waist free"
+    assert describe(6).startswith("mode machine 6: 29 joints, waist locked; warning: the waist")
+    assert "not known" in describe(77)
+
+
+@pytest.fixture(scope="module")
+def robot() -> LiveRobot:
+    quiet = EpisodeConfig(ticks=10_000, event_ticks=(9000, 9000), empty_probability=1.0)
+    return LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
+
+
+type Look = Callable[..., tuple[int, dict[str, str]]]
+
+
+@pytest.fixture
+def look(
+    robot: LiveRobot,
+    artefact_dir: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> Look:
+    """``look(change, ...)``: a dry run before a fake robot; exit code and line per check.
+
+    The limits of the connection are those of a busy machine.
+    """
+    limits = {"STATE_HZ": 5.0, "IMAGE_HZ": 1.0, "MOST_LOST": 0.95, "LISTEN_S": 1.5}
+    for name, value in limits.items():
+        monkeypatch.setattr(f"egovcp_deploy.live.preflight.{name}", value)
+
+    def look(change: Callable[[FakeBridge], object], detailed: bool = True) -> Any:
+        robot.start(Scenario("ball", 0, 0))
+        ports = Ports(command_port=0, state_port=0, camera_port=0)
+        fake = FakeBridge(robot, ports, detailed=detailed)
+        change(fake)
+        running = Running(fake)
+        try:
+            code = main(
+                [
+                    *("--dry_run=true", "--robot.type=unitree_g1", "--robot.controller=stance"),
+                    f"--policy.path={artefact_dir}",
+                    f"--output_dir={tmp_path / 'run'}",
+                    f"--robot.bridge.state_port={fake.ports.state_port}",
+                    f"--robot.bridge.command_port={fake.ports.command_port}",
+                    f"--robot.camera.server.port={fake.ports.camera_port}",
+                    *("--robot.limits.state_hold_s=5", "--robot.limits.state_damp_s=10"),
+                    *("--robot.limits.picture_hold_s=5", "--env.delay.image_age=[0.02,5.0]"),
+                    *("--planner.samples=16", "--planner.elites=4"),
+                ]
+            )
+        finally:
+            running.stop()
+            fake.close()
+        lines = [line for line in capsys.readouterr().out.splitlines() if ": " in line]
+        return code, {line[7:].partition(": ")[0]: line for line in lines}
+
+    return look
+
+
+def test_a_robot_that_is_well_is_go_in_every_line(look: Look) -> None:
+    def settle(fake: FakeBridge) -> None:
+        """Its limp joints come to rest; moving ones are damped by torques that nobody commands."""
+        for _ in range(400):
+            fake.step()
+
+    _, lines = look(settle)
+    checks = ["mode", "joints", "posture", "motors", "states", "other publishers"]
+    checks += ["controller", "robot", "camera", "images", "image age"]
+    assert [lines[name] for name in checks if not lines[name].startswith("go")] == []
+    assert "mode machine 5: 29 joints, waist free" in lines["mode"]
+    assert "casing 35 deg C, winding 35 deg C" in lines["motors"]
+    assert "when they arrive" in lines["image age"]
+
+
+def test_a_hot_motor_is_a_no_go_and_named(look: Look) -> None:
+    code, lines = look(lambda fake: fake.faults.obey("hot_motor left_ankle_roll 110"))
+    assert code == 5
+    assert lines["motors"].startswith("NO-GO")
+    assert "left_ankle_roll_joint is at casing 35 deg C, winding 110 deg C" in lines["motors"]
+
+
+def test_a_bridge_without_temperatures_is_go_and_says_which_checks_are_off(look: Look) -> None:
+    _, lines = look(lambda fake: fake.faults.obey("no_temperature"), detailed=False)
+    assert lines["motors"].startswith("go")
+    assert "no temperatures are reported; checks that are off" in lines["motors"]
+
+
+def test_a_robot_with_a_locked_waist_is_a_no_go(look: Look) -> None:
+    code, lines = look(lambda fake: fake.faults.obey("mode 6"))
+    assert code == 5
+    assert lines["robot"].startswith("NO-GO")
+    assert "waist is locked" in lines["robot"]
+    assert lines["image age"].startswith("go"), "the camera is looked at all the same"
+
+
+def test_another_program_that_commands_is_a_no_go(look: Look) -> None:
+    code, lines = look(lambda fake: fake.faults.obey("intruder"))
+    assert code == 5
+    assert lines["other publishers"].startswith("NO-GO")
