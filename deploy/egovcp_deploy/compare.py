@@ -30,8 +30,8 @@ _EPILOG: Final = (
     "Differences are RUN - OTHER, and their 95 % intervals come from drawing scenarios again, each "
     "with both of its episodes, so that how hard it is does not count. An interval without 0 is a "
     "difference that chance hardly explains. Options in which the runs differ are listed first: "
-    "with other `egovcp-eval --env.*` the scenes are not the same. With one run, compare two of its controllers: "
-    "--other_controller=hold."
+    "with other `egovcp-eval --env.*` the scenes are not the same. With one run, compare two of "
+    "its controllers: --other_controller=hold."
 )
 _HEAD: Final = (
     *("task", "episodes", "success", "other", "points", "95 %"),

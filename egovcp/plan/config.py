@@ -46,7 +46,8 @@ class PlannerConfig:
     process: Process = "walk"
     """What candidates are made of. walk: a step of its own in every tick, as the paper's data;
     ramp: the steps drawn add up to one place, to which it goes by eta a tick and where it rests, as
-    data of a longer `egovcp-collect --step_ticks`. Its first action is found with fewer candidates."""
+    data of a longer `egovcp-collect --step_ticks`. Its first action is found with fewer
+    candidates."""
     termination_threshold: float = bounded(0.9, least=0, most=1)
     """A candidate whose termination probability exceeds this loses its later values."""
     termination_rule: TerminationRule = "shift"

@@ -175,7 +175,8 @@ class ExperimentConfig:
     most: int = bounded(0, least=0)
     """Of all, only so many variants; 0: no limit."""
     scenes: tuple[str, ...] = ()
-    """Flags of both collection and play, of `egovcp-collect --env.*`, '[--env.controller=stance]'."""
+    """Flags of both collection and play, as of `egovcp-collect --env.*`:
+    '[--env.controller=stance]'."""
     data: DataConfig = field(default_factory=DataConfig)
     """Data."""
     train: TrainingConfig = field(default_factory=TrainingConfig)
