@@ -75,7 +75,8 @@ def test_an_interrupt_during_work_ends_the_command(run: Run) -> None:
 
 
 def test_an_interrupt_during_a_late_import_is_delivered_after_it(run: Run, tmp_path: Path) -> None:
-    late = f"try:\n    import os, signal\n    {INTERRUPT.splitlines()[1]}\nexcept BaseException:\n    pass\n"
+    late = f"try:\n    import os, signal\n    {INTERRUPT.splitlines()[1]}\n"
+    late += "except BaseException:\n    pass\n"
     (tmp_path / "late_import.py").write_text(late, encoding="utf-8")
     body = "def run(config):\n    import late_import, time\n    print('imported', flush=True)\n"
     done = run(f"{RUN_COMMAND}{body}    time.sleep(30)\n")
