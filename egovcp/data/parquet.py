@@ -67,24 +67,48 @@ def open_parquet(path: Path, rows: int | None = None) -> pq.ParquetFile:
     with damaged(path):
         size = require_regular(path).st_size
         file = pq.ParquetFile(path)
-        for problem in _size_problems(file.metadata, size, rows):
+        for problem in _row_problems(file.metadata, rows):
+            raise DataError.at(path, problem)
+        _parse_column_chunks(path)
+        for problem in _column_problems(file.metadata, size):
             raise DataError.at(path, problem)
         return file
 
 
-def _size_problems(content: pq.FileMetaData, size: int, rows: int | None) -> Iterator[str]:
+def _parse_column_chunks(path: Path) -> None:
+    """Let Arrow's reader parse the footer's entry of every column chunk, and one row.
+
+    `RowGroupMetaData.column` aborts the process where an entry contradicts the schema; the reader
+    raises. With `pre_buffer` it parses all entries before it reads the first row.
+    """
+    with pq.ParquetFile(path, pre_buffer=True) as file:
+        next(file.iter_batches(batch_size=1, use_threads=False), None)
+
+
+def _row_problems(content: pq.FileMetaData, rows: int | None) -> Iterator[str]:
     if content.num_columns > _COLUMNS:
         yield f"has {content.num_columns} columns, expected at most {_COLUMNS}"
     if content.num_rows < 0 or (rows is not None and content.num_rows > rows):
         expected = "none below 0" if rows is None else f"at most {rows}"
         yield f"has {content.num_rows} rows, expected {expected}"
-    total, stored = 0, content.serialized_size
+    total = 0
     for number in range(content.num_row_groups):
         group = content.row_group(number)
         total += group.num_rows
         if not 0 <= group.num_rows <= ROW_GROUP_ROWS:
             found = f"row group {number} has {group.num_rows} rows"
             yield f"{found}, expected at most {ROW_GROUP_ROWS}"
+        if group.num_columns != content.num_columns:
+            found = f"row group {number} has {group.num_columns} columns"
+            yield f"{found}, expected {content.num_columns}"
+    if total != content.num_rows:
+        yield f"has {content.num_rows} rows, but its row groups {total}"
+
+
+def _column_problems(content: pq.FileMetaData, size: int) -> Iterator[str]:
+    stored = content.serialized_size
+    for number in range(content.num_row_groups):
+        group = content.row_group(number)
         for index in range(group.num_columns):
             column = group.column(index)
             stored += max(0, column.total_compressed_size)
@@ -96,7 +120,5 @@ def _size_problems(content: pq.FileMetaData, size: int, rows: int | None) -> Ite
             if not 0 <= column.num_values <= values:
                 found = f"holds {column.num_values} values"
                 yield f"column {column.path_in_schema} {found}, expected at most {values}"
-    if total != content.num_rows:
-        yield f"has {content.num_rows} rows, but its row groups {total}"
     if size > stored + _PADDING_BYTES:
         yield f"has {size} bytes, but its row groups only {stored}"
