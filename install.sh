@@ -17,6 +17,9 @@ find_python() {
   exit 5
 }
 
-[ -x .venv/bin/python ] || "$(find_python)" -m venv .venv
+if [ ! -x .venv/bin/python ]; then
+  python=$(find_python)
+  "$python" -m venv .venv
+fi
 .venv/bin/python -m pip install --quiet --disable-pip-version-check "uv>=0.8"
 VIRTUAL_ENV="$PWD/.venv" .venv/bin/uv sync --active --locked --quiet
