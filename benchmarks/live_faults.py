@@ -23,9 +23,9 @@ from egovcp_deploy.live.priority import raise_priority
 RIG_PRIORITY = 5
 
 
-def burn() -> None:
-    """Occupy a core until killed."""
-    while True:
+def burn(parent: int) -> None:
+    """Occupy a core until killed, or until the parent process has ended."""
+    while os.getppid() == parent:
         sum(range(10000))
 
 
@@ -33,7 +33,9 @@ def burn() -> None:
 def loaded(processes: int) -> Iterator[None]:
     """``processes`` busy processes beside the measurement."""
     context = multiprocessing.get_context("spawn")
-    busy = [context.Process(target=burn, daemon=True) for _ in range(processes)]
+    busy = [
+        context.Process(target=burn, args=(os.getpid(),), daemon=True) for _ in range(processes)
+    ]
     for process in busy:
         process.start()
     try:

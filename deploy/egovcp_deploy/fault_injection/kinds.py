@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
-import time
-import zlib
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -15,7 +12,9 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.plan import PolicyStep
-from egovcp.spec import ACTION_DIM, JOINT_NAMES
+from egovcp.spec import ACTION_DIM
+from egovcp_deploy.fault_injection import messages as m
+from egovcp_deploy.fault_injection.messages import Tamper
 from egovcp_deploy.fault_injection.proxy import Stream
 from egovcp_deploy.fault_injection.rig import FaultRig, answer_steadily, steady
 from egovcp_deploy.live.link import Order, encode_reply
@@ -23,10 +22,6 @@ from egovcp_deploy.pilot.desk import Reply, Report
 from egovcp_deploy.pilot.states import Request
 
 Begin = Callable[[FaultRig], None]
-Tamper = Callable[[bytes], Iterable[bytes]]
-Edit = Callable[[dict[str, Any]], None]
-
-_KNEE: Final = JOINT_NAMES.index("left_knee_joint")
 
 
 class Outcome(StrEnum):
@@ -39,7 +34,7 @@ class Outcome(StrEnum):
     DAMP = "damp"
     """Damped within the limit of the last good reading."""
     LATER = "later"
-    """Damped at some time: once the robot tilts, or once no more good states get through."""
+    """Damped at some time: m.once the robot tilts, or m.once no more good states get through."""
     ANY = "any"
     """Not known here, or not the runner's to decide; only the commands are judged."""
 
@@ -83,138 +78,25 @@ def _replaced(*messages: bytes) -> Begin:
     return _states(lambda message: messages)
 
 
-def _edited(edit: Edit) -> Tamper:
-    def tamper(message: bytes) -> Iterable[bytes]:
-        content = json.loads(message)
-        edit(content["data"])
-        return (json.dumps(content).encode(),)
-
-    return tamper
-
-
-def _once(tamper: Tamper) -> Tamper:
-    """Only the first state."""
-    return _every(10**9, tamper)
-
-
-def _every(period: int, tamper: Tamper) -> Tamper:
-    """The first state and then every ``period``-th."""
-    count = iter(range(10**12))
-    return lambda message: tamper(message) if next(count) % period == 0 else (message,)
-
-
-def _for_seconds(duration: float, tamper: Tamper) -> Tamper:
-    """Only the states of the first ``duration`` s."""
-    begin: list[float] = []
-
-    def during(message: bytes) -> Iterable[bytes]:
-        now = time.monotonic()
-        begin.extend([now] if not begin else [])
-        return tamper(message) if now - begin[0] < duration else (message,)
-
-    return during
-
-
-def _nothing(message: bytes) -> Iterable[bytes]:
-    return ()
-
-
-def _garbage(number: int) -> list[bytes]:
-    """New each time: a message that repeats the one before costs nothing."""
-    return [os.urandom(_GARBAGE_BYTES) for _ in range(number)]
-
-
-def _valid_json(number: int) -> list[bytes]:
-    """30 kB each."""
-    values = np.random.default_rng().random(1500).tolist()
-    body = {"topic": "rt/lowstate", "data": {"x": values}}
-    return [json.dumps(body | {"n": i}).encode() for i in range(number)]
-
-
-def _with(extra: Callable[[], Iterable[bytes]]) -> Tamper:
-    """Each state, and further messages after it."""
-    return lambda message: (message, *extra())
-
-
 def _instead(messages: Callable[[], Iterable[bytes]]) -> Begin:
     return _states(lambda message: messages())
 
 
-def _motor(joint: int, name: str, change: Callable[[float], object]) -> Edit:
-    def edit(data: dict[str, Any]) -> None:
-        motor = data["motor_state"][joint]
-        motor[name] = change(motor[name])
+def _dropped(tamper: Tamper) -> Begin:
+    """The left knee gives no torque, and its states say so."""
 
-    return edit
+    def begin(rig: FaultRig) -> None:
+        rig.fake.faults.dropped_motor = m.KNEE
+        rig.fake.tamper_state = tamper
 
-
-def _all_motors(name: str, change: Callable[[int, float], object]) -> Edit:
-    def edit(data: dict[str, Any]) -> None:
-        for i, motor in enumerate(data["motor_state"][: len(JOINT_NAMES)]):
-            motor[name] = change(i, motor[name])
-
-    return edit
-
-
-def _imu(name: str, change: Callable[[list[float]], object]) -> Edit:
-    def edit(data: dict[str, Any]) -> None:
-        data["imu_state"][name] = change(data["imu_state"][name])
-
-    return edit
-
-
-def _set(name: str, value: object) -> Edit:
-    return lambda data: data.__setitem__(name, value)
-
-
-def _without(name: str) -> Edit:
-    def edit(data: dict[str, Any]) -> None:
-        del data[name]
-
-    return edit
-
-
-def _rolled(quaternion: list[float], angle: float = 0.8) -> list[float]:
-    w, x, y, z = quaternion
-    c, s = np.cos(angle / 2), np.sin(angle / 2)
-    return [float(v) for v in (w * c - x * s, w * s + x * c, y * c + z * s, z * c - y * s)]
-
-
-def _wild(data: dict[str, Any]) -> None:
-    rng = np.random.default_rng(zlib.crc32(json.dumps(data["motor_state"][0]).encode()))
-    for motor in data["motor_state"][: len(JOINT_NAMES)]:
-        motor["q"] = float(rng.uniform(-0.2, 0.2))
-        motor["dq"] = float(rng.uniform(-10, 10))
-
-
-def _raw(text: str, number: str) -> Tamper:
-    """The first knee position replaced by ``number`` as it stands."""
-
-    def tamper(message: bytes) -> Iterable[bytes]:
-        content = json.loads(message)
-        content["data"]["motor_state"][_KNEE]["q"] = text
-        return (json.dumps(content).replace(f'"{text}"', number).encode(),)
-
-    return tamper
+    return begin
 
 
 def _number(number: str) -> Begin:
-    return _states(_raw("PLACEHOLDER", number))
+    return _states(m.raw_position("PLACEHOLDER", number))
 
 
-_GARBAGE_BYTES: Final = 2000
 _FULL_RATE: Final = 100  # messages per state, 20 000 a second
-
-
-def _repeats() -> Tamper:
-    """Each state is the first one, twenty times."""
-    first: list[bytes] = []
-
-    def tamper(message: bytes) -> Iterable[bytes]:
-        first.extend([message] if not first else [])
-        return first * 20
-
-    return tamper
 
 
 def _stream(stream: Stream, tamper: Tamper | None = None) -> Begin:
@@ -230,11 +112,11 @@ _R, _H, _D, _ANY = Outcome.RUN, Outcome.HOLD, Outcome.DAMP, Outcome.ANY
 
 _STATES: Final = (
     FaultKind("state: silent", _D, _fault("mute_state")),
-    FaultKind("state: silent for 60 ms", _R, _states_anew(lambda: _for_seconds(0.06, _nothing))),
-    FaultKind("state: silent for 150 ms", _H, _states_anew(lambda: _for_seconds(0.15, _nothing))),
+    FaultKind("state: silent for 60 ms", _R, _states_anew(lambda: m.for_seconds(0.06, m.nothing))),
+    FaultKind("state: silent for 150 ms", _H, _states_anew(lambda: m.for_seconds(0.15, m.nothing))),
     FaultKind("state: frozen", _D, _fault("freeze_state")),
-    FaultKind("state: every second torn", _R, _fault("garble_state")),
-    FaultKind("state: all torn", _D, _states(lambda m: (m[: len(m) // 2],))),
+    FaultKind("state: m.every second torn", _R, _fault("garble_state")),
+    FaultKind("state: all torn", _D, _states(lambda message: (message[: len(message) // 2],))),
     FaultKind("state: 30 % lost", _R, _fault("drop", 0.3)),
     FaultKind("state: empty messages", _D, _replaced(b"")),
     FaultKind("state: not JSON", _D, _replaced(b"\xff\xfe not json")),
@@ -248,78 +130,113 @@ _STATES: Final = (
     FaultKind("state: position null", _D, _number("null")),
     FaultKind("state: position a string", _D, _number('"0.3"')),
     FaultKind("state: position true", _D, _number("true")),
-    FaultKind("state: no motors", _D, _states(_edited(_without("motor_state")))),
+    FaultKind("state: no motors", _D, _states(m.edited(m.without_field("motor_state")))),
     FaultKind(
         "state: 29 motor slots",
         _D,
-        _states(_edited(lambda d: d.__setitem__("motor_state", d["motor_state"][:29]))),
+        _states(m.edited(lambda d: d.__setitem__("motor_state", d["motor_state"][:29]))),
     ),
-    FaultKind("state: no IMU", _D, _states(_edited(_without("imu_state")))),
-    FaultKind("state: no mode machine", _D, _states(_edited(_without("mode_machine")))),
+    FaultKind("state: no IMU", _D, _states(m.edited(m.without_field("imu_state")))),
+    FaultKind("state: no mode machine", _D, _states(m.edited(m.without_field("mode_machine")))),
     FaultKind(
-        "state: remote control not base64", _D, _states(_edited(_set("wireless_remote", "%")))
+        "state: remote control not base64",
+        _D,
+        _states(m.edited(m.set_field("wireless_remote", "%"))),
     ),
     FaultKind(
-        "state: quaternion zero", _D, _states(_edited(_imu("quaternion", lambda q: [0.0] * 4)))
+        "state: quaternion zero", _D, _states(m.edited(m.imu("quaternion", lambda q: [0.0] * 4)))
     ),
     FaultKind(
         "state: quaternion of length 2",
         _D,
-        _states(_edited(_imu("quaternion", lambda q: [2 * v for v in q]))),
+        _states(m.edited(m.imu("quaternion", lambda q: [2 * v for v in q]))),
     ),
 )
-_gyro: Final = _edited(_imu("gyroscope", lambda w: [150.0, *w[1:]]))
-_speed: Final = _edited(_motor(_KNEE, "dq", lambda v: 190.0))
-_jump: Final = _edited(_motor(_KNEE, "q", lambda q: q + 0.5))
+_gyro: Final = m.edited(m.imu("gyroscope", lambda w: [150.0, *w[1:]]))
+_speed: Final = m.edited(m.motor(m.KNEE, "dq", lambda v: 190.0))
+_jump: Final = m.edited(m.motor(m.KNEE, "q", lambda q: q + 0.5))
 _IMPLAUSIBLE: Final = (
     FaultKind("gyroscope: 150 rad/s", _D, _fault("gyroscope", 150.0)),
-    FaultKind("gyroscope: 150 rad/s once", _R, _states_anew(lambda: _once(_gyro))),
-    FaultKind("gyroscope: 150 rad/s at 50 Hz", _R, _states_anew(lambda: _every(4, _gyro))),
+    FaultKind("gyroscope: 150 rad/s once", _R, _states_anew(lambda: m.once(_gyro))),
+    FaultKind("gyroscope: 150 rad/s at 50 Hz", _R, _states_anew(lambda: m.every(4, _gyro))),
     FaultKind("gyroscope: 20 rad/s", _D, _fault("gyroscope", 20.0)),
     FaultKind("joint speed: 190 rad/s", _D, _fault("joint_speed", 190.0)),
-    FaultKind("joint speed: 190 rad/s once", _R, _states_anew(lambda: _once(_speed))),
-    FaultKind("joint speed: 190 rad/s at 50 Hz", _R, _states_anew(lambda: _every(4, _speed))),
+    FaultKind("joint speed: 190 rad/s once", _R, _states_anew(lambda: m.once(_speed))),
+    FaultKind("joint speed: 190 rad/s at 50 Hz", _R, _states_anew(lambda: m.every(4, _speed))),
     FaultKind("joint speed: 25 rad/s", _D, _fault("joint_speed", 25.0)),
     FaultKind(
         "joint speed: all +-190 rad/s",
         _D,
-        _states(_edited(_all_motors("dq", lambda i, v: 190.0 * (-1) ** i))),
+        _states(m.edited(m.all_motors("dq", lambda i, v: 190.0 * (-1) ** i))),
     ),
-    FaultKind("joint position: 9 rad", _D, _states(_edited(_motor(_KNEE, "q", lambda q: 9.0)))),
+    FaultKind("joint position: 9 rad", _D, _states(m.edited(m.motor(m.KNEE, "q", lambda q: 9.0)))),
     FaultKind("joint position: jumps by 0.5 rad", _D, _states(_jump)),
-    FaultKind("joint position: jumps by 0.5 rad once", _R, _states_anew(lambda: _once(_jump))),
-    FaultKind("joint position: all zero", _D, _states(_edited(_all_motors("q", lambda i, q: 0.0)))),
-    FaultKind("joints: random within bounds", _D, _states(_edited(_wild))),
-    FaultKind("torque: 900 N m", _D, _states(_edited(_motor(_KNEE, "tau_est", lambda t: 900.0)))),
+    FaultKind("joint position: jumps by 0.5 rad once", _R, _states_anew(lambda: m.once(_jump))),
+    FaultKind(
+        "joint position: all zero", _D, _states(m.edited(m.all_motors("q", lambda i, q: 0.0)))
+    ),
+    FaultKind("joints: random within bounds", _D, _states(m.edited(m.random_joints))),
+    FaultKind(
+        "torque: 900 N m", _D, _states(m.edited(m.motor(m.KNEE, "tau_est", lambda t: 900.0)))
+    ),
     FaultKind(
         "torque: 900 N m once",
         _R,
-        _states_anew(lambda: _once(_edited(_motor(_KNEE, "tau_est", lambda t: 900.0)))),
+        _states_anew(lambda: m.once(m.edited(m.motor(m.KNEE, "tau_est", lambda t: 900.0)))),
     ),
-    FaultKind("orientation: jumps by 0.8 rad", _D, _states(_edited(_imu("quaternion", _rolled)))),
+    FaultKind(
+        "orientation: jumps by 0.8 rad", _D, _states(m.edited(m.imu("quaternion", m.rolled)))
+    ),
     FaultKind(
         "orientation: jumps by 0.8 rad once",
         _R,
-        _states_anew(lambda: _once(_edited(_imu("quaternion", _rolled)))),
+        _states_anew(lambda: m.once(m.edited(m.imu("quaternion", m.rolled)))),
     ),
     FaultKind("mode machine: 5 to 6", _D, _fault("mode", 6)),
     FaultKind("mode machine: 5 to 4", _D, _fault("mode", 4)),
     FaultKind(
-        "mode machine: 0 once", _R, _states_anew(lambda: _once(_edited(_set("mode_machine", 0))))
+        "mode machine: 0 once",
+        _R,
+        _states_anew(lambda: m.once(m.edited(m.set_field("mode_machine", 0)))),
     ),
 )
-_FLOODS: Final = (
-    FaultKind("flood: 2 kB garbage, 40 per 10 ms", _R, _states(_with(lambda: _garbage(20)))),
-    FaultKind("flood: the same without states", _D, _instead(lambda: _garbage(20))),
-    FaultKind("flood: garbage at full rate", _ANY, _states(_with(lambda: _garbage(_FULL_RATE)))),
+_OVERHEATED: Final = 0x200  # status bits, see `motor_fields.FAULTS`
+_DISCONNECTED: Final = 0x80000000
+_MOTORS: Final = (
+    FaultKind("motor: winding at 125 deg C", _H, _fault("hot_motor", (m.KNEE, 125.0)), 1.0),
     FaultKind(
-        "flood: the same without states, full rate", _D, _instead(lambda: _garbage(_FULL_RATE))
+        "motor: status overheated", _H, _states(m.knee_reports("motorstate", 0, _OVERHEATED)), 1.0
     ),
-    FaultKind("flood: 30 kB of valid JSON without states", _D, _instead(lambda: _valid_json(5))),
-    FaultKind("flood: one state repeated", _D, _states_anew(lambda: _repeats())),
-    FaultKind("flood: oversized messages", Outcome.LATER, _states(_with(lambda: [b"x" * 200_000]))),
+    FaultKind("motor: no temperatures", _R, _fault("no_temperature")),
+    FaultKind("motor: temperature 900 deg C", _R, _states(m.knee_reports("temperature", 40, 900))),
+    FaultKind(
+        "motor: dropped, status disconnected",
+        _D,
+        _dropped(m.knee_reports("motorstate", 0, _DISCONNECTED)),
+    ),
+    FaultKind("motor: dropped, mode off", _D, _dropped(m.knee_reports("mode", 1, 0))),
+    FaultKind("motor: dropped without a report", Outcome.LATER, _fault("dropped_motor", m.KNEE)),
+)
+_FLOODS: Final = (
+    FaultKind(
+        "flood: 2 kB m.garbage, 40 per 10 ms", _R, _states(m.followed_by(lambda: m.garbage(20)))
+    ),
+    FaultKind("flood: the same without states", _D, _instead(lambda: m.garbage(20))),
+    FaultKind(
+        "flood: m.garbage at full rate", _ANY, _states(m.followed_by(lambda: m.garbage(_FULL_RATE)))
+    ),
+    FaultKind(
+        "flood: the same without states, full rate", _D, _instead(lambda: m.garbage(_FULL_RATE))
+    ),
+    FaultKind("flood: 30 kB of valid JSON without states", _D, _instead(lambda: m.valid_json(5))),
+    FaultKind("flood: one state repeated", _D, _states_anew(lambda: m.repeats())),
+    FaultKind(
+        "flood: oversized messages", Outcome.LATER, _states(m.followed_by(lambda: [b"x" * 200_000]))
+    ),
     FaultKind("flood: oversized without states", _D, _replaced(*[b"x" * 200_000] * 4)),
-    FaultKind("flood: garbage in split packets", _D, _stream(Stream.SPLIT, lambda m: _garbage(4))),
+    FaultKind(
+        "flood: m.garbage in split packets", _D, _stream(Stream.SPLIT, lambda message: m.garbage(4))
+    ),
     FaultKind("connection: split packets", _R, _stream(Stream.SPLIT)),
     FaultKind("connection: 20 kB/s", _D, _stream(Stream.SLOW)),
     FaultKind("connection: stalls", _D, _stream(Stream.STALL)),
@@ -332,14 +249,6 @@ def _pictures(tamper: Tamper) -> Begin:
     return lambda rig: setattr(rig.fake, "tamper_picture", tamper)
 
 
-def _bad_checksum(message: bytes) -> Iterable[bytes]:
-    return (message[:-1] + bytes([message[-1] ^ 1]),)
-
-
-def _wrong_view(message: bytes) -> Iterable[bytes]:
-    return (message[:12] + np.float32(2.0).tobytes() + message[16:],)
-
-
 def _picture(name: str, outcome: Outcome, begin: Begin) -> FaultKind:
     return FaultKind(f"picture: {name}", outcome, begin, since_onset=True)
 
@@ -347,12 +256,12 @@ def _picture(name: str, outcome: Outcome, begin: Begin) -> FaultKind:
 _PICTURES: Final = (
     _picture("silent", _H, _fault("mute_camera")),
     _picture("frozen", _H, _fault("freeze_camera")),
-    _picture("cut short", _H, _pictures(lambda m: (m[:-100],))),
-    _picture("wrong checksum", _H, _pictures(_bad_checksum)),
-    _picture("another field of view", _H, _pictures(_wrong_view)),
-    _picture("garbage", _H, _pictures(lambda m: _garbage(1))),
-    _picture("flood of garbage", _R, _pictures(_with(lambda: _garbage(20)))),
-    _picture("oversized", _H, _pictures(lambda m: (m * 20,))),
+    _picture("cut short", _H, _pictures(lambda message: (message[:-100],))),
+    _picture("wrong checksum", _H, _pictures(m.bad_checksum)),
+    _picture("another field of view", _H, _pictures(m.wrong_field_of_view)),
+    _picture("garbage", _H, _pictures(lambda message: m.garbage(1))),
+    _picture("flood of garbage", _R, _pictures(m.followed_by(lambda: m.garbage(20)))),
+    _picture("oversized", _H, _pictures(lambda message: (message * 20,))),
 )
 
 
@@ -406,7 +315,7 @@ def _told(*orders: Order) -> Begin:
 
 
 def _flood_of_messages(rig: FaultRig) -> None:
-    rig.answer = lambda report: [*([g] for g in _garbage(100)), *answer_steadily(report)]
+    rig.answer = lambda report: [*([g] for g in m.garbage(100)), *answer_steadily(report)]
 
 
 def _pressed(*buttons: str) -> Begin:
@@ -424,7 +333,7 @@ _OTHERS: Final = (
     _other("planner: plans Infinity", _H, _planner(_plan_of(np.inf)), 0.6),
     _other("planner: plans 1e30", _R, _planner(_plan_of(1e30))),
     _other("planner: random full strokes", _R, _planner(_shaking())),
-    _other("planner: answers garbage", _H, _planner(lambda report: [_garbage(1), [b"", b""]])),
+    _other("planner: answers garbage", _H, _planner(lambda report: [m.garbage(1), [b"", b""]])),
     _other("planner: answers of other ticks", _H, _planner(_shifted)),
     _other("planner: flood of messages", _ANY, _flood_of_messages),
     _other("operator: velocity NaN", _R, _told(Order(velocity=(np.nan,) * 3))),
@@ -435,8 +344,10 @@ _OTHERS: Final = (
         "remote control: sticks NaN",
         _R,
         _states(
-            _edited(
-                _set("wireless_remote", "VVEAAP//////////////////////////////////////////////")
+            m.edited(
+                m.set_field(
+                    "wireless_remote", "VVEAAP//////////////////////////////////////////////"
+                )
             ),
         ),
     ),
@@ -464,6 +375,7 @@ _PROCESSES: Final = (
 FAULTS: Final = (
     *_STATES,
     *_IMPLAUSIBLE,
+    *_MOTORS,
     *_FLOODS,
     *_PICTURES,
     *_OTHERS,
