@@ -254,7 +254,8 @@ def test_a_computer_without_the_simulator_is_told_what_to_install(tmp_path: Path
     )
     ended = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert ended.returncode == 5
-    assert "mujoco is not installed" in ended.stderr
+    assert "--robot.type=sim needs mujoco, which is not installed" in ended.stderr
+    assert "pip install 'egovcp-deploy[sim]'" in ended.stderr
     assert "Traceback" not in ended.stderr
 
 

@@ -60,7 +60,7 @@ def test_figures_have_the_documented_keys() -> None:
 
 def test_the_table_has_one_aligned_line_per_controller() -> None:
     played = {"ball": {"planner": [score(0, True)], "hold": [score(0, False)]}}
-    lines = table(summary(played)).splitlines()
+    lines = table(summary(played, 1)).splitlines()
     assert len(lines) == 3
     assert lines[1].split()[:3] == ["ball", "planner", "100.0%"]
     assert len({len(line) for line in lines}) == 1
@@ -68,7 +68,7 @@ def test_the_table_has_one_aligned_line_per_controller() -> None:
 
 def test_parts_of_a_sequence_have_shares_of_their_own() -> None:
     won = [replace(score(i, i > 1), parts={"arch": i > 0, "ball": i > 1}) for i in range(4)]
-    figures = summary({"sequence": {"hold": won}})
+    figures = summary({"sequence": {"hold": won}}, 4)
     parts = figures["sequence"]["hold"]["parts"]
     assert {name: part["success_rate"] for name, part in parts.items()} == {
         "arch": 0.75,

@@ -34,7 +34,7 @@ class Outcome(StrEnum):
     DAMP = "damp"
     """Damped within the limit of the last good reading."""
     LATER = "later"
-    """Damped at some time: m.once the robot tilts, or m.once no more good states get through."""
+    """Damped at some time: once the robot tilts, or once no more good states get through."""
     ANY = "any"
     """Not known here, or not the runner's to decide; only the commands are judged."""
 
@@ -50,6 +50,7 @@ class FaultKind:
         duration_s: how long it lasts, if it does not damp.
         since_onset: whether times count from the onset, for faults that are not of the states;
             else from the last good state.
+        reason: part of the reason that must be reported for HOLD or DAMP; empty: any.
     """
 
     name: str
@@ -57,6 +58,7 @@ class FaultKind:
     begin: Begin
     duration_s: float = 0.5
     since_onset: bool = False
+    reason: str = ""
 
 
 # --- states ------------------------------------------------------------------------------
@@ -82,12 +84,19 @@ def _instead(messages: Callable[[], Iterable[bytes]]) -> Begin:
     return _states(lambda message: messages())
 
 
-def _dropped(tamper: Tamper) -> Begin:
-    """The left knee gives no torque, and its states say so."""
+def _knee(name: str, value: object) -> Begin:
+    """The motor of the left knee reports ``value`` in the field ``name``."""
+    return _states(m.edited(m.motor(m.KNEE, name, lambda usual: value)))
+
+
+def _dropped(status: int, mode: int) -> Begin:
+    """The left knee gives no torque, and reports this status and mode."""
+    motorstate = m.edited(m.motor(m.KNEE, "motorstate", lambda v: status))
+    enabled = m.edited(m.motor(m.KNEE, "mode", lambda v: mode))
 
     def begin(rig: FaultRig) -> None:
         rig.fake.faults.dropped_motor = m.KNEE
-        rig.fake.tamper_state = tamper
+        rig.fake.tamper_state = lambda message: enabled(*motorstate(message))
 
     return begin
 
@@ -115,7 +124,7 @@ _STATES: Final = (
     FaultKind("state: silent for 60 ms", _R, _states_anew(lambda: m.for_seconds(0.06, m.nothing))),
     FaultKind("state: silent for 150 ms", _H, _states_anew(lambda: m.for_seconds(0.15, m.nothing))),
     FaultKind("state: frozen", _D, _fault("freeze_state")),
-    FaultKind("state: m.every second torn", _R, _fault("garble_state")),
+    FaultKind("state: every second torn", _R, _fault("garble_state")),
     FaultKind("state: all torn", _D, _states(lambda message: (message[: len(message) // 2],))),
     FaultKind("state: 30 % lost", _R, _fault("drop", 0.3)),
     FaultKind("state: empty messages", _D, _replaced(b"")),
@@ -169,16 +178,14 @@ _IMPLAUSIBLE: Final = (
         _D,
         _states(m.edited(m.all_motors("dq", lambda i, v: 190.0 * (-1) ** i))),
     ),
-    FaultKind("joint position: 9 rad", _D, _states(m.edited(m.motor(m.KNEE, "q", lambda q: 9.0)))),
+    FaultKind("joint position: 9 rad", _D, _knee("q", 9.0)),
     FaultKind("joint position: jumps by 0.5 rad", _D, _states(_jump)),
     FaultKind("joint position: jumps by 0.5 rad once", _R, _states_anew(lambda: m.once(_jump))),
     FaultKind(
         "joint position: all zero", _D, _states(m.edited(m.all_motors("q", lambda i, q: 0.0)))
     ),
     FaultKind("joints: random within bounds", _D, _states(m.edited(m.random_joints))),
-    FaultKind(
-        "torque: 900 N m", _D, _states(m.edited(m.motor(m.KNEE, "tau_est", lambda t: 900.0)))
-    ),
+    FaultKind("torque: 900 N m", _D, _knee("tau_est", 900.0)),
     FaultKind(
         "torque: 900 N m once",
         _R,
@@ -202,28 +209,42 @@ _IMPLAUSIBLE: Final = (
 )
 _OVERHEATED: Final = 0x200  # status bits, see `motor_fields.FAULTS`
 _DISCONNECTED: Final = 0x80000000
+
+
+def _motor(
+    name: str, outcome: Outcome, begin: Begin, reason: str = "", duration_s: float = 0.5
+) -> FaultKind:
+    return FaultKind(f"motor: {name}", outcome, begin, duration_s, reason=reason)
+
+
 _MOTORS: Final = (
-    FaultKind("motor: winding at 125 deg C", _H, _fault("hot_motor", (m.KNEE, 125.0)), 1.0),
-    FaultKind(
-        "motor: status overheated", _H, _states(m.knee_reports("motorstate", 0, _OVERHEATED)), 1.0
+    _motor("winding at 125 deg C", _H, _fault("hot_motor", (m.KNEE, 125.0)), "is too hot", 1.0),
+    _motor(
+        "one temperature, 85 deg C",
+        _H,
+        _states(m.edited(m.all_motors("temperature", lambda i, v: 85 if i == m.KNEE else 35))),
+        "is too hot",
+        1.0,
     ),
-    FaultKind("motor: no temperatures", _R, _fault("no_temperature")),
-    FaultKind("motor: temperature 900 deg C", _R, _states(m.knee_reports("temperature", 40, 900))),
-    FaultKind(
-        "motor: dropped, status disconnected",
-        _D,
-        _dropped(m.knee_reports("motorstate", 0, _DISCONNECTED)),
+    _motor("status overheated", _H, _knee("motorstate", _OVERHEATED), "winding overheating", 1.0),
+    _motor("no temperatures", _R, _fault("no_temperature")),
+    _motor("temperature 900 deg C", _R, _knee("temperature", [900, 900])),
+    _motor(
+        "no status, mode and temperature",
+        _R,
+        _states(m.edited(m.without_motor_fields("motorstate", "mode", "lost", "temperature"))),
     ),
-    FaultKind("motor: dropped, mode off", _D, _dropped(m.knee_reports("mode", 1, 0))),
-    FaultKind("motor: dropped without a report", Outcome.LATER, _fault("dropped_motor", m.KNEE)),
+    _motor("dropped, status disconnected", _D, _dropped(_DISCONNECTED, 1), "lost the connection"),
+    _motor("dropped, mode off", _D, _dropped(0, 0), "its mode says that it is off"),
+    _motor("dropped without a report", Outcome.LATER, _dropped(0, 1), "does not follow its target"),
 )
 _FLOODS: Final = (
     FaultKind(
-        "flood: 2 kB m.garbage, 40 per 10 ms", _R, _states(m.followed_by(lambda: m.garbage(20)))
+        "flood: 2 kB garbage, 40 per 10 ms", _R, _states(m.followed_by(lambda: m.garbage(20)))
     ),
     FaultKind("flood: the same without states", _D, _instead(lambda: m.garbage(20))),
     FaultKind(
-        "flood: m.garbage at full rate", _ANY, _states(m.followed_by(lambda: m.garbage(_FULL_RATE)))
+        "flood: garbage at full rate", _ANY, _states(m.followed_by(lambda: m.garbage(_FULL_RATE)))
     ),
     FaultKind(
         "flood: the same without states, full rate", _D, _instead(lambda: m.garbage(_FULL_RATE))
@@ -235,7 +256,7 @@ _FLOODS: Final = (
     ),
     FaultKind("flood: oversized without states", _D, _replaced(*[b"x" * 200_000] * 4)),
     FaultKind(
-        "flood: m.garbage in split packets", _D, _stream(Stream.SPLIT, lambda message: m.garbage(4))
+        "flood: garbage in split packets", _D, _stream(Stream.SPLIT, lambda message: m.garbage(4))
     ),
     FaultKind("connection: split packets", _R, _stream(Stream.SPLIT)),
     FaultKind("connection: 20 kB/s", _D, _stream(Stream.SLOW)),
@@ -343,13 +364,7 @@ _OTHERS: Final = (
     _other(
         "remote control: sticks NaN",
         _R,
-        _states(
-            m.edited(
-                m.set_field(
-                    "wireless_remote", "VVEAAP//////////////////////////////////////////////"
-                )
-            ),
-        ),
+        _states(m.edited(m.set_field("wireless_remote", "VVEAAP" + "/" * 46))),
     ),
     _other("robot: pushed", _R, _fault("push", (0.2, 0.0))),
     _other("robot: pushed over", Outcome.LATER, _fault("push", (-2.5, 1.0)), 3.0),

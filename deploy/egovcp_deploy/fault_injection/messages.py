@@ -97,14 +97,15 @@ def all_motors(name: str, change: Callable[[int, float], object]) -> Edit:
     return edit
 
 
-def knee_reports(name: str, usual: object, knee: object) -> Tamper:
-    """Every motor reports ``usual`` in the field ``name``, and the left knee ``knee``."""
+def without_motor_fields(*names: str) -> Edit:
+    """Remove fields of every motor."""
 
     def edit(data: dict[str, Any]) -> None:
-        for i, motor in enumerate(data["motor_state"][: len(JOINT_NAMES)]):
-            motor[name] = knee if i == KNEE else usual
+        for motor in data["motor_state"]:
+            for name in names:
+                motor.pop(name, None)
 
-    return edited(edit)
+    return edit
 
 
 def imu(name: str, change: Callable[[list[float]], object]) -> Edit:

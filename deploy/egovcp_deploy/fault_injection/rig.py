@@ -120,12 +120,12 @@ class FaultRig:
     """Starts runs and lets things go wrong in them. Close it afterwards."""
 
     def __init__(self) -> None:
-        quiet = EpisodeConfig(ticks=10**6, event_ticks=(10**6 - 1,) * 2, empty_probability=1.0)
+        quiet = EpisodeConfig(empty_probability=1.0)  # never begins: there is no time limit
         self._robot = LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
         self._robot.start(Scenario("ball", 0, 0))
         free = Ports(command_port=0, state_port=0, camera_port=0)
         with raised_priority(RECEIVING):  # a robot has computers of its own
-            self.fake = FakeBridge(self._robot, free)
+            self.fake = FakeBridge(self._robot, free, detailed=True)
             self.proxy = Proxy(self.fake.ports.state_port)
         self.fake.on_command = self._record
         self.answer: Answer = answer_steadily

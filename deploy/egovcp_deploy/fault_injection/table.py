@@ -44,7 +44,8 @@ class Row:
             return f"{self.unsound} commands were not sound"
         outcome = self.kind.outcome
         if outcome in _DAMPS:
-            return "" if self.damped_ms is not None else f"was not damped, but {self.end}"
+            damped = self.damped_ms is not None
+            return self._wrong_reason if damped else f"was not damped, but {self.end}"
         if outcome is Outcome.ANY:
             return ""
         if self.damped_ms is not None:
@@ -55,7 +56,14 @@ class Row:
             return "was not held"
         if outcome is Outcome.RUN and "proprioception" in self.reason:
             return f"was held: {self.reason}"
-        return ""
+        return self._wrong_reason
+
+    @property
+    def _wrong_reason(self) -> str:
+        """A report can be lost when the process ends: no reason is not a wrong one."""
+        if not self.reason or self.kind.reason in self.reason:
+            return ""
+        return f"the reason is not {self.kind.reason!r}, but {self.reason!r}"
 
 
 def run_fault(rig: FaultRig, kind: FaultKind) -> Row:
@@ -86,7 +94,7 @@ def run_fault(rig: FaultRig, kind: FaultKind) -> Row:
         _ms(observed.damped_ns, reference),
         observed.greatest_change,
         sum(not command.sound for command in observed.commands),
-        _reason(observed),
+        _reason(observed, kind.reason),
     )
     if damped or end != State.RUN:
         rig.end_run()
@@ -97,12 +105,13 @@ def _ms(time_ns: int | None, since_ns: int) -> float | None:
     return None if time_ns is None else (time_ns - since_ns) / 1e6
 
 
-def _reason(observed: Observed) -> str:
+def _reason(observed: Observed, expected: str) -> str:
+    """Of the change to the worst state; of several, the first that contains ``expected``."""
     changes = [event.partition(": ") for event in observed.events if " -> " in event]
     for state in (State.DAMP, State.HOLD):
-        for change, _, reason in changes:
-            if change.endswith(f"-> {state}"):
-                return reason
+        reasons = [reason for change, _, reason in changes if change.endswith(f"-> {state}")]
+        if reasons:
+            return next((reason for reason in reasons if expected in reason), reasons[0])
     return ""
 
 

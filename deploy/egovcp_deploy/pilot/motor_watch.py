@@ -162,8 +162,9 @@ class MotorWatch:
         )
         if joint is None:
             return ""
-        what = fault_words(int(faults[joint])) if faults[joint] else "no longer enabled"
-        return f"the motor of {JOINT_NAMES[joint]} does not obey: it reports {what}"
+        bits = int(faults[joint])
+        what = f"it reports {fault_words(bits)}" if bits else "its mode says that it is off"
+        return f"the motor of {JOINT_NAMES[joint]} does not obey: {what}"
 
     def _why_torque(
         self,

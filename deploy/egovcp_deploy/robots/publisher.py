@@ -34,7 +34,7 @@ _MEMORY_S: Final = 0.3  # time constant of each joint's average
 _SHARE: Final = 0.35  # of the readings; two who send equally often get half of them each
 _SLACK: Final = np.maximum(1.0, 0.05 * EFFORT_LIMIT)  # N m
 _RELATIVE: Final = 0.5  # of the expected torque: gains and estimates are rough
-_GAP_S: Final = 0.2  # a silence after which listening starts again
+GAP_S: Final = 0.2  # a silence after which listening starts again
 _OURS_S: Final = 1.0  # how long a bridge may still count us after our last command
 _QUIET: Final = MotorCommand(np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS))
 
@@ -63,7 +63,7 @@ class PublisherWatch:
         elapsed = math.inf if self._heard_ns is None else (now - self._heard_ns) / 1e9
         self._heard_ns = now
         self._count_strangers(state.sources or 0, now)
-        if elapsed > _GAP_S:
+        if elapsed > GAP_S:
             self._restart()
             return
         wrong = np.abs(state.motors.torque - self._expected(state)) > self._slack(state)

@@ -31,7 +31,7 @@ QUICK = [
 #: A busy machine is no fault here.
 PATIENT = [
     "--robot.limits.planner_hold_s=5",
-    "--robot.limits.misses_hold=100000",
+    "--robot.limits.misses_hold=10000",
     "--robot.limits.picture_hold_s=5",
     "--robot.limits.state_hold_s=5",
     "--robot.limits.state_damp_s=10",

@@ -128,6 +128,7 @@ def look(
     limits = {"STATE_HZ": 5.0, "IMAGE_HZ": 1.0, "MOST_LOST": 0.95, "LISTEN_S": 1.5}
     for name, value in limits.items():
         monkeypatch.setattr(f"egovcp_deploy.live.preflight.{name}", value)
+    monkeypatch.setattr("egovcp_deploy.robots.publisher.GAP_S", 2.0)
 
     def look(change: Callable[[FakeBridge], object], detailed: bool = True) -> Any:
         robot.start(Scenario("ball", 0, 0))
@@ -145,7 +146,7 @@ def look(
                     f"--robot.bridge.command_port={fake.ports.command_port}",
                     f"--robot.camera.server.port={fake.ports.camera_port}",
                     *("--robot.limits.state_hold_s=5", "--robot.limits.state_damp_s=10"),
-                    *("--robot.limits.picture_hold_s=5", "--env.delay.image_age=[0.02,5.0]"),
+                    *("--robot.limits.picture_hold_s=5", "--env.delay.image_age=[0.02,1.0]"),
                     *("--planner.samples=16", "--planner.elites=4"),
                 ]
             )

@@ -165,7 +165,7 @@ def test_a_motor_that_is_no_longer_enabled_is_damped() -> None:
     enabled = np.arange(29) < 20
     enabled[KNEE] = False
     damp = rig.run(0.1, replace(HEALTHY, enabled=enabled)).damp
-    assert "left_knee_joint does not obey: it reports no longer enabled" in damp
+    assert "left_knee_joint does not obey: its mode says that it is off" in damp
 
 
 def test_an_overloaded_motor_is_held_and_a_sensor_fault_forbids_arming_only() -> None:
