@@ -15,6 +15,7 @@ from egovcp.cli import run_command
 from egovcp.data import Provenance
 from egovcp.data.committer import Committer, committing
 from egovcp.data.source import local_root
+from egovcp.packages import require_packages
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.env import decided
 from egovcp.sim.scenario import Scenario
@@ -59,6 +60,8 @@ def collect(config: CollectConfig, command: str = "") -> None:
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     config.check()
+    if config.backend == "ray":
+        require_packages("egovcp-collect", "--backend=ray", "ray")
     config = replace(config, env=decided(config.env))
     provenance = _provenance(config, command)
     agree = partial(require_same, provenance) if config.resume else None

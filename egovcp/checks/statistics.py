@@ -17,6 +17,9 @@ from egovcp.errors import DataError
 
 _RELATIVE = 1e-4  # of the column's range: statistics may have been gathered in float32
 _LEAST = 1e-6
+#: LeRobot's editing tools keep the statistics that these had in the dataset an episode came from.
+_STALE = ("index", "episode_index", "task_index")
+_CHECKED = tuple(key for key in schema.FEATURES if key not in _STALE)
 
 
 class StatisticsCheck:
@@ -49,7 +52,7 @@ class StatisticsCheck:
                 yield DataError.at(path, f"has no statistics of {key}")
         if self._total is None or self._frames != self._reader.num_frames:
             return
-        for key in schema.FEATURES:
+        for key in _CHECKED:
             if isinstance(found.get(key), dict):
                 for problem in _differences(found[key], self._total, key, self._frames):
                     yield DataError.at(path, f"{key}: {problem}")
@@ -76,7 +79,7 @@ class EpisodeStatistics:
         if found_row is None or matrix is None:
             return
         path, row = found_row
-        for key in schema.FEATURES:
+        for key in _CHECKED:
             prefix = f"stats/{key}/"
             found = {k.removeprefix(prefix): v for k, v in row.items() if k.startswith(prefix)}
             length = int(self._reader.lengths[index])

@@ -76,7 +76,9 @@ def files_below(folder: Path) -> list[Path]:
 
 
 def hidden_files(folder: Path) -> int:
-    """Number of hidden files and folders in ``folder``, at any depth."""
+    """Number of hidden files and folders in ``folder``, at any depth; links are not followed."""
+    if folder.is_symlink():
+        return 0
     return sum(
         name.startswith(".") for _, folders, files in folder.walk() for name in (*folders, *files)
     )

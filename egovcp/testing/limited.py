@@ -36,7 +36,7 @@ class LimitedResult:
     seconds: float
     """Wall time, less the time in which the child waited for a processor that others used."""
     memory_bytes: int
-    """Growth of the peak resident memory over what the parent had at the fork."""
+    """Peak resident memory beyond what the parent had at the fork."""
     timed_out: bool
 
     @property
@@ -61,7 +61,7 @@ def run_limited(
         network: without it, opening a connection raises in the child, and the result has exit
             code 70 and a traceback.
     """
-    before = _status_bytes("VmHWM")
+    before = _status_bytes("VmRSS")
     with tempfile.TemporaryFile() as log:
         started = time.monotonic()
         pid = os.fork()

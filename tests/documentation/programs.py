@@ -81,7 +81,9 @@ def known_flags() -> frozenset[str]:
     found |= set(_option_names(EgovcpConfig, "--policy."))
     found |= set(_option_names(EgovcpEnvConfig, "--env."))
     for script in (ROOT / "benchmarks").glob("*.py"):
-        found |= set(re.findall(r'"(--[\w.-]+)"', script.read_text(encoding="utf-8")))
+        text = script.read_text(encoding="utf-8")
+        found |= set(re.findall(r'"(--[\w.-]+)"', text))
+        found |= {f"--{name}" for name in re.findall(r"^    (\w+): [^=\n]+ = ", text, re.M)}
     for study in (ROOT / "experiment/egovcp_experiment/studies").glob("[a-z]*.py"):
         module = import_module(f"egovcp_experiment.studies.{study.stem}")
         found |= set(_option_names(module.CONFIG, "--")) if hasattr(module, "CONFIG") else set()

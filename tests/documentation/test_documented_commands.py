@@ -3,6 +3,7 @@
 import re
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 
 import pytest
 
@@ -70,7 +71,10 @@ def is_result(command: Command) -> bool:
 
 
 @pytest.mark.parametrize("page", [name for name in PAGES if not name.startswith("docs/results/")])
-def test_programs_accept_the_commands_of_a_page(page: str) -> None:
+def test_programs_accept_the_commands_of_a_page(
+    page: str, prepared: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(prepared)
     mentions = {command.argv: command for command in commands(PAGES[page])}
     problems = [refusal(command) for command in mentions.values()]
     assert not [problem for problem in problems if problem]

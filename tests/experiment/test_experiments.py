@@ -10,7 +10,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egovcp.manifest import MANIFEST
+from egovcp.artefact import save_artefact
+from egovcp.plan import PlannerConfig
+from egovcp.testing import toy_model
 from egovcp_experiment.cell import Cell, Output
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.report.document import Plot, Report, Table
@@ -175,9 +177,11 @@ def test_multitask_says_for_how_long_models_were_trained(tmp_path: Path) -> None
 
     assert words({}).startswith("Every model was trained for 10 minutes: the one on mixed data")
     assert "Returns of arch reach 50 ticks" in words({})
-    (tmp_path / MANIFEST).write_text('{"step": 4321}')
-    some = words({"ball": str(tmp_path), "all": "me/model"})
+    policy = str(tmp_path / "policy")
+    entries = {"controller_id": "stance-1", "step": 4321}
+    save_artefact(Path(policy), toy_model(), PlannerConfig(), entries)
+    some = words({"ball": policy, "all": "me/model"})
     assert "of ball alone, 4321 gradient steps; on mixed data, `me/model`. Every other" in some
     assert "Returns of" not in some
-    every = words(dict.fromkeys(("ball", "wall", "arch", "all"), str(tmp_path)))
+    every = words(dict.fromkeys(("ball", "wall", "arch", "all"), policy))
     assert "10 minutes" not in every

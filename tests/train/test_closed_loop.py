@@ -64,5 +64,5 @@ def test_without_the_simulator_it_is_refused_before_training(
 ) -> None:
     monkeypatch.setitem(sys.modules, package, None)
     assert main(arguments(tmp_path / "run", eval_closed_loop=1)) == 5
-    assert f"needs the package {package}" in capsys.readouterr().err
+    assert f"--eval_closed_loop needs {package}, which is not installed" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()

@@ -201,7 +201,7 @@ def test_a_failed_export_leaves_nothing(
     [
         ([], 2, "--policy.path and --output_dir are needed"),
         (["--policy.path=absent"], 2, "--policy.path and --output_dir are needed"),
-        (["--policy.path=absent", "--output_dir=new"], 4, "no policy artefact"),
+        (["--policy.path=absent", "--output_dir=new"], 4, "no such folder: 'absent'"),
         (["--policy.path=absent", "--output_dir=."], 2, "exists and is not empty"),
     ],
 )

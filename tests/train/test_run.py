@@ -155,7 +155,7 @@ def test_a_missing_dataset_is_named_before_anything_is_written(
     arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = arguments(tmp_path / "run", dataset__root=tmp_path / "nothing")
-    _refused(argv, 3, capsys, f"no dataset at {tmp_path}/nothing")
+    _refused(argv, 3, capsys, f"no such folder: {tmp_path}/nothing")
     assert not (tmp_path / "run").exists()
 
 

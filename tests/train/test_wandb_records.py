@@ -100,7 +100,7 @@ def test_without_the_package_it_is_refused_before_anything_is_written(
 ) -> None:
     monkeypatch.setitem(sys.modules, "wandb", None)
     assert main(arguments(tmp_path / "run", "--wandb.enable")) == 5
-    assert "pip install wandb" in capsys.readouterr().err
+    assert "pip install 'egovcp-train[wandb]'" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 

@@ -44,15 +44,19 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+#: Nothing uses the statistics of the others, and LeRobot's tools leave wrong ones.
+_CHECKED = [key for key in schema.FEATURES if key not in ("index", "episode_index", "task_index")]
+
+
 def _content(root: Path) -> str:
-    """Digest of everything that is loaded from a dataset."""
+    """Digest of everything that is loaded from a dataset and used."""
     reader = DatasetReader.open(DatasetConfig(root=str(root)))
     parts: list[object] = [asdict(reader.origin), reader.fps, reader.lengths.tolist()]
-    parts += [reader.task_names, {key: reader.stats[key] for key in schema.FEATURES}]
+    parts += [reader.task_names, {key: reader.stats[key] for key in _CHECKED}]
     for index, episode in enumerate(reader):
         facts = [episode.task, episode.time_limit, dict(episode.metadata)]
         parts += [episode.digest(), facts, reader.identity(index)]
-    for key in schema.FEATURES:
+    for key in _CHECKED:
         if key != "observation.images.ego_depth":
             mean, std = reader.episode_stats(key)
             parts += [mean.tolist(), std.tolist()]

@@ -53,7 +53,7 @@ def test_a_local_folder_never_asks_the_hub(
     hub: FakeHub, dataset_root: Path, tmp_path: Path
 ) -> None:
     DatasetReader.open(DatasetConfig(repo_id="me/six", root=str(dataset_root)))
-    with pytest.raises(DataError, match="no dataset at"):
+    with pytest.raises(DataError, match="no such folder"):
         DatasetReader.open(DatasetConfig(repo_id="me/six", root=str(tmp_path / "none")))
     home = source.lerobot_home() / "me"
     home.mkdir(parents=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ def test_model_path_is_the_wheels_file() -> None:
 
 
 def test_a_missing_wheel_is_an_environment_failure(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "mjlab", None)
     with pytest.raises(EnvironmentFailure, match=r"egovcp\[sim\]"):
         g1.model_path()
 

@@ -131,7 +131,7 @@ def test_few_episodes_are_enough(policy: Path, dataset_root: Path, tmp_path: Pat
         ("--stride=0", 2, "--stride=0"),
         ("--policy.path=", 2, "no policy given"),
         ("--split=test", 2, "unknown split 'test'"),
-        ("--policy.path=/nowhere", 4, "no policy artefact"),
+        ("--policy.path=/nowhere", 4, "no such folder: '/nowhere'"),
         ("--dataset.root=/nowhere", 3, "/nowhere"),
         ("--device=tpu9", 2, "unknown --device"),
         ("--return_steps=0", 2, "--return_steps=0"),

@@ -27,12 +27,9 @@ from egovcp.robot.gait import GaitConfig
 from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
 from egovcp.sim.capacity import require_robots
 from egovcp.sim.config import SensorConfig
-from egovcp.sim.sensors import noise_std
 from egovcp.spec import ACTION_BOX, CONTROLLER_HZ
 from egovcp.terminal import echo
-from egovcp_train.lowlevel import events, rewards
-from egovcp_train.lowlevel.physics import Physics
-from egovcp_train.lowlevel.sensing import measure
+from egovcp_train.lowlevel import events
 from egovcp_train.lowlevel.task import DisturbanceConfig
 from egovcp_train.output import require_writable
 
@@ -142,6 +139,12 @@ _MOST: Final = 3.0  # of the score below, per second
 
 def walk(gaits: Sequence[GaitConfig], config: TuneConfig, generation: int) -> Array:
     """(len(gaits),) score of each, the mean over its robots, at most 3 per second."""
+    # They need the simulator, which `tune` asks for together with the other packages.
+    from egovcp.sim.sensors import noise_std
+    from egovcp_train.lowlevel import rewards
+    from egovcp_train.lowlevel.physics import Physics
+    from egovcp_train.lowlevel.sensing import measure
+
     each = len(_SPEEDS)
     robots = each * len(gaits)
     rng = np.random.default_rng([config.seed, generation])
