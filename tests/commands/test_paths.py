@@ -99,8 +99,11 @@ INPUTS = (
     *("absent", "fifo", "dangling", "loop", "empty", "folder", "empty/below", "/dev/null"),
     *("x" * 300, "y/" * 3000, "\x1b[31m", "\udcff", "~nobody/x", "", "recording.mcap"),
 )
-#: A recording, and a config file without options.
-VALID = {("file", "recording.mcap"), ("files", "recording.mcap"), ("config_path", "empty")}
+#: A recording, a config file without options, no records, and what has the form of a Hub id.
+VALID = {
+    *(("file", "recording.mcap"), ("files", "recording.mcap"), ("config_path", "empty")),
+    *(("records", ""), ("train.policies", "empty/below")),
+}
 OUTPUTS = ("loop", "empty/below", "x" * 300, "/proc/new", "/dev/null/new", "\udcff", "a\0b", "fifo")
 
 
