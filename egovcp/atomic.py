@@ -29,6 +29,11 @@ def removed_on_error(path: Path) -> Iterator[Path]:
         raise
 
 
+def partial_path(path: Path) -> Path:
+    """Where `write_bytes` writes before it renames."""
+    return path.with_name(f".{path.name}.partial")
+
+
 def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
     """Write a file, or replace it; its mode follows the umask.
 
@@ -39,7 +44,7 @@ def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
         content: all of it.
         durable: wait until the disk has it.
     """
-    with removed_on_error(path.with_name(f".{path.name}.partial")) as temporary:
+    with removed_on_error(partial_path(path)) as temporary:
         with temporary.open("wb") as file:
             file.write(content)
             file.flush()
@@ -48,9 +53,9 @@ def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
         temporary.replace(path)
 
 
-def write_text(path: Path, text: str) -> None:
+def write_text(path: Path, text: str, durable: bool = True) -> None:
     """Write a UTF-8 text file, or replace it; see `write_bytes`."""
-    write_bytes(path, text.encode())
+    write_bytes(path, text.encode(), durable)
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -28,6 +28,7 @@ from egovcp.flags import HELP, flag_values, flags_of, merged, split_flags
 from egovcp.help_text import print_help
 from egovcp.interrupts import EXIT_CODE as INTERRUPTED
 from egovcp.interrupts import raise_on_sigint
+from egovcp.outputs import check_output_files
 from egovcp.packages import missing_package
 from egovcp.terminal import echo, one_line
 from egovcp.values import WrongValue, build
@@ -93,6 +94,7 @@ def parse_config[C](
         raise UsageError(f"{error}; see {prog} --help") from None
     check_bounds(config, "--")
     check_cores(config, "--")
+    check_output_files(config, "--")
     return config
 
 

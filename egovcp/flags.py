@@ -86,6 +86,8 @@ def flag_values(args: Sequence[str], flags: Mapping[str, Any]) -> dict[str, Any]
         flag, _, text = arg.partition("=")
         if flag == CONFIG_FILE:
             file = convert(str, text, flag)
+            if not file:
+                raise WrongValue(f"option {CONFIG_FILE} needs a file, {CONFIG_FILE}=...")
         else:
             value: Any = _value(flag, text, flags[flag])
             for part in reversed(flag.removeprefix("--").split(".")):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Final
 
 from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.outputs import nearest_existing, require_writable
 
 _MOUNTS: Final = Path("/proc/self/mountinfo")
 _MOUNT_POINT_FIELD: Final = 4  # proc_pid_mountinfo(5), counted from 0
@@ -41,11 +42,20 @@ def is_vacant(root: Path) -> bool:
 
 
 def require_new(root: Path) -> None:
-    """Raise `UsageError` if there is something at ``root``; nothing is ever overwritten."""
-    if not is_vacant(resolve_root(root)):
+    """Raise if there is something at ``root``, or it cannot be created; nothing is overwritten.
+
+    Raises:
+        UsageError: ``root`` is a file, lies below a file, or is a folder that is not empty.
+        EnvironmentFailure: no permission, or a file system that takes no files.
+    """
+    resolved = resolve_root(root)
+    if not is_vacant(resolved):
         raise UsageError(
             f"output folder {root} exists already and is not empty; choose another or remove it"
         )
+    if not nearest_existing(resolved.parent).is_dir():
+        raise _below_file(root)
+    require_writable(resolved.parent)
 
 
 def require_replaceable(root: Path) -> None:
@@ -80,4 +90,8 @@ def make_parent(root: Path) -> None:
     try:
         root.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
-        raise UsageError(f"output folder {root} would lie below a file; choose another") from error
+        raise _below_file(root) from error
+
+
+def _below_file(root: Path) -> UsageError:
+    return UsageError(f"output folder {root} would lie below a file; choose another")

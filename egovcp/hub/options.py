@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from egovcp.hub.retry import RetryPolicy
+from egovcp.outputs import output_file
 
 
 @dataclass(frozen=True)
@@ -23,5 +24,5 @@ class PublishConfig:
     """Title of the commit; empty: what was published says it."""
     network: RetryPolicy = field(default_factory=RetryPolicy)
     """How long to try."""
-    json: str = ""
+    json: str = output_file()
     """File for {"repo_id", "branch", "tag", "commit", "new"}; empty: none."""

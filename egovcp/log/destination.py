@@ -48,12 +48,15 @@ class RrdFile:
         return False
 
     def attach(self, stream: rr.RecordingStream, look: rrb.Blueprint) -> None:
-        """Create the file; raises `EnvironmentFailure` when it exists."""
+        """Create the file; raises `EnvironmentFailure` when it exists or cannot be created."""
         if self.path.exists():
             raise EnvironmentFailure(
                 f"{self.path} exists already; recordings are never overwritten: choose another"
             )
-        stream.save(self.path, default_blueprint=look)
+        try:
+            stream.save(self.path, default_blueprint=look)
+        except RuntimeError as error:  # Rerun has no other type for it
+            raise EnvironmentFailure(f"cannot create {self.path}: {error}") from error
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ from egovcp.log.mcap_records import MAGIC, Damage, RecordFile
 from egovcp.log.messages import VALUE_MAPS, Topic
 from egovcp.log.tick import BasePose, Candidates, MotorReadings, SceneObject, Tick, ValueMap
 from egovcp.rate import NS_PER_S
+from egovcp.safe_files import UnsafeFileError, open_regular
 from egovcp.spec import DEPTH_COLS
 
 _FLAGS = ("terminated", "truncated", "success")
@@ -340,12 +341,14 @@ _SHOWN_LOSSES: Final = 5
 def _require_mcap(path: Path) -> None:
     """Raise `DataError` for a file that neither begins nor ends like an MCAP file."""
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:  # a FIFO would block
             start = file.read(len(MAGIC))
             file.seek(max(0, path.stat().st_size - len(MAGIC)))
             end = file.read(len(MAGIC))
     except FileNotFoundError as error:
         raise DataError(f"no recording at {path}; expected an MCAP file") from error
+    except UnsafeFileError as error:
+        raise DataError(f"{path}: {error}") from error
     except IsADirectoryError as error:
         raise DataError(f"{path} is a folder; expected an MCAP file") from error
     if MAGIC not in (start, end):

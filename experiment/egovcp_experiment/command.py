@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 import draccus
 
+from egovcp.artefact import load_artefact
 from egovcp.cli import report_error, run_command
-from egovcp.errors import UsageError, suggest
+from egovcp.data import DatasetConfig, DatasetReader
+from egovcp.errors import EgovcpError, UsageError, suggest
+from egovcp.hub import is_local_path
 from egovcp.packages import require_packages
 from egovcp.terminal import echo
 from egovcp_experiment.cell import Cell, in_order
@@ -75,6 +78,7 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     config.check()
+    require_given(config)
     experiment = EXPERIMENTS[name]
     cells = in_order(experiment.cells(config))
     store = Store(Path(config.output_dir))
@@ -98,6 +102,35 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
     for line in report.shows:
         echo(f"- {line}")
     echo(f"report: {store.folder / name}.html, .md, .json")
+
+
+def require_given(config: ExperimentConfig) -> None:
+    """Refuse datasets and policies that the user named and that cannot be used.
+
+    Otherwise the first cell that needs one would fail, hours later perhaps. Policies on the Hub
+    are left to their cells.
+
+    Raises:
+        UsageError: one is missing, or is something else.
+    """
+    for task, root in config.data.roots.items():
+        with _naming(f"--data.roots: {task}"):
+            if not root:
+                raise UsageError("expected the folder of a dataset")
+            DatasetReader.open(DatasetConfig(root=root))
+    for task, path in config.train.policies.items():
+        with _naming(f"--train.policies: {task}"):
+            if is_local_path(path):
+                load_artefact(path)
+
+
+@contextmanager
+def _naming(option: str) -> Iterator[None]:
+    """Put the option before the message of an error."""
+    try:
+        yield
+    except EgovcpError as error:
+        raise UsageError(f"{option}: {error}") from error
 
 
 def _require_packages(cells: Sequence[Cell]) -> None:

@@ -57,6 +57,8 @@ def _named(text: str, own: set[str]) -> Iterator[str]:
                 program = word
             for flag in FLAG.findall(word.replace(".NAME", "")):
                 other = _flags_of_programs(program) if program.startswith("egovcp-") else own
+                if f"[{flag}" in word:  # an item of a list of flags for another command
+                    other = _flags_of_programs("egovcp-")
                 foreign = bool(program) and not program.startswith("egovcp-")
                 if not foreign and not _is_known(flag, own | other | COMMON):
                     yield flag

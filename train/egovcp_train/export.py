@@ -80,7 +80,7 @@ def export(config: ExportConfig) -> None:
             "--policy.path and --output_dir are needed: the artefact, and a new folder"
         )
     _require_packages()
-    output = prepare_output(config.output_dir, resume=False)
+    output = prepare_output(config.output_dir, resume=False, resumable=False)
     artefact = load_artefact(config.policy.path, config.policy.revision)
     with removed_on_error(output.with_name(output.name + ".partial")) as work:
         shutil.rmtree(work, ignore_errors=True)

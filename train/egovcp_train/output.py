@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from egovcp.errors import ArtefactError, EnvironmentFailure, UsageError
+from egovcp.errors import ArtefactError, UsageError
 from egovcp.flags import read_config
+from egovcp.outputs import require_writable
 from egovcp.values import build
 from egovcp_train.checkpoint import load_training_state
 
@@ -59,8 +59,13 @@ def saved_options(config_class: type, output: Path) -> dict[str, Any]:
     return options
 
 
-def prepare_output(output_dir: str, resume: bool) -> Path:
+def prepare_output(output_dir: str, resume: bool, resumable: bool = True) -> Path:
     """Refuse a bad destination before any work starts.
+
+    Args:
+        output_dir: the folder, which need not exist.
+        resume: go on with the run in it.
+        resumable: whether the command has the option ``--resume``.
 
     Raises:
         ArtefactError: there is nothing to resume.
@@ -72,23 +77,9 @@ def prepare_output(output_dir: str, resume: bool) -> Path:
         load_training_state(output)
         return output
     if output.exists() and (not output.is_dir() or any(output.iterdir())):
-        raise UsageError(
-            f"output folder {output} exists and is not empty; choose another, or continue the run "
-            "in it with --resume"
+        remedy = "choose another" + (
+            ", or continue the run in it with --resume" if resumable else ""
         )
+        raise UsageError(f"output folder {output} exists and is not empty; {remedy}")
     require_writable(output)
     return output
-
-
-def require_writable(folder: Path) -> None:
-    """Refuse a folder, existing or to be made, that cannot be written to.
-
-    Raises:
-        EnvironmentFailure: no permission, no space, or a file in the way.
-    """
-    parent = next(p for p in [folder, *folder.absolute().parents] if p.exists())
-    try:
-        with tempfile.TemporaryFile(dir=parent):
-            pass
-    except OSError as error:
-        raise EnvironmentFailure(f"cannot write to {parent}: {error.strerror}") from error

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from egovcp.artefact import load_artefact
-from egovcp.atomic import write_text
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.hub import PublishConfig, is_repo_id, publish
+from egovcp.outputs import write_report
 from egovcp_train.publish import publication, report
 
 PROG = "egovcp-push"
@@ -65,7 +63,5 @@ def push(config: PushConfig) -> None:
     target = replace(plain, branch=config.branch, tag=config.tag)
     published = publish(target, config.network)
     report(target, published)
-    if config.json:
-        facts = {"repo_id": config.repo_id, "branch": config.branch, "tag": config.tag}
-        text = json.dumps({**facts, **asdict(published)}, indent=1) + "\n"
-        write_text(Path(os.path.expanduser(config.json)), text)
+    facts = {"repo_id": config.repo_id, "branch": config.branch, "tag": config.tag}
+    write_report(config.json, {**facts, **asdict(published)})

@@ -13,9 +13,9 @@ from egovcp.bounds import bounded
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.data.selection import select_episodes
 from egovcp.errors import DataError
+from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo
 from egovcp_collect.dataset.again import changed_versions, simulated_again
-from egovcp_collect.dataset.replace import write_report
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class AuditConfig:
     --count of them."""
     count: int = bounded(5, least=1)
     """How many episodes, spread evenly over the dataset."""
-    json: str = ""
+    json: str = output_file()
     """File for the result: {"ok", "episodes", "different", "versions"}; empty: none."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -13,6 +14,7 @@ from huggingface_hub import DatasetCard, DatasetCardData
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.errors import UsageError
+from egovcp.outputs import output_file
 from egovcp.terminal import echo
 from egovcp_collect.dataset import card_tables
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
@@ -42,7 +44,7 @@ class CardConfig:
     """The dataset: a folder, or an id of the Hub."""
     repo_id: str = ""
     """Id on the Hub that the card's examples name, `user/name`; empty: the dataset's own."""
-    output: str = ""
+    output: str = output_file()
     """File to write; empty: README.md in the dataset's folder."""
     assets: str = ASSETS
     """Folder for the pictures, relative to the card."""
@@ -65,7 +67,7 @@ def run(config: CardConfig) -> None:
         raise UsageError(
             f"{reader.root} is the Hub's cache and stays as it is; name a file by --output"
         )
-    output = Path(config.output) if config.output else reader.root / CARD
+    output = Path(os.path.expanduser(config.output)) if config.output else reader.root / CARD
     found = survey(reader, ReturnConfig())
     paths = draw_figures(found, ReturnConfig(), output.parent / config.assets)
     pictures = {path.stem: f"{config.assets}/{path.name}" for path in paths}

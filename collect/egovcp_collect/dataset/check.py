@@ -17,8 +17,8 @@ from egovcp.data import DatasetConfig, metadata
 from egovcp.data.paths import hidden_files
 from egovcp.data.source import local_root, locate
 from egovcp.errors import DataError
+from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo, one_line
-from egovcp_collect.dataset.replace import write_report
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class CheckConfig:
     """The dataset: a folder, for which the network is never asked, or an id of the Hub."""
     max_problems: int = bounded(20, least=1)
     """Stop after this many problems."""
-    json: str = ""
+    json: str = output_file()
     """File for the result: {"ok", "episodes", "frames", "problems": [{"file", "episode", "frame",
     "problem"}]}; empty: none."""
 

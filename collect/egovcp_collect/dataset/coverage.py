@@ -7,9 +7,9 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig
+from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo, echo_lines
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
-from egovcp_collect.dataset.replace import replace_json
 from egovcp_collect.dataset.spread import Spread
 from egovcp_collect.dataset.survey import EventRate, TaskSurvey, survey
 from egovcp_collect.dataset.verdict import Finding, Thresholds, judge, summary
@@ -27,7 +27,7 @@ class CoverageConfig:
     """The dataset: a folder, or an id of the Hub."""
     output_dir: str = ""
     """Folder for the pictures events.png, returns.png, actions.png, depth.png; empty: none."""
-    json: str = ""
+    json: str = output_file()
     """File for the figures and the verdict as JSON; empty: none."""
     returns: ReturnConfig = field(default_factory=ReturnConfig)
     """The Monte Carlo return that Q would be trained on."""
@@ -64,7 +64,7 @@ def run(config: CoverageConfig) -> None:
             "summary": summary(findings),
             "findings": [asdict(finding) for finding in findings],
         }
-        replace_json(Path(config.json), {"tasks": found.to_json(), "verdict": verdict})
+        write_report(config.json, {"tasks": found.to_json(), "verdict": verdict})
 
 
 def _verdict(findings: list[Finding]) -> Iterator[str]:

@@ -8,8 +8,8 @@ from typing import Any
 
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.data.split import HELDOUT_FRACTION, in_split
+from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo_lines
-from egovcp_collect.dataset.replace import write_report
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class InfoConfig:
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, or an id of the Hub."""
-    json: str = ""
+    json: str = output_file()
     """File for the same facts as JSON; empty: none."""
 
 

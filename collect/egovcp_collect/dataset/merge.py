@@ -13,10 +13,10 @@ from tqdm import tqdm
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter
 from egovcp.data.duplicates import Duplicate, DuplicateFinder
 from egovcp.errors import DataError, UsageError
+from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo
 from egovcp_collect.dataset.origin import joint, moved, require_one_controller
 from egovcp_collect.dataset.output import new_folder
-from egovcp_collect.dataset.replace import write_report
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class MergeConfig:
     """Folder of the new dataset."""
     duplicates: Literal["refuse", "drop"] = "refuse"
     """What to do about an episode whose content equals that of an earlier one."""
-    json: str = ""
+    json: str = output_file()
     """File for the result: {"episodes", "frames", "dropped"}; empty: none."""
 
 

@@ -15,8 +15,8 @@ from egovcp.data.source import Source, record, recorded
 from egovcp.data.version import publish
 from egovcp.errors import DataError, UsageError
 from egovcp.hub import RetryPolicy, fetch, is_repo_id, resolve
+from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo
-from egovcp_collect.dataset.replace import write_report
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class PullConfig:
     """The new folder."""
     network: RetryPolicy = field(default_factory=RetryPolicy)
     """How long to try."""
-    json: str = ""
+    json: str = output_file()
     """File for {"repo_id", "commit", "root", "episodes", "frames"}; empty: none."""
 
 

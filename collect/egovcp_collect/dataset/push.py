@@ -15,9 +15,9 @@ from egovcp.data import DatasetConfig, DatasetReader, schema
 from egovcp.data.committer import work_folder
 from egovcp.errors import DataError, UsageError
 from egovcp.hub import Content, Publication, PublishConfig, Published, is_repo_id, publish
+from egovcp.outputs import write_report
 from egovcp.terminal import echo
 from egovcp_collect.dataset.card import ASSETS, CARD, card_text
-from egovcp_collect.dataset.replace import write_report
 
 #: Folders of a LeRobot dataset: whatever else lies in them on the Hub is of an earlier version.
 _OWNED: Final = ("data", "meta", "videos", "images", ASSETS)

@@ -17,11 +17,11 @@ from egovcp.data.duplicates import DuplicateFinder
 from egovcp.data.origin import ScenarioKeys
 from egovcp.data.source import Source, local_root, require_folder
 from egovcp.errors import DataError
+from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo, one_line
 from egovcp_collect.dataset.book import Book, open_book
 from egovcp_collect.dataset.check import as_json
 from egovcp_collect.dataset.output import new_folder
-from egovcp_collect.dataset.replace import write_report
 from egovcp_collect.dataset.salvage import Found, salvage
 
 
@@ -40,7 +40,7 @@ class RepairConfig:
     records: str = ""
     """Datasets that the episodes were taken from, separated by commas; an episode is found among
     theirs by the SHA-256 of its content."""
-    json: str = ""
+    json: str = output_file()
     """File for the result: {"episodes", "frames", "dropped": [{"file", "episode", "frame",
     "problem"}]}; empty: none."""
 

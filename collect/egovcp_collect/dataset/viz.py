@@ -7,6 +7,7 @@ placed relative to it.
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from dataclasses import dataclass, field
@@ -15,6 +16,7 @@ from pathlib import Path
 from egovcp.atomic import removed_on_error
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import UsageError
+from egovcp.outputs import output_file, require_writable
 from egovcp.packages import require_packages
 from egovcp.rollouts import POSE, run_info, ticks_of
 from egovcp.terminal import echo
@@ -32,7 +34,7 @@ class VizConfig:
     """The dataset: a folder, or an id of the Hub."""
     episode: int = 0
     """Which episode, counted from 0."""
-    output: str = ""
+    output: str = output_file()
     """Recording to create; empty: NAME-episode-N.rrd in the present folder."""
     spawn: bool = False
     """Open the recording in the Rerun viewer at once."""
@@ -58,7 +60,8 @@ def run(config: VizConfig) -> None:
     name = f"{reader.root.name}-episode-{config.episode}.rrd"
     if reader.source.commit:  # the folder of a downloaded dataset is named after its commit
         name = f"{reader.source.repo_id.partition('/')[2]}-episode-{config.episode}.rrd"
-    output = Path(config.output or name)
+    output = Path(os.path.expanduser(config.output or name))
+    require_writable(output.parent)
     write_recording(reader, config.episode, output)
     echo(f"wrote {output}; {POSE}")
     if config.spawn:

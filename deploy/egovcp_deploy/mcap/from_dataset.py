@@ -8,6 +8,7 @@ from pathlib import Path
 from egovcp.cli import DatasetConfig
 from egovcp.errors import UsageError
 from egovcp.log.mcap import McapSink
+from egovcp.outputs import output_file
 from egovcp.packages import DATA_MODULES, require_packages
 from egovcp.terminal import echo
 
@@ -21,7 +22,7 @@ class FromDatasetConfig:
     """The dataset: a folder, or an id of the Hub."""
     episode: int = 0
     """Which episode, counted from 0."""
-    output: str = ""
+    output: str = output_file()
     """The recording to create."""
 
 

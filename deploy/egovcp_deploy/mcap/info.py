@@ -8,11 +8,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from egovcp.atomic import write_text
 from egovcp.errors import UsageError
 from egovcp.log.info import RunInfo
 from egovcp.log.mcap_reader import Moment, RecordingReader
 from egovcp.log.messages import Topic
+from egovcp.outputs import STDOUT, output_file, write_report
 from egovcp.rate import NS_PER_S
 from egovcp.terminal import echo, echo_lines
 from egovcp_deploy.mcap.history import History, history_words
@@ -26,7 +26,7 @@ class InfoConfig:
 
     file: str = ""
     """The recording, an MCAP file."""
-    json: str = ""
+    json: str = output_file(or_stdout=True)
     """File for the same in JSON; `-`: print that instead."""
 
 
@@ -118,11 +118,10 @@ def run(config: InfoConfig) -> None:
     reader = RecordingReader(Path(config.file))
     summary = _summarise(Path(config.file), reader)
     report = json.dumps(summary.to_json(), indent=2)
-    if config.json and config.json != "-":
-        write_text(Path(config.json), report + "\n")
-    if config.json == "-":
+    if config.json == STDOUT:
         echo(report)
     else:
+        write_report(config.json, summary.to_json())
         echo_lines(text(summary))
     reader.require_undamaged()
 

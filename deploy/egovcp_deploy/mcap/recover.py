@@ -8,6 +8,7 @@ from pathlib import Path
 from egovcp.errors import UsageError
 from egovcp.log.mcap import McapFile
 from egovcp.log.mcap_reader import RecordingReader
+from egovcp.outputs import output_file
 from egovcp.terminal import echo
 
 
@@ -18,7 +19,7 @@ class RecoverConfig:
 
     file: str = ""
     """The torn or damaged recording."""
-    output: str = ""
+    output: str = output_file()
     """The new recording."""
 
 

@@ -18,6 +18,7 @@ from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore
 from egovcp.errors import ArtefactError, UsageError
+from egovcp.outputs import require_writable
 from egovcp.policy_options import PolicyOptions
 from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
@@ -30,7 +31,6 @@ from egovcp_train.heldout.report import Report, measure
 from egovcp_train.heldout.table import table
 from egovcp_train.labels.config import PassingConfig
 from egovcp_train.labels.passing import label
-from egovcp_train.output import require_writable
 from egovcp_train.return_scale import ReturnScale, on_task_scales
 
 PROG: Final = "egovcp-eval-model"

@@ -18,6 +18,7 @@ from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
 from egovcp.hardware import available_cores
 from egovcp.intervals import wilson
+from egovcp.outputs import require_writable
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
@@ -26,7 +27,6 @@ from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
 from egovcp_train.lowlevel.skills import SKILLS, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
-from egovcp_train.output import require_writable
 
 PROG = "egovcp-eval-lowlevel"
 RESULT = "lowlevel.json"

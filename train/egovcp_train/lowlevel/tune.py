@@ -22,6 +22,7 @@ from egovcp.atomic import write_json
 from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import run_command
 from egovcp.hardware import available_cores
+from egovcp.outputs import require_writable
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.gait import GaitConfig
 from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
@@ -31,7 +32,6 @@ from egovcp.spec import ACTION_BOX, CONTROLLER_HZ
 from egovcp.terminal import echo
 from egovcp_train.lowlevel import events
 from egovcp_train.lowlevel.task import DisturbanceConfig
-from egovcp_train.output import require_writable
 
 PROG: Final = "egovcp-tune-gait"
 RESULT: Final = "gait.json"
@@ -84,10 +84,10 @@ def tune(config: TuneConfig) -> None:
     """
     require_robots("--population", config.population, config.population * len(_SPEEDS))
     require_packages("egovcp-train", PROG, "cma", *SIMULATOR_MODULES)
-    import cma
-
     output = Path(config.output_dir)
     require_writable(output)
+    import cma
+
     output.mkdir(parents=True, exist_ok=True)
     search = cma.CMAEvolutionStrategy(
         np.zeros(len(flat(config.start))),

@@ -15,7 +15,7 @@ import torch
 from egovcp.cli import run_command, save_config
 from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
-from egovcp.robot.controllers import absolute_controller
+from egovcp.robot.controllers import absolute_controller, make_controller
 from egovcp.sim.capacity import require_robots
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import (
@@ -49,6 +49,7 @@ def train(config: PpoTrainConfig) -> None:
     """
     require_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)
+    make_controller(config.env.controller)  # raises before the simulator is imported
     controller = absolute_controller(config.env.controller)  # resumed from any working directory
     config = dataclasses.replace(config, env=dataclasses.replace(config.env, controller=controller))
     torch.set_num_threads(config.threads or available_cores())

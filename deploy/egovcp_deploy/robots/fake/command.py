@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import queue
 import sys
@@ -12,10 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.atomic import write_bytes
 from egovcp.bounds import bounded
 from egovcp.cli import run_command
 from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.outputs import output_file, write_report
 from egovcp.rate import NS_PER_S, Clock, MonotonicClock
 from egovcp.sim.config import EnvConfig, eventful
 from egovcp.sim.live import LiveRobot, Outcome
@@ -68,7 +67,7 @@ class FakeConfig:
     detailed: bool = False
     """Tell casing and winding temperatures, status and lost packets of each motor in every state;
     LeRobot's bridge sends one temperature and no status."""
-    json: str = ""
+    json: str = output_file()
     """File for the outcomes, rewritten after each episode."""
     env: EnvConfig = field(default_factory=eventful)
     """Scenes, sensors, delays and randomisation. The controller only says in which pose to stand
@@ -109,7 +108,7 @@ def run(config: FakeConfig, opened: Callable[[Ports], None] = lambda ports: None
 
 def _check(config: FakeConfig) -> None:
     held_out(config.task, config.seed, 0)
-    folder = Path(config.json).parent
+    folder = Path(os.path.expanduser(config.json)).parent
     if config.json and not folder.is_dir():
         raise EnvironmentFailure(f"--json={config.json}: there is no folder {folder}")
 
@@ -140,13 +139,8 @@ def _live(config: FakeConfig, bridge: FakeBridge, stage: Stage) -> None:
             os._exit(1)
         if config.json and len(stage.outcomes) > written:
             written = len(stage.outcomes)
-            _write(config.json, stage.outcomes)
-
-
-def _write(path: str, outcomes: Sequence[Outcome]) -> None:
-    """Complete or absent, and quickly: the robot waits meanwhile."""
-    text = json.dumps([record(outcome) for outcome in outcomes], indent=2) + "\n"
-    write_bytes(Path(path), text.encode(), durable=False)
+            outcomes = [record(outcome) for outcome in stage.outcomes]
+            write_report(config.json, outcomes, durable=False)  # quickly: the robot waits
 
 
 class Pace:

@@ -1,0 +1,138 @@
+"""Files and folders that a command writes, refused before work starts if they cannot be written.
+
+    @dataclass(frozen=True)
+    class InfoConfig:
+        json: str = output_file()
+
+`egovcp.cli` checks such options after parsing. `write_report` writes the file.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import tempfile
+from contextlib import suppress
+from dataclasses import field
+from pathlib import Path
+from typing import Any, Final
+
+from egovcp.atomic import partial_path, write_text
+from egovcp.bounds import shown
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.safe_files import UnsafeFileError, require_regular
+
+STDOUT: Final = "-"
+"""Stands for standard output where an option allows it."""
+
+_KEY: Final = "output_file"
+
+
+def output_file(*, or_stdout: bool = False) -> str:
+    """A dataclass field for a file to write; its default, the empty string, means none.
+
+    Args:
+        or_stdout: `STDOUT` is allowed too.
+    """
+    exceptions = ("", STDOUT) if or_stdout else ("",)
+    option: str = field(default="", metadata={_KEY: exceptions})
+    return option
+
+
+def check_output_files(config: Any, prefix: str = "") -> None:
+    """Check every option of a dataclass, and of those within it, that names a file to write.
+
+    Args:
+        prefix: what stands before the name of an option, such as ``--``.
+
+    Raises:
+        UsageError: as `require_output_file`.
+        EnvironmentFailure: as `require_output_file`.
+    """
+    for option in dataclasses.fields(config):
+        name, value = f"{prefix}{option.name}", getattr(config, option.name)
+        if dataclasses.is_dataclass(value):
+            check_output_files(value, f"{name}.")
+        elif _KEY in option.metadata and value not in option.metadata[_KEY]:
+            require_output_file(value, name)
+
+
+def require_output_file(file: str, option: str) -> None:
+    """Raise unless ``file`` is a regular file, or a new file can be created there.
+
+    Files are replaced by renaming, which would replace a FIFO, a device or a dangling link too.
+
+    Args:
+        file: its path; ``~`` is expanded, and missing folders are created by `write_report`.
+        option: the flag, for messages.
+
+    Raises:
+        UsageError: something else is there, a parent is a file, or the name is too long.
+        EnvironmentFailure: no permission, or a file system that takes no files.
+    """
+    path, named = Path(os.path.expanduser(file)), f"{option}={shown(file)}"
+    try:
+        if path.is_symlink() or os.path.lexists(path):
+            require_regular(path)
+        else:
+            nearest_existing(partial_path(path))  # raises if the name is too long
+    except UnsafeFileError as error:
+        raise UsageError(f"{named} is {error}") from error
+    except PermissionError as error:
+        raise EnvironmentFailure(f"{named}: {error.strerror}") from error
+    except FileNotFoundError as error:
+        raise UsageError(f"{named} is a symbolic link to nothing; remove it") from error
+    except OSError as error:
+        raise UsageError(f"{named} cannot be a file: {error.strerror}") from error
+    if not nearest_existing(path.parent).is_dir():
+        raise UsageError(
+            f"{named} cannot be a file: {nearest_existing(path.parent)} is not a folder"
+        )
+    try:
+        require_writable(path.parent)
+    except EnvironmentFailure as error:
+        raise EnvironmentFailure(f"{named}: {error}") from error
+
+
+def require_writable(folder: Path) -> None:
+    """Raise unless files can be created in ``folder``, or the folder itself can be created.
+
+    Raises:
+        EnvironmentFailure: no permission, no space, a file or a broken link in the way.
+        OSError: the path is too long.
+    """
+    existing = nearest_existing(folder)
+    try:
+        with tempfile.TemporaryFile(dir=existing):
+            pass
+    except OSError as error:
+        raise EnvironmentFailure(f"cannot write to {existing}: {error.strerror}") from error
+
+
+def write_report(file: str, content: Any, durable: bool = True) -> None:
+    """Write the result of a command as strict JSON to the file of an option; nothing if empty.
+
+    Missing folders are created. A link is replaced, not followed.
+
+    Raises:
+        UsageError: the path is a folder, or lies below a file.
+        ValueError: ``content`` holds NaN or infinite numbers.
+    """
+    if not file:
+        return
+    path = Path(os.path.expanduser(file))
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n", durable)
+    except (FileExistsError, IsADirectoryError, NotADirectoryError) as error:
+        raise UsageError(f"--json={file} cannot be a file: {error.strerror}") from error
+
+
+def nearest_existing(path: Path) -> Path:
+    """The path itself, or the nearest of its parents that exists; links are not followed."""
+    for candidate in (path, *path.absolute().parents):
+        with suppress(FileNotFoundError, NotADirectoryError):
+            candidate.lstat()
+            return candidate
+    raise FileNotFoundError(str(path))
