@@ -28,3 +28,12 @@ def test_numbers_that_are_not_finite_and_silence_are_nothing_new() -> None:
     fresh.update(100_000_000, np.array([1.0, math.nan, 0.0]))
     fresh.update(150_000_000, None)
     assert fresh.age_s(200_000_000) == 0.2
+
+
+def test_empty_pictures_may_repeat_but_not_with_the_same_time() -> None:
+    fresh, empty = Freshness(), np.zeros((48, 64), np.uint16)
+    fresh.update(10**9, empty)
+    fresh.update(2 * 10**9, empty)
+    assert fresh.age_s(2 * 10**9) == 0.0
+    fresh.update(2 * 10**9, empty)
+    assert fresh.age_s(3 * 10**9) == 1.0
