@@ -36,7 +36,7 @@ class LimitedResult:
     seconds: float
     """Wall time, less the time in which the child waited for a processor that others used."""
     memory_bytes: int
-    """Peak resident memory beyond what the parent had at the fork."""
+    """Peak resident memory beyond what the child had right after the fork."""
     timed_out: bool
 
     @property
@@ -61,16 +61,18 @@ def run_limited(
         network: without it, opening a connection raises in the child, and the result has exit
             code 70 and a traceback.
     """
-    before = _status_bytes("VmRSS")
-    with tempfile.TemporaryFile() as log:
+    readable, writable = os.pipe()
+    with tempfile.TemporaryFile() as log, os.fdopen(readable) as at_start:
         started = time.monotonic()
         pid = os.fork()
         if pid == 0:
-            _run_child(function, log.fileno(), memory_bytes, network)
+            _run_child(function, log.fileno(), writable, memory_bytes, network)
+        os.close(writable)
         elapsed, timed_out = _wait(pid, started, seconds)
         if timed_out:
             os.kill(pid, signal.SIGKILL)
         _, status, usage = os.wait4(pid, 0)
+        before = int(at_start.read() or 0)
         log.seek(0)
         output = log.read().decode("utf-8", errors="backslashreplace")
     return LimitedResult(
@@ -107,10 +109,14 @@ def _queued_seconds(pid: int) -> float:
     return int(queued_ns) / 1e9
 
 
-def _run_child(function: Callable[[], int], log: int, memory_bytes: int, network: bool) -> NoReturn:
+def _run_child(
+    function: Callable[[], int], log: int, at_start: int, memory_bytes: int, network: bool
+) -> NoReturn:
     """Never returns: whatever happens, the child ends here and not in the test runner."""
     code = _CRASHED
     try:
+        os.write(at_start, str(_status_bytes("VmRSS")).encode())  # less than the parent's
+        os.close(at_start)
         os.dup2(log, 1)
         os.dup2(log, 2)
         sys.stdout = os.fdopen(1, "w", encoding="utf-8", buffering=1, closefd=False)

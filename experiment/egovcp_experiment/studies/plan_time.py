@@ -37,6 +37,7 @@ SEARCHES: Final[Mapping[str, tuple[OptimiserName, int]]] = {
 _FEW: Final = 256
 _MANY: Final = 1024
 _STEP: Final = 32  # candidates are a multiple of it
+_MOST: Final = 65_536
 
 
 @dataclass(frozen=True)
@@ -111,11 +112,11 @@ def _in_turns[K](policies: Mapping[K, Policy], rounds: int) -> dict[K, float]:
 def _afforded(
     planner: PlannerConfig, search: str, few_ms: float, many_ms: float, budget_ms: float
 ) -> dict[str, Any]:
-    """The largest number of candidates whose plan is in time; at least one elite's worth."""
+    """The largest number of candidates whose plan is in time, from `_STEP` to `_MOST`."""
     optimiser, iterations = SEARCHES[search]
     slope = max((many_ms - few_ms) / (_MANY - _FEW), 1e-9)
     room = _FEW + (budget_ms - few_ms) / slope
-    samples = max(_STEP, int(room // _STEP) * _STEP)
+    samples = min(max(_STEP, int(room // _STEP) * _STEP), _MOST)
     return {
         "optimiser": optimiser,
         "iterations": iterations,

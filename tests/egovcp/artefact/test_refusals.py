@@ -195,7 +195,7 @@ def _loaded(folder: Path) -> dict[str, torch.Tensor] | None:
         return None
 
 
-def test_of_1000_mutated_artefacts_none_loads_as_another_or_runs_code(
+def test_of_200_mutated_artefacts_none_loads_as_another_or_runs_code(
     original: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(*_: object, **__: object) -> None:
@@ -206,7 +206,7 @@ def test_of_1000_mutated_artefacts_none_loads_as_another_or_runs_code(
     folder, rng = Path(shutil.copytree(original, tmp_path / "copy")), np.random.default_rng(0)
     contents = {name: (original / name).read_bytes() for name in sorted(FILES)}
     truth, loads = load_artefact(str(original)).world_model.state_dict(), 0
-    for number in range(1000):
+    for number in range(200):
         name = sorted(FILES)[number % len(FILES)]
         mutate = _near_the_head if number % 2 else _mutate
         mutated = mutate(rng, contents[name])
@@ -221,7 +221,7 @@ def test_of_1000_mutated_artefacts_none_loads_as_another_or_runs_code(
             _loaded(folder)
             (folder / MANIFEST).write_bytes(contents[MANIFEST])
         (folder / name).write_bytes(contents[name])
-    assert loads < 20
+    assert loads < 4
 
 
 def test_it_holds_only_json_and_safetensors(original: Path) -> None:
