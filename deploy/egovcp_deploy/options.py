@@ -10,6 +10,7 @@ from typing import Final
 
 from egovcp.errors import EnvironmentFailure, UsageError, suggest
 from egovcp.hub import is_local_path
+from egovcp.outputs import require_writable
 
 PLANNER: Final = "planner"
 REFERENCES: Final = ("hold", "random", "oracle")
@@ -32,6 +33,7 @@ def check_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
 
     Raises:
         UsageError: no folder was named, or it holds other files.
+        EnvironmentFailure: it cannot be created or written to.
     """
     if not path:
         raise UsageError("--output_dir is missing; name a new folder for the results")
@@ -45,6 +47,10 @@ def check_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
             f"--output_dir={path} holds {foreign[0]} already; results are never overwritten: "
             "name another folder or remove this one"
         )
+    try:
+        require_writable(folder)
+    except EnvironmentFailure as error:
+        raise EnvironmentFailure(f"cannot create {path}: {error}") from error
     return folder
 
 

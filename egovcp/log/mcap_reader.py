@@ -348,9 +348,7 @@ def _require_mcap(path: Path) -> None:
     except FileNotFoundError as error:
         raise DataError(f"no recording at {path}; expected an MCAP file") from error
     except UnsafeFileError as error:
-        raise DataError(f"{path}: {error}") from error
-    except IsADirectoryError as error:
-        raise DataError(f"{path} is a folder; expected an MCAP file") from error
+        raise DataError(f"{path} is {error}") from error
     if MAGIC not in (start, end):
         found = "is empty" if not start else f"begins with {start!r}"
         raise DataError(f"{path} {found}; expected an MCAP file")

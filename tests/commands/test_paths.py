@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.artefact import save_artefact
+from egovcp.artefact import load_artefact, save_artefact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.flags import flags_of
 from egovcp.log.info import RunInfo
@@ -117,6 +117,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
             writer.add(random_episode(number, length=30))
     planner = PlannerConfig(samples=16, horizon=3, iterations=2, elites=4, eta=0.02)
     save_artefact(folder / "policy", toy_model(), planner, {"controller_id": StanceController().id})
+    load_artefact(str(folder / "policy"))  # imports what the forked commands would each import
     sink = McapSink(folder / "recording.mcap")
     sink.open(RunInfo("ball", seed=3, episode=7, hashes={CONTROLLER: StanceController().id}))
     for tick in ticks_of(random_episode(0, length=8)):
