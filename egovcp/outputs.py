@@ -78,7 +78,7 @@ def require_output_file(file: str, option: str) -> None:
         else:
             nearest_existing(partial_path(path))  # raises if the name is too long
     except UnsafeFileError as error:
-        raise UsageError(f"{named} is {error}") from error
+        raise UsageError(f"{named} cannot be a file: found {error}") from error
     except PermissionError as error:
         raise EnvironmentFailure(f"{named}: {error.strerror}") from error
     except FileNotFoundError as error:
