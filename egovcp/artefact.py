@@ -301,8 +301,8 @@ def _check_processors(folder: Path) -> None:
 def _require_digest(path: Path, found: str, expected: object) -> None:
     if found != expected:
         raise ArtefactError(
-            f"{path}: SHA-256 is {found[:12]}..., the manifest says {shown(expected)[:13]}...; the "
-            "file was changed or damaged: fetch it again"
+            f"{path}: SHA-256 is {found[:12]}..., the manifest says {shown(str(expected)[:12])}; "
+            "the file was changed or damaged: fetch it again"
         )
 
 
