@@ -27,7 +27,7 @@ install: .venv/installed
 	@touch $@
 
 test: install
-	pytest --numprocesses=$(WORKERS) --dist=loadfile -m "not slow and not gpu"
+	pytest --numprocesses=$(WORKERS) --dist=loadfile --no-loadscope-reorder -m "not slow and not gpu"
 
 # Laptop scale: the throw comes at once, so that each simulated second teaches something, and the
 # robot stands by the stance law, which is cheaper to simulate and keeps the camera still. Hands

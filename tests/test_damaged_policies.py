@@ -13,9 +13,10 @@ import egovcp_train.export
 import egovcp_train.heldout.command
 import egovcp_train.push
 from egovcp.artefact import CONFIG, save_artefact
+from egovcp.data import DatasetWriter, Provenance
 from egovcp.errors import ArtefactError
 from egovcp.plan import PlannerConfig
-from egovcp.testing import toy_model
+from egovcp.testing import random_episode, toy_model
 from egovcp.testing.mutations.editing import edit_json, edit_tensors
 
 type Command = Callable[[str, str], int]
@@ -26,7 +27,7 @@ COMMANDS: dict[str, Command] = {
     "export": lambda policy, out: egovcp_train.export.main([policy, out]),
     "push": lambda policy, _: egovcp_train.push.main([policy, "--repo_id=me/policy"]),
     "eval-model": lambda policy, out: egovcp_train.heldout.command.main(
-        [policy, "--dataset.root=absent", out]
+        [policy, out, f"--dataset.root={Path(out.partition('=')[2]).parent / 'data'}"]
     ),
 }
 
@@ -46,6 +47,14 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture
+def data(tmp_path: Path) -> None:
+    """A dataset in ``data``, which `egovcp-eval-model` opens before the policy."""
+    with DatasetWriter(tmp_path / "data", Provenance("stance-1", 0, "egovcp-collect")) as writer:
+        writer.add(random_episode(0, 20, task="ball"))
+
+
+@pytest.mark.usefixtures("data")
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("damage", [_nan, _huge_plan])
 def test_a_damaged_policy_is_refused_by_every_command(
@@ -76,6 +85,7 @@ def test_a_damaged_policy_is_refused_by_lerobot(
         modeling.EgovcpPolicy.from_pretrained(folder)
 
 
+@pytest.mark.usefixtures("data")
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_folder_of_a_run_is_refused_with_the_folder_of_its_policy(
     original: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str

@@ -38,7 +38,7 @@ def test_every_subcommand_explains_its_options(
         (["check"], "which dataset?"),
         (["check", "{sound}", "--max_problem=3"], "did you mean '--max_problems'"),
         (["check", "{sound}", "--max_problems=0"], "expected at least 1"),
-        (["info", "{sound}", "--json={sound}"], "is a folder, expected a regular file"),
+        (["info", "{sound}", "--json={sound}"], "found a folder, expected a regular file"),
         (["audit", "{sound}", "--episodes=[0,6]"], "names episode 6, but the dataset has"),
         (["audit", "{sound}", "--episodes=1000"], "--episodes=1000: for a single episode write"),
     ],
