@@ -61,6 +61,8 @@ def run_all(kinds: Sequence[FaultKind], repetitions: int) -> list[Row]:
                 if row.problem:
                     print(f"{kind.name}: {row.problem}", file=sys.stderr, flush=True)
             print(f"{repetition + 1} of {repetitions}", file=sys.stderr, flush=True)
+    except KeyboardInterrupt:
+        print(f"interrupted: {len(rows)} runs are summed up", file=sys.stderr)
     finally:
         rig.close()
     return rows
