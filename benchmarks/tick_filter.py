@@ -19,8 +19,6 @@ from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import State
 
-_NOTHING = np.zeros(0, np.float32)
-
 
 class Unplanned:
     """A policy that costs nothing: what is measured is what surrounds it."""
@@ -39,7 +37,7 @@ class Unplanned:
     ) -> PolicyStep:
         """Neutral."""
         action = np.zeros((1, ACTION_DIM), np.float32)
-        return PolicyStep(action, _NOTHING, _NOTHING, _NOTHING, _NOTHING, _NOTHING, 0)
+        return PolicyStep(action)
 
 
 _TICK_NS = 1_000_000_000 // PLANNER_HZ

@@ -107,21 +107,33 @@ class OutOfBounds(UsageError):
         return OutOfBounds(f"{prefix}{option}", value, expected)
 
 
+def leaf_options(
+    config: Any, prefix: str = ""
+) -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:
+    """Name, field and value of every option of a dataclass and of the dataclasses within it.
+
+    Args:
+        prefix: what stands before each name, such as ``--policy.``.
+    """
+    for option in dataclasses.fields(config):
+        name, value = f"{prefix}{option.name}", getattr(config, option.name)
+        if dataclasses.is_dataclass(value):
+            yield from leaf_options(value, f"{name}.")
+        else:
+            yield name, option, value
+
+
 def check_bounds(config: Any, prefix: str = "") -> None:
     """Hold every number in a dataclass, and in those within it, against its bounds; without any it
     has to be finite.
 
     Args:
-        prefix: What stands before the name of an option, ``--policy.``.
+        prefix: as `leaf_options`.
 
     Raises:
         OutOfBounds: one is not within.
     """
-    for option in dataclasses.fields(config):
-        name, value = f"{prefix}{option.name}", getattr(config, option.name)
-        if dataclasses.is_dataclass(value):
-            check_bounds(value, f"{name}.")
-            continue
+    for name, option, value in leaf_options(config, prefix):
         bounds = bounds_of(option) or _ANY
         if bounds.longest is not None and len(value) > bounds.longest:
             raise OutOfBounds(name, f"a list of {len(value)}", f"at most {bounds.longest} numbers")
@@ -139,11 +151,9 @@ def check_cores(config: Any, prefix: str = "") -> None:
     Raises:
         OutOfBounds: there are too many.
     """
-    for option in dataclasses.fields(config):
-        name, value = f"{prefix}{option.name}", getattr(config, option.name)
-        if dataclasses.is_dataclass(value):
-            check_cores(value, f"{name}.")
-        elif (bounds := bounds_of(option)) and bounds.per_core is not None:
+    for name, option, value in leaf_options(config, prefix):
+        bounds = bounds_of(option)
+        if bounds is not None and bounds.per_core is not None:
             require_cores(name, value, bounds.per_core)
 
 

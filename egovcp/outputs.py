@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import tempfile
@@ -19,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.atomic import partial_path, write_text
-from egovcp.bounds import shown
+from egovcp.bounds import leaf_options, shown
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.safe_files import UnsafeFileError, require_regular
 
@@ -44,17 +43,14 @@ def check_output_files(config: Any, prefix: str = "") -> None:
     """Check every option of a dataclass, and of those within it, that names a file to write.
 
     Args:
-        prefix: what stands before the name of an option, such as ``--``.
+        prefix: as `egovcp.bounds.leaf_options`.
 
     Raises:
         UsageError: as `require_output_file`.
         EnvironmentFailure: as `require_output_file`.
     """
-    for option in dataclasses.fields(config):
-        name, value = f"{prefix}{option.name}", getattr(config, option.name)
-        if dataclasses.is_dataclass(value):
-            check_output_files(value, f"{name}.")
-        elif _KEY in option.metadata and value not in option.metadata[_KEY]:
+    for name, option, value in leaf_options(config, prefix):
+        if _KEY in option.metadata and value not in option.metadata[_KEY]:
             require_output_file(value, name)
 
 

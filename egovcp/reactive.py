@@ -249,8 +249,7 @@ class ReactivePolicy:
         """Depth (E, 48, 64) mm and state (E, 74) -> actions and no plan, in no time."""
         pictures = self._look(depth)
         action = self._network(pictures, torch.as_tensor(state, dtype=torch.float32)).numpy()
-        none = np.zeros(0, np.float32)
-        return PolicyStep(action, none, none, none, none, none, 0)
+        return PolicyStep(action)
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
         """See a picture without acting."""

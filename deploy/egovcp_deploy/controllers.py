@@ -132,9 +132,8 @@ class Scripted:
         remaining: Callable[[], float] | None = None,
     ) -> PolicyStep:
         """The reference's action, and no plan; it takes no time worth limiting."""
-        none = np.zeros(0, np.float32)
         action = self._controller.act(self._robot.env, Observation(depth, state))
-        return PolicyStep(np.asarray(action, np.float32), none, none, none, none, none, 0)
+        return PolicyStep(np.asarray(action, np.float32))
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
         """References keep no state of what they saw."""

@@ -27,16 +27,19 @@ LARGEST_STATE: Final = 1e3
 _WARM_UP_PLANS: Final = 2
 
 
+_NONE: Final[Array] = np.zeros(0, np.float32)
+
+
 class PolicyStep(NamedTuple):
-    """What the policy decided for E robots, as numpy arrays."""
+    """What the policy decided for E robots, as numpy arrays; empty where it decided nothing."""
 
     action: Array  # (E, 7) in [-1, 1]
-    plan: Array  # (E, N, 7)
-    value: Array  # (E,) J of the plan
-    termination: Array  # (E,) probability at the filtered state
-    candidates: Array  # (E, elites, N, 7), best first
-    candidate_values: Array  # (E, elites)
-    iterations: int
+    plan: Array = _NONE  # (E, N, 7)
+    value: Array = _NONE  # (E,) J of the plan
+    termination: Array = _NONE  # (E,) probability at the filtered state
+    candidates: Array = _NONE  # (E, elites, N, 7), best first
+    candidate_values: Array = _NONE  # (E, elites)
+    iterations: int = 0
     skipped: NDArray[np.bool_] = np.zeros(0, np.bool_)  # (E,) see `Policy.skipped`
 
 

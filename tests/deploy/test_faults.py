@@ -46,8 +46,7 @@ class Steady:
         self._count += 1
         plan = np.full((1, 4, ACTION_DIM), self._level if level is None else level, np.float32)
         plan[..., -1] = 0.0  # stay upright
-        none = np.zeros(0, np.float32)
-        return PolicyStep(plan[:, 0], plan, none, none, none, none, 1)
+        return PolicyStep(plan[:, 0], plan, iterations=1)
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
         pass

@@ -146,8 +146,7 @@ class _OraclePolicy:
         """One action, which is the whole plan."""
         truth = snapshot([self._robot.lane])
         action = self._oracle[truth.task[0]].act(truth, 0).astype(np.float32)[None]
-        none = np.zeros(0, np.float32)
-        return PolicyStep(action, action[:, None], none, none, none, none, 1)
+        return PolicyStep(action, action[:, None], iterations=1)
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
         """Nothing to remember."""

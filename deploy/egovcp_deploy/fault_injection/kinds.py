@@ -302,8 +302,7 @@ def _plan_of(value: float) -> Callable[[Report], list[list[bytes]]]:
 
 def _filled(report: Report, plan: np.ndarray[Any, np.dtype[np.floating[Any]]]) -> Reply:
     values = plan.astype(np.float32)
-    none = np.zeros(0, np.float32)
-    return Reply(report.tick, PolicyStep(values[:, 0], values, none, none, none, none, 1), 1.0)
+    return Reply(report.tick, PolicyStep(values[:, 0], values, iterations=1), 1.0)
 
 
 def _shaking() -> Callable[[Report], list[list[bytes]]]:

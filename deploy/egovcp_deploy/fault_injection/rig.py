@@ -107,8 +107,7 @@ def steady(report: Report, level: float = 0.3) -> Reply:
     """A plan that reaches a little, with the pelvis at its neutral height."""
     plan = np.full((1, 4, ACTION_DIM), level, np.float32)
     plan[..., -1] = 0.0
-    none = np.zeros(0, np.float32)
-    return Reply(report.tick, PolicyStep(plan[:, 0], plan, none, none, none, none, 1), 1.0)
+    return Reply(report.tick, PolicyStep(plan[:, 0], plan, iterations=1), 1.0)
 
 
 def answer_steadily(report: Report) -> list[list[bytes]]:

@@ -23,7 +23,6 @@ from egovcp_deploy.pilot.states import Request
 
 _REPLY_PARTS: Final = 2
 _MOST_RECEIVED: Final = 4 * BACKLOG  # messages per call
-_NONE: Final = np.zeros(0, np.float32)
 
 
 @dataclass(frozen=True)
@@ -124,7 +123,7 @@ def decode_reply(parts: Sequence[bytes]) -> Reply | None:
         raw, plan = parts
         header = json.loads(raw)
         steps = np.frombuffer(plan, "<f4").reshape(1, -1, ACTION_DIM)
-        step = PolicyStep(steps[:, 0], steps, _NONE, _NONE, _NONE, _NONE, 0)
+        step = PolicyStep(steps[:, 0], steps)
         events = tuple(map(str, header["events"]))
         return Reply(int(header["tick"]), step, float(header["plan_ms"]), events=events)
     except (ValueError, KeyError, TypeError, IndexError):

@@ -147,8 +147,7 @@ class Puppet:
             raise UsageError(f"an action is {ACTION_DIM} numbers in [-1, 1], found {wanted}")
         assert self._newest is not None, "connect first"
         steps = np.repeat(wanted[None, None].astype(np.float32), _KEPT, axis=1)
-        none = np.zeros(0, np.float32)
-        step = PolicyStep(steps[:, 0], steps, none, none, none, none, 0)
+        step = PolicyStep(steps[:, 0], steps)
         self._link.send(encode_reply(Reply(self._newest.tick, step, 0.0)))
         last = self._newest.sent
         taken = last + np.clip(wanted - last, -ACTION_RATE_LIMIT, ACTION_RATE_LIMIT)

@@ -136,8 +136,7 @@ class Reaching:
         self.observe(depth, state)
         plan = np.full((1, 4, ACTION_DIM), self.level, np.float32)
         plan[..., -1] = 0.0
-        none = np.zeros(0, np.float32)
-        return PolicyStep(plan[:, 0], plan, none, none, none, none, 1)
+        return PolicyStep(plan[:, 0], plan, iterations=1)
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
         self.seen.append(state[0].copy())

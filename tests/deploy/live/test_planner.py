@@ -33,8 +33,8 @@ class Still:
         self._left -= 1
         if self._left < 0:
             raise RuntimeError("out of\nideas")
-        none, plan = np.zeros(0, np.float32), np.zeros((1, 4, ACTION_DIM), np.float32)
-        return PolicyStep(plan[:, 0], plan, none, none, none, none, 1)
+        plan = np.zeros((1, 4, ACTION_DIM), np.float32)
+        return PolicyStep(plan[:, 0], plan, iterations=1)
 
     def observe(self, depth: object, state: object) -> None: ...
 
