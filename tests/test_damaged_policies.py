@@ -19,9 +19,9 @@ from egovcp.plan import PlannerConfig
 from egovcp.testing import random_episode, toy_model
 from egovcp.testing.mutations.editing import edit_json, edit_tensors
 
-type Command = Callable[[str, str], int]
+type RunCommand = Callable[[str, str], int]
 
-COMMANDS: dict[str, Command] = {
+COMMANDS: dict[str, RunCommand] = {
     "eval": lambda policy, out: egovcp_deploy.evaluate.main([policy, "--task=ball", out]),
     "deploy": lambda policy, out: egovcp_deploy.deploy.main([policy, "--task=ball", out]),
     "export": lambda policy, out: egovcp_train.export.main([policy, out]),

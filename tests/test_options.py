@@ -18,7 +18,7 @@ from egovcp.errors import UsageError
 
 ROOT = Path(__file__).resolve().parents[1]
 
-#: Command -> the class of its options, of those with numbers among them.
+#: ListedCommand -> the class of its options, of those with numbers among them.
 CONFIGS = {
     "egovcp-collect": "egovcp_collect.config:CollectConfig",
     "egovcp-train": "egovcp_train.config:TrainConfig",

@@ -13,7 +13,7 @@ from unittest import mock
 
 
 @dataclass(frozen=True)
-class Command:
+class ListedCommand:
     """A command, or one subcommand of it."""
 
     prog: str
@@ -41,12 +41,12 @@ class _ParsedError(Exception):
 
 
 @cache
-def all_commands() -> tuple[Command, ...]:
+def all_commands() -> tuple[ListedCommand, ...]:
     """Every command; of the experiments, which have the same options, the first."""
     return tuple(_commands())
 
 
-def _commands() -> Iterator[Command]:
+def _commands() -> Iterator[ListedCommand]:
     for entry in metadata.entry_points(group="console_scripts"):
         if not entry.name.startswith("egovcp-"):
             continue
@@ -61,7 +61,7 @@ def _commands() -> Iterator[Command]:
                     module.main(list(arguments))
                 except _ParsedError:
                     config_class, _, prog, _, defaults = parse.call_args.args
-                    yield Command(prog, module.main, arguments, config_class, defaults)
+                    yield ListedCommand(prog, module.main, arguments, config_class, defaults)
 
 
 def options_of(config_class: type[Any], prefix: str = "--") -> Iterator[tuple[str, Option]]:

@@ -20,11 +20,11 @@ from egovcp.rollouts import CONTROLLER, ticks_of
 from egovcp.testing import random_episode, toy_model
 from egovcp.testing.limited import LimitedResult, run_limited
 
-from .listing import Command, all_commands
+from .listing import ListedCommand, all_commands
 
 SECONDS = 30.0  # on a busy machine; what hangs takes for ever
 STANCE = "--env.controller=stance"
-#: Command -> (its arguments, options that name an input, options that name an output).
+#: ListedCommand -> (its arguments, options that name an input, options that name an output).
 CASES = {
     "egovcp-collect": (
         f"--dataset.root=NEW --episodes=1 --num_workers=1 {STANCE}",
@@ -131,7 +131,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_every_command_with_paths_is_covered() -> None:
+def test_every_command_is_listed() -> None:
     without = {"egovcp-depth-server"}
     assert {c.prog for c in all_commands()} == CASES.keys() | without
 
@@ -181,7 +181,7 @@ def _bad_flags(prog: str) -> Iterator[tuple[str, str]]:
                 yield f"--{option}", value
 
 
-def _problem(command: Command, flag: str, value: str, found: LimitedResult) -> str:
+def _problem(command: ListedCommand, flag: str, value: str, found: LimitedResult) -> str:
     output = found.output.replace("\n", "\\n")[-600:]
     if found.timed_out:
         return f"took more than {SECONDS} s: {output}"

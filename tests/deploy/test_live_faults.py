@@ -9,9 +9,9 @@ from collections.abc import Iterator
 
 import pytest
 
-from egovcp_deploy.fault_injection.kinds import FAULTS, FaultKind
+from egovcp_deploy.fault_injection.kinds import FAULTS, FaultKind, Outcome
 from egovcp_deploy.fault_injection.rig import FaultRig
-from egovcp_deploy.fault_injection.table import Row, markdown, run_fault
+from egovcp_deploy.fault_injection.table import DAMP_LIMIT_MS, run_fault
 
 _ATTEMPTS = 3  # a machine that is busy with other things delays sensors and planner as well
 
@@ -23,24 +23,17 @@ def rig() -> Iterator[FaultRig]:
     found.close()
 
 
-@pytest.fixture(scope="module")
-def rows() -> Iterator[list[Row]]:
-    """Those of all kinds that were tested; printed at the end."""
-    found: list[Row] = []
-    yield found
-    print("\n" + markdown(found))
-
-
 def test_there_are_at_least_60_kinds() -> None:
     assert len({kind.name for kind in FAULTS}) == len(FAULTS) >= 60
 
 
 @pytest.mark.parametrize("kind", FAULTS, ids=lambda kind: kind.name)
-def test_fault_ends_as_it_must(rig: FaultRig, rows: list[Row], kind: FaultKind) -> None:
+def test_fault_ends_as_it_must(rig: FaultRig, kind: FaultKind) -> None:
     for _ in range(_ATTEMPTS):
         row = run_fault(rig, kind)
         assert not row.unsound  # never, however busy the machine is
-        if not row.problem:
+        late = kind.outcome is Outcome.DAMP and (row.damped_ms or 0.0) > 2 * DAMP_LIMIT_MS
+        if not row.problem and not late:
             break
-    rows.append(row)
     assert not row.problem
+    assert not late, f"damped after {row.damped_ms:.0f} ms"

@@ -1,4 +1,4 @@
-"""Command lines and Python snippets of a Markdown file.
+"""DocumentedCommand lines and Python snippets of a Markdown file.
 
 A shell block is a fenced block marked ``bash``, ``sh`` or ``shell``, or an indented block whose
 lines are all commands. An inline command is a code span that begins with the name of a program.
@@ -30,7 +30,7 @@ command_not_found_handle() { printf '%s\0' "$#" "$@" >&3; }
 
 
 @dataclass(frozen=True)
-class Command:
+class DocumentedCommand:
     """A command line as the program would get it."""
 
     place: str
@@ -79,7 +79,7 @@ def read_page(path: Path, name: str) -> Page:
     return Page(tuple(shell), tuple(python), tuple(spans))
 
 
-def commands(page: Page) -> list[Command]:
+def commands(page: Page) -> list[DocumentedCommand]:
     """Every command of the page, expanded."""
     inline = [span for span in page.spans if _COMMAND.match(span.body)]
     found = [c for text in page.shell for c in expanded(text, inline=False)]
@@ -87,7 +87,7 @@ def commands(page: Page) -> list[Command]:
 
 
 @cache
-def expanded(text: Text, inline: bool) -> tuple[Command, ...]:
+def expanded(text: Text, inline: bool) -> tuple[DocumentedCommand, ...]:
     """What bash would start."""
     done = subprocess.run(
         ["/bin/bash", "-c", f"exec 3>&1 >/dev/null{_RECORD}{text.body}"],
@@ -98,7 +98,7 @@ def expanded(text: Text, inline: bool) -> tuple[Command, ...]:
     assert not done.stderr, f"{text.place}: {done.stderr.decode()}\n{text.body}"
     words = iter(done.stdout.decode().split("\0")[:-1])
     records = [tuple(islice(words, int(count))) for count in words]
-    return tuple(Command(text.place, argv, inline) for argv in records)
+    return tuple(DocumentedCommand(text.place, argv, inline) for argv in records)
 
 
 def _blocks(lines: list[str]) -> Iterator[tuple[int, str, list[str]]]:

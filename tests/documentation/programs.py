@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import io
 import re
 import runpy
@@ -15,11 +14,12 @@ from functools import cache
 from importlib import import_module, metadata
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, get_type_hints
+from typing import Any
 from unittest import mock
 
 import egovcp.cli
 from egovcp.entry_point import EntryPoint
+from egovcp.flags import flags_of
 from lerobot_env_egovcp import EgovcpEnvConfig
 from lerobot_policy_egovcp import EgovcpConfig
 
@@ -78,26 +78,16 @@ def known_flags() -> frozenset[str]:
         if point.name.startswith("egovcp-"):
             for subcommand in _subcommands(point.name):
                 found |= set(re.findall(r"--[\w.-]+", _help(point.name, *subcommand)))
-    found |= set(_option_names(EgovcpConfig, "--policy."))
-    found |= set(_option_names(EgovcpEnvConfig, "--env."))
+    found |= {flag.replace("--", "--policy.", 1) for flag in flags_of(EgovcpConfig)}
+    found |= {flag.replace("--", "--env.", 1) for flag in flags_of(EgovcpEnvConfig)}
     for script in (ROOT / "benchmarks").glob("*.py"):
         text = script.read_text(encoding="utf-8")
         found |= set(re.findall(r'"(--[\w.-]+)"', text))
         found |= {f"--{name}" for name in re.findall(r"^    (\w+): [^=\n]+ = ", text, re.M)}
     for study in (ROOT / "experiment/egovcp_experiment/studies").glob("[a-z]*.py"):
         module = import_module(f"egovcp_experiment.studies.{study.stem}")
-        found |= set(_option_names(module.CONFIG, "--")) if hasattr(module, "CONFIG") else set()
+        found |= set(flags_of(module.CONFIG)) if hasattr(module, "CONFIG") else set()
     return frozenset(found)
-
-
-def _option_names(config_class: type, prefix: str) -> Iterator[str]:
-    """Flags of a dataclass and of those within it."""
-    kinds = get_type_hints(config_class)
-    for field in dataclasses.fields(config_class):
-        name, kind = prefix + field.name, kinds[field.name]
-        yield name
-        if isinstance(kind, type) and dataclasses.is_dataclass(kind):
-            yield from _option_names(kind, f"{name}.")
 
 
 def _subcommands(program: str) -> list[list[str]]:

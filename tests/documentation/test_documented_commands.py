@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from .markdown import Command, Page, Text, commands, expanded, read_page
+from .markdown import DocumentedCommand, Page, Text, commands, expanded, read_page
 from .programs import ROOT, WrongCommand, check, known_flags
 
 #: The lab notebook quotes commands of its day; the template is filled in before it is read.
@@ -54,7 +54,7 @@ def complete(argv: Sequence[str]) -> list[str]:
     return [arg for arg in filled if arg != "..."]
 
 
-def refusal(command: Command) -> str:
+def refusal(command: DocumentedCommand) -> str:
     """Why the program refuses the command; empty if it does not."""
     argv = complete(command.argv)
     try:
@@ -65,7 +65,7 @@ def refusal(command: Command) -> str:
     return ""
 
 
-def is_result(command: Command) -> bool:
+def is_result(command: DocumentedCommand) -> bool:
     """Whether a report lists the command among hundreds that differ in few values."""
     return command.place.startswith("docs/results/")
 

@@ -4,7 +4,6 @@ import glob
 import re
 import shlex
 import shutil
-import socket
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,8 +13,9 @@ from huggingface_hub import HfApi
 from egovcp.log.destination import Viewer
 from egovcp.log.live import LiveRerun
 from egovcp.testing.hub import FakeHub, in_this_process
+from egovcp.testing.ports import free_port
 
-from .markdown import Command, Text
+from .markdown import DocumentedCommand, Text
 from .programs import main_of
 from .test_documented_commands import COMMANDS, PAGES, complete, is_result
 
@@ -56,9 +56,9 @@ _PUBLISHED = {
 }
 
 
-def runnable() -> list[Command]:
+def runnable() -> list[DocumentedCommand]:
     """Complete commands of ours; one of those that have the same flags."""
-    distinct: dict[tuple[str, ...], Command] = {}
+    distinct: dict[tuple[str, ...], DocumentedCommand] = {}
     for command in COMMANDS:
         line = " ".join(command.argv)
         if (
@@ -75,7 +75,7 @@ def runnable() -> list[Command]:
     return list(distinct.values())
 
 
-def _subcommand(command: Command) -> str:
+def _subcommand(command: DocumentedCommand) -> str:
     return "" if command.argv[1].startswith("-") else command.argv[1]
 
 
@@ -108,16 +108,11 @@ def sandbox(
 
 def _viewer_at_free_ports(words: str) -> LiveRerun:
     """`LiveRerun.of`, beside whatever runs on this machine."""
-    return LiveRerun(words, Viewer(f"rerun+http://127.0.0.1:{_free_port()}/proxy"), _free_port())
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as server:
-        return int(server.getsockname()[1])
+    return LiveRerun(words, Viewer(f"rerun+http://127.0.0.1:{free_port()}/proxy"), free_port())
 
 
 @pytest.mark.parametrize("command", runnable(), ids=lambda c: f"{c.place}-{c.argv[0]}")
-def test_a_documented_command_succeeds(command: Command, sandbox: Path) -> None:
+def test_a_documented_command_succeeds(command: DocumentedCommand, sandbox: Path) -> None:
     program, *args = complete(command.argv)
     _remove_outputs(program, args)
     args = [_EPISODES.sub(r"\g<1>4", arg) for arg in args]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
@@ -167,7 +166,3 @@ def test_entry_points_import_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True)
     assert done.stdout == b"set()\n"
-
-
-def test_sigint_has_its_default_handler_in_these_tests() -> None:
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler

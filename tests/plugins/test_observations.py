@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +19,6 @@ from egovcp.errors import ArtefactError, DataError
 from lerobot_policy_egovcp import EgovcpPolicy
 from lerobot_policy_egovcp.observations import read_observation
 
-README = Path(__file__).resolve().parents[2] / "README.md"
 ROBOTS = 2
 Batch = dict[str, Any]
 
@@ -185,32 +183,11 @@ def test_a_controller_other_than_that_of_the_data_is_refused(
     policy.select_action(batch | {"info": {}})
 
 
-# --- README --------------------------------------------------------------------------------
-def _snippet() -> str:
-    (found,) = [
-        code
-        for code in re.findall(
-            r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL
-        )
-        if "lerobot_policy_egovcp" in code
-    ]
-    return found
-
-
-def test_the_python_of_the_readme_selects_an_action(
-    artefact: Path, dataset_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "data").mkdir()
-    (tmp_path / "data" / "ball").symlink_to(dataset_root)
-    (tmp_path / "runs" / "lerobot" / "checkpoints" / "last").mkdir(parents=True)
-    place = tmp_path / "runs" / "lerobot" / "checkpoints" / "last" / "pretrained_model"
-    place.symlink_to(artefact)
-    monkeypatch.chdir(tmp_path)
-    names: dict[str, Any] = {}
-    exec(_snippet(), names)
-    assert isinstance(names["policy"], EgovcpPolicy)
-    action = names["action"]
-    assert action.shape == (1, spec.ACTION_DIM)
+# --- datasets ------------------------------------------------------------------------------
+def test_a_frame_of_a_dataset_is_accepted(artefact: Path, dataset_root: Path) -> None:
     frame = LeRobotDataset("me/ball", root=dataset_root)[0]
     batch = {key: frame[key][None] for key in (spec.DEPTH_KEY, spec.STATE_KEY)}
-    assert torch.equal(action, EgovcpPolicy.from_pretrained(artefact).select_action(batch))
+    expected = EgovcpPolicy.from_pretrained(artefact).select_action(batch)
+    action = EgovcpPolicy.from_pretrained(artefact).select_action(frame)
+    assert action.shape == (1, spec.ACTION_DIM)
+    assert torch.equal(action, expected)

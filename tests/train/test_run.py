@@ -1,6 +1,7 @@
 """egovcp-train from its command line: what it writes, what it refuses."""
 
 import os
+import pwd
 import re
 import shutil
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from egovcp.artefact import load_artefact
 from egovcp.checks import check_artefact
 from egovcp.cli import parse_config
 from egovcp.data import DatasetWriter, Episode, Provenance
+from egovcp.entry_point import prepare_process
 from egovcp.manifest import MANIFEST
 from egovcp.model import PRESETS, Batch
 from egovcp_train import device
@@ -82,6 +84,22 @@ def test_the_options_of_a_run_are_kept_and_repeat_it(arguments: Arguments, tmp_p
     assert main([f"--config_path={saved}", f"--output_dir={two}"]) == 0
     weights = "pretrained_model/model.safetensors"
     assert (_last(one) / weights).read_bytes() == (_last(two) / weights).read_bytes()
+
+
+def test_a_user_without_account_and_home_trains(
+    arguments: Arguments, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As under ``docker run --user 12345``."""
+
+    def unknown(uid: int) -> None:
+        raise KeyError(f"getpwuid(): uid not found: {uid}")
+
+    monkeypatch.delenv("HOME", raising=False)
+    for name in ("USER", "LOGNAME", "USERNAME", "LNAME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", unknown)
+    prepare_process()
+    assert main(arguments(tmp_path / "run", steps=1)) == 0
 
 
 def test_another_seed_gives_other_weights(arguments: Arguments, tmp_path: Path) -> None:

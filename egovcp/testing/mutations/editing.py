@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -38,8 +38,28 @@ def renew_digests(folder: Path) -> None:
     (folder / MANIFEST).write_text(json.dumps(sealed(manifest)))
 
 
-def pick(rng: Random, choices: Any) -> Any:
+def pick[T](rng: Random, choices: Sequence[T]) -> T:
+    """One of them."""
     return choices[int(rng.integers(len(choices)))]
+
+
+def flip_bits(path: Path, rng: Random, most: int) -> None:
+    """Flip up to ``most`` bits of a file."""
+    content = bytearray(path.read_bytes())
+    for at in rng.integers(len(content), size=int(rng.integers(1, most + 1))):
+        content[at] ^= 1 << int(rng.integers(8))
+    path.write_bytes(content)
+
+
+def wrong_encodings(text: str) -> list[bytes]:
+    """JSON that is not UTF-8, or not JSON at all."""
+    return [
+        text.encode("utf-16"),
+        text.encode().replace(b"e", b"\xff", 1),
+        text.replace("{", '{"\\ud800": 1,', 1).encode(),
+        text.encode() + b"\0",
+        b"",
+    ]
 
 
 def edit_json(folder: Path, name: str, change: Callable[[Json], object]) -> str:

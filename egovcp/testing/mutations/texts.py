@@ -17,6 +17,7 @@ from egovcp.testing.mutations.editing import (
     edit_json,
     pick,
     write_json,
+    wrong_encodings,
 )
 
 
@@ -164,15 +165,7 @@ def _write_many_values(folder: Path, rng: Random) -> str:
 
 def _write_json_in_another_encoding(folder: Path, rng: Random) -> str:
     name = pick(rng, JSON_FILES)
-    text = (folder / name).read_text()
-    kinds = [
-        text.encode("utf-16"),
-        text.encode().replace(b"e", b"\xff", 1),
-        text.replace("{", '{"\\ud800": 1,', 1).encode(),
-        text.encode() + b"\0",
-        b"",
-    ]
-    write_json(folder, name, pick(rng, kinds))
+    write_json(folder, name, pick(rng, wrong_encodings((folder / name).read_text())))
     return str(name)
 
 

@@ -17,6 +17,7 @@ from egovcp.testing.mutations.editing import (
     Random,
     edit_header,
     edit_tensors,
+    flip_bits,
     pick,
     pickled,
     renew_digests,
@@ -25,10 +26,7 @@ from egovcp.testing.mutations.editing import (
 
 def _flip_bits_of_a_file(folder: Path, rng: Random) -> str:
     name = pick(rng, FILES)
-    content = bytearray((folder / name).read_bytes())
-    for at in rng.integers(len(content), size=int(rng.integers(1, 8))):
-        content[at] ^= 1 << int(rng.integers(8))
-    (folder / name).write_bytes(content)
+    flip_bits(folder / name, rng, 7)
     return str(name)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.data import DatasetConfig, DatasetReader, destination
+from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.testing.hub import FakeHub
 from egovcp_collect.dataset.cli import main
 
@@ -77,15 +77,10 @@ def test_a_folder_that_holds_something_stays_as_it_is(
 def test_a_mount_point_is_refused_before_work_starts(
     command: Write,
     sound: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    mount_point: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    root, table = tmp_path / "mnt", tmp_path / "mountinfo"
-    root.mkdir()
-    table.write_text(f"1 2 254:0 / {root} rw - ext4 /dev/x rw\n")
-    monkeypatch.setattr(destination, "_MOUNTS", table)
     capsys.readouterr()
-    assert command(sound, root) == 5
-    assert f"{root} is a mount point" in capsys.readouterr().err
-    assert not os.listdir(root)
+    assert command(sound, mount_point) == 5
+    assert f"{mount_point} is a mount point" in capsys.readouterr().err
+    assert not os.listdir(mount_point)

@@ -38,6 +38,19 @@ PATIENT = [
 ]
 
 
+#: Nothing happens before the robot.
+QUIET = EnvConfig(
+    controller="stance",
+    ball_episode=EpisodeConfig(ticks=10_000, event_ticks=(9000, 9000), empty_probability=1.0),
+)
+
+
+@pytest.fixture(scope="module")
+def robot() -> LiveRobot:
+    """On the crane, before an empty scene."""
+    return LiveRobot(QUIET)
+
+
 @dataclass
 class Faults:
     """What is wrong with the readings at the moment."""
@@ -207,8 +220,7 @@ def make_rig() -> Callable[..., Rig]:
     """A robot on the crane before an empty scene; ``delay_ms`` by tick is the planner's."""
 
     def make(delay_ms: Callable[[int], int] = lambda tick: 10, level: float = 0.5) -> Rig:
-        quiet = EpisodeConfig(ticks=10_000, event_ticks=(9000, 9000), empty_probability=1.0)
-        robot = LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
+        robot = LiveRobot(QUIET)
         robot.start(Scenario("ball", 0, 0))
         clock, faults, policy = LockstepClock(time_ns=10**12), Faults(), Reaching(level)
         body = SimBody(robot, clock, faults)

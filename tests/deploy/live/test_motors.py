@@ -30,7 +30,7 @@ def sent(command: MotorCommand) -> Array:
     return decode_command(encode_command(command)).motors.position
 
 
-def test_the_slack_is_as_measured_per_joint() -> None:
+def test_targets_exceed_joint_ranges_by_0_1_to_0_6_rad() -> None:
     below, above = JOINT_LOWER - TARGET_LOW, TARGET_HIGH - JOINT_UPPER
     for slack in (below, above):
         assert (slack >= 0.0999).all()

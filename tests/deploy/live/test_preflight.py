@@ -11,7 +11,6 @@ import pytest
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.robot.stance_table import standing_pose
-from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
@@ -102,12 +101,6 @@ def test_modes_in_words() -> None:
     assert describe(5) == "mode machine 5: 29 joints, waist free"
     assert describe(6).startswith("mode machine 6: 29 joints, waist locked; warning: the waist")
     assert "not known" in describe(77)
-
-
-@pytest.fixture(scope="module")
-def robot() -> LiveRobot:
-    quiet = EpisodeConfig(ticks=10_000, event_ticks=(9000, 9000), empty_probability=1.0)
-    return LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
 
 
 type Look = Callable[..., tuple[int, dict[str, str]]]

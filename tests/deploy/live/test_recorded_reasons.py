@@ -18,7 +18,6 @@ from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.tick import Tick
 from egovcp.rate import MonotonicClock
-from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions, open_hardware
@@ -33,7 +32,7 @@ from egovcp_deploy.robots.fake import FakeBridge, Ports
 from egovcp_deploy.robots.fake.running import Running, config_of
 from egovcp_deploy.robots.zmq_eye import ZmqEyeConfig
 
-from .conftest import Reaching
+from .conftest import QUIET, Reaching
 
 #: A busy machine is no fault here.
 PATIENT = Limits(5.0, 10.0, 5.0, 5.0, 100_000, stand_s=0.3)
@@ -43,8 +42,7 @@ def test_a_recording_says_why_the_robot_was_held_and_damped(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "run.mcap"
-    quiet = EpisodeConfig(ticks=10_000, event_ticks=(9000, 9000), empty_probability=1.0)
-    robot = LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
+    robot = LiveRobot(QUIET)
     robot.start(Scenario("ball", 0, 0))
     fake = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
     running = Running(fake)

@@ -20,7 +20,6 @@ import pytest
 
 from egovcp.errors import DataError
 from egovcp.log.mcap_reader import read_recording
-from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp_deploy.pilot.states import State
@@ -88,12 +87,6 @@ class Stand:
     def end(self) -> str:
         """Its last words."""
         return self.program.communicate(timeout=120)[1]
-
-
-@pytest.fixture(scope="module")
-def robot() -> LiveRobot:
-    quiet = EpisodeConfig(ticks=10_000, event_ticks=(9000, 9000), empty_probability=1.0)
-    return LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
 
 
 @pytest.fixture

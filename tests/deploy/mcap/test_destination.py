@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.data import destination, open_dataset
+from egovcp.data import open_dataset
 from egovcp_deploy.mcap.cli import main
 
 from .conftest import Record
@@ -26,15 +26,8 @@ def test_a_link_stays_and_its_target_is_written(
 
 
 def test_a_mount_point_is_refused(
-    record: Record,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    record: Record, mount_point: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    root, table = tmp_path / "mnt", tmp_path / "mountinfo"
-    root.mkdir()
-    table.write_text(f"1 2 254:0 / {root} rw - ext4 /dev/x rw\n")
-    monkeypatch.setattr(destination, "_MOUNTS", table)
-    assert main(["to-dataset", str(record()), f"--dataset.root={root}"]) == 5
-    assert f"{root} is a mount point" in capsys.readouterr().err
-    assert not list(root.iterdir())
+    assert main(["to-dataset", str(record()), f"--dataset.root={mount_point}"]) == 5
+    assert f"{mount_point} is a mount point" in capsys.readouterr().err
+    assert not list(mount_point.iterdir())

@@ -32,7 +32,7 @@ def reading(time_ns: int, motors: MotorReadings, position: np.ndarray = ZERO) ->
     return BodyState(time_ns, position, ZERO, upright, np.zeros(3), motors=motors)
 
 
-class Rig:
+class WatchRig:
     """A watch and its clock; collects all events."""
 
     def __init__(self) -> None:
@@ -66,7 +66,7 @@ def torques(joint: int, torque: float) -> MotorReadings:
 
 
 def test_healthy_motors_say_nothing() -> None:
-    rig = Rig()
+    rig = WatchRig()
     assert rig.run(30.0) == MotorVerdict()
     assert rig.events == []
 
@@ -75,7 +75,7 @@ def test_healthy_motors_say_nothing() -> None:
 def test_a_motor_that_heats_up_is_warned_of_then_not_armed_with_then_held(
     column: int, limits: tuple[float, float, float]
 ) -> None:
-    rig = Rig()
+    rig = WatchRig()
     temperatures = [35.0, 35.0]
 
     def at(degrees: float) -> MotorVerdict:
@@ -99,14 +99,14 @@ def test_a_motor_that_heats_up_is_warned_of_then_not_armed_with_then_held(
 
 
 def test_a_single_hot_reading_holds_nothing() -> None:
-    rig = Rig()
+    rig = WatchRig()
     rig.run(1.0)
     assert not rig.run(0.1, heated(KNEE, 35.0, 200.0)).hold
     assert not rig.run(1.0).hold
 
 
 def test_one_temperature_per_motor_has_its_own_limits_and_is_told_once() -> None:
-    rig = Rig()
+    rig = WatchRig()
     temperature = np.full((29, 1), 35.0)
     single = replace(HEALTHY, temperature=temperature)
     assert rig.run(5.0, single) == MotorVerdict()
@@ -117,13 +117,13 @@ def test_one_temperature_per_motor_has_its_own_limits_and_is_told_once() -> None
 
 
 def test_the_reminder_comes_every_ten_seconds() -> None:
-    rig = Rig()
+    rig = WatchRig()
     rig.run(25.0, heated(KNEE, 35.0, 130.0))
     assert sum("let the robot down" in event for event in rig.events) == 3
 
 
 def test_what_is_not_reported_is_said_once_and_the_rest_goes_on() -> None:
-    rig = Rig()
+    rig = WatchRig()
     bare = MotorReadings(torque=HEALTHY.torque)
     assert rig.run(5.0, bare) == MotorVerdict()
     assert rig.events == [
@@ -134,7 +134,7 @@ def test_what_is_not_reported_is_said_once_and_the_rest_goes_on() -> None:
 
 
 def test_a_field_that_disappears_is_said() -> None:
-    rig = Rig()
+    rig = WatchRig()
     rig.run(1.0)
     rig.run(1.0, replace(HEALTHY, temperature=None))
     assert rig.events == [
@@ -147,7 +147,7 @@ def test_a_field_that_disappears_is_said() -> None:
     [(0x80000000, "lost the connection to the motor"), (0x1000, "output encoder (0x1000)")],
 )
 def test_a_motor_whose_status_says_that_it_dropped_out_is_damped(bits: int, words: str) -> None:
-    rig = Rig()
+    rig = WatchRig()
     rig.run(1.0)
     faults = np.zeros(29, np.int64)
     faults[KNEE] = bits
@@ -159,7 +159,7 @@ def test_a_motor_whose_status_says_that_it_dropped_out_is_damped(bits: int, word
 
 
 def test_a_motor_that_is_no_longer_enabled_is_damped() -> None:
-    rig = Rig()
+    rig = WatchRig()
     rig.run(1.0, replace(HEALTHY, enabled=np.arange(29) < 20))
     assert rig.run(1.0, replace(HEALTHY, enabled=np.arange(29) < 20)).damp == "", "never was"
     enabled = np.arange(29) < 20
@@ -169,7 +169,7 @@ def test_a_motor_that_is_no_longer_enabled_is_damped() -> None:
 
 
 def test_an_overloaded_motor_is_held_and_a_sensor_fault_forbids_arming_only() -> None:
-    rig = Rig()
+    rig = WatchRig()
     faults = np.zeros(29, np.int64)
     faults[KNEE] = 0x1
     verdict = rig.run(0.1, replace(HEALTHY, faults=faults))
@@ -183,7 +183,7 @@ def test_an_overloaded_motor_is_held_and_a_sensor_fault_forbids_arming_only() ->
 
 
 def test_a_motor_without_torque_although_much_is_commanded_is_damped_with_its_name() -> None:
-    rig = Rig()
+    rig = WatchRig()
     rig.run(1.0)
     asked = replace(HOLD_STILL, position=np.where(np.arange(29) == KNEE, 0.4, 0.0))
     dead = torques(KNEE, 0.3)
@@ -194,13 +194,13 @@ def test_a_motor_without_torque_although_much_is_commanded_is_damped_with_its_na
 
 @pytest.mark.parametrize("torque", [40.0, 10.0, -20.0])
 def test_a_motor_that_works_against_a_load_is_not_damped(torque: float) -> None:
-    rig = Rig()
+    rig = WatchRig()
     asked = replace(HOLD_STILL, position=np.where(np.arange(29) == KNEE, 0.4, 0.0))
     assert rig.run(5.0, torques(KNEE, torque), asked) == MotorVerdict()
 
 
 def test_a_target_that_changes_its_side_each_tick_accuses_nobody() -> None:
-    rig = Rig()
+    rig = WatchRig()
     rig.run(1.0)
     for k in range(100):
         away = np.where(np.arange(29) == KNEE, 0.4 * (-1) ** k, 0.0)
@@ -208,7 +208,7 @@ def test_a_target_that_changes_its_side_each_tick_accuses_nobody() -> None:
 
 
 def test_a_robot_that_estimates_no_torque_is_not_29_dead_motors() -> None:
-    rig = Rig()
+    rig = WatchRig()
     asked = replace(HOLD_STILL, position=np.full(29, 0.4))
     assert rig.run(5.0, replace(HEALTHY, torque=ZERO), asked) == MotorVerdict()
     assert rig.events == [
@@ -225,7 +225,7 @@ def test_the_same_reading_again_proves_nothing() -> None:
 
 
 def test_a_motor_that_loses_packets_is_warned_of_once_a_second() -> None:
-    rig = Rig()
+    rig = WatchRig()
     rig.run(1.0)
     for k in range(150):
         lost = np.where(np.arange(29) == KNEE, 3 * k, 0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import socket
 import time
 from collections.abc import Iterator
 
@@ -12,6 +11,7 @@ import zmq
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.robot.g1 import DAMPING, STIFFNESS
+from egovcp.testing.ports import free_port
 from egovcp_deploy.robots.body import MotorCommand
 from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
 from egovcp_deploy.robots.fake import FakeBridge
@@ -142,12 +142,6 @@ def test_a_robot_that_is_back_is_heard_again(body: BridgeBody, running: Running)
     finally:
         again.stop()
         revived.close()
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 def test_no_bridge_is_a_clear_failure() -> None:

@@ -55,7 +55,7 @@ def test_the_work_on_a_flood_is_bounded(listen: Callable[..., Listener]) -> None
         return False
 
     assert not listen(slow)._take_newest([b"bad"] * 100)
-    assert len(tried) <= 2
+    assert 1 <= len(tried) <= 2
 
 
 def test_a_full_queue_is_not_believed(listen: Callable[..., Listener]) -> None:

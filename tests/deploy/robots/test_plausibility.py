@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass
-class Reading:
+class StandingRobot:
     """A robot that stands still, with the noise of its sensors."""
 
     rng: np.random.Generator
@@ -45,7 +45,7 @@ class Reading:
         return BodyState(time_ns, *parts)
 
 
-Change = Callable[[Reading], None]
+Change = Callable[[StandingRobot], None]
 
 
 def problems(
@@ -55,7 +55,7 @@ def problems(
     rng = np.random.default_rng(0)
     plausibility, found = PlausibilityFilter(consistency), list[str]()
     for k in range(ONSET + duration):
-        reading = Reading(rng)
+        reading = StandingRobot(rng)
         if k >= ONSET:
             change(reading)
         found.append(plausibility.judge(reading.at(k * step_ns), reading.torque))
@@ -67,7 +67,7 @@ def speed(value: float) -> Change:
     return lambda reading: reading.speed.__setitem__(KNEE, value)
 
 
-def all_speeds(reading: Reading) -> None:
+def all_speeds(reading: StandingRobot) -> None:
     reading.speed[:] = 190.0 * (-1.0) ** np.arange(29)
 
 
@@ -83,7 +83,7 @@ def torque(value: float) -> Change:
     return lambda reading: reading.torque.__setitem__(KNEE, value)
 
 
-def rolled(reading: Reading) -> None:
+def rolled(reading: StandingRobot) -> None:
     reading.quaternion = np.array([np.cos(0.4), np.sin(0.4), 0.0, 0.0])
 
 
@@ -144,7 +144,7 @@ def test_one_bad_reading_costs_only_itself() -> None:
 def test_random_readings_within_bounds_are_rejected() -> None:
     rng = np.random.default_rng(1)
 
-    def wild(reading: Reading) -> None:
+    def wild(reading: StandingRobot) -> None:
         reading.position = rng.uniform(-0.2, 0.2, 29)
         reading.speed = rng.uniform(-1, 1, 29) * VELOCITY_LIMIT
 

@@ -21,15 +21,9 @@ from egovcp.log.destination import Viewer
 from egovcp.log.info import RunInfo
 from egovcp.log.live import LiveRerun
 from egovcp.log.rerun import RerunSink
+from egovcp.testing.ports import free_port
 
 INFO = RunInfo("ball")
-
-
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 def address(port: int) -> str:

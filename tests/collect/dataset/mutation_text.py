@@ -1,0 +1,172 @@
+"""Mutations of JSON files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Final
+
+from egovcp import spec
+from egovcp.testing.mutations.editing import Random, pick, wrong_encodings
+
+from . import damage as d
+from .damage import (
+    COLLECTION,
+    HASHES,
+    INFO,
+    STATS,
+)
+from .mutation_editing import (
+    JSON_FILES,
+    Mutate,
+    settle_hashes,
+)
+
+
+def _nest_json(root: Path, rng: Random) -> str:
+    name = pick(rng, (*JSON_FILES, HASHES))
+    depth = int(rng.integers(1000, 1_000_000))
+    opening, closing = pick(rng, [("[", "]"), ('{"a":', "}")])
+    _insert(root, name, opening * depth + "1" + closing * depth)
+    if name != HASHES:
+        settle_hashes(root, rng)
+    return name
+
+
+def _write_many_values(root: Path, rng: Random) -> str:
+    name = pick(rng, JSON_FILES)
+    _insert(root, name, "[" + ",".join(["[]"] * 1_500_000) + "]")
+    settle_hashes(root, rng)
+    return name
+
+
+def _write_a_constant_that_is_no_json(root: Path, rng: Random) -> str:
+    name = pick(rng, JSON_FILES)
+    _insert(root, name, pick(rng, ["NaN", "Infinity", "-Infinity", "1e999", "1" * 5000]))
+    settle_hashes(root, rng)
+    return name
+
+
+def _insert(root: Path, name: str, value: str) -> None:
+    text = (root / name).read_text()
+    (root / name).write_text(text.replace("{", f'{{"extra": {value},', 1))
+
+
+def _write_json_in_another_encoding(root: Path, rng: Random) -> str:
+    name = pick(rng, JSON_FILES)
+    (root / name).write_bytes(pick(rng, wrong_encodings((root / name).read_text())))
+    settle_hashes(root, rng)
+    return name
+
+
+def _write_something_else_than_an_object(root: Path, rng: Random) -> str:
+    name = pick(rng, (*JSON_FILES, HASHES))
+    texts = ["[]", "3", "null", '"text"', "true", "{}", "[{}]"]
+    (root / name).write_text(pick(rng, texts))
+    if name != HASHES:
+        settle_hashes(root, rng)
+    return name
+
+
+WRONG: Final[list[Any]] = [
+    None, True, False, -1, 10**30, 1e30, 0.5, "", "many", "1", [], {}, [1], [[[]]], {"a": 1},
+]  # fmt: skip
+
+
+def _other(rng: Random, value: object) -> Any:
+    """A value of another type or out of any range."""
+    wrong = [v for v in WRONG if type(v) is not type(value) or isinstance(v, int)]
+    return pick(rng, [v for v in wrong if v != value])
+
+
+def _change_info(root: Path, rng: Random) -> str:
+    required = ["codebase_version", "fps", "features", "total_episodes", "total_frames"]
+    required += ["total_tasks", "data_path", "splits"]
+
+    def change(content: dict[str, Any]) -> None:
+        group: Any = content
+        key: Any = pick(rng, required)
+        if rng.random() < 0.5:
+            feature = content["features"][pick(rng, list(spec.FEATURES))]
+            group, key = feature, pick(rng, ["dtype", "shape", "names"])
+        group[key] = _other(rng, group[key])
+
+    d.edit(INFO, change)(root)
+    settle_hashes(root, rng)
+    return INFO
+
+
+def _leave_the_folder(root: Path, rng: Random) -> str:
+    paths = [
+        "../../etc/passwd",
+        "/etc/passwd",
+        "data/../../x-{chunk_index}",
+        "data/{chunk_index.__class__}/{file_index}",
+        "data/{chunk_index:999999999d}.parquet",
+        "data/{0}.parquet",
+        "data/" + "x" * 100_000,
+        "data/.hidden/{file_index}.parquet",
+        "data/\0.parquet",
+        "data/chunk-{chunk_index:03d}/file-{chunk_index:03d}.parquet",
+    ]
+    d.info(data_path=pick(rng, paths))(root)
+    settle_hashes(root, rng)
+    return f"{INFO}|data/"
+
+
+def _change_a_record(root: Path, rng: Random) -> str:
+    def change(content: dict[str, Any]) -> None:
+        record = pick(rng, content["episodes"])
+        key = pick(rng, ["task", "time_limit", "sha256", "metadata", "length"])
+        record[key] = _other(rng, record[key])
+
+    d.edit(COLLECTION, change)(root)
+    settle_hashes(root, rng)
+    return f"{COLLECTION}|data/"
+
+
+def _change_the_provenance(root: Path, rng: Random) -> str:
+    names = ["controller_id", "seed", "command", "versions", "config", "spec_version", "episodes"]
+
+    def change(content: dict[str, Any]) -> None:
+        key = pick(rng, names)
+        # another seed, command or an empty object is a valid one
+        wrong = [v for v in WRONG if type(v) is not type(content[key]) and v is not None]
+        content[key] = pick(rng, wrong)
+
+    d.edit(COLLECTION, change)(root)
+    settle_hashes(root, rng)
+    return COLLECTION
+
+
+def _change_the_sources(root: Path, rng: Random) -> str:
+    wrong: list[Any] = [3, "x", {"a": 1}, [3], ["x"], [{}], [{"controller_id": 3}], [None]]
+    d.edit(COLLECTION, lambda c: c["config"].update(sources=pick(rng, wrong)))(root)
+    settle_hashes(root, rng)
+    return COLLECTION
+
+
+def _change_statistics(root: Path, rng: Random) -> str:
+    def change(content: dict[str, Any]) -> None:
+        feature = content[pick(rng, list(content))]
+        key = pick(rng, list(feature))
+        values = [_other(rng, feature[key]), [1e300], [10**400], ["0.5"], [True], None]
+        feature[key] = pick(rng, values)
+
+    d.edit(STATS, change)(root)
+    settle_hashes(root, rng)
+    return STATS
+
+
+TEXT_MUTATIONS: Final[tuple[Mutate, ...]] = (
+    _nest_json,
+    _write_many_values,
+    _write_a_constant_that_is_no_json,
+    _write_json_in_another_encoding,
+    _write_something_else_than_an_object,
+    _change_info,
+    _leave_the_folder,
+    _change_a_record,
+    _change_the_provenance,
+    _change_the_sources,
+    _change_statistics,
+)
