@@ -98,7 +98,7 @@ class OutOfBounds(UsageError):
     """A number that an option may not be."""
 
     def __init__(self, option: str, value: object, expected: str) -> None:
-        super().__init__(f"{option}={shown(value)}: expected {expected}")
+        super().__init__(f"{option}={as_flag_value(value)}: expected {expected}")
         self._facts = option, value, expected
 
     def under(self, prefix: str) -> OutOfBounds:
@@ -190,7 +190,7 @@ def _numbers(value: object, name: str) -> Iterator[float]:
                     yield from _numbers(inner, name)
 
 
-def shown(value: object) -> str:
+def as_flag_value(value: object) -> str:
     """A value as it is written on a command line, shortened if it is long."""
     text = ""
     for part in _yaml(value):  # may be endless: a YAML alias can name the list that it is in

@@ -47,8 +47,8 @@ class DataError(EgovcpError):
         """``"FILE, episode 3, frame 7: problem"``, with the place kept for reports."""
         numbers = {"episode": episode, "frame": frame}
         place = [f"{name} {number}" for name, number in numbers.items() if number is not None]
-        shown = os.fsencode(file).decode("utf-8", "backslashreplace")  # a name is bytes
-        error = cls(f"{', '.join([shown, *place])}: {problem}")
+        path = os.fsencode(file).decode("utf-8", "backslashreplace")  # a name is bytes
+        error = cls(f"{', '.join([path, *place])}: {problem}")
         error.problem, error.file, error.episode, error.frame = problem, str(file), episode, frame
         return error
 
@@ -79,12 +79,16 @@ class ConformanceError(EgovcpError):
     """A part does not keep its contract with the others (see `egovcp.checks`)."""
 
 
+def did_you_mean(name: str, valid: Iterable[str]) -> str:
+    """``"; did you mean 'ball'?"`` for an unknown ``name``; empty: nothing is near."""
+    near = difflib.get_close_matches(name, sorted(valid), n=1)
+    return f"; did you mean {near[0]!r}?" if near else ""
+
+
 def suggest(name: str, valid: Iterable[str]) -> str:
-    """``"; did you mean 'ball'? Choose from: arch, ball, wall"`` for an unknown ``name``."""
+    """``"; did you mean 'ball'? choose from: arch, ball, wall"`` for an unknown ``name``."""
     choices = sorted(valid)
-    near = difflib.get_close_matches(name, choices, n=1)
-    hint = f" did you mean {near[0]!r}?" if near else ""
-    return f";{hint} choose from: {', '.join(choices)}"
+    return f"{did_you_mean(name, choices) or ';'} choose from: {', '.join(choices)}"
 
 
 def suggest_path(path: str | os.PathLike[str]) -> str:

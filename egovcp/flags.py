@@ -10,7 +10,7 @@ from typing import Any, Final
 
 from draccus.utils import CONFIG_ARG
 
-from egovcp.errors import UsageError, suggest
+from egovcp.errors import UsageError, did_you_mean
 from egovcp.safe_files import UnsafeFileError, read_text, require_bounded
 from egovcp.values import (
     WrongValue,
@@ -63,8 +63,7 @@ def _checked(arg: str, flags: Mapping[str, Any]) -> str:
     if not flag.startswith("-"):
         raise UsageError(f"unexpected argument {arg!r}; options are written --name=value")
     if flag not in flags:
-        near = suggest(flag, flags).split(" choose from")[0].rstrip(";")
-        raise WrongValue(f"unknown option {flag}{near}")
+        raise WrongValue(f"unknown option {flag}{did_you_mean(flag, flags)}")
     if not equals and flags[flag] is not bool:
         raise WrongValue(f"option {flag} needs a value, {flag}=...")
     return arg if equals else f"{arg}=true"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import sys
 from pathlib import Path
 from typing import Final
 
@@ -50,13 +51,15 @@ def _of_the_system() -> int:
 
 
 def _of_the_container() -> int:
-    """What is left below the limit of control group v2; the system's memory where it has none."""
+    """What is left below the limit of control group v2; `sys.maxsize` if it has none."""
     try:
         limit = (_CGROUP / "memory.max").read_text(encoding="ascii").strip()
         used = int((_CGROUP / "memory.current").read_text(encoding="ascii"))
-        return int(limit) - used
-    except (OSError, ValueError):  # no such group, or its limit is "max"
-        return _of_the_system()
+        statistics = (_CGROUP / "memory.stat").read_text(encoding="ascii").splitlines()
+        cached = next(int(n) for key, n in map(str.split, statistics) if key == "inactive_file")
+        return int(limit) - used + cached  # the page cache is given up for other uses
+    except (OSError, ValueError, StopIteration):  # no such group, or its limit is "max"
+        return sys.maxsize
 
 
 def hardware() -> dict[str, object]:

@@ -11,7 +11,8 @@ from collections.abc import Iterator
 from itertools import pairwise
 from typing import Any, Final
 
-from egovcp.bounds import bounds_of, shown
+from egovcp.bounds import as_flag_value, bounds_of
+from egovcp.flags import CONFIG_FILE
 from egovcp.terminal import echo
 from egovcp.values import default_of, is_dataclass_type, option_types, type_name
 
@@ -31,11 +32,11 @@ def print_help(config_class: type, prog: str, epilog: str) -> None:
         prog,
         f"{prog} [--NAME=VALUE ...]",
         description=_first_paragraph(config_class),
-        epilog=_escaped(f"{_SYNTAX} {epilog}"),
+        epilog=f"{_SYNTAX} {epilog}",
         formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=44, width=110),
     )
     config_file = "Read options from this YAML, JSON or TOML file; flags override them."
-    parser.add_argument("--config_path", metavar="text", help=config_file)
+    parser.add_argument(CONFIG_FILE, metavar="text", help=config_file)
     _add_options(parser, parser, config_class, None, "--")
     echo(parser.format_help(), end="")
     raise SystemExit(0)
@@ -63,7 +64,7 @@ def _add_options(
         if default is dataclasses.MISSING:
             words.append("(required)")
         elif default != "":
-            words.append(f"(default: {shown(default)})")
+            words.append(f"(default: {as_flag_value(default)})")
         group.add_argument(flag, metavar=type_name(kind), help=_escaped(" ".join(words)))
     for flag, kind, default in nested:
         inner = parser.add_argument_group(flag.removeprefix("--"), _first_paragraph(kind))
@@ -91,7 +92,7 @@ def _documents(config_class: type) -> Iterator[tuple[str, str]]:
 
 def _first_paragraph(config_class: type) -> str:
     text = inspect.cleandoc(config_class.__doc__ or "").split("\n\n")[0]
-    return _escaped(" ".join(text.split()))
+    return " ".join(text.split())
 
 
 def _escaped(text: str) -> str:

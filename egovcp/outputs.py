@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.atomic import partial_path, write_text
-from egovcp.bounds import leaf_options, shown
+from egovcp.bounds import as_flag_value, leaf_options
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.safe_files import UnsafeFileError, require_regular
 
@@ -67,9 +67,9 @@ def require_output_file(file: str, option: str) -> None:
         UsageError: something else is there, a parent is a file, or the name is too long.
         EnvironmentFailure: no permission, or a file system that takes no files.
     """
-    path, named = Path(os.path.expanduser(file)), f"{option}={shown(file)}"
+    path, named = Path(os.path.expanduser(file)), f"{option}={as_flag_value(file)}"
     try:
-        if path.is_symlink() or os.path.lexists(path):
+        if os.path.lexists(path):
             require_regular(path)
         else:
             nearest_existing(partial_path(path))  # raises if the name is too long
@@ -81,10 +81,9 @@ def require_output_file(file: str, option: str) -> None:
         raise UsageError(f"{named} is a symbolic link to nothing; remove it") from error
     except OSError as error:
         raise UsageError(f"{named} cannot be a file: {error.strerror}") from error
-    if not nearest_existing(path.parent).is_dir():
-        raise UsageError(
-            f"{named} cannot be a file: {nearest_existing(path.parent)} is not a folder"
-        )
+    existing = nearest_existing(path.parent)
+    if not existing.is_dir():
+        raise UsageError(f"{named} cannot be a file: {existing} is not a folder")
     try:
         require_writable(path.parent)
     except EnvironmentFailure as error:
@@ -107,7 +106,7 @@ def require_writable(folder: Path) -> None:
 
 
 def write_report(file: str, content: Any, durable: bool = True) -> None:
-    """Write the result of a command as strict JSON to the file of an option; nothing if empty.
+    """Write the result of a command as strict JSON to the file of --json; nothing if empty.
 
     Missing folders are created. A link is replaced, not followed.
 

@@ -17,15 +17,15 @@ from typing import Any, Final, Literal, Union, get_args, get_origin, get_type_hi
 
 from draccus import cfgparsing
 
-from egovcp.bounds import OutOfBounds, shown
-from egovcp.errors import UsageError, suggest
+from egovcp.bounds import OutOfBounds, as_flag_value
+from egovcp.errors import UsageError, did_you_mean
 
 _BOOLEANS: Final[Mapping[str, bool]] = {
     **dict.fromkeys(("true", "yes", "on"), True),
     **dict.fromkeys(("false", "no", "off"), False),
 }
 _NULL: Final = ("null", "none", "~")
-_INT: Final = re.compile(r"[+-]?[0-9]{1,19}", re.ASCII)
+_INT: Final = re.compile(r"[+-]?[0-9]{1,19}")
 _YAML_FLOATS: Final[Mapping[Any, str]] = {".inf": "inf", "-.inf": "-inf", ".nan": "nan"}
 _INT_LIMIT: Final = 2**63
 _MAIN_OPTIONS: Final = ("root", "path", "type")
@@ -40,7 +40,7 @@ class WrongValue(UsageError):
     @classmethod
     def of(cls, name: str, value: object, kind: Any, hint: str = "") -> WrongValue:
         """``name=value: expected type``."""
-        return cls(f"{name}={shown(value)}: expected {type_name(kind)}{hint}")
+        return cls(f"{name}={as_flag_value(value)}: expected {type_name(kind)}{hint}")
 
 
 def type_name(kind: Any) -> str:
@@ -111,8 +111,8 @@ def build[C](
     options = {field.name: field for field in dataclasses.fields(config_class)}  # type: ignore[arg-type]
     for key in values:
         if key not in options:
-            near = suggest(f"{prefix}{key}", [f"{prefix}{name}" for name in options])
-            raise WrongValue(f"unknown option {prefix}{shown(key)}{near.split(' choose from')[0]}")
+            near = did_you_mean(f"{prefix}{key}", [f"{prefix}{name}" for name in options])
+            raise WrongValue(f"unknown option {prefix}{as_flag_value(key)}{near}")
     found: dict[str, Any] = {}
     for key, field in options.items():
         base = default_of(field) if default is None else getattr(default, key)
@@ -141,9 +141,10 @@ def convert(kind: Any, value: Any, name: str, default: Any = None) -> Any:
     """
     origin, args = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
-        if value is None or (isinstance(value, str) and value.lower() in _NULL):
+        null = value is None or (isinstance(value, str) and value.lower() in _NULL)
+        if null and NoneType in args:
             return None
-        return _converted_or_none(kind, value, name)
+        return _convert_union(kind, value, name)
     if is_dataclass_type(kind):
         if not isinstance(value, Mapping):
             raise WrongValue.of(name, value, kind, _options_of(kind, value, name))
@@ -160,12 +161,12 @@ def convert(kind: Any, value: Any, name: str, default: Any = None) -> Any:
         return _text(value, name)
     found = _scalar(kind, value)
     if found is None:
-        near = suggest(value, args) if origin is Literal and isinstance(value, str) else ""
-        raise WrongValue.of(name, value, kind, near.split(" choose from")[0].rstrip(";"))
+        near = did_you_mean(value, args) if origin is Literal and isinstance(value, str) else ""
+        raise WrongValue.of(name, value, kind, near)
     return found
 
 
-def _converted_or_none(kind: Any, value: Any, name: str) -> Any:
+def _convert_union(kind: Any, value: Any, name: str) -> Any:
     for part in get_args(kind):
         if part is not NoneType:
             try:
@@ -205,7 +206,7 @@ def _collection_or(text: str) -> Any:
 
 def _text(value: Any, name: str) -> str:
     if not isinstance(value, str):
-        raise WrongValue.of(name, value, str, f'; write "{shown(value)}"')
+        raise WrongValue.of(name, value, str, f'; write "{as_flag_value(value)}"')
     if "\0" in value:
         raise WrongValue.of(name, value, str, " without a NUL character")
     if not value.isascii():
@@ -245,7 +246,7 @@ def _options_of(config_class: Any, value: Any, name: str) -> str:
     names = [field.name for field in dataclasses.fields(config_class)]
     meant = [key for key in _MAIN_OPTIONS if key in names and isinstance(value, str)]
     if meant:
-        return f"; did you mean {name}.{meant[0]}={shown(value)}?"
+        return f"; did you mean {name}.{meant[0]}={as_flag_value(value)}?"
     prefix = "" if name.endswith("]") else f"{name}."  # of an item in a list: no flag
     listed = ", ".join(f"{prefix}{key}" for key in names[:_SHOWN_OPTIONS])
     return f"; its options are {listed}{', ...' if len(names) > _SHOWN_OPTIONS else ''}"
@@ -266,7 +267,7 @@ def _with_brackets(text: str) -> str:
     """
     out: list[str] = []
     opened: list[str] = []
-    quote, before = "", ","  # the quote that is open; the last character that is not a space
+    quote, before = "", ""  # the quote that is open; the last character that is not a space
     for character in text:
         starts = before in "[{(,:"  # a value may start here
         written = character
@@ -274,7 +275,7 @@ def _with_brackets(text: str) -> str:
             quote = "" if character == quote else quote
         elif starts and character in "'\"":
             quote = character
-        elif character in "[{" or (starts and character == "("):
+        elif character in "[{" or (starts and character == "(" and (opened or not before)):
             opened.append(character)
             if len(opened) > _NESTING_LIMIT:
                 raise ValueError(f"nested more than {_NESTING_LIMIT} deep")

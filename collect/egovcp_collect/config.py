@@ -46,7 +46,7 @@ class CollectConfig:
     """Number of episodes, those that --resume finds included."""
     resume: bool = False
     """Go on with the collection that is there, if any; with more episodes, extend the dataset."""
-    shard_episodes: int = bounded(SHARD_EPISODES, least=1, most=1_000_000)
+    shard_episodes: int = bounded(SHARD_EPISODES, least=1, most=65_536)
     """Episodes per data file; the dataset grows by one such shard at a time."""
     seed: int = bounded(0, least=0)
     """Episode i is a function of (seed, i) alone, whatever the number of workers."""

@@ -65,7 +65,7 @@ def dataset_problems(root: Path, progress: Progress | None = None) -> Iterator[D
         if episode is not None and not problems:
             for frame, problem in command_problems(episode):
                 yield DataError.at(reader.data_path(index), problem, index, frame)
-            matrix = total.add(index, episode)
+            matrix = total.add(episode)
             yield from duplicates.problems(index, reader.digest(index) or episode.digest())
         yield from _raised(table.problems(index, matrix))
         if progress is not None:

@@ -1,4 +1,4 @@
-"""Is every episode of a dataset in it once?"""
+"""Checks that no episode of a dataset occurs twice."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from egovcp.errors import DataError
 
 
 class DuplicateEpisodes:
-    """Finds episodes of a dataset that are in it twice."""
+    """Finds the episodes of a dataset that occur twice."""
 
     def __init__(self, reader: DatasetReader) -> None:
         self._reader = reader
@@ -25,8 +25,7 @@ class DuplicateEpisodes:
             yield error
             return
         found = self._finder.add(index, digest, scenario)
-        if found is not None and found.equal:
-            yield DataError.at(reader.data_path(index), f"repeats episode {found.place}", index)
-        elif found is not None:
-            problem = f"is {scenario}, and so is episode {found.place}, of other content"
-            yield DataError.at(reader.root / schema.COLLECTION_PATH, problem, index)
+        if found is not None:
+            record = reader.root / schema.COLLECTION_PATH
+            path = reader.data_path(index) if found.equal else record
+            yield DataError.at(path, found.problem(scenario), index)

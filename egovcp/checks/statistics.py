@@ -30,9 +30,9 @@ class StatisticsCheck:
         self._frames = 0
         self._total: stats.Matrix | None = None
 
-    def add(self, index: int, episode: Episode) -> stats.Matrix:
+    def add(self, episode: Episode) -> stats.Matrix:
         """Take in a valid episode; the statistics (R, D) of its frames."""
-        matrix = _statistics(self._reader, index, episode)
+        matrix = _statistics(self._reader, episode)
         parts = [matrix] if self._total is None else [self._total, matrix]
         counts = [len(episode)] if self._total is None else [self._frames, len(episode)]
         self._total = stats.aggregate(parts, counts)
@@ -96,18 +96,14 @@ class EpisodeStatistics:
                         yield path, row
 
 
-def _statistics(reader: DatasetReader, index: int, episode: Episode) -> stats.Matrix:
-    """(R, D) of an episode at its place in a dataset."""
+def _statistics(reader: DatasetReader, episode: Episode) -> stats.Matrix:
+    """(R, D) of the frames of an episode."""
     columns = {key: getattr(episode, name) for name, key in EPISODE_FEATURES.items()}
     depth = columns.pop(spec.DEPTH_KEY)
     frames = np.arange(len(episode), dtype=np.int64)
-    numbers = {name: number for number, name in reader.task_names.items()}
     places: dict[str, NDArray[np.generic]] = {
+        **dict.fromkeys(schema.INDEX_FEATURES, frames),  # those in _STALE are not compared
         "timestamp": (frames / reader.fps).astype(np.float32),
-        "frame_index": frames,
-        "episode_index": np.full_like(frames, index),
-        "index": frames + reader.first_frame(index),
-        "task_index": np.full_like(frames, numbers[episode.task]),
     }
     return np.concatenate([stats.data_stats(depth, columns), stats.index_stats(places)], axis=1)
 

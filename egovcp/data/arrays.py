@@ -14,7 +14,6 @@ or episode by episode, read when it is asked for::
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -38,10 +37,11 @@ def open_dataset(where: str | Path, revision: str = "") -> DatasetReader:
         revision: branch, tag or commit SHA, of a dataset on the Hub.
 
     Raises:
+        UsageError: nothing is named, or a revision of a folder.
         DataError: there is no such folder, it is damaged, or not one of this specification.
         EnvironmentFailure: the Hub cannot be reached.
     """
-    if not isinstance(where, str) or is_local_path(os.path.expanduser(where)):
+    if not isinstance(where, str) or is_local_path(where):
         return DatasetReader.open(DatasetConfig(root=str(where), revision=revision))
     return DatasetReader.open(DatasetConfig(repo_id=str(where), revision=revision))
 

@@ -155,6 +155,7 @@ class Committer:
         with removed_on_error(run.with_suffix(".partial")) as partial:
             partial.unlink(missing_ok=True)
             files.write_json(partial, asdict(self.provenance))
+            files.sync(partial)
             files.rename(partial, run)
 
 

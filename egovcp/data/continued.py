@@ -46,8 +46,8 @@ def read_version(root: Path) -> Existing:
     table = metadata.load_episode_table(root, info)
     episodes = len(table.length)
     collection = metadata.load_collection(root, table.length)
-    size = collection.get("shard_episodes")
-    if not isinstance(size, int) or size < 1 or not load_hashes(root):
+    size, hashes = collection.get("shard_episodes"), load_hashes(root)
+    if not isinstance(size, int) or size < 1 or not hashes:
         raise DataError(
             f"{root} was not written in shards by egovcp and cannot be extended; "
             "`egovcp-dataset repair` writes a copy that can"
@@ -66,7 +66,7 @@ def read_version(root: Path) -> Existing:
         int(table.length[:kept].sum()),
         _tasks(records[:kept], names_by_index),
         [(stats.aggregate(matrices[n], lengths[n]), sum(lengths[n])) for n in range(full)],
-        {name: load_hashes(root)[name] for name in names},
+        {name: hashes[name] for name in names},
     )
     tail = _tail(root, full, records[kept:], matrices[full]) if kept < episodes else []
     provenance = parse_provenance(collection, root / schema.COLLECTION_PATH)

@@ -30,7 +30,7 @@ def resolve_root(root: str | Path) -> Path:
     try:
         return Path(os.path.expanduser(root)).resolve()
     except (OSError, RuntimeError) as error:
-        raise UsageError(f"{root} is a symbolic link that leads nowhere; remove it") from error
+        raise UsageError(f"{root} is a loop of symbolic links; remove it") from error
 
 
 def is_vacant(root: Path) -> bool:
@@ -44,18 +44,21 @@ def is_vacant(root: Path) -> bool:
 def require_new(root: Path) -> None:
     """Raise if there is something at ``root``, or it cannot be created; nothing is overwritten.
 
+    Args:
+        root: as `resolve_root` returns it.
+
     Raises:
         UsageError: ``root`` is a file, lies below a file, or is a folder that is not empty.
-        EnvironmentFailure: no permission, or a file system that takes no files.
+        EnvironmentFailure: no permission, a file system that takes no files, or a mount point.
     """
-    resolved = resolve_root(root)
-    if not is_vacant(resolved):
+    if not is_vacant(root):
         raise UsageError(
             f"output folder {root} exists already and is not empty; choose another or remove it"
         )
-    if not nearest_existing(resolved.parent).is_dir():
+    if not nearest_existing(root.parent).is_dir():
         raise _below_file(root)
-    require_writable(resolved.parent)
+    require_writable(root.parent)
+    require_replaceable(root)
 
 
 def require_replaceable(root: Path) -> None:

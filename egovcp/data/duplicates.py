@@ -1,4 +1,4 @@
-"""Finds episodes that are there twice: with equal content, or of the same scenario."""
+"""Finds episodes that occur twice: with equal content, or of the same scenario."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from egovcp.data.origin import ScenarioKey
 
 @dataclass(frozen=True)
 class Duplicate[P]:
-    """An episode that came before."""
+    """The earlier episode that an episode repeats."""
 
     place: P
     """Where the earlier episode is."""
@@ -17,9 +17,15 @@ class Duplicate[P]:
     """Whether the content is equal. If not, seed, number and provenance are, so that one of the two
     was altered, or they were simulated on different machines."""
 
+    def problem(self, scenario: ScenarioKey | None) -> str:
+        """What is wrong with the later episode, which simulates ``scenario``."""
+        if self.equal:
+            return f"repeats episode {self.place}"
+        return f"is {scenario}, and so is episode {self.place}, of other content"
+
 
 class DuplicateFinder[P]:
-    """Is told of episodes one by one; ``P`` is whatever says where one is."""
+    """Finds repeated episodes among those passed to `add`; ``P`` is the type of a place."""
 
     def __init__(self) -> None:
         self._by_digest: dict[str, P] = {}

@@ -15,7 +15,7 @@ from egovcp.errors import DataError, suggest
 
 _ACTION_SLACK = 1e-6  # float32 rounding of an action on the wall of its box
 
-#: Longest episode, which is read as a whole: more than an hour.
+#: Longest episode, frames (33 minutes); an episode is read as a whole.
 EPISODE_FRAMES: Final = 50_000
 
 #: The arrays of an episode, in the order in which its digest takes them.

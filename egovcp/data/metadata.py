@@ -16,7 +16,6 @@ from egovcp.data import schema
 from egovcp.data.episode import EPISODE_FRAMES
 from egovcp.data.parquet import damaged, open_parquet
 from egovcp.data.paths import check_template, files_below, require_file
-from egovcp.data.provenance import parse_provenance
 from egovcp.data.records import record_problems
 from egovcp.errors import DataError
 from egovcp.safe_files import JSON_LIMIT_BYTES, read_json
@@ -238,7 +237,6 @@ def load_collection(root: Path, lengths: NDArray[np.int64]) -> dict[str, Any]:
     if collection.get("spec_version") != spec.SPEC_VERSION:
         found = collection.get("spec_version")
         raise DataError.at(path, f"specification {found}, expected {spec.SPEC_VERSION}")
-    parse_provenance(collection, path)
     for episode, problem in record_problems(collection.get("episodes"), lengths):
         raise DataError.at(path, problem, episode)
     return collection

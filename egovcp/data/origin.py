@@ -55,11 +55,6 @@ def source_of(count: int, facts: Mapping[str, Any]) -> int:
     return source
 
 
-def without_command(origin: Provenance) -> Provenance:
-    """What an episode depends on; the command that asked for it is not among it."""
-    return replace(origin, command="")
-
-
 @dataclass(frozen=True)
 class ScenarioKey:
     """Two collected episodes with equal keys simulate the same scenario."""

@@ -36,14 +36,15 @@ def damaged(path: Path) -> Iterator[None]:
     except UnsafeFileError as error:
         raise DataError.at(path, f"damaged: {error}") from error
     except MemoryError as error:  # ArrowMemoryError among them
-        raise DataError.at(path, "damaged: its content does not fit into memory") from error
+        raise DataError.at(path, "its content does not fit into memory") from error
     except OSError as error:
         if error.errno is not None:
             raise
         raise _damage(path, error) from error
-    except (pa.ArrowException, ArithmeticError, ValueError, TypeError, LookupError) as error:
-        raise _damage(path, error) from error
-    except RecursionError as error:
+    except (
+        *(pa.ArrowException, ArithmeticError, ValueError, TypeError, LookupError),
+        RecursionError,
+    ) as error:
         raise _damage(path, error) from error
 
 

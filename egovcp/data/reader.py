@@ -56,7 +56,10 @@ class DatasetReader:
         self._collection = metadata.load_collection(source.root, self.lengths)
         self.origin = parse_provenance(self._collection, source.root / schema.COLLECTION_PATH)
         """How the dataset was collected."""
-        self._scenarios = ScenarioKeys(self.origin)
+        try:
+            self._scenarios = ScenarioKeys(self.origin)
+        except DataError as error:
+            raise DataError.at(source.root / schema.COLLECTION_PATH, error.problem) from error
         self._task_names = metadata.load_tasks(source.root)
         self._file_start = _file_starts(self._table)
         self._shelf, self._episodes = shelf, episodes
@@ -157,7 +160,7 @@ class DatasetReader:
     @property
     def controller_id(self) -> str:
         """Low-level controller that the actions were given to."""
-        return str(self._collection["controller_id"])
+        return self.origin.controller_id
 
     @property
     def provenance(self) -> Mapping[str, Any]:
@@ -168,10 +171,6 @@ class DatasetReader:
     def stats(self) -> dict[str, Any]:
         """Statistics of every feature, as in ``meta/stats.json``."""
         return metadata.load_stats(self.root)
-
-    def first_frame(self, index: int) -> int:
-        """Index, in the dataset, of the first frame of an episode."""
-        return int(self._table.start[index])
 
     def task(self, index: int) -> str:
         """Task of an episode."""
@@ -192,10 +191,10 @@ class DatasetReader:
 
     @property
     def content_digest(self) -> str:
-        """Hash of the recorded digests of the episodes that are asked for, in order: equal for
-        copies of a dataset, wherever they lie."""
-        digests = "\n".join(self.digest(index) for index in self.chosen.tolist())
-        return hashlib.sha256(digests.encode()).hexdigest()
+        """Hash of identity, length and recorded digest of the episodes that are asked for, in
+        order: equal for copies of a dataset, wherever they lie."""
+        facts = (f"{self.identity(i)} {self.lengths[i]} {self.digest(i)}" for i in self.chosen)
+        return hashlib.sha256("\n".join(facts).encode()).hexdigest()
 
     def identity(self, index: int) -> str:
         """What the episode is, whatever dataset holds it: task, seed and episode number."""

@@ -7,7 +7,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.bounds import shown
+from egovcp.bounds import as_flag_value
 from egovcp.errors import UsageError
 
 _PART = re.compile(r"(\d{1,18})|(\d{0,18}):(\d{0,18})", re.ASCII)
@@ -30,7 +30,7 @@ def select_episodes(text: str, count: int, flag: str = "--dataset.episodes") -> 
     """
     if not text.strip():
         return np.arange(count)
-    given = f"{flag}={shown(text)}"
+    given = f"{flag}={as_flag_value(text)}"
     wanted: NDArray[np.int64] = np.unique(
         np.concatenate([_part(part, given, count) for part in _parts(text, given)])
     )
@@ -45,8 +45,8 @@ def _parts(text: str, given: str) -> list[str]:
         inner = inner[1:-1]
     elif inner.isdigit():
         raise UsageError(
-            f"{given}: for a single episode write [{shown(inner)}], for the first ones "
-            f"0:{shown(inner)}; in YAML, quote a range: '0:{shown(inner)}'"
+            f"{given}: for a single episode write [{as_flag_value(inner)}], for the first ones "
+            f"0:{as_flag_value(inner)}; in YAML, quote a range: '0:{as_flag_value(inner)}'"
         )
     return [part.strip() for part in inner.split(",")]
 
@@ -55,7 +55,7 @@ def _part(part: str, given: str, count: int) -> NDArray[np.int64]:
     found = _PART.fullmatch(part)
     if found is None:
         raise UsageError(
-            f"{given}: {shown(part)!r} is no episode; expected numbers, [0, 5, 7], a "
+            f"{given}: {as_flag_value(part)!r} is no episode; expected numbers, [0, 5, 7], a "
             "range without its end, 0:1334, or both, [0:100, 250]"
         )
     number, first, end = found.groups()

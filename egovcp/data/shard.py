@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 
 from egovcp.data import files, schema, stats
 from egovcp.data.encoded import EncodedEpisode, with_index
+from egovcp.safe_files import sha256
 
 
 def shard_paths(number: int) -> tuple[str, str]:
@@ -86,8 +87,7 @@ class Shard:
     def hashes(self) -> Mapping[str, str]:
         """SHA-256 of each file by its relative path."""
         return {
-            path: files.sha256(self._folder / path)
-            for path in (self._data_path, self._episodes_path)
+            path: sha256(self._folder / path) for path in (self._data_path, self._episodes_path)
         }
 
     def _episodes_table(self, counts: list[int]) -> pa.Table:

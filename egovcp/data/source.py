@@ -39,7 +39,7 @@ def local_root(config: DatasetConfig) -> Path:
         UsageError: neither root nor a well-formed repo id is given.
     """
     if config.root:
-        return Path(os.path.abspath(os.path.expanduser(config.root)))
+        return Path(os.path.expanduser(config.root)).absolute()
     _require_repo_id(config.repo_id)
     return lerobot_home() / config.repo_id
 

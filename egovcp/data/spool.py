@@ -19,6 +19,7 @@ import pyarrow as pa
 from egovcp.data import files
 from egovcp.data.encoded import EncodedEpisode, from_buffer, to_bytes
 from egovcp.errors import EnvironmentFailure
+from egovcp.safe_files import sha256
 
 _NAME: Final = re.compile(r"(\d{9})-([0-9a-f]{64})\.arrow")
 
@@ -106,6 +107,6 @@ class Spool:
 def _read(path: Path) -> EncodedEpisode | None:
     """The episode in a sealed file; None if the content is not what was sealed."""
     match = _NAME.fullmatch(path.name)
-    if match is None or files.sha256(path) != match[2]:
+    if match is None or sha256(path) != match[2]:
         return None
     return from_buffer(pa.memory_map(str(path)).read_buffer())

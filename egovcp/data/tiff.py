@@ -12,16 +12,12 @@ import io
 import struct
 import warnings
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from egovcp.errors import DataError
-
-if TYPE_CHECKING:
-    from PIL import Image
 
 _SHORT, _LONG = 3, 4
 _ENTRY_BYTES = 12
@@ -97,7 +93,10 @@ def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uin
     from PIL import Image, UnidentifiedImageError  # only for layouts that are not ours
 
     try:
-        with warnings.catch_warnings(action="ignore"), _open(blob) as image:
+        with (
+            warnings.catch_warnings(action="ignore"),
+            Image.open(io.BytesIO(blob), formats=("TIFF",)) as image,
+        ):
             mode, size = image.mode, image.size
             if mode.startswith("I;16") and size == (cols, rows):
                 return np.asarray(image).astype(np.uint16)
@@ -107,12 +106,6 @@ def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uin
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise _at(frame, f"is not a readable TIFF: {reason}") from error
     raise _at(frame, f"is {mode} {size[1]}x{size[0]}, expected uint16 {rows}x{cols}")
-
-
-def _open(blob: bytes) -> Image.Image:
-    from PIL import Image
-
-    return Image.open(io.BytesIO(blob), formats=("TIFF",))
 
 
 #: What Pillow raises on a damaged TIFF: its parser trusts what it reads.

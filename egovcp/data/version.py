@@ -23,6 +23,7 @@ from egovcp.data.encoded import EncodedEpisode
 from egovcp.data.provenance import Provenance
 from egovcp.data.shard import Shard, shard_paths
 from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.safe_files import sha256
 
 #: A file system or kernel that cannot exchange two folders.
 _NO_EXCHANGE: Final = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
@@ -203,7 +204,7 @@ class Version:
     def _all_hashes(self) -> dict[str, str]:
         """Every file of the dataset but this list itself."""
         paths = (schema.INFO_PATH, schema.STATS_PATH, schema.TASKS_PATH, schema.COLLECTION_PATH)
-        meta = {path: files.sha256(self.folder / path) for path in paths}
+        meta = {path: sha256(self.folder / path) for path in paths}
         return {**self._hashes, **meta}
 
 

@@ -13,7 +13,7 @@ from types import TracebackType
 from typing import Self
 
 from egovcp.data import schema
-from egovcp.data.destination import make_parent, require_new, require_replaceable, resolve_root
+from egovcp.data.destination import make_parent, require_new, resolve_root
 from egovcp.data.encoded import encode
 from egovcp.data.episode import Episode
 from egovcp.data.provenance import Provenance
@@ -42,7 +42,6 @@ class DatasetWriter:
         """
         self.root = resolve_root(root)
         require_new(self.root)
-        require_replaceable(self.root)
         make_parent(self.root)
         folder = self.root.with_name(f".{self.root.name}.{secrets.token_hex(4)}.partial")
         self._version = Version(folder, provenance, Contents(shard_episodes))

@@ -20,7 +20,6 @@ _FLOATS_PER_S: Final = 2e9  # element-wise operations
 _CALL_S: Final = 5e-4  # overhead of the operations of one step, whatever the number of samples
 _ACTION_COPIES: Final = 8  # noise, deltas, actions, and what the optimisers derive from them
 _BYTES: Final = 4
-_LARGEST: Final = 10**12  # numbers beyond it are not told apart
 
 
 class PlanCost(NamedTuple):
@@ -33,9 +32,7 @@ class PlanCost(NamedTuple):
 
 def plan_cost(model: WorldModelConfig, planner: PlannerConfig) -> PlanCost:
     """Estimate time and memory of a plan for one robot, on one core without a GPU."""
-    samples, iterations, actions = (
-        min(n, _LARGEST) for n in (planner.samples, planner.iterations, planner.actions)
-    )
+    samples, iterations, actions = planner.samples, planner.iterations, planner.actions
     steps = samples * actions * iterations
     floats = _floats_per_step(model)
     per_step = _products_per_step(model) / _PRODUCTS_PER_S + floats / _FLOATS_PER_S
@@ -50,17 +47,13 @@ def require_affordable(model: WorldModelConfig, planner: PlannerConfig) -> None:
     cost = plan_cost(model, planner)
     if cost.seconds > MAX_SECONDS or cost.memory_bytes > MAX_BYTES:
         raise UsageError(
-            f"planner.samples={_short(planner.samples)}, "
-            f"planner.horizon={_short(planner.horizon)} and "
-            f"planner.iterations={_short(planner.iterations)} take about {cost.seconds:,.1f} s on "
+            f"planner.samples={planner.samples}, "
+            f"planner.horizon={planner.horizon} and "
+            f"planner.iterations={planner.iterations} take about {cost.seconds:,.1f} s on "
             f"one core and {cost.memory_bytes / 1e6:,.0f} MB for each plan of one robot with these "
             f"networks; expected at most {MAX_SECONDS:.0f} s and {MAX_BYTES / 1e6:.0f} MB: lower "
             "them"
         )
-
-
-def _short(number: int) -> str:
-    return str(number) if number <= _LARGEST else f"{number:.3g}"
 
 
 def _products_per_step(c: WorldModelConfig) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from importlib import resources
 from pathlib import Path
 from typing import Final
@@ -25,7 +26,7 @@ def is_controller_file(which: str) -> bool:
 
 def absolute_controller(which: str) -> str:
     """The name of a controller that means the same in any working directory."""
-    return str(Path(which).expanduser().absolute()) if is_controller_file(which) else which
+    return os.path.abspath(os.path.expanduser(which)) if is_controller_file(which) else which
 
 
 def make_controller(which: str) -> LowLevelController:
@@ -44,9 +45,9 @@ def make_controller(which: str) -> LowLevelController:
         with resources.as_file(resources.files("egovcp.robot").joinpath(_SHIPPED)) as path:
             return WalkingController(WalkPolicy.load(path))
     if which.endswith(".safetensors"):
-        return WalkingController(WalkPolicy.load(Path(which)))
+        return WalkingController(WalkPolicy.load(Path(os.path.expanduser(which))))
     if which.endswith(".onnx"):
-        return WalkingController(OnnxPolicy(Path(which)))
+        return WalkingController(OnnxPolicy(Path(os.path.expanduser(which))))
     raise UsageError(
         f"unknown controller {which!r}; expected stance, walk, or a file PATH.safetensors or "
         "PATH.onnx that egovcp-train-lowlevel wrote"

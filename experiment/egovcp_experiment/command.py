@@ -111,7 +111,9 @@ def require_given(config: ExperimentConfig) -> None:
     are left to their cells.
 
     Raises:
-        UsageError: one is missing, or is something else.
+        UsageError: a folder is not named.
+        DataError: a dataset is missing or damaged.
+        ArtefactError: a policy is missing or damaged.
     """
     for task, root in config.data.roots.items():
         with _naming(f"--data.roots: {task}"):
@@ -130,7 +132,7 @@ def _naming(option: str) -> Iterator[None]:
     try:
         yield
     except EgovcpError as error:
-        raise UsageError(f"{option}: {error}") from error
+        raise type(error)(f"{option}: {error}") from error
 
 
 def _require_packages(cells: Sequence[Cell]) -> None:

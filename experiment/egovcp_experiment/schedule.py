@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import signal
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Final
 
 from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.stop_signals import stop_on_signal
 from egovcp_experiment.cell import Cell, in_order
 from egovcp_experiment.local import LocalRunner
 from egovcp_experiment.runner import INTERRUPTED, Run, Runner
@@ -80,7 +78,7 @@ class Schedule:
             EnvironmentFailure: cells failed; all that do not need them are complete.
             KeyboardInterrupt: after SIGINT or SIGTERM, once the commands have ended.
         """
-        with _stop_on_signal() as stopped:
+        with stop_on_signal() as stopped:
             try:
                 while not stopped and (self._start_some() or self._running):
                     self._collect()
@@ -187,22 +185,6 @@ class Schedule:
             f"cell {name}{more} failed: {words}; see {log}. All that does not need it is "
             "complete; the same command goes on from here once the cause is mended"
         )
-
-
-@contextmanager
-def _stop_on_signal() -> Iterator[list[int]]:
-    """Each SIGINT or SIGTERM adds itself to the list."""
-    received: list[int] = []
-
-    def note(number: int, frame: object) -> None:
-        received.append(number)
-
-    previous = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield received
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def _last_line(log: Path) -> str:

@@ -8,7 +8,6 @@ checkpoints/last -> 000500
 
 from __future__ import annotations
 
-import contextlib
 import os
 import shutil
 import warnings
@@ -26,7 +25,7 @@ from egovcp.model.weights import MAX_WEIGHT_BYTES
 from egovcp.safe_files import UnsafeFileError, open_regular, read_text, sha256
 
 STATE_FILE = "state.pt"
-DIGEST_FILE = "state.pt.sha256"
+DIGEST_FILE = f"{STATE_FILE}.sha256"
 """As ``sha256sum`` writes it; checkpoints of earlier versions have none."""
 _LIMIT_BYTES: Final = 5 * MAX_WEIGHT_BYTES + (1 << 30)  # weights, averages and moments; positions
 
@@ -99,7 +98,7 @@ def load_training_state(output_dir: Path) -> dict[str, Any]:
         ) from error
 
 
-@contextlib.contextmanager
+@contextmanager
 def restoring(output_dir: Path) -> Iterator[None]:
     """Around the code that takes a training state.
 

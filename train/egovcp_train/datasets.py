@@ -189,6 +189,8 @@ def require_datasets(config: TrainConfig, saved: Mapping[str, Any]) -> None:
         return
     before = saved.get("datasets") or [saved.get("dataset", {})]
     stored = [str(entry["root"]) for entry in before if entry.get("root")]
+    if not stored:
+        raise DataError(f"no dataset at {missing[0]}")
     flag = "--dataset.root=FOLDER"
     if config.datasets:
         entries = [{k: v for k, v in entry.items() if v not in (None, "")} for entry in before]
@@ -210,8 +212,12 @@ def require_same_content(readers: Sequence[DatasetReader], digests: Sequence[str
         DataError: a dataset is another one.
     """
     found = [reader.content_digest for reader in readers]
-    for number, reader in enumerate(readers):
-        if found[number : number + 1] != list(digests[number : number + 1]):
+    if len(found) != len(digests):
+        raise DataError(
+            f"cannot resume with {len(found)} datasets: the run was started with {len(digests)}"
+        )
+    for reader, digest, before in zip(readers, found, digests, strict=True):
+        if digest != before:
             raise DataError(
                 f"cannot resume with {reader.root}: its episodes are not those that the run was "
                 "started with; give the same data (an unchanged copy will do), or start a new run"

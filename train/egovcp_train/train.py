@@ -64,7 +64,7 @@ from egovcp_train.wandb_records import WandbRecorder, require_wandb
 
 PROG = "egovcp-train"
 LAUNCHER_ECHO_S = 5.0
-_BATCH_COPIES: Final = 4  # of a batch, as float32 and with what gradients need of it; at least
+_BATCH_COPIES: Final = 4  # of a batch on a CPU: float32, and what gradients need
 _UNRECORDED = (
     f"{PROG}: steps are right but many times slower than this GPU could make them, because they "
     "cannot be recorded as a CUDA graph ({reason}); --device=cpu may be as fast; please report it"
@@ -105,7 +105,7 @@ def train(config: TrainConfig) -> None:
     ranks = join(cpu=config.device == "cpu")  # first: it says which GPU is this process' own
     device = choose_device(config.device)
     bf16 = choose_bf16(config.mixed_precision, device)
-    _require_batch_memory(config, ranks)
+    _require_batch_memory(config, ranks, device)
     output = _prepare_output(config, ranks)
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
@@ -127,11 +127,12 @@ def train(config: TrainConfig) -> None:
     run.execute()
 
 
-def _require_batch_memory(config: TrainConfig, ranks: Ranks) -> None:
+def _require_batch_memory(config: TrainConfig, ranks: Ranks, device: torch.device) -> None:
     """Raise `UsageError` for a batch that is too large for this machine."""
     size, length = config.batch_size, config.sampling.length
     option = f"--batch_size={size} with --sampling.length={length}"
-    require_memory(option, size * length * ranks.local * _BATCH_COPIES * FRAME_BYTES)
+    copies = _BATCH_COPIES if device.type == "cpu" else 1
+    require_memory(option, size * length * ranks.local * copies * FRAME_BYTES)
 
 
 class Run:

@@ -8,8 +8,8 @@ from typing import Any
 import draccus
 from draccus.utils import DraccusException
 
-from egovcp.data import DatasetReader, Episode, schema
-from egovcp.data.origin import origin_of, parts_of, source_of
+from egovcp.data import DatasetReader, Episode, Provenance, schema
+from egovcp.data.origin import parts_of, source_of
 from egovcp.errors import DataError
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.scenario import Scenario
@@ -96,7 +96,7 @@ def _collection(reader: DatasetReader, index: int) -> CollectConfig:
         DataError: there is none, or this version cannot follow it.
     """
     path = reader.root / schema.COLLECTION_PATH
-    origin = origin_of(reader.origin, reader.metadata(index))
+    origin = _origin(reader, index, parts_of(reader.origin))
     settings = {name: origin.config[name] for name in SHAPING if name in origin.config}
     if "env" not in settings:
         raise DataError.at(path, "records no configuration of the simulator to repeat", index)
@@ -113,6 +113,15 @@ def _collection(reader: DatasetReader, index: int) -> CollectConfig:
     return config
 
 
+def _origin(reader: DatasetReader, index: int, parts: Sequence[Provenance]) -> Provenance:
+    """That of ``parts`` which an episode comes from."""
+    try:
+        return parts[source_of(len(parts), reader.metadata(index))]
+    except DataError as error:
+        raise DataError.at(reader.root / schema.COLLECTION_PATH, error.problem, index) from error
+
+
 def _recorded_versions(reader: DatasetReader, chosen: Sequence[int]) -> Iterator[Mapping[str, Any]]:
+    parts = parts_of(reader.origin)
     for index in chosen:
-        yield origin_of(reader.origin, reader.metadata(index)).versions
+        yield _origin(reader, index, parts).versions

@@ -12,13 +12,13 @@ from typing import Any, Final
 from huggingface_hub import DatasetCard, DatasetCardData
 
 from egovcp import spec
+from egovcp.atomic import write_text
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.errors import UsageError
 from egovcp.outputs import output_file
 from egovcp.terminal import echo
 from egovcp_collect.dataset import card_tables
 from egovcp_collect.dataset.figures import draw_figures, require_matplotlib
-from egovcp_collect.dataset.replace import replace_text
 from egovcp_collect.dataset.survey import Survey, survey
 from egovcp_collect.dataset.verdict import Thresholds, judge
 
@@ -71,7 +71,8 @@ def run(config: CardConfig) -> None:
     found = survey(reader, ReturnConfig())
     paths = draw_figures(found, ReturnConfig(), output.parent / config.assets)
     pictures = {path.stem: f"{config.assets}/{path.name}" for path in paths}
-    replace_text(output, _render(reader, config.repo_id, found, pictures))
+    output.parent.mkdir(parents=True, exist_ok=True)
+    write_text(output, _render(reader, config.repo_id, found, pictures))
     echo(f"wrote {output} and {len(paths)} pictures in {output.parent / config.assets}")
 
 

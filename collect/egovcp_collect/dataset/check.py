@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -57,12 +58,17 @@ def run(config: CheckConfig) -> None:
         echo(one_line(error))
     if hidden := hidden_files(root / "data") + hidden_files(root / "meta"):
         echo(
-            f"ignored {hidden} hidden files such as ._NAME of macOS, which LeRobot would read; "
-            f"remove them: find {root} -type f -name '.*' -delete"
+            f"ignored {hidden} hidden files and folders such as ._NAME of macOS, which LeRobot "
+            f"would read; remove them: find {_quoted(root / 'data')} {_quoted(root / 'meta')} "
+            "-name '.*' -prune -exec rm -r {} +"
         )
     if found:
         raise DataError(_verdict(found, root, config.max_problems))
     echo(f"{root}: {episodes} episodes, {frames} frames, nothing wrong")
+
+
+def _quoted(path: Path) -> str:
+    return shlex.quote(str(path))
 
 
 def _verdict(found: list[DataError], root: Path, limit: int) -> str:

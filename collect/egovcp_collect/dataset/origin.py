@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from egovcp.data import Provenance
-from egovcp.data.origin import SOURCE, SOURCES, parts_of, source_of, without_command
+from egovcp.data.origin import SOURCE, SOURCES, parts_of, source_of
 from egovcp.errors import DataError
 
 
@@ -47,6 +47,11 @@ def moved(facts: Mapping[str, Any], origins: Sequence[Provenance], index: int) -
         return dict(facts)
     before = sum(len(parts_of(origin)) for origin in origins[:index])
     return {**facts, SOURCE: before + source_of(len(parts_of(origins[index])), facts)}
+
+
+def without_command(origin: Provenance) -> Provenance:
+    """The provenance without its command, on which no episode depends."""
+    return replace(origin, command="")
 
 
 def _agreed(origins: Sequence[Provenance], name: str, version: str) -> bool:

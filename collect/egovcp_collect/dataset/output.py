@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from egovcp.data.destination import require_new, require_replaceable, resolve_root
+from egovcp.data.destination import require_new, resolve_root
 from egovcp.errors import UsageError
 
 
@@ -23,5 +23,4 @@ def new_folder(output_dir: str, sources: Sequence[Path]) -> Path:
         if folder.is_relative_to(source.resolve()):
             raise UsageError(f"--output_dir={output_dir} lies inside {source}; choose another")
     require_new(folder)
-    require_replaceable(folder)
     return folder

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader, schema
-from egovcp.data.destination import require_new, require_replaceable, resolve_root
+from egovcp.data.destination import require_new, resolve_root
 from egovcp.data.files import sync_tree
 from egovcp.data.hashes import verify_hashes
 from egovcp.data.lock import only_writer
@@ -55,12 +55,12 @@ def run(config: PullConfig) -> None:
         raise UsageError("--output_dir is missing: the new folder for the dataset")
     root = resolve_root(config.output_dir)
     if not (root / schema.SOURCE_PATH).is_file():
-        _require_free(root)
+        require_new(root)
     commit = resolve(repo_id, config.dataset.revision, config.network)
     if _is_there(root, repo_id, commit):
         echo(f"{root} is {repo_id}@{commit} already")
     else:
-        _require_free(root)
+        require_new(root)
         _bring(Source(root, repo_id, commit), config.network)
     _report(config, DatasetReader.open(DatasetConfig(root=str(root))))
 
@@ -70,11 +70,6 @@ def _is_there(root: Path, repo_id: str, commit: str) -> bool:
         return False
     verify_hashes(root)
     return True
-
-
-def _require_free(root: Path) -> None:
-    require_new(root)
-    require_replaceable(root)
 
 
 def _bring(source: Source, retry: RetryPolicy) -> None:

@@ -59,7 +59,7 @@ def run(config: RepairConfig) -> None:
     require_folder(root)
     output = new_folder(config.output_dir, [root])
     originals = _originals(config)
-    book = open_book(root, originals, _command(config))
+    book = open_book(root, originals, _command(root, originals))
     dropped: list[DataError] = []
     with tqdm(unit="ep", delay=1) as bar:
         kept, frames = _rebuild(root, book, output, dropped, bar)
@@ -73,8 +73,8 @@ def run(config: RepairConfig) -> None:
     echo(f"{output}: {kept} episodes, {frames} frames; {len(dropped)} problem(s) left behind")
 
 
-def _command(config: RepairConfig) -> str:
-    root, records = local_root(config.dataset), ",".join(map(str, _originals(config)))
+def _command(root: Path, originals: list[Path]) -> str:
+    records = ",".join(map(str, originals))
     flags = [f"--records={records}"] if records else []
     return shlex.join(["egovcp-dataset", "repair", str(root), *flags])
 
@@ -139,10 +139,8 @@ def _repetition(
         yield None, error.problem
         return
     found = finder.add(number, digest, scenario)
-    if found is not None and found.equal:
-        yield None, f"the same as episode {found.place}"
-    elif found is not None:
-        yield None, f"is {scenario}, and so is episode {found.place}, of other content"
+    if found is not None:
+        yield None, found.problem(scenario)
 
 
 def _place(root: Path, number: int) -> Path:

@@ -61,13 +61,12 @@ def run(config: ToDatasetConfig) -> None:
         raise UsageError("--dataset.revision has no meaning for a new dataset; drop it")
     require_packages("egovcp-deploy", "writing a dataset", *DATA_MODULES)
     from egovcp.data import DatasetWriter
-    from egovcp.data.destination import require_new, require_replaceable, resolve_root
+    from egovcp.data.destination import require_new, resolve_root
     from egovcp.data.source import local_root
 
     paths = [Path(os.path.expanduser(file)) for file in config.files]
     root = resolve_root(local_root(config.dataset))
     require_new(root)
-    require_replaceable(root)
     known = provenance(paths)
     require_different(paths, config.gaps)
     with DatasetWriter(root, known) as writer:

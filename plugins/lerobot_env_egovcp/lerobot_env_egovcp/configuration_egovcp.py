@@ -56,7 +56,6 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
     """LeRobot's names for it."""
 
     def __post_init__(self) -> None:
-        check_cores(self.simulation, "--env.simulation.")
         if self.task not in spec.TASKS:
             raise UsageError(f"no task {self.task!r}{suggest(str(self.task), spec.TASKS)}")
         if self.fps != spec.PLANNER_HZ:
@@ -71,6 +70,7 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gymnasium.vector.VectorEnv[Any, Any, Any]]]:
         """``n_envs`` robots side by side, in one process or in one each."""
+        check_cores(self.simulation, "--env.simulation.")
         make = [partial(LeRobotView, **self.gym_kwargs)] * n_envs
         mode = gymnasium.vector.AutoresetMode.SAME_STEP
         envs: gymnasium.vector.VectorEnv[Any, Any, Any] = (

@@ -86,7 +86,7 @@ def _tensor(batch: Mapping[str, Any], key: str) -> Tensor:
         raise DataError(
             f"{key} is a {type(value).__name__}; expected a torch.Tensor (torch.from_numpy)"
         )
-    if value.dtype not in (*_INTEGERS, *_FLOATS):
+    if key == spec.STATE_KEY and value.dtype not in (*_INTEGERS, *_FLOATS):
         raise DataError(f"{key} has type {_name(value)}; expected numbers, such as float32")
     return value
 

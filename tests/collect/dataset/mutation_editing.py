@@ -6,7 +6,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from egovcp.data.hashes import write_hashes
+from egovcp.atomic import write_json
+from egovcp.data.hashes import covered
+from egovcp.safe_files import sha256
 from egovcp.testing.mutations.editing import Random
 
 from .damage import (
@@ -31,6 +33,11 @@ ALL_FILES: Final = (*JSON_FILES, *PARQUET_FILES)
 ANY_FILE: Final = "|".join((*ALL_FILES, HASHES))
 MARKER: Final = "code-was-executed"
 SPARSE_BYTES: Final = 1 << 40
+
+
+def write_hashes(root: Path) -> None:
+    """List the SHA-256 of the files as they are now."""
+    write_json(root / HASHES, {name: sha256(root / name) for name in covered(root)})
 
 
 def settle_hashes(root: Path, rng: Random) -> None:

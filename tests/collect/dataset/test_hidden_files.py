@@ -1,7 +1,9 @@
 """Files that macOS writes beside those of a dataset are ignored by every reader."""
 
 import json
+import re
 import shutil
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -37,7 +39,12 @@ def test_check_passes_and_says_what_it_ignored(
     if not hashed:
         (from_mac / "meta/sha256.json").unlink()
     assert main(["check", str(from_mac)]) == 0
-    assert "hidden files such as ._NAME of macOS" in capsys.readouterr().out
+    note = capsys.readouterr().out
+    assert "hidden files and folders such as ._NAME of macOS" in note
+    (command,) = re.findall(r"remove them: (find .*)", note)
+    subprocess.run(command, shell=True, check=True)
+    assert main(["check", str(from_mac)]) == 0
+    assert "hidden" not in capsys.readouterr().out
 
 
 def test_a_dataset_without_hidden_files_has_no_note(

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
 from egovcp.model.gaussian import kl_divergence
 from egovcp.model.losses import Rollout, filter_sequence
@@ -101,6 +102,7 @@ def measure(
         stopped: once it returns true, the rest of the episodes is left out.
 
     Raises:
+        DataError: there are no episodes.
         KeyboardInterrupt: it was stopped before anything was measured.
     """
     model.eval()
@@ -113,7 +115,9 @@ def measure(
         summary.add(model, group.batch, rollout)
         tasks.setdefault(group.task, TaskReport(stride)).add(model, group, rollout)
     if not tasks:
-        raise KeyboardInterrupt
+        if stopped():
+            raise KeyboardInterrupt
+        raise DataError("no episodes to measure")
     return Report(
         summary.result(),
         {task: found.result() for task, found in tasks.items()},
