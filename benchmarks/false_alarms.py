@@ -10,11 +10,11 @@ import sys
 
 from report import parser, publish
 
-from egovcp_deploy.fault_injection.false_alarms import SITUATIONS, Healthy
+from egovcp_deploy.fault_injection.false_alarms import SITUATIONS, HealthyRun
 
 
 def main() -> None:
-    p = parser(__doc__)
+    p = parser(__doc__, rounds=None)
     p.add_argument("--minutes", type=float, default=10.0, help="simulated time, all together")
     p.add_argument("--seed", type=int, default=0, help="of the scenarios")
     args = p.parse_args()
@@ -22,7 +22,7 @@ def main() -> None:
     figures: dict[str, object] = {}
     total = dict.fromkeys(("seconds", "readings", "rejected", "holds", "falls"), 0.0)
     for situation in SITUATIONS:
-        healthy, episode = Healthy(situation, args.seed), 0
+        healthy, episode = HealthyRun(situation, args.seed), 0
         while (alarms := healthy.alarms).seconds < share:
             healthy.play(episode)
             episode += 1

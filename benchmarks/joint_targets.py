@@ -26,7 +26,7 @@ from egovcp.spec import JOINT_NAMES, TASKS
 Array = NDArray[np.float64]
 
 
-class Recorder:
+class TargetRecorder:
     """A controller that remembers the greatest excess of its targets, per robot."""
 
     def __init__(self, controller: LowLevelController, robots: int) -> None:
@@ -47,7 +47,7 @@ class Recorder:
 
 def excess(which: str, task: str, policy: Policy, robots: int, seed: int) -> tuple[Array, Array]:
     """(29,) rad below and above the range, the greatest of all robots that did not fall."""
-    recorder = Recorder(make_controller(which), robots)
+    recorder = TargetRecorder(make_controller(which), robots)
     config = replace(eventful(), controller=which)
     env = VectorEnv(config, robots, recorder, pictures=False)  # type: ignore[arg-type]
     scenarios = [Scenario(task, seed, i) for i in range(robots)]
@@ -56,14 +56,13 @@ def excess(which: str, task: str, policy: Policy, robots: int, seed: int) -> tup
     while not env.done.all():
         env.step(policy.act(env))
     stood = np.array([not lane.terminated for lane in env.lanes])
-    nothing = np.full(len(JOINT_NAMES), -np.inf)
     below = recorder.below[stood].max(axis=0, initial=-np.inf)
     above = recorder.above[stood].max(axis=0, initial=-np.inf)
-    return np.maximum(below, nothing), np.maximum(above, nothing)
+    return below, above
 
 
 def main() -> None:
-    p = parser(__doc__)
+    p = parser(__doc__, rounds=None)
     p.add_argument("--robots", type=int, default=16, help="episodes of each kind")
     p.add_argument("--seed", type=int, default=5, help="of the scenarios")
     args = p.parse_args()

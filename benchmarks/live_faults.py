@@ -15,9 +15,15 @@ from pathlib import Path
 
 from report import parser, publish
 
-from egovcp_deploy.fault_injection.kinds import FAULTS, FaultKind, Outcome
+from egovcp_deploy.fault_injection.kinds import FAULTS, FaultKind, Reaction
 from egovcp_deploy.fault_injection.rig import FaultRig
-from egovcp_deploy.fault_injection.table import DAMP_LIMIT_MS, Row, markdown, percentile, run_fault
+from egovcp_deploy.fault_injection.table import (
+    DAMP_LIMIT_MS,
+    FaultRun,
+    markdown,
+    percentile,
+    run_fault,
+)
 from egovcp_deploy.live.priority import raise_priority
 
 RIG_PRIORITY = 5
@@ -47,14 +53,14 @@ def loaded(processes: int) -> Iterator[None]:
             process.join()
 
 
-def run_all(kinds: Sequence[FaultKind], repetitions: int) -> list[Row]:
+def run_all(kinds: Sequence[FaultKind], repetitions: int) -> list[FaultRun]:
     """All faults in turn, ``repetitions`` times over; those without a judged time less often."""
     rows = []
     rig = FaultRig()
     try:
         for repetition in range(repetitions):
             for kind in kinds:
-                if kind.outcome is not Outcome.DAMP and repetition % UNTIMED_EVERY:
+                if kind.outcome is not Reaction.DAMP and repetition % UNTIMED_EVERY:
                     continue
                 row = run_fault(rig, kind)
                 rows.append(row)
@@ -68,7 +74,7 @@ def run_all(kinds: Sequence[FaultKind], repetitions: int) -> list[Row]:
     return rows
 
 
-def figures(rows: Sequence[Row]) -> dict[str, object]:
+def figures(rows: Sequence[FaultRun]) -> dict[str, object]:
     """Flat keys: per kind and over all."""
     out: dict[str, object] = {"kinds": len({row.kind.name for row in rows}), "runs": len(rows)}
     for name in dict.fromkeys(row.kind.name for row in rows):
@@ -79,7 +85,7 @@ def figures(rows: Sequence[Row]) -> dict[str, object]:
         out[f"{key}_damp_ms_p50"] = percentile([row.damped_ms for row in same], 50)
         out[f"{key}_damp_ms_p99"] = percentile([row.damped_ms for row in same], 99)
         out[f"{key}_greatest_change_rad"] = max(row.greatest_change for row in same)
-    timed = [row.damped_ms for row in rows if row.kind.outcome is Outcome.DAMP]
+    timed = [row.damped_ms for row in rows if row.kind.outcome is Reaction.DAMP]
     out["all_damp_ms_p50"] = percentile(timed, 50)
     out["all_damp_ms_p99"] = percentile(timed, 99)
     out["all_damp_ms_max"] = percentile(timed, 100)
@@ -88,9 +94,9 @@ def figures(rows: Sequence[Row]) -> dict[str, object]:
     return out
 
 
-def too_late(rows: Sequence[Row]) -> list[str]:
+def too_late(rows: Sequence[FaultRun]) -> list[str]:
     """Kinds that must damp and do so too late."""
-    names = dict.fromkeys(r.kind.name for r in rows if r.kind.outcome is Outcome.DAMP)
+    names = dict.fromkeys(r.kind.name for r in rows if r.kind.outcome is Reaction.DAMP)
     late = []
     for name in names:
         p99 = percentile([row.damped_ms for row in rows if row.kind.name == name], 99)
@@ -100,7 +106,7 @@ def too_late(rows: Sequence[Row]) -> list[str]:
 
 
 def main() -> None:
-    p = parser(__doc__)
+    p = parser(__doc__, rounds=None)
     p.add_argument(
         "--repetitions",
         type=int,

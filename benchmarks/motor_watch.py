@@ -76,7 +76,9 @@ def play(
             verdict = watches[i].update(reading, motors)
             seconds += 1.0 / CONTROLLER_HZ
             if verdict.damp or verdict.hold:
-                alarms.append(f"{skill.name} {tick / CONTROLLER_HZ:.2f} s: {verdict.damp}")
+                alarms.append(
+                    f"{skill.name} {tick / CONTROLLER_HZ:.2f} s: {verdict.damp or verdict.hold}"
+                )
                 noticed.append((tick - _DROPPED_TICK) / CONTROLLER_HZ)
                 standing[i] = False
     physics.close()
@@ -85,10 +87,15 @@ def play(
 
 def main() -> None:
     p = parser(__doc__)
-    p.add_argument("--controller", default="walk")
-    p.add_argument("--robots", type=int, default=16)
-    p.add_argument("--skills", nargs="*", default=["stand", "walk", "crouch", "push"])
-    p.add_argument("--dropped", action="store_true")
+    p.add_argument("--controller", default="walk", help="low-level controller")
+    p.add_argument("--robots", type=int, default=16, help="robots of each skill")
+    p.add_argument(
+        "--skills",
+        nargs="*",
+        default=["stand", "walk", "crouch", "push"],
+        help="of egovcp-eval-lowlevel",
+    )
+    p.add_argument("--dropped", action="store_true", help="let a knee drop out after a while")
     p.set_defaults(rounds=1)
     args = p.parse_args()
     total, alarms, noticed = 0.0, list[str](), list[float]()
@@ -99,11 +106,14 @@ def main() -> None:
             total, alarms, noticed = total + seconds, alarms + found, noticed + times
     for line in alarms[:20]:
         print(line)
-    figures: dict[str, object] = {"seconds": total, "alarms": len(alarms)}
+    name = "detections" if args.dropped else "alarms"
+    figures: dict[str, object] = {"seconds": total, name: len(alarms)}
     if noticed:
         p50, p99 = np.percentile(noticed, [50, 99])
         figures |= {"noticed_s_p50": p50, "noticed_s_p99": p99}
     publish(figures, args.json)
+    if alarms and not args.dropped:
+        raise SystemExit(1)
 
 
 if __name__ == "__main__":

@@ -33,13 +33,18 @@ def interleaved(cases: dict[str, Callable[[], object]], rounds: int) -> dict[str
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def parser(description: str | None) -> argparse.ArgumentParser:
-    """Options that all benchmarks share."""
+def parser(description: str | None, rounds: int | None = 15) -> argparse.ArgumentParser:
+    """Options that all benchmarks share.
+
+    Args:
+        rounds: default of ``--rounds``; None: there is no such option.
+    """
     p = argparse.ArgumentParser(
         description=description, formatter_class=argparse.ArgumentDefaultsHelpFormatter
     )
     p.add_argument("--json", type=Path, help="also write the figures to this file")
-    p.add_argument("--rounds", type=int, default=15, help="measurements of each case")
+    if rounds is not None:
+        p.add_argument("--rounds", type=int, default=rounds, help="measurements of each case")
     return p
 
 

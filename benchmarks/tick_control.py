@@ -24,9 +24,10 @@ from egovcp_deploy.live.hardware import Hardware, open_hardware
 from egovcp_deploy.live.priority import CONTROL, RECEIVING, raise_priority, raised_priority
 from egovcp_deploy.live.simulated import simulated
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Request, State
-from egovcp_deploy.robots.body import BodyState
+from egovcp_deploy.robots.body import BodyState, MotorCommand
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
 
 _CONTROLLER = "stance"
@@ -41,12 +42,24 @@ class _Unchecked(PlausibilityFilter):
         return ""
 
 
+class _Unwatched(MotorWatch):
+    """Finds nothing."""
+
+    def update(
+        self, reading: BodyState, command: MotorCommand | None, standing: bool = True
+    ) -> MotorVerdict:
+        """Nothing is wrong."""
+        return MotorVerdict()
+
+
 def _loop(hardware: Hardware, clock: MonotonicClock, checked: bool) -> ControlLoop:
     body = hardware.body
     pilot = Pilot(InlineDesk(Thinker(Unplanned()), clock), state=State.ARMED)
     controller = make_controller(_CONTROLLER)
     if not checked:
-        return ControlLoop(body, hardware.eye, controller, pilot)
+        loop = ControlLoop(body, hardware.eye, controller, pilot)
+        loop._motor_watch = _Unwatched()
+        return loop
     return ControlLoop(
         body,
         hardware.eye,
@@ -55,6 +68,7 @@ def _loop(hardware: Hardware, clock: MonotonicClock, checked: bool) -> ControlLo
         refusal=lambda: body.trouble,
         fault=lambda: body.fault,
         skipped=lambda: body.skipped,
+        link=hardware.link,
     )
 
 

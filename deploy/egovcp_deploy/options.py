@@ -37,7 +37,7 @@ def check_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
     """
     if not path:
         raise UsageError("--output_dir is missing; name a new folder for the results")
-    folder = Path(path)
+    folder = Path(os.path.expanduser(path))
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--output_dir={path} is a file; name a new folder")
     present = [entry.name for entry in folder.iterdir()] if folder.exists() else []
@@ -76,7 +76,7 @@ def absolute_path(path: str) -> str:
 
     An empty path stays empty, an id on the Hub is none.
     """
-    return str(Path(path).expanduser().absolute()) if path and is_local_path(path) else path
+    return os.path.abspath(os.path.expanduser(path)) if path and is_local_path(path) else path
 
 
 def versions() -> dict[str, str]:

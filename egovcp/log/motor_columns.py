@@ -28,25 +28,25 @@ def log_motor_styles(stream: rr.RecordingStream) -> None:
             stream.log(f"{path}/{name}", lines, static=True)
 
 
-def motor_columns(ticks: Sequence[Tick]) -> Iterator[Columns]:
-    """Torque, temperature, faults, lost packets, connection and state of the runner."""
+def motor_columns(ticks: Sequence[Tick], shown: dict[str, set[int]]) -> Iterator[Columns]:
+    """Torque, temperature, faults, lost packets, connection and state of the runner.
+
+    Args:
+        shown: path -> joints that have a curve of faults or lost packets, which this extends: a
+            curve that has begun goes on in later ticks.
+    """
     read = [(tick, tick.motors) for tick in ticks if tick.motors is not None]
     yield from _limbs(paths.MOTOR_TORQUE, [(tick, m.torque) for tick, m in read])
-    hottest = [(tick, hottest_sensor(m)) for tick, m in read if m.temperature is not None]
+    hottest = [
+        (tick, np.fmax.reduce(m.temperature, axis=1))
+        for tick, m in read
+        if m.temperature is not None
+    ]
     yield from _limbs(paths.MOTOR_TEMPERATURE, hottest)
     for path, pick in ((paths.MOTOR_FAULTS, _faults), (paths.MOTOR_LOST, _lost)):
-        yield from named_columns(path, ticks, _nonzero(ticks, pick))
+        yield from named_columns(path, ticks, _nonzero(ticks, pick, shown.setdefault(path, set())))
     yield from named_columns(paths.LINK, ticks, lambda tick: tick.link)
     yield from named_columns(paths.RUNNER, ticks, _mode)
-
-
-def hottest_sensor(motors: MotorReadings) -> NDArray[np.float64]:
-    """(29,) deg C, the hotter of a motor's sensors; not-a-number where none reports."""
-    assert motors.temperature is not None, "only motors that report temperatures have a hottest"
-    temperature = np.asarray(motors.temperature, np.float64)
-    known = np.isfinite(temperature)
-    hottest = np.where(known, temperature, -np.inf).max(axis=1)
-    return np.where(known.any(axis=1), hottest, np.nan)
 
 
 def _limbs(path: str, rows: Sequence[tuple[Tick, NDArray[np.floating]]]) -> Iterator[Columns]:
@@ -61,16 +61,19 @@ def _limbs(path: str, rows: Sequence[tuple[Tick, NDArray[np.floating]]]) -> Iter
 
 
 def _nonzero(
-    ticks: Sequence[Tick], pick: Callable[[MotorReadings], NDArray[np.integer] | None]
+    ticks: Sequence[Tick],
+    pick: Callable[[MotorReadings], NDArray[np.integer] | None],
+    shown: set[int],
 ) -> Callable[[Tick], Mapping[str, float]]:
-    """Of each tick the values of the joints that are not zero throughout ``ticks``."""
+    """Of each tick the values of the joints that have not been zero throughout."""
     rows = [pick(tick.motors) for tick in ticks if tick.motors is not None]
     known = [row for row in rows if row is not None]
-    shown = np.flatnonzero(np.any(known, axis=0)) if known else ()
+    if known:
+        shown.update(map(int, np.flatnonzero(np.any(known, axis=0))))
 
     def values(tick: Tick) -> Mapping[str, float]:
         row = None if tick.motors is None else pick(tick.motors)
-        return {} if row is None else {JOINT_NAMES[i]: float(row[i]) for i in shown}
+        return {} if row is None else {JOINT_NAMES[i]: float(row[i]) for i in sorted(shown)}
 
     return values
 

@@ -65,6 +65,7 @@ class RerunSink:
         self._wants_meshes = meshes
         self._meshes: dict[str, LinkMesh] = {}
         self._signals = signals
+        self._motors_shown: dict[str, set[int]] = {}
         self._batch: list[Tick] = []
         self._known: set[str] = set()
         self._stream: rr.RecordingStream | None = None
@@ -146,7 +147,7 @@ class RerunSink:
         if self._signals:
             groups += signal_columns(self._batch)
         else:
-            groups += motor_columns(self._batch)
+            groups += motor_columns(self._batch, self._motors_shown)
         for path, ticks, columns in groups:
             if ticks:
                 self._stream.send_columns(path, _times(ticks), columns)

@@ -14,30 +14,30 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.log.tick import MotorReadings
 from egovcp.plan import PolicyStep
-from egovcp.rate import NS_PER_S, LockstepClock
+from egovcp.rate import LockstepClock
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import eventful
 from egovcp.sim.live import LiveRobot, Phase, Servos
 from egovcp.sim.oracles import Oracle
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.truth import snapshot
-from egovcp.spec import PHYSICS_DT
+from egovcp.spec import CONTROLLER_HZ, PHYSICS_STEPS_PER_CONTROLLER_TICK
 from egovcp_deploy.live.control import ControlLoop, Wishes
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Request, State
 from egovcp_deploy.robots.body import BodyState, MotorCommand, Picture
+from egovcp_deploy.robots.fake.bridge import MODE
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
+from egovcp_deploy.robots.sim_body import STEP_NS
 
-_STEP_NS: Final = round(PHYSICS_DT * NS_PER_S)
-_STEPS_PER_TICK: Final = 4
 _SETTLE_TICKS: Final = 50
 _FALLING: Final = 0.8  # rad; from here on anything may be measured
 _STEERED_S: Final = 20.0
 _STEERING_TICKS: Final = 100  # between new velocities of the operator, and between pushes
 _PUSH: Final = 0.3  # m/s
-_MODE: Final = 5
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class _Body:
     def step(self) -> None:
         """Let 5 ms pass, then measure."""
         self._robot.advance()
-        self._clock.advance(_STEP_NS)
+        self._clock.advance(STEP_NS)
         seen = self._robot.measure()
         reading = BodyState(
             self._clock.now_ns(),
@@ -94,7 +94,8 @@ class _Body:
             seen.joint_velocity,
             seen.quaternion_w,
             seen.angular_velocity,
-            mode=_MODE,
+            mode=MODE,
+            motors=MotorReadings(seen.torque),
         )
         problem = self._filter.judge(reading, seen.torque)
         self._alarms.readings += 1
@@ -155,7 +156,7 @@ class _OraclePolicy:
         """Nothing to remember."""
 
 
-class Healthy:
+class HealthyRun:
     """Plays one situation.
 
     Args:
@@ -182,7 +183,7 @@ class Healthy:
         loop = ControlLoop(body, _Eye(robot, clock), controller, pilot)
         limit = min(most_s, _STEERED_S if self._situation.steered else np.inf)
         tick, events = 0, list[str]()
-        while tick * _STEPS_PER_TICK * PHYSICS_DT < limit and robot.phase is not Phase.OVER:
+        while tick / CONTROLLER_HZ < limit and robot.phase is not Phase.OVER:
             if robot.robot.tilt > _FALLING or loop.state is State.DAMP:
                 alarms.falls += robot.robot.tilt > _FALLING
                 break
@@ -190,10 +191,10 @@ class Healthy:
                 robot.begin()
             loop.tick(clock.now_ns(), self._wishes(tick))
             events += pilot.events()
-            for _ in range(_STEPS_PER_TICK):
+            for _ in range(PHYSICS_STEPS_PER_CONTROLLER_TICK):
                 body.step()
             tick += 1
-        alarms.seconds += tick * _STEPS_PER_TICK * PHYSICS_DT
+        alarms.seconds += tick / CONTROLLER_HZ
         alarms.events += [
             e for e in events if any(f"-> {s}" in e for s in (State.HOLD, State.DAMP))
         ]

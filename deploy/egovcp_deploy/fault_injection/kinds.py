@@ -20,11 +20,12 @@ from egovcp_deploy.fault_injection.rig import FaultRig, answer_steadily, steady
 from egovcp_deploy.live.link import Order, encode_reply
 from egovcp_deploy.pilot.desk import Reply, Report
 from egovcp_deploy.pilot.states import Request
+from egovcp_deploy.robots.motor_fields import DISCONNECTED
 
 Begin = Callable[[FaultRig], None]
 
 
-class Outcome(StrEnum):
+class Reaction(StrEnum):
     """What must come of a fault."""
 
     RUN = "run"
@@ -54,14 +55,13 @@ class FaultKind:
     """
 
     name: str
-    outcome: Outcome
+    outcome: Reaction
     begin: Begin
     duration_s: float = 0.5
     since_onset: bool = False
     reason: str = ""
 
 
-# --- states ------------------------------------------------------------------------------
 def _fault(name: str, value: object = True) -> Begin:
     """One of the fake's own faults (`robots.fake.Faults`)."""
     return lambda rig: setattr(rig.fake.faults, name, value)
@@ -102,7 +102,7 @@ def _dropped(status: int, mode: int) -> Begin:
 
 
 def _number(number: str) -> Begin:
-    return _states(m.raw_position("PLACEHOLDER", number))
+    return _states(m.raw_position(number))
 
 
 _FULL_RATE: Final = 100  # messages per state, 20 000 a second
@@ -117,7 +117,7 @@ def _stream(stream: Stream, tamper: Tamper | None = None) -> Begin:
     return begin
 
 
-_R, _H, _D, _ANY = Outcome.RUN, Outcome.HOLD, Outcome.DAMP, Outcome.ANY
+_R, _H, _D, _ANY = Reaction.RUN, Reaction.HOLD, Reaction.DAMP, Reaction.ANY
 
 _STATES: Final = (
     FaultKind("state: silent", _D, _fault("mute_state")),
@@ -207,12 +207,11 @@ _IMPLAUSIBLE: Final = (
         _states_anew(lambda: m.once(m.edited(m.set_field("mode_machine", 0)))),
     ),
 )
-_OVERHEATED: Final = 0x200  # status bits, see `motor_fields.FAULTS`
-_DISCONNECTED: Final = 0x80000000
+_OVERHEATED: Final = 0x200  # status bits, see `motor_fields.MOTOR_STATUS_BITS`
 
 
 def _motor(
-    name: str, outcome: Outcome, begin: Begin, reason: str = "", duration_s: float = 0.5
+    name: str, outcome: Reaction, begin: Begin, reason: str = "", duration_s: float = 0.5
 ) -> FaultKind:
     return FaultKind(f"motor: {name}", outcome, begin, duration_s, reason=reason)
 
@@ -234,14 +233,17 @@ _MOTORS: Final = (
         _R,
         _states(m.edited(m.without_motor_fields("motorstate", "mode", "lost", "temperature"))),
     ),
-    _motor("dropped, status disconnected", _D, _dropped(_DISCONNECTED, 1), "lost the connection"),
+    _motor("dropped, status disconnected", _D, _dropped(DISCONNECTED, 1), "lost the connection"),
     _motor("dropped, mode off", _D, _dropped(0, 0), "its mode says that it is off"),
-    _motor("dropped without a report", Outcome.LATER, _dropped(0, 1), "does not follow its target"),
+    _motor(
+        "dropped without a report",
+        Reaction.LATER,
+        _dropped(0, 1),
+        "does not follow its target",
+    ),
 )
 _FLOODS: Final = (
-    FaultKind(
-        "flood: 2 kB garbage, 40 per 10 ms", _R, _states(m.followed_by(lambda: m.garbage(20)))
-    ),
+    FaultKind("flood: 2 kB garbage, 40 per 10 ms", _R, _fault("flood", 20)),
     FaultKind("flood: the same without states", _D, _instead(lambda: m.garbage(20))),
     FaultKind(
         "flood: garbage at full rate", _ANY, _states(m.followed_by(lambda: m.garbage(_FULL_RATE)))
@@ -252,7 +254,9 @@ _FLOODS: Final = (
     FaultKind("flood: 30 kB of valid JSON without states", _D, _instead(lambda: m.valid_json(5))),
     FaultKind("flood: one state repeated", _D, _states_anew(lambda: m.repeats())),
     FaultKind(
-        "flood: oversized messages", Outcome.LATER, _states(m.followed_by(lambda: [b"x" * 200_000]))
+        "flood: oversized messages",
+        Reaction.LATER,
+        _states(m.followed_by(lambda: [b"x" * 200_000])),
     ),
     FaultKind("flood: oversized without states", _D, _replaced(*[b"x" * 200_000] * 4)),
     FaultKind(
@@ -265,12 +269,11 @@ _FLOODS: Final = (
 )
 
 
-# --- pictures ----------------------------------------------------------------------------
 def _pictures(tamper: Tamper) -> Begin:
     return lambda rig: setattr(rig.fake, "tamper_picture", tamper)
 
 
-def _picture(name: str, outcome: Outcome, begin: Begin) -> FaultKind:
+def _picture(name: str, outcome: Reaction, begin: Begin) -> FaultKind:
     return FaultKind(f"picture: {name}", outcome, begin, since_onset=True)
 
 
@@ -286,7 +289,6 @@ _PICTURES: Final = (
 )
 
 
-# --- planner and operator ----------------------------------------------------------------
 def _planner(answer: Callable[[Report], list[list[bytes]]]) -> Begin:
     return lambda rig: setattr(rig, "answer", answer)
 
@@ -342,7 +344,7 @@ def _pressed(*buttons: str) -> Begin:
     return lambda rig: setattr(rig.fake, "pressed", frozenset(buttons))
 
 
-def _other(name: str, outcome: Outcome, begin: Begin, duration_s: float = 0.5) -> FaultKind:
+def _other(name: str, outcome: Reaction, begin: Begin, duration_s: float = 0.5) -> FaultKind:
     return FaultKind(name, outcome, begin, duration_s, since_onset=True)
 
 
@@ -366,13 +368,12 @@ _OTHERS: Final = (
         _states(m.edited(m.set_field("wireless_remote", "VVEAAP" + "/" * 46))),
     ),
     _other("robot: pushed", _R, _fault("push", (0.2, 0.0))),
-    _other("robot: pushed over", Outcome.LATER, _fault("push", (-2.5, 1.0)), 3.0),
-    _other("robot: hears no commands", Outcome.LATER, _fault("deaf"), 4.0),
+    _other("robot: pushed over", Reaction.LATER, _fault("push", (-2.5, 1.0)), 3.0),
+    _other("robot: hears no commands", Reaction.LATER, _fault("deaf"), 4.0),
     _other("robot: another program commands it", _ANY, _fault("intruder")),
 )
 
 
-# --- processes ---------------------------------------------------------------------------
 def _signal(number: signal.Signals) -> Begin:
     def begin(rig: FaultRig) -> None:
         assert rig.process.pid is not None

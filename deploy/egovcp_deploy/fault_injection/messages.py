@@ -12,13 +12,13 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.spec import JOINT_NAMES
+from egovcp_deploy.robots.fake.bridge import GARBAGE_BYTES
 
 Tamper = Callable[[bytes], Iterable[bytes]]
 Edit = Callable[[dict[str, Any]], None]
 """Changes the data of a decoded state."""
 
 KNEE: Final = JOINT_NAMES.index("left_knee_joint")
-_GARBAGE_BYTES: Final = 2000
 
 
 def edited(edit: Edit) -> Tamper:
@@ -62,7 +62,7 @@ def nothing(message: bytes) -> Iterable[bytes]:
 
 def garbage(number: int) -> list[bytes]:
     """Random bytes, new each time: the runner drops repeated messages at no cost."""
-    return [os.urandom(_GARBAGE_BYTES) for _ in range(number)]
+    return [os.urandom(GARBAGE_BYTES) for _ in range(number)]
 
 
 def valid_json(number: int) -> list[bytes]:
@@ -146,12 +146,9 @@ def random_joints(data: dict[str, Any]) -> None:
         motor["dq"] = float(rng.uniform(-10, 10))
 
 
-def raw_position(text: str, number: str) -> Tamper:
-    """Write ``number``, which may be invalid JSON, as the position of the left knee.
-
-    Args:
-        text: a placeholder that occurs nowhere else in the message.
-    """
+def raw_position(number: str) -> Tamper:
+    """Write ``number``, which may be invalid JSON, as the position of the left knee."""
+    text = "replaced"  # occurs nowhere else in the message
 
     def tamper(message: bytes) -> Iterable[bytes]:
         content = json.loads(message)

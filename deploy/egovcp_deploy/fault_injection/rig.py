@@ -50,7 +50,6 @@ LIMITS: Final = Limits(stand_s=0.1, recover_s=0.2)
 _START_S: Final = 60.0
 _STARTS: Final = 5
 _REPORT_S: Final = 0.1  # for the report that says why
-_NS: Final = 1e9
 
 
 @dataclass(frozen=True)
@@ -78,11 +77,6 @@ class Observed:
     """When the fault began."""
     last_good_ns: int = 0
     """When the last state before it was sent."""
-
-    @property
-    def states(self) -> set[str]:
-        """States of the state machine that were reported."""
-        return {mode for _, mode in self.modes}
 
     @property
     def damped_ns(self) -> int | None:

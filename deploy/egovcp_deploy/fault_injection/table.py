@@ -9,18 +9,18 @@ from typing import Final
 
 import numpy as np
 
-from egovcp_deploy.fault_injection.kinds import FaultKind, Outcome
+from egovcp_deploy.fault_injection.kinds import FaultKind, Reaction
 from egovcp_deploy.fault_injection.rig import FaultRig, Observed
 from egovcp_deploy.pilot.states import State
 
 DAMP_LIMIT_MS: Final = 250.0
-_DAMPS: Final = (Outcome.DAMP, Outcome.LATER)
+_DAMPS: Final = (Reaction.DAMP, Reaction.LATER)
 _PATIENCE_S: Final = 1.5  # for a damping that must come
 _RECOVERY_S: Final = 5.0
 
 
 @dataclass(frozen=True)
-class Row:
+class FaultRun:
     """What came of one fault, once."""
 
     kind: FaultKind
@@ -46,15 +46,15 @@ class Row:
         if outcome in _DAMPS:
             damped = self.damped_ms is not None
             return self._wrong_reason if damped else f"was not damped, but {self.end}"
-        if outcome is Outcome.ANY:
+        if outcome is Reaction.ANY:
             return ""
         if self.damped_ms is not None:
             return f"was damped: {self.reason}"
         if self.end != State.RUN:
             return f"did not return to run, but is in {self.end}: {self.reason}"
-        if outcome is Outcome.HOLD and self.held_ms is None:
+        if outcome is Reaction.HOLD and self.held_ms is None:
             return "was not held"
-        if outcome is Outcome.RUN and "proprioception" in self.reason:
+        if outcome is Reaction.RUN and "proprioception" in self.reason:
             return f"was held: {self.reason}"
         return self._wrong_reason
 
@@ -66,7 +66,7 @@ class Row:
         return f"the reason is not {self.kind.reason!r}, but {self.reason!r}"
 
 
-def run_fault(rig: FaultRig, kind: FaultKind) -> Row:
+def run_fault(rig: FaultRig, kind: FaultKind) -> FaultRun:
     """Bring ``rig`` to RUN, let the fault happen, and end it."""
     rig.ensure_running()
     begin = time.monotonic()
@@ -87,7 +87,7 @@ def run_fault(rig: FaultRig, kind: FaultKind) -> Row:
             time.sleep(0.01)
         end = rig.mode or "silent"
     reference = observed.onset_ns if kind.since_onset else observed.last_good_ns
-    row = Row(
+    row = FaultRun(
         kind,
         end,
         _ms(observed.held_ns, reference),
@@ -121,7 +121,7 @@ def percentile(values: Sequence[float | None], q: float) -> float | None:
     return float(np.percentile(numbers, q)) if numbers else None
 
 
-def markdown(rows: Sequence[Row]) -> str:
+def markdown(rows: Sequence[FaultRun]) -> str:
     """A table, one line per kind of fault."""
     lines = [
         "| fault | end state | HOLD, ms | DAMP, ms (median, p99) | greatest change, rad |",

@@ -101,9 +101,9 @@ class ControlLoop:
         if state is not None and self._count % CONTROLLER_TICKS_PER_PLAN == 0:
             seen = _BLIND if depth is None else depth
             events = self.pilot.events()
-            motors = None if reading is None else reading.motors
+            reported = None if reading is None else reading.motors
             self.pilot.report(
-                now_ns, seen, state.astype(np.float32), events, motors, self._link(now_ns)
+                now_ns, seen, state.astype(np.float32), events, reported, self._link(now_ns)
             )
             self._open = True
         self._command = self._motors(now_ns, before, reading, state)

@@ -75,7 +75,7 @@ def decode_report(parts: Sequence[bytes]) -> Report | None:
             motors=_unpack_motors(header["motors"], np.frombuffer(motors, "<f8")),
             link={str(name): float(value) for name, value in header["link"].items()},
         )
-    except (ValueError, KeyError, TypeError, AttributeError):
+    except (ValueError, LookupError, TypeError, AttributeError):
         return None
 
 

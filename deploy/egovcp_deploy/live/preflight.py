@@ -90,7 +90,7 @@ def examine_hardware(config: DeployConfig, artefact: Artefact | None) -> Iterato
         connected = body if robot.error is None else None
         heard = listen(connected, eyes[0] if eyes else None, LISTEN_S)
         if heard.reading is not None:
-            yield from _examine_robot(body, heard.reading, heard, config.robot.limits)
+            yield from _examine_robot(body, heard, config.robot.limits)
         if eyes:
             gap_ms = config.robot.limits.picture_hold_s * 1e3
             yield examine("images", lambda: arrivals(heard.images, IMAGE_HZ, gap_ms, "images"))
@@ -98,9 +98,9 @@ def examine_hardware(config: DeployConfig, artefact: Artefact | None) -> Iterato
             yield examine("image age", lambda: image_age(heard.image_ages_ms, most_ms))
 
 
-def _examine_robot(
-    body: BridgeBody, reading: BodyState, heard: Heard, limits: Limits
-) -> Iterator[Finding]:
+def _examine_robot(body: BridgeBody, heard: Heard, limits: Limits) -> Iterator[Finding]:
+    reading = heard.reading
+    assert reading is not None, "called once one has arrived"
     yield Finding("mode", machine.describe(reading.mode))
     yield examine("joints", lambda: joint_offsets(reading.joint_position))
     yield examine("posture", lambda: posture(reading.joint_position, reading.quaternion_w))

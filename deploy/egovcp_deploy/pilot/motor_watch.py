@@ -41,7 +41,7 @@ WINDING: Final = HeatLimits(90.0, 105.0, 120.0)
 #: 40 deg C, which is the coldest that it stays beside a hot winding.
 SINGLE: Final = HeatLimits(65.0, 72.0, 80.0)
 
-#: Status bits (`motor_fields.FAULTS`) that forbid to go on standing under load.
+#: Status bits (`motor_fields.MOTOR_STATUS_BITS`) that forbid to go on standing under load.
 OVERLOAD_BITS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x10 | 0x20 | 0x80 | 0x200
 #: Status bits of a motor that does not know its position or is not connected: it does not obey.
 DROPPED_BITS: Final = 0x400 | 0x800 | 0x1000 | 0x4000 | 0x40000000 | 0x80000000
@@ -210,7 +210,9 @@ class MotorWatch:
 
     # --- heat and overload ---------------------------------------------------------------
     def _why_hold(self, motors: MotorReadings, elapsed: float, events: list[str]) -> str:
-        reason = self._why_overload(motors, events) or self._why_heat(motors, elapsed, events)
+        overload = self._why_overload(motors, events)
+        heat = self._why_heat(motors, elapsed, events)
+        reason = overload or heat
         return f"{reason}; {_LET_DOWN}" if reason else ""
 
     def _may_remind(self, time_ns: int) -> bool:
@@ -235,7 +237,8 @@ class MotorWatch:
     def _why_heat(self, motors: MotorReadings, elapsed: float, events: list[str]) -> str:
         """Held once a motor has been too hot for a while, until all are cool enough to arm."""
         if motors.temperature is None:
-            return ""
+            was_hot = "motors were too hot and no longer report temperatures"
+            return was_hot if self._overheated else ""
         beyond = margins(motors.temperature)
         joint = int(np.argmax(beyond.hold))
         if self._hot.worst(beyond.hold >= 0.0, elapsed, HEAT_PERSISTS_S) is not None:
@@ -244,7 +247,9 @@ class MotorWatch:
         self._warn(motors.temperature, beyond.warn, events)
         if not self._overheated:
             return ""
-        return f"the motor of {JOINT_NAMES[joint]} is too hot: {degrees(motors, joint)}"
+        return (
+            f"the motor of {JOINT_NAMES[joint]} is too hot: {_degrees(motors.temperature[joint])}"
+        )
 
     def _warn(self, temperature: Array, beyond: Array, events: list[str]) -> None:
         for joint in np.flatnonzero((beyond >= 0.0) & ~self._warned):
@@ -263,7 +268,8 @@ class MotorWatch:
         joint = int(np.argmax(beyond))
         if beyond[joint] < 0.0:
             return ""
-        return f"the motor of {JOINT_NAMES[joint]} is at {degrees(motors, joint)}; let it cool"
+        words = _degrees(motors.temperature[joint])
+        return f"the motor of {JOINT_NAMES[joint]} is at {words}; let it cool"
 
     # --- lost packets --------------------------------------------------------------------
     def _lost_packets(self, motors: MotorReadings, time_ns: int) -> list[str]:
@@ -340,13 +346,7 @@ def hottest(motors: MotorReadings) -> str:
     if motors.temperature is None:
         return ""
     joint = int(np.argmax(margins(motors.temperature).hold))
-    return f"{JOINT_NAMES[joint]}, {degrees(motors, joint)}"
-
-
-def degrees(motors: MotorReadings, joint: int) -> str:
-    """Temperatures of a joint's motor in words."""
-    assert motors.temperature is not None, "only motors that report temperatures have one"
-    return _degrees(motors.temperature[joint])
+    return f"{JOINT_NAMES[joint]}, {_degrees(motors.temperature[joint])}"
 
 
 def _degrees(row: Array) -> str:

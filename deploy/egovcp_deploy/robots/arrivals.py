@@ -65,8 +65,9 @@ class Arrivals:
         if not len(times):
             return ArrivalStats(gap_ms=window_s * 1e3, lost=1.0)
         intervals = np.diff(times) / 1e6
-        if not self._numbered and len(intervals):
-            lost += int(np.rint(intervals / np.median(intervals) - 1.0).clip(min=0.0).sum())
+        if not self._numbered and len(intervals):  # messages that are not usable leave gaps too
+            gaps = np.rint(intervals / np.median(intervals) - 1.0).clip(min=0.0).sum()
+            lost = max(lost, int(gaps))
         gap = max(float(intervals.max(initial=0.0)), (now_ns - int(times[-1])) / 1e6)
         jitter = 0.0
         if len(intervals):

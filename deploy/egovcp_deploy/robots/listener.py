@@ -1,4 +1,4 @@
-"""Receives from a publisher in a thread that stamps each message on arrival.
+"""Receives from a publisher in a thread that stamps messages when it takes them.
 
 All messages that have arrived are taken at once, and the newest usable one counts. After that the
 thread rests: for 3 ms or four times as long as its work took, whichever is longer; where nothing
@@ -6,8 +6,8 @@ was usable, or much had to be searched, for forty times as long, up to 15 ms. So
 messages, but the interpreter's lock, which the control loop needs as well, is held for little of
 the time: on loaded cores a thread that holds it may be put aside for many milliseconds.
 
-Nothing is believed to be newer than it is: where more messages wait than the queue holds, older
-ones may wait in the network as well, and none of them is used.
+A message is taken up to 15 ms after its arrival. Where more messages wait than the queue holds,
+older ones may wait in the network as well, and none of them is used.
 """
 
 from __future__ import annotations

@@ -78,7 +78,7 @@ def describe(mode: int) -> str:
         return warning(mode)
     waist = "waist locked" if machine.waist_locked else "waist free"
     words = f"mode machine {mode}: {machine.joints} joints, {waist}"
-    note = warning(mode).partition(": ")[2]
+    note = _note(machine)
     return f"{words}; warning: {note}" if note else words
 
 
@@ -91,14 +91,20 @@ def warning(mode: int) -> str:
             f"mode machine {mode} is not known: whether the robot has 29 joints and a free waist "
             f"(as {known} do) is not checked"
         )
+    note = _note(machine)
+    return f"mode machine {mode}: {note}" if note else ""
+
+
+def _note(machine: Machine) -> str:
+    """How a variant differs from the one that the controllers are made for; empty: not."""
     if machine.waist_locked:
         return (
-            f"mode machine {mode}: the waist is locked, the controller's targets for waist roll "
-            "and pitch have no effect, and its balance is untested without them"
+            "the waist is locked, the controller's targets for waist roll and pitch have no "
+            "effect, and its balance is untested without them"
         )
     if machine.hip_pitch_gear != Machine(29).hip_pitch_gear:
         return (
-            f"mode machine {mode}: the hip pitch gear is {machine.hip_pitch_gear}, the gains are "
-            f"for {Machine(29).hip_pitch_gear}; untested"
+            f"the hip pitch gear is {machine.hip_pitch_gear}, the gains are for "
+            f"{Machine(29).hip_pitch_gear}; untested"
         )
     return ""

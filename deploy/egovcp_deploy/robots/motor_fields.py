@@ -17,7 +17,7 @@ from egovcp.log.tick import MotorReadings
 
 #: ``motorstate``: bit -> meaning, from Unitree's developer documentation of the G1 ("Common
 #: mistakes and definitions"). Untested on hardware.
-FAULTS: Final = {
+MOTOR_STATUS_BITS: Final = {
     0x1: "overcurrent",
     0x2: "transient overvoltage",
     0x4: "sustained overvoltage",
@@ -41,14 +41,15 @@ FAULTS: Final = {
     0x40000000: "motor lost the connection to the robot's computer",
     0x80000000: "the robot's computer lost the connection to the motor",
 }
+DISCONNECTED: Final = 0x80000000
 _ENABLED_MODE: Final = 1
 _COLDEST, _HOTTEST = -40.0, 250.0  # deg C, what a sensor of a G1's motor can report
 
 
 def fault_words(bits: int) -> str:
     """What status bits mean, such as ``winding overheating (0x200)``."""
-    words = [meaning for bit, meaning in FAULTS.items() if bits & bit]
-    if bits & ~sum(FAULTS):
+    words = [meaning for bit, meaning in MOTOR_STATUS_BITS.items() if bits & bit]
+    if bits & ~sum(MOTOR_STATUS_BITS):
         words.append("unknown")
     return f"{', '.join(words)} (0x{bits:x})"
 

@@ -79,7 +79,7 @@ class RealSenseEye:
         self._newest: Picture | None = None
         self.problem = ""
         """Why the last `read` found nothing new, in the driver's words."""
-        self.arrivals = Arrivals()
+        self.arrivals = Arrivals(numbered=True)  # what two reads skip is not lost
         """Of pictures, as they are read."""
 
     @classmethod

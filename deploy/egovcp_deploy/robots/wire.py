@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
-from egovcp.spec import NUM_JOINTS
+from egovcp.spec import JOINT_NAMES, NUM_JOINTS
 from egovcp_deploy.robots.body import BodyState, MotorCommand
 from egovcp_deploy.robots.motor_fields import decode_motor_fields, encode_motor_fields
 
@@ -95,8 +95,13 @@ def encode_command(command: MotorCommand) -> bytes:
     """
     position = _checked(command.position, _MOST_ANGLE, "position")
     target = np.asarray(command.position)
-    if ((target < TARGET_LOW - _ROUNDING) | (target > TARGET_HIGH + _ROUNDING)).any():
-        raise Garbled("position of a command is beyond the bounds of the joints' targets")
+    beyond = (target < TARGET_LOW - _ROUNDING) | (target > TARGET_HIGH + _ROUNDING)
+    if beyond.any():
+        i = int(beyond.argmax())
+        raise Garbled(
+            f"target of {JOINT_NAMES[i]} is {target[i]:+.2f} rad, expected {TARGET_LOW[i]:.2f} to "
+            f"{TARGET_HIGH[i]:.2f}"
+        )
     stiffness = _checked(command.stiffness, _MOST_GAIN, "stiffness", least=0.0)
     damping = _checked(command.damping, _MOST_GAIN, "damping", least=0.0)
     motors = [

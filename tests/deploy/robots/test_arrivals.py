@@ -39,6 +39,13 @@ def test_missing_messages_are_estimated_from_intervals() -> None:
     assert filled(times).stats(1000 * MS).lost == pytest.approx(0.1, abs=0.01)
 
 
+def test_messages_that_are_not_usable_are_counted_once_although_they_leave_gaps() -> None:
+    arrivals = filled([5.0 * k for k in range(1, 201) if k % 10])
+    for k in range(10, 201, 10):
+        arrivals.lost(round(5.0 * k * MS))
+    assert arrivals.stats(1000 * MS).lost == pytest.approx(0.1, abs=0.01)
+
+
 def test_numbered_messages_are_counted_not_estimated() -> None:
     arrivals = filled([5.0 * k for k in range(1, 201) if k % 10], numbered=True)
     assert arrivals.stats(1000 * MS).lost == 0.0

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from egovcp.robot.g1 import VELOCITY_LIMIT
 from egovcp.spec import JOINT_NAMES
-from egovcp_deploy.fault_injection.false_alarms import Healthy, Situation
+from egovcp_deploy.fault_injection.false_alarms import HealthyRun, Situation
 from egovcp_deploy.robots.body import BodyState
-from egovcp_deploy.robots.plausibility import RESYNC_S, PlausibilityFilter
+from egovcp_deploy.robots.plausibility import JUMP_RESYNC_S, RESYNC_S, PlausibilityFilter
 
 KNEE = JOINT_NAMES.index("left_knee_joint")
 STEP_NS = 5_000_000
@@ -158,6 +158,19 @@ def test_a_jump_is_believed_after_the_robot_would_have_been_damped() -> None:
     assert not any(found[believed:])
 
 
+def test_a_speed_that_jumps_is_believed_once_positions_follow_it() -> None:
+    ticks = iter(range(1000))
+
+    def moved(reading: StandingRobot) -> None:
+        reading.speed[KNEE] = 25.0
+        reading.position[KNEE] += 25.0 * next(ticks) * STEP_NS * 1e-9
+
+    found = problems(moved, duration=12)
+    believed = found.index("")
+    assert 0 < believed * STEP_NS * 1e-9 <= JUMP_RESYNC_S + STEP_NS * 1e-9
+    assert not any(found[believed:])
+
+
 @pytest.mark.parametrize(
     "situation",
     [
@@ -168,7 +181,7 @@ def test_a_jump_is_believed_after_the_robot_would_have_been_damped() -> None:
 )
 def test_a_healthy_robot_causes_no_alarm(situation: Situation) -> None:
     """``benchmarks/false_alarms.py`` plays ten minutes of this."""
-    healthy = Healthy(situation)
+    healthy = HealthyRun(situation)
     healthy.play(0, most_s=8.0)
     assert healthy.alarms.seconds > 4.0
     assert healthy.alarms.readings > 800

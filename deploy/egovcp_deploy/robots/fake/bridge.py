@@ -25,6 +25,7 @@ from egovcp.spec import JOINT_NAMES, NUM_JOINTS, PHYSICS_DT
 from egovcp_deploy.robots.body import BodyState
 from egovcp_deploy.robots.depth_wire import WirePicture, encode_picture
 from egovcp_deploy.robots.fake.faults import Faults
+from egovcp_deploy.robots.motor_fields import DISCONNECTED
 from egovcp_deploy.robots.remote import Remote
 from egovcp_deploy.robots.wire import (
     CAMERA_PORT,
@@ -41,10 +42,9 @@ from egovcp_deploy.robots.wire import (
 WATCHDOG_S: Final = 0.2
 MODE: Final = 5  # what the fake reports as its mode machine
 _MOTOR_DEG_C: Final = 35.0
-_DISCONNECTED: Final = 0x80000000  # see `motor_fields.FAULTS`
 _COUNTED_S: Final = 0.5  # how long a program counts as one that sends commands
 _MOST_PER_STEP: Final = 100  # commands taken in within 5 ms; the rest waits
-_GARBAGE_BYTES: Final = 2000
+GARBAGE_BYTES: Final = 2000
 _FALSE_JOINT: Final = JOINT_NAMES.index("left_knee_joint")
 
 
@@ -246,7 +246,7 @@ class FakeBridge:
             return readings
         status, lost = np.zeros(NUM_JOINTS, np.int64), np.zeros(NUM_JOINTS, np.int64)
         if faults.dropped_motor is not None:
-            status[faults.dropped_motor] = _DISCONNECTED
+            status[faults.dropped_motor] = DISCONNECTED
             lost[faults.dropped_motor] = self.robot.steps
         return replace(readings, faults=status, lost=lost, enabled=status == 0)
 
@@ -268,7 +268,7 @@ class FakeBridge:
         for message in self.tamper_state(state):
             self._states.send(message)
         for _ in range(faults.flood):
-            self._states.send(os.urandom(_GARBAGE_BYTES))
+            self._states.send(os.urandom(GARBAGE_BYTES))
 
     def _lost(self) -> bool:
         return self.faults.drop > 0.0 and bool(self._rng.random() < self.faults.drop)
