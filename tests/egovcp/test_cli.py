@@ -20,6 +20,7 @@ from egovcp.errors import (
     SafetyStop,
     UsageError,
 )
+from egovcp.flags import read_config
 
 PROG = "egovcp-test"
 
@@ -125,6 +126,12 @@ def test_a_boolean_can_be_switched_off(value: str) -> None:
 
 def test_a_value_may_hold_an_equals_sign_and_spaces() -> None:
     assert _parse("--name=a=b c").name == "a=b c"
+
+
+def test_a_config_file_keeps_parentheses_in_plain_text(tmp_path: Path) -> None:
+    file = tmp_path / "options.yaml"
+    file.write_text("name: /data/Smith, (lab)/x\n", encoding="utf-8")
+    assert read_config(file) == {"name": "/data/Smith, (lab)/x"}
 
 
 def test_sequences_are_written_in_brackets() -> None:

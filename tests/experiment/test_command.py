@@ -68,6 +68,22 @@ def test_a_missing_package_is_named_before_any_cell_runs(
     assert not (tmp_path / "out" / "logs").exists()
 
 
+@pytest.mark.parametrize(
+    ("flag", "code", "message"),
+    [
+        ("--data.roots={{ball: {folder}/none}}", 3, "--data.roots: ball: no such folder"),
+        ("--train.policies={{ball: {folder}}}", 4, "--train.policies: ball:"),
+    ],
+)
+def test_a_dataset_or_policy_that_cannot_be_used_is_refused_before_any_cell_runs(
+    flag: str, code: int, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    argv = ["table1", f"--output_dir={tmp_path / 'out'}", "--scale=smoke"]
+    assert main([*argv, flag.format(folder=tmp_path)]) == code
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out" / "logs").exists()
+
+
 def test_a_flag_takes_from_one_task_what_the_scale_gives_it() -> None:
     argv = ["--scale=small", "--play.task_flags={ball: []}"]
     config = parse_config(ExperimentConfig, argv, "test", defaults=scale_of)

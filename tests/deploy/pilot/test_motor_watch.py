@@ -122,6 +122,20 @@ def test_the_reminder_comes_every_ten_seconds() -> None:
     assert sum("let the robot down" in event for event in rig.events) == 3
 
 
+def test_an_overheated_robot_stays_held_when_its_temperatures_stop_arriving() -> None:
+    rig = WatchRig()
+    assert rig.run(1.0, heated(ANKLE, 35.0, 125.0)).hold
+    assert "no longer report temperatures" in rig.run(5.0, replace(HEALTHY, temperature=None)).hold
+
+
+def test_heat_is_warned_of_while_a_motor_is_overloaded() -> None:
+    rig, hot = WatchRig(), heated(ANKLE, 35.0, 95.0)
+    faults = np.zeros(29, np.int64)
+    faults[ANKLE] = 0x1  # overcurrent
+    rig.run(1.0, replace(hot, faults=faults))
+    assert any("is hot" in event for event in rig.events)
+
+
 def test_what_is_not_reported_is_said_once_and_the_rest_goes_on() -> None:
     rig = WatchRig()
     bare = MotorReadings(torque=HEALTHY.torque)
