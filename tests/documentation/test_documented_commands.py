@@ -115,13 +115,13 @@ def test_a_block_is_expanded_as_a_shell_does() -> None:
         "X=1 egovcp-deploy | head -1"
     )
     found = [command.argv for command in expanded(Text("place", block), inline=False)]
-    assert found == [
+    assert found[:3] == [
         ("egovcp-train", "--a=[1,2]", "--b", "--c={x: 1}"),
         ("egovcp-eval", "--task=ball"),
         ("egovcp-eval", "--task=wall"),
-        ("egovcp-deploy",),
-        ("head", "-1"),
     ]
+    # The two ends of a pipe start at the same time, in either order.
+    assert sorted(found[3:]) == [("egovcp-deploy",), ("head", "-1")]
 
 
 @pytest.mark.parametrize(
