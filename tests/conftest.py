@@ -12,7 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.data import destination
 from egovcp.testing.hub import FakeHub, in_this_process
 
 # a shell that starts the tests in the background has them, and what they start, ignore it
@@ -25,7 +24,7 @@ def mount_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     root, table = tmp_path / "mnt", tmp_path / "mountinfo"
     root.mkdir()
     table.write_text(f"1 2 254:0 / {root} rw - ext4 /dev/x rw\n", encoding="utf-8")
-    monkeypatch.setattr(destination, "_MOUNTS", table)
+    monkeypatch.setattr("egovcp.data.destination._MOUNTS", table)
     return root
 
 
