@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from egovcp.artefact import FILES, save_artefact
-from egovcp.atomic import removed_on_error, write_bytes, write_json
+from egovcp.atomic import removed_on_error, write_bytes, write_json, write_text
 from egovcp.plan import PlannerConfig
 from egovcp.testing import toy_model
 
@@ -41,6 +41,14 @@ def test_failed_write_keeps_the_old_file_and_leaves_nothing_beside_it(
 def _interrupt(path: Path) -> None:
     with removed_on_error(path):
         raise KeyboardInterrupt
+
+
+def test_a_hard_link_keeps_the_old_content(tmp_path: Path) -> None:
+    path, link = tmp_path / "README.md", tmp_path / "older"
+    path.write_text("first")
+    link.hardlink_to(path)
+    write_text(path, "second")
+    assert (path.read_text(), link.read_text()) == ("second", "first")
 
 
 def test_temporary_file_folder_or_link_is_removed_and_nothing_else(tmp_path: Path) -> None:

@@ -1,6 +1,5 @@
 """Dataset cards: readable by the Hub, complete, and out of the way of the data."""
 
-import os
 import re
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from egovcp_collect.dataset import card
 from egovcp_collect.dataset.card import CardConfig, card_text
 from egovcp_collect.dataset.card_tables import field_docs, settings_tables
 from egovcp_collect.dataset.cli import main
-from egovcp_collect.dataset.replace import replace_text
 
 from .conftest import write
 from .scenes import SETTINGS, three_balls, write_scenes
@@ -147,19 +145,6 @@ def test_the_cache_of_the_hub_is_not_written_to(
     monkeypatch.setattr(card.DatasetReader, "open", lambda config: reader)
     with pytest.raises(UsageError, match="--output"):
         card.run(CardConfig())
-
-
-def test_a_file_that_is_replaced_is_not_written_through_its_other_name(tmp_path: Path) -> None:
-    old, other = tmp_path / "README.md", tmp_path / "older"
-    old.write_text("first")
-    os.link(old, other)
-    previous = os.umask(0o002)
-    try:
-        replace_text(old, "second")
-    finally:
-        os.umask(previous)
-    assert (old.read_text(), other.read_text()) == ("second", "first")
-    assert old.stat().st_mode & 0o777 == 0o664
 
 
 def test_the_template_of_the_repository_is_the_one_that_ships() -> None:
