@@ -82,7 +82,7 @@ def test_it_ends_on_an_interrupt() -> None:
     [
         ("--task=bal", 2, "did you mean 'ball'"),
         ("--episode=-1", 2, "--episode=-1: expected at least 0"),
-        ("--json=/nowhere/at/all.json", 5, "no folder"),
+        ("--json=/dev/null/all.json", 2, "/dev/null is not a folder"),
     ],
 )
 def test_bad_options_are_refused(

@@ -95,7 +95,7 @@ def test_a_link_to_a_folder_that_is_not_there_yet(
 def test_a_loop_of_links_is_refused(tmp_path: Path, episodes: list[Episode]) -> None:
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
-    with pytest.raises(UsageError, match="symbolic link that loop of symbolic links"):
+    with pytest.raises(UsageError, match="a is a loop of symbolic links; remove it"):
         _write(tmp_path / "a", episodes[:1])
 
 

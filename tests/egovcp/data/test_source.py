@@ -2,6 +2,7 @@
 
 import logging
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.hub import Content, Publication, RetryPolicy, publish
 from egovcp.testing.hub import FakeHub
 from egovcp.testing.hub.faults import Trouble
+from egovcp.testing.ports import reserved_port
 
 QUICK = RetryPolicy(attempts=2, wait_s=0.01, timeout_s=20)
 SIX = DatasetConfig(repo_id="me/six")
@@ -77,7 +79,10 @@ def test_a_hub_that_fails_is_an_environment_failure(
 
 def test_no_server_at_all(hub: FakeHub, commit: str) -> None:
     hub.close()
-    with pytest.raises(EnvironmentFailure, match="cannot be used: ConnectError"):
+    with (
+        reserved_port(urlsplit(hub.endpoint).port),
+        pytest.raises(EnvironmentFailure, match="cannot be used: ConnectError"),
+    ):
         source.locate(SIX, QUICK)
 
 
