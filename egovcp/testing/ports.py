@@ -12,9 +12,9 @@ def free_port() -> int:
 
 
 @contextmanager
-def reserved_port(port: int | None) -> Iterator[None]:
+def reserved_port(port: int) -> Iterator[None]:
     """Keep a TCP port of the loopback closed: no other program can open it meanwhile."""
     with socket.socket() as holder:
         holder.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        holder.bind(("127.0.0.1", port or 0))
+        holder.bind(("127.0.0.1", port))
         yield

@@ -78,9 +78,11 @@ def test_a_hub_that_fails_is_an_environment_failure(
 
 
 def test_no_server_at_all(hub: FakeHub, commit: str) -> None:
+    port = urlsplit(hub.endpoint).port
+    assert port
     hub.close()
     with (
-        reserved_port(urlsplit(hub.endpoint).port),
+        reserved_port(port),
         pytest.raises(EnvironmentFailure, match="cannot be used: ConnectError"),
     ):
         source.locate(SIX, QUICK)
