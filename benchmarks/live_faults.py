@@ -60,7 +60,7 @@ def run_all(kinds: Sequence[FaultKind], repetitions: int) -> list[FaultRun]:
     try:
         for repetition in range(repetitions):
             for kind in kinds:
-                if kind.outcome is not Reaction.DAMP and repetition % UNTIMED_EVERY:
+                if kind.reaction is not Reaction.DAMP and repetition % UNTIMED_EVERY:
                     continue
                 row = run_fault(rig, kind)
                 rows.append(row)
@@ -85,7 +85,7 @@ def figures(rows: Sequence[FaultRun]) -> dict[str, object]:
         out[f"{key}_damp_ms_p50"] = percentile([row.damped_ms for row in same], 50)
         out[f"{key}_damp_ms_p99"] = percentile([row.damped_ms for row in same], 99)
         out[f"{key}_greatest_change_rad"] = max(row.greatest_change for row in same)
-    timed = [row.damped_ms for row in rows if row.kind.outcome is Reaction.DAMP]
+    timed = [row.damped_ms for row in rows if row.kind.reaction is Reaction.DAMP]
     out["all_damp_ms_p50"] = percentile(timed, 50)
     out["all_damp_ms_p99"] = percentile(timed, 99)
     out["all_damp_ms_max"] = percentile(timed, 100)
@@ -96,7 +96,7 @@ def figures(rows: Sequence[FaultRun]) -> dict[str, object]:
 
 def too_late(rows: Sequence[FaultRun]) -> list[str]:
     """Kinds that must damp and do so too late."""
-    names = dict.fromkeys(r.kind.name for r in rows if r.kind.outcome is Reaction.DAMP)
+    names = dict.fromkeys(r.kind.name for r in rows if r.kind.reaction is Reaction.DAMP)
     late = []
     for name in names:
         p99 = percentile([row.damped_ms for row in rows if row.kind.name == name], 99)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import Any, Final
 
 from egovcp.cli import run_command
 from egovcp.errors import DataError, UsageError, suggest
+from egovcp.safe_files import read_json
 from egovcp.terminal import echo
 from egovcp_deploy.report import aligned
 from egovcp_deploy.scores import (
@@ -23,6 +23,7 @@ from egovcp_deploy.scores import (
 
 PROG: Final = "egovcp-compare"
 _FILE: Final = "eval_run.json"
+_LIMIT_BYTES: Final = 256 << 20
 #: Options that say where something is or who computes it.
 _PLACES: Final = ("output_dir", "num_envs", "num_workers", "episodes", "constant.path")
 _EPILOG: Final = (
@@ -131,7 +132,7 @@ def load_evaluation(folder: Path) -> Evaluation:
     """
     path = folder / _FILE
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path, _LIMIT_BYTES)
         episodes = {
             task: {name: [_score(entry) for entry in played] for name, played in row.items()}
             for task, row in content["episodes"].items()

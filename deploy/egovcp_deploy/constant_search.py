@@ -8,7 +8,6 @@ The scenarios are `scenarios.for_search`, so the choice never sees the evaluatio
 from __future__ import annotations
 
 import itertools
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.errors import DataError
+from egovcp.safe_files import UnsafeFileError, read_json
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
 from egovcp_deploy.scenarios import for_search
@@ -94,10 +94,12 @@ def load_constants(path: Path) -> dict[str, BestConstant]:
         DataError: no such file, or not one of ours.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         return {task: _parse(entry) for task, entry in content.items()}
     except OSError as error:
         raise DataError(f"cannot read --constant.path={path}: {error.strerror}") from error
+    except UnsafeFileError as error:
+        raise DataError(f"cannot read --constant.path={path}: {error}") from error
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise DataError(
             f"--constant.path={path} is not the constant.json of an evaluation: {error!r}"

@@ -26,6 +26,17 @@ _COLUMNS: Final = 4096
 _PADDING_BYTES: Final = 16 << 20  # page indexes and Bloom filters lie between the row groups
 
 
+#: What pyarrow and the code around it raise on damaged files.
+_READ_ERRORS: Final = (
+    pa.ArrowException,
+    ArithmeticError,
+    LookupError,
+    RecursionError,
+    TypeError,
+    ValueError,
+)
+
+
 @contextmanager
 def damaged(path: Path) -> Iterator[None]:
     """Turn what is raised while a damaged file is read into a `DataError` that names it."""
@@ -41,10 +52,7 @@ def damaged(path: Path) -> Iterator[None]:
         if error.errno is not None:
             raise
         raise _damage(path, error) from error
-    except (
-        *(pa.ArrowException, ArithmeticError, ValueError, TypeError, LookupError),
-        RecursionError,
-    ) as error:
+    except _READ_ERRORS as error:
         raise _damage(path, error) from error
 
 

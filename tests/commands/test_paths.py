@@ -95,6 +95,27 @@ CASES = {
         ("output_dir",),
     ),
 }
+#: The same of commands that take further paths, depending on other options.
+MORE = (
+    (
+        "egovcp-deploy",
+        f"--policy.path=POLICY --output_dir=NEW --robot.type=replay {STANCE}",
+        ("robot.recordings",),
+        (),
+    ),
+    (
+        "egovcp-eval",
+        f"--output_dir=NEW --episodes=1 --controllers=constant {STANCE}",
+        ("constant.path",),
+        (),
+    ),
+    (
+        "egovcp-eval",
+        f"--output_dir=NEW --episodes=1 --controllers=ppo {STANCE}",
+        ("ppo.path",),
+        (),
+    ),
+)
 INPUTS = (
     *("absent", "fifo", "dangling", "loop", "empty", "folder", "empty/below", "/dev/null"),
     *("x" * 300, "y/" * 3000, "\x1b[31m", "\udcff", "~nobody/x", "", "recording.mcap"),
@@ -102,7 +123,8 @@ INPUTS = (
 #: A recording, a config file without options, no records, and what has the form of a Hub id.
 VALID = {
     *(("file", "recording.mcap"), ("files", "recording.mcap"), ("config_path", "empty")),
-    *(("records", ""), ("train.policies", "empty/below")),
+    *(("records", ""), ("train.policies", "empty/below"), ("robot.recordings", "recording.mcap")),
+    ("constant.path", ""),
 }
 OUTPUTS = ("loop", "empty/below", "x" * 300, "/proc/new", "/dev/null/new", "\udcff", "a\0b", "fifo")
 
@@ -136,9 +158,17 @@ def test_every_command_is_listed() -> None:
     assert {c.prog for c in all_commands()} == CASES.keys() | without
 
 
-@pytest.mark.parametrize("prog", CASES)
+@pytest.mark.parametrize(
+    ("prog", "arguments", "inputs", "outputs"),
+    [*((prog, *case) for prog, case in CASES.items()), *MORE],
+)
 def test_a_bad_path_is_refused_before_work_starts(
-    prog: str, places: Path, monkeypatch: pytest.MonkeyPatch
+    prog: str,
+    arguments: str,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    places: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.chdir(places)
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
@@ -146,8 +176,8 @@ def test_a_bad_path_is_refused_before_work_starts(
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)  # read at its import
     before = _contents(places)
     problems = []
-    for flag, value in _bad_flags(prog):
-        argv = [*command.arguments, *_arguments(prog), f"{flag}={value}"]
+    for flag, value in _bad_flags(inputs, outputs):
+        argv = [*command.arguments, *_arguments(arguments), f"{flag}={value}"]
         found = run_limited(lambda argv=argv: command.main(argv), SECONDS)
         if problem := _problem(command, flag, value, found):
             problems.append(f"{prog} {flag}={value[:60]!a}: {problem}")
@@ -159,16 +189,14 @@ def test_a_bad_path_is_refused_before_work_starts(
     assert not problems, "\n".join(problems)
 
 
-def _arguments(prog: str) -> list[str]:
+def _arguments(text: str) -> list[str]:
     names = {"DATA": "data", "POLICY": "policy", "RECORDING": "recording.mcap"}
-    text = CASES[prog][0]
     for name, path in names.items():
         text = text.replace(name, path)
     return text.replace("NEW", "new").split()
 
 
-def _bad_flags(prog: str) -> Iterator[tuple[str, str]]:
-    _, inputs, outputs = CASES[prog]
+def _bad_flags(inputs: tuple[str, ...], outputs: tuple[str, ...]) -> Iterator[tuple[str, str]]:
     for options, values in ((inputs, INPUTS), (outputs, OUTPUTS)):
         for option in options:
             for value in values:

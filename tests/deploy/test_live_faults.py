@@ -32,7 +32,7 @@ def test_fault_ends_as_it_must(rig: FaultRig, kind: FaultKind) -> None:
     for _ in range(_ATTEMPTS):
         row = run_fault(rig, kind)
         assert not row.unsound  # never, however busy the machine is
-        late = kind.outcome is Reaction.DAMP and (row.damped_ms or 0.0) > 2 * DAMP_LIMIT_MS
+        late = kind.reaction is Reaction.DAMP and (row.damped_ms or 0.0) > 2 * DAMP_LIMIT_MS
         if not row.problem and not late:
             break
     assert not row.problem

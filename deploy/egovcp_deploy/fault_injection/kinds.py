@@ -46,7 +46,7 @@ class FaultKind:
 
     Args:
         name: unique.
-        outcome: what must come of it.
+        reaction: what must come of it.
         begin: starts it; called in the robot's thread, between two steps.
         duration_s: how long it lasts, if it does not damp.
         since_onset: whether times count from the onset, for faults that are not of the states;
@@ -55,7 +55,7 @@ class FaultKind:
     """
 
     name: str
-    outcome: Reaction
+    reaction: Reaction
     begin: Begin
     duration_s: float = 0.5
     since_onset: bool = False
@@ -211,9 +211,9 @@ _OVERHEATED: Final = 0x200  # status bits, see `motor_fields.MOTOR_STATUS_BITS`
 
 
 def _motor(
-    name: str, outcome: Reaction, begin: Begin, reason: str = "", duration_s: float = 0.5
+    name: str, reaction: Reaction, begin: Begin, reason: str = "", duration_s: float = 0.5
 ) -> FaultKind:
-    return FaultKind(f"motor: {name}", outcome, begin, duration_s, reason=reason)
+    return FaultKind(f"motor: {name}", reaction, begin, duration_s, reason=reason)
 
 
 _MOTORS: Final = (
@@ -273,8 +273,8 @@ def _pictures(tamper: Tamper) -> Begin:
     return lambda rig: setattr(rig.fake, "tamper_picture", tamper)
 
 
-def _picture(name: str, outcome: Reaction, begin: Begin) -> FaultKind:
-    return FaultKind(f"picture: {name}", outcome, begin, since_onset=True)
+def _picture(name: str, reaction: Reaction, begin: Begin) -> FaultKind:
+    return FaultKind(f"picture: {name}", reaction, begin, since_onset=True)
 
 
 _PICTURES: Final = (
@@ -344,8 +344,8 @@ def _pressed(*buttons: str) -> Begin:
     return lambda rig: setattr(rig.fake, "pressed", frozenset(buttons))
 
 
-def _other(name: str, outcome: Reaction, begin: Begin, duration_s: float = 0.5) -> FaultKind:
-    return FaultKind(name, outcome, begin, duration_s, since_onset=True)
+def _other(name: str, reaction: Reaction, begin: Begin, duration_s: float = 0.5) -> FaultKind:
+    return FaultKind(name, reaction, begin, duration_s, since_onset=True)
 
 
 _OTHERS: Final = (

@@ -42,19 +42,19 @@ class FaultRun:
         """Why this is not what must come of the fault; empty: it is."""
         if self.unsound:
             return f"{self.unsound} commands were not sound"
-        outcome = self.kind.outcome
-        if outcome in _DAMPS:
+        reaction = self.kind.reaction
+        if reaction in _DAMPS:
             damped = self.damped_ms is not None
             return self._wrong_reason if damped else f"was not damped, but {self.end}"
-        if outcome is Reaction.ANY:
+        if reaction is Reaction.ANY:
             return ""
         if self.damped_ms is not None:
             return f"was damped: {self.reason}"
         if self.end != State.RUN:
             return f"did not return to run, but is in {self.end}: {self.reason}"
-        if outcome is Reaction.HOLD and self.held_ms is None:
+        if reaction is Reaction.HOLD and self.held_ms is None:
             return "was not held"
-        if outcome is Reaction.RUN and "proprioception" in self.reason:
+        if reaction is Reaction.RUN and "proprioception" in self.reason:
             return f"was held: {self.reason}"
         return self._wrong_reason
 
@@ -70,7 +70,7 @@ def run_fault(rig: FaultRig, kind: FaultKind) -> FaultRun:
     """Bring ``rig`` to RUN, let the fault happen, and end it."""
     rig.ensure_running()
     begin = time.monotonic()
-    must_damp = kind.outcome in _DAMPS
+    must_damp = kind.reaction in _DAMPS
     limit = begin + max(kind.duration_s, _PATIENCE_S if must_damp else 0.0)
 
     def over(observed: Observed) -> bool:

@@ -227,7 +227,7 @@ def test_the_first_interrupt_holds_the_second_damps(drive: Callable[..., Stand])
 def test_a_robot_that_goes_silent_is_damped_and_the_run_is_a_safety_stop(
     drive: Callable[..., Stand],
 ) -> None:
-    stand = drive("--robot.limits.state_damp_s=0.4", "--robot.limits.state_hold_s=0.3")
+    stand = drive("--robot.limits.state_damp_s=3", "--robot.limits.state_hold_s=2")
     stand.await_run()
     stand.fake.faults.freeze_state = True
     assert eventually(lambda: not stand.holds)
