@@ -37,7 +37,7 @@ SCENES := --env.controller=stance --env.ball_episode.ticks=46 --env.ball_episode
 # The artefact keeps how it plans: few candidates, as two cores like it, which go to one place and
 # rest there like the data's hands, and pay for steps and for hands away from the neutral pose
 # (docs/planner.md).
-PLANNER := --planner.samples=64 --planner.elites=4 --planner.process=ramp --planner.hands_cost=0.1 --planner.step_cost=0.2
+PLANNER := --planner.samples=64 --planner.elites=4 --planner.process=ramp --planner.hands_cost=0.02 --planner.step_cost=0.2
 POLICY := $(OUT)/policy/checkpoints/last/pretrained_model
 
 quickstart: install

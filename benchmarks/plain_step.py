@@ -2,8 +2,7 @@
 
 The same mathematics as `egovcp.model` and `egovcp_train.loop`: the same weights, loss terms and
 random draws, optimiser and averaging. Every network is a plain module on concatenated inputs, the
-encoder and all heads work on whole stacked sequences, and the recurrence is a loop over time, in
-which what flies is followed as it is on the robot, a picture at a time.
+encoder and all heads work on whole stacked sequences, and the recurrence is a loop over time.
 """
 
 from __future__ import annotations
@@ -15,12 +14,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from egovcp import spec
-from egovcp.model import Batch, LossConfig, WorldModel, flight
-from egovcp.model.camera_pose import camera_pose
-from egovcp.model.depth import within
-from egovcp.model.floor import floor
+from egovcp.model import Batch, LossConfig, WorldModel
 from egovcp.model.nets import SplitLinear, SplitMlp
-from egovcp.model.world_model import PASSING_UNIT
+from egovcp.model.two_hot import REACH
 from egovcp_train.config import OptimizerConfig
 
 
@@ -71,16 +67,8 @@ class PlainModel(nn.Module):
         patches = copy.deepcopy(model.decode_depth.layers)
         self.decode_depth = nn.Sequential(*patches, nn.PixelShuffle(model.decode_depth.PATCH))
         self.decode_state = mlp(model.decode_state)
-        self.decode_motion = mlp(model.decode_motion)
-        self.decode_sight = copy.deepcopy(model.decode_sight)
-        self.decode_passing = mlp(model.decode_passing)
         self.termination = mlp(model.termination_head)
-        heads = model.q_heads
-        assert heads.passing is not None
-        reduced = [head.reduce for head in heads.states if head.reduce is not None]
-        self.reduce = nn.ModuleList(linear(reduce) for reduce in reduced)
-        self.value_heads = nn.ModuleList(mlp(head.mlp) for head in heads.states)
-        self.passing_value = mlp(heads.passing)
+        self.value = mlp(model.value_head)
         for name, buffer in model.named_buffers():
             self.register_buffer(name, buffer.clone())
 
@@ -92,39 +80,12 @@ class PlainModel(nn.Module):
         new: Tensor = self.gru(self.mix(torch.cat([z, action], -1)), h)
         return new
 
-    def background(self, features: Tensor) -> Tensor:
-        """(N, features) -> nearness (N, 48, 64) without what flies."""
+    def picture(self, features: Tensor) -> Tensor:
+        """(N, features) -> nearness (N, 48, 64)."""
         maps = self.decoder_input(features)
         maps = maps.view(len(maps), -1, spec.DEPTH_ROWS // 8, spec.DEPTH_COLS // 8)
         image: Tensor = self.decode_depth(maps)[:, 0]
         return image
-
-    def motion(self, features: Tensor) -> Tensor:
-        """(..., features) -> (..., A, 4)."""
-        output: Tensor = self.decode_motion(features)
-        return output.unflatten(-1, (len(self.config.motion_ahead), 4))
-
-    @torch.no_grad()
-    def follow(
-        self, memory: Tensor, near: Tensor, state: Tensor, sight: Tensor, first: Tensor
-    ) -> Tensor:
-        """What is remembered of a flight (N, ...) after one more picture."""
-        max_m, config = self.config.depth_max_m, self.config.flight
-        seen = flight.sighting(near, sight, max_m, config)
-        pose = camera_pose(state, config.camera)
-        ground = floor(near, pose, max_m, config.camera)
-        return flight.follow(memory, pose, seen, ground, first, config)
-
-    def value(self, h: Tensor, z: Tensor, memory: Tensor, action: Tensor) -> Tensor:
-        """Standardised, of each head, (..., heads)."""
-        features = torch.cat([h, z], -1)
-        passing = flight.told(memory, PASSING_UNIT)
-        own = [
-            head(torch.cat([reduce(features), action], -1))
-            for reduce, head in zip(self.reduce, self.value_heads, strict=True)
-        ]
-        shared: Tensor = self.passing_value(torch.cat([passing, action], -1))
-        return torch.cat(own, -1) + shared
 
 
 def widest(x: Tensor) -> Tensor:
@@ -157,10 +118,8 @@ def pixel_weights(near: Tensor, batch: Batch, loss: LossConfig) -> Tensor:
     threshold = loss.moving_threshold
     moving = (near[:, 1:] > high + threshold) | (near[:, 1:] < low - threshold)
     moving = F.pad(moving, (0, 0, 0, 0, 1, 0)) & ~batch.is_first[..., None, None]
-    place = batch.passing[..., spec.IN_PICTURE].flatten(0, 1)
-    disc = within(near.flatten(0, 1), place).view_as(near)
     close = near > loss.near_threshold
-    return (1 + loss.moving * moving.float() + loss.near * close.float()) * (~disc).float()
+    return 1 + loss.moving * moving.float() + loss.near * close.float()
 
 
 def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> Tensor:
@@ -172,25 +131,20 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
     image = model.encode_depth(torch.stack([near, (near > 0).float()], 1))
     observation = torch.cat([image, model.encode_state(state.flatten(0, 1))], -1)
     observation = model.embed(observation).view(size, length, -1)
-    sight = model.decode_sight(observation)
     near = near.view(size, length, *near.shape[1:])
 
     h, z = torch.zeros(size, config.hidden), torch.zeros(size, config.latent)
-    memory = torch.zeros(size, flight.SIZE)
-    hs, zs, means, stds, memories = [], [], [], [], []
+    hs, zs, means, stds = [], [], [], []
     for t in range(length):
         keep = (~batch.is_first[:, t, None]).float()
         h = model.transition(h * keep, z * keep, batch.prev_action[:, t] * keep)
         mean, std = model.gaussian(model.posterior(model.posterior_h(h) + observation[:, t]))
         z = mean + std * torch.randn(mean.shape, generator=generator)
-        seen = near[:, t], batch.state[:, t], sight[:, t]
-        memory = model.follow(memory, *seen, batch.is_first[:, t])
         hs.append(h)
         zs.append(z)
         means.append(mean)
         stds.append(std)
-        memories.append(memory)
-    h, z, mean, std, memory = (torch.stack(x, 1) for x in (hs, zs, means, stds, memories))
+    h, z, mean, std = (torch.stack(x, 1) for x in (hs, zs, means, stds))
     features = torch.cat([h, z], -1)
     prior_mean, prior_std = model.gaussian(model.prior(h))
 
@@ -199,11 +153,9 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
     foreseen = foresight_terms(model, (h, z), near, state, weight, batch, generator)
     terms = [
         loss.depth * depth_loss(model, features, near, weight, batch, generator),
-        loss.motion * motion_loss(model, features, sight, batch),
-        loss.passing * passing_loss(model, features, batch),
         loss.state * mean_where(error, batch.valid),
         *kl_terms(model, (mean, std), (prior_mean, prior_std), batch),
-        *value_terms(model, h, z, memory, batch),
+        *value_terms(model, h, z, batch),
         *foreseen,
     ]
     return torch.stack(terms).sum()
@@ -219,45 +171,10 @@ def depth_loss(
 ) -> Tensor:
     every = model.config.loss.decode_every
     chosen = slice(int(torch.randint(every, (), generator=generator)), None, every)
-    image = model.background(features[:, chosen].flatten(0, 1))
+    image = model.picture(features[:, chosen].flatten(0, 1))
     error = 0.5 * (image - near[:, chosen].flatten(0, 1)) ** 2
     error = error * weight[:, chosen].flatten(0, 1)
     return mean_where(error.mean((-2, -1)), batch.valid[:, chosen].flatten())
-
-
-def motion_target(batch: Batch, max_m: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Place (B, T, 3), whether anything flies, whether that is known, (B, T) each."""
-    row, column, radius, depth = batch.passing[..., spec.IN_PICTURE].unbind(-1)
-    half = (spec.DEPTH_ROWS - 1) / 2, (spec.DEPTH_COLS - 1) / 2
-    place = [column / half[1] - 1, row / half[0] - 1, 1 - depth / max_m]
-    return torch.stack(place, -1), radius > 0, batch.passing[..., 4] > 0
-
-
-def motion_error(guess: Tensor, place: Tensor, flies: Tensor, known: Tensor) -> Tensor:
-    error = F.huber_loss(guess[..., :3], place, reduction="none", delta=0.1)
-    presence = F.binary_cross_entropy_with_logits(guess[..., 3], flies.float(), reduction="none")
-    return mean_where(error.sum(-1) / 0.1, known & flies) + 0.3 * mean_where(presence, known)
-
-
-def motion_loss(model: PlainModel, features: Tensor, sight: Tensor, batch: Batch) -> Tensor:
-    place, flies, labelled = motion_target(batch, model.config.depth_max_m)
-    total = motion_error(sight, place, flies, batch.valid & labelled)
-    output, length = model.motion(features), place.shape[1]
-    for i, k in enumerate(model.config.motion_ahead):
-        if k < length:
-            known = unbroken(batch, k) & labelled[:, k:]
-            guess = output[:, : length - k, i]
-            total = total + motion_error(guess, place[:, k:], flies[:, k:], known)
-    return total
-
-
-def passing_loss(model: PlainModel, features: Tensor, batch: Batch) -> Tensor:
-    output = model.decode_passing(features)
-    on, known = batch.passing[..., 3], (batch.passing[..., 4] > 0) & batch.valid
-    place = batch.passing[..., :3] / torch.tensor(PASSING_UNIT)
-    error = F.huber_loss(output[..., :3], place, reduction="none", delta=0.5).sum(-1)
-    presence = F.binary_cross_entropy_with_logits(output[..., 3], on, reduction="none")
-    return mean_where(error, known & (on > 0)) + mean_where(presence, known)
 
 
 def kl_terms(
@@ -274,18 +191,24 @@ def kl_terms(
     return [loss.kl_prior * kl(fixed_q, p), loss.kl_posterior * kl(q, fixed_p)]
 
 
-def value_error(q: Tensor, target: Tensor) -> Tensor:
-    """Of heads (..., heads) beside the target (...,), (...,)."""
-    return ((q - target[..., None]) ** 2).mean(-1)
+def value_error(logits: Tensor, target: Tensor) -> Tensor:
+    """Cross entropy (...,) of logits (..., bins) and the two-hot encoded target (...,)."""
+    even = torch.linspace(-REACH, REACH, logits.shape[-1])
+    bins = even.sign() * torch.expm1(even.abs())
+    target = target.clamp(bins[0], bins[-1])
+    above = torch.bucketize(target, bins).clamp(min=1)
+    share = (target - bins[above - 1]) / (bins[above] - bins[above - 1])
+    high, low = F.one_hot(above, len(bins)), F.one_hot(above - 1, len(bins))
+    encoded = share[..., None] * high + (1 - share[..., None]) * low
+    return -(encoded * F.log_softmax(logits, -1)).sum(-1)
 
 
-def value_terms(
-    model: PlainModel, h: Tensor, z: Tensor, memory: Tensor, batch: Batch
-) -> list[Tensor]:
+def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[Tensor]:
     loss = model.config.loss
     target = (batch.mc_return - model.return_mean) / model.return_std  # type: ignore[operator]
     usable = batch.valid & batch.mc_valid
-    value = mean_where(value_error(model.value(h, z, memory, batch.action), target), usable)
+    q = model.value(torch.cat([h, z, batch.action], -1))
+    value = mean_where(value_error(q, target), usable)
     h = model.transition(h, z, batch.action)
     z = model.gaussian(model.prior(h))[0]
     fall = F.binary_cross_entropy_with_logits(
@@ -293,8 +216,7 @@ def value_terms(
         batch.terminal_next.float(),
         reduction="none",
     )
-    later = flight.later(memory)[:, :-1]
-    q = model.value(h[:, :-1], z[:, :-1], later, batch.action[:, 1:])
+    q = model.value(torch.cat([h[:, :-1], z[:, :-1], batch.action[:, 1:]], -1))
     error = value_error(q, target[:, 1:])
     imagined = mean_where(error, usable[:, 1:] & unbroken(batch, 1))
     return [
@@ -330,13 +252,10 @@ def foresight_terms(
             rows.append(start + k)
             known.append(unbroken(batch, k)[:, start])
     features, at, valid = torch.cat(seen, 1), torch.cat(rows), torch.cat(known, 1)
-    image = model.background(features.flatten(0, 1)).view(len(near), len(at), *near.shape[2:])
+    image = model.picture(features.flatten(0, 1)).view(len(near), len(at), *near.shape[2:])
     picture = (0.5 * weight[:, at] * (image - near[:, at]) ** 2).mean((-2, -1))
     proprioception = (0.5 * (model.decode_state(features) - state[:, at]) ** 2).mean(-1)
-    place, flies, labelled = (x[:, at] for x in motion_target(batch, model.config.depth_max_m))
-    motion = motion_error(model.motion(features)[..., 0, :], place, flies, labelled & valid)
     return [
-        loss.foresight_motion * motion,
         loss.foresight_depth * mean_where(picture, valid),
         loss.foresight_state * mean_where(proprioception, valid),
     ]

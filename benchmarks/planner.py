@@ -28,7 +28,6 @@ from egovcp.plan.config import BackendName
 from egovcp.plan.process import reflect
 
 SIDE = 1024  # of the matrices of the plain product
-PRODUCTS = {"float32": "float32", "bfloat16": "bfloat16", "int8": "int8", "compile": "float32"}
 
 
 def plain_plan(
@@ -48,7 +47,7 @@ def plain_plan(
         values, alive = [], torch.ones(m)
         for k in range(n):
             action = reflect(action + config.eta * deltas[:, k])
-            values.append(alive * (model.lowest_value(state, action) - model.return_floor))
+            values.append(alive * (model.value(state, action) - model.return_floor))
             if k > 0:
                 alive = alive * (model.termination(state) <= config.termination_threshold)
             state = model.imagine(state, action)
@@ -61,19 +60,12 @@ def needed_gflop(model: WorldModel, config: PlannerConfig) -> float:
     """Arithmetic of one plan: multiplications and additions of matrix products, without those that
     all candidates share at k = 0, the prior's deviation, and what follows the last step."""
 
-    def macs(*modules: nn.Module | None) -> int:
-        linears = [x for m in modules if m is not None for x in m.modules()]
+    def macs(*modules: nn.Module) -> int:
+        linears = [x for m in modules for x in m.modules()]
         return sum(x.weight.numel() for x in linears if isinstance(x, nn.Linear))
 
-    def state_parts(module: nn.Module) -> int:
-        return macs(*list(module.parts)[:-1])  # type: ignore[arg-type]
-
-    heads = model.q_heads.parts
-    mlps = [getattr(part, "mlp", part) for part in heads]
-    asked = model.passing_value_head is not None and not model.config.follows_flight
-    told = model.decode_passing if asked else None
-    q_start = sum(macs(mlp) - state_parts(mlp.first) for mlp in mlps)
-    q_later = macs(*heads, told)
+    q_later = macs(model.value_head)
+    q_start = q_later - macs(*list(model.value_head.first.parts)[:-1])
     prior = macs(model.prior) - model.config.latent * model.config.units
     first = macs(model.mix.parts[1], model.gru.project.parts[0])
     later = macs(model.mix, model.gru)
@@ -101,7 +93,7 @@ def gpu_plans(
 
         return run
 
-    names: tuple[BackendName, ...] = ("eager", "float32", "bfloat16")
+    names: tuple[BackendName, ...] = ("eager", "float32")
     return {
         f"gpu_{name}": planned(judge_of_model(there, PlannerConfig(backend=name))) for name in names
     }
@@ -110,14 +102,12 @@ def gpu_plans(
 def plain_products() -> dict[str, Callable[[], object]]:
     """Precision -> a product of two square matrices, by the fastest call that torch has."""
     a, b = torch.randn(SIDE, SIDE), torch.randn(SIDE, SIDE)
-    a16, b16 = a.bfloat16(), b.bfloat16()
     weight = torch.randint(-127, 128, (SIDE, SIDE), dtype=torch.int8)
     packed = torch.ops.onednn.qlinear_prepack(weight, [SIDE, SIDE])
     rows = torch.randint(0, 256, (SIDE, SIDE), dtype=torch.uint8)
     scale, zero = torch.ones(SIDE), torch.zeros(SIDE, dtype=torch.int32)
     return {
         "float32": lambda: a @ b,
-        "bfloat16": lambda: a16 @ b16,
         "int8": lambda: torch.ops.onednn.qlinear_pointwise(
             rows, 1.0, 0, packed, scale, zero, None, 1.0, 0, torch.float32, "none", [], ""
         ),
@@ -128,15 +118,13 @@ def plain_products() -> dict[str, Callable[[], object]]:
 def main() -> None:
     p = parser(__doc__)
     p.add_argument("--samples", type=int, default=1024, help="M")
-    p.add_argument("--compile", action="store_true", help="also torch.compile: it takes minutes")
     args = p.parse_args()
     torch.manual_seed(0)
     model = WorldModel(WorldModelConfig()).eval().requires_grad_(False)
-    for head in model.q_heads.states:
-        torch.nn.init.normal_(head.mlp.rest[-1].weight, std=0.1)
+    torch.nn.init.normal_(model.value_head.rest[-1].weight, std=0.1)  # type: ignore[arg-type]
     config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))
     h, z = torch.randn(1, model.config.hidden).tanh(), torch.randn(1, model.config.latent)
-    carry = Carry(h, z, model.initial(1).flight)
+    carry = Carry(h, z)
     executed = torch.zeros(1, spec.ACTION_DIM)
 
     def planned(judge: Judge[Carry]) -> Callable[[], Tensor]:
@@ -147,8 +135,7 @@ def main() -> None:
 
         return run
 
-    names: list[BackendName] = ["auto", "eager", "float32", "bfloat16", "int8"]
-    names += ["compile"] if args.compile else []
+    names: tuple[BackendName, ...] = ("auto", "eager", "float32", "int8")
     plans = {name: planned(judge_of_model(model, PlannerConfig(backend=name))) for name in names}
 
     def plain() -> Tensor:
@@ -194,8 +181,8 @@ def main() -> None:
         figures[f"{name}_ratio"] = p50["plain"] / seconds
         figures[f"{name}_action_difference"] = differences[name]
         figures[f"{name}_gflops"] = gflop / seconds
-        if name in PRODUCTS:
-            figures[f"{name}_arithmetic_share"] = gflop / seconds / rate[PRODUCTS[name]]
+        if name in rate:
+            figures[f"{name}_arithmetic_share"] = gflop / seconds / rate[name]
     for name in products:
         figures[f"product_{name}_gflops"] = rate[name]
     for name in ("observe", "command", *on_gpu):

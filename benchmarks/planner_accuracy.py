@@ -26,7 +26,7 @@ from egovcp.plan.backends import judge_of_model
 from egovcp.plan.config import BackendName
 from egovcp.plan.process import walk
 
-BACKENDS: tuple[BackendName, ...] = ("float32", "bfloat16", "int8")
+BACKENDS: tuple[BackendName, ...] = ("float32", "int8")
 BATCH = 8  # robots planned together
 
 

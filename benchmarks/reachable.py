@@ -34,17 +34,19 @@ from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.data.index import EpisodeIndex, require_mixable
 from egovcp.data.split import in_split
 from egovcp.data.targets import mc_return, mc_valid
+from egovcp.data.windows import gather
 from egovcp.errors import DataError, UsageError
 from egovcp.model.losses import filter_sequence
 from egovcp.policy_options import PolicyOptions
 from egovcp.trained import returns_of
-from egovcp_train.batches import whole_episodes
+from egovcp_train.batches import to_tensors
 from egovcp_train.heldout.calibration import calibration
 from egovcp_train.heldout.command import require_same_controller
 
 PROG = "reachable.py"
 VALIDATION = 0.16  # hashes below it are not learned from; held out are those below 0.05
 RESAMPLES = 1000
+AT_ONCE = 32  # episodes that are filtered together
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ class ReachableConfig:
     """Further policies, '[RUN_A, RUN_B]'."""
     episodes: int = 0
     """At most so many training episodes of each task, evenly spread; 0: all. Held-out ones: all."""
-    horizons: tuple[int, ...] = (16, spec.RETURN_STEPS)
+    horizons: tuple[int, ...] = (spec.RETURN_STEPS, 50)
     """Ticks K of the return where no policy says how its own was made."""
     gamma: float = spec.GAMMA
     """Discount where no policy says."""
@@ -287,8 +289,10 @@ def values(artefact: Artefact, heldout: EpisodeIndex, returns: ReturnConfig) -> 
     """Q of the recorded actions on the rows whose return is complete, episodes filtered from
     their start as on the robot."""
     model = artefact.world_model.eval()
-    found = []
-    for batch in whole_episodes(EpisodeStore.read(heldout, returns), torch.device("cpu")):
+    store, found = EpisodeStore.read(heldout, returns), []
+    for which in np.split(np.arange(len(store.length)), range(AT_ONCE, len(store.length), AT_ONCE)):
+        arrays = gather(store, store.start[which], which, int(store.length[which].max()))
+        batch = to_tensors(arrays, torch.device("cpu"))
         carry = filter_sequence(model, batch, sample=False).carry
         found.append(model.value(carry, batch.action)[batch.valid & batch.mc_valid])
     return np.asarray(torch.cat(found).numpy())

@@ -13,7 +13,7 @@ The cases take turns; ratios are medians of the ratios of one turn. Processor ti
 other programs on the machine do not; with several threads that is the time of all of them, waiting
 for each other included. ``clock_ratio`` and the rates are by the clock and want a quiet machine.
 
-    python benchmarks/train_step.py --root data/ball --return_steps 20
+    python benchmarks/train_step.py --root data/ball
 """
 
 from __future__ import annotations
@@ -48,8 +48,6 @@ from egovcp_train.allocation import keep_freed_memory
 from egovcp_train.batches import set_normalisation, to_tensors
 from egovcp_train.config import OptimizerConfig, SamplingConfig
 from egovcp_train.device import choose_bf16
-from egovcp_train.labels.config import PassingConfig
-from egovcp_train.labels.passing import label
 from egovcp_train.loop import Learner
 
 TOLERANCE = 1e-4  # of the loss, relative: sums of some million fp32 numbers in another order
@@ -73,7 +71,7 @@ class Learners:
         torch.set_num_threads(threads)
         torch.manual_seed(0)
         index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
-        store = label(EpisodeStore.read(index, returns), PassingConfig())
+        store = EpisodeStore.read(index, returns)
         self._model = WorldModel(WorldModelConfig())
         set_normalisation(self._model, store)
         self._config = OptimizerConfig(warmup_steps=0)

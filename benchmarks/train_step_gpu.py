@@ -10,7 +10,7 @@ By the clock, what waits for the GPU included, with each number of windows:
 
 The cases take turns, after as many steps as it takes to record them (`egovcp.cuda_graphs`).
 
-    python benchmarks/train_step_gpu.py --root data/ball --return_steps 20
+    python benchmarks/train_step_gpu.py --root data/ball
 """
 
 from __future__ import annotations
@@ -37,8 +37,6 @@ from egovcp.model import Batch, WorldModel, WorldModelConfig
 from egovcp_train.batches import set_normalisation, to_tensors
 from egovcp_train.config import OptimizerConfig, SamplingConfig
 from egovcp_train.device import choose_bf16
-from egovcp_train.labels.config import PassingConfig
-from egovcp_train.labels.passing import label
 from egovcp_train.loop import Learner
 
 LENGTH = SamplingConfig().length
@@ -108,9 +106,7 @@ def main() -> None:
         if args.root is None:
             write(root, [make_episode(i, 150) for i in range(EPISODES)])
         index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
-        store = label(
-            EpisodeStore.read(index, ReturnConfig(steps=args.return_steps)), PassingConfig()
-        )
+        store = EpisodeStore.read(index, ReturnConfig(steps=args.return_steps))
         for size in args.batches:
             seconds = interleaved(cases(store, size, size in args.cpu_batches), args.rounds)
             for name, value in seconds.items():

@@ -44,8 +44,18 @@ from egovcp.plan.cost import require_affordable
 from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
 from egovcp.safe_files import JSON_LIMIT_BYTES, UnsafeFileError, read_bytes, sha256
 
-#: Options of models made before there were these, where the default is another.
-_BEFORE: Final[Mapping[str, Any]] = {"flight": {"enabled": False}}
+#: Options of world models that older versions trained; this version has none of them.
+_TRACKER_OPTIONS: Final = frozenset(
+    {
+        "flight",
+        "motion_ahead",
+        "paint_flight",
+        "q_heads",
+        "value_of_passing",
+        "value_state",
+        "value_units",
+    }
+)
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 #: All files of an artefact: nothing else is read, nor fetched from the Hub.
 FILES: Final = (CONFIG, WEIGHTS, MANIFEST, *PROCESSORS)
@@ -202,12 +212,15 @@ def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
         ArtefactError: they are missing, not readable, or ask too much of the machine.
     """
     config = read_object(folder / CONFIG)
+    world_model = config.get("world_model")
+    if isinstance(world_model, dict) and not _TRACKER_OPTIONS.isdisjoint(world_model):
+        raise ArtefactError(
+            f"{folder / CONFIG}: trained by an older version with a ball tracker, which this "
+            "version no longer has; train again"
+        )
     try:
         if config.get("type") != "egovcp":
             raise DecodeError(f'type is {shown(config.get("type"))}, expected "egovcp"')
-        world_model = config.get("world_model")
-        if isinstance(world_model, dict):
-            world_model = {**_BEFORE, **world_model}
         model = decode(WorldModelConfig, world_model, "world_model")
         planner = decode(PlannerConfig, config.get("planner"), "planner")
         require_answers(model, planner)

@@ -62,8 +62,6 @@ class WeightedDatasetConfig(SelectedDatasetConfig):
     weight: float | None = bounded(None, least=0)
     """Share of the windows, relative to the other datasets; null, and then for all: in proportion
     to the frames."""
-    return_steps: int | None = bounded(None, least=1, most=100_000)
-    """Horizon K of the returns of its rows, planner ticks; null: --returns.steps."""
 
 
 def parse_config[C](

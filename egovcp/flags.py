@@ -11,6 +11,7 @@ from typing import Any, Final
 from draccus.utils import CONFIG_ARG
 
 from egovcp.errors import UsageError, did_you_mean
+from egovcp.removed_options import refuse_removed_flag, refuse_removed_options
 from egovcp.safe_files import UnsafeFileError, read_text, require_bounded
 from egovcp.values import (
     WrongValue,
@@ -44,7 +45,7 @@ def split_flags(argv: Sequence[str], flags: Mapping[str, Any]) -> list[str]:
     """The arguments as ``--name=value`` each: ``--a b`` is ``--a=b``, a switch alone is true.
 
     Raises:
-        UsageError: an argument is no flag, an unknown one, or lacks its value.
+        UsageError: an argument is no flag, an unknown or removed one, or lacks its value.
     """
     joined: list[str] = []
     for arg in argv:
@@ -63,6 +64,7 @@ def _checked(arg: str, flags: Mapping[str, Any]) -> str:
     if not flag.startswith("-"):
         raise UsageError(f"unexpected argument {arg!r}; options are written --name=value")
     if flag not in flags:
+        refuse_removed_flag(flag)
         raise WrongValue(f"unknown option {flag}{did_you_mean(flag, flags)}")
     if not equals and flags[flag] is not bool:
         raise WrongValue(f"option {flag} needs a value, {flag}=...")
@@ -77,7 +79,8 @@ def flag_values(args: Sequence[str], flags: Mapping[str, Any]) -> dict[str, Any]
         flags: as `flags_of` returns them.
 
     Raises:
-        UsageError: a value is not of the type of its option, or the file cannot be read.
+        UsageError: a value is not of the type of its option, or the file cannot be read or has
+            options that were removed.
     """
     given: dict[str, Any] = {}
     file = ""
@@ -122,13 +125,15 @@ def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
 
 def _config_file(file: str) -> dict[str, Any]:
     try:
-        return read_config(Path(file))
+        options = read_config(Path(file))
     except OSError as error:
         raise UsageError(f"{CONFIG_FILE}: cannot read {file}: {error.strerror}") from error
     except UnsafeFileError as error:
         raise UsageError(f"{CONFIG_FILE}: cannot read {file}: {error}") from error
     except ValueError as error:
         raise UsageError(f"{CONFIG_FILE}: {file} {error}") from error
+    refuse_removed_options(options, f"{CONFIG_FILE}={file}")
+    return options
 
 
 def read_config(path: Path) -> dict[str, Any]:

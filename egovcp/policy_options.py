@@ -8,7 +8,7 @@ from egovcp.artefact import Artefact, load_artefact
 from egovcp.bounds import OutOfBounds, bounded
 from egovcp.errors import UsageError
 from egovcp.plan import PlannerConfig, require_answers
-from egovcp.plan.choices import Ensemble, Latent
+from egovcp.plan.choices import Latent
 from egovcp.plan.config import BackendName, Objective, OptimiserName, Process, TerminationRule
 from egovcp.plan.cost import require_affordable
 
@@ -39,7 +39,7 @@ class PlannerOptions:
     """N, planner ticks of 40 ms."""
     objective: Objective | None = None
     """J of a plan: value (mean of Q), reward (sum of predicted rewards), td (the same and Q at the
-    end). The last two need a model trained with loss.reward, and compute step by step."""
+    end). The last two need a model trained with loss.reward."""
     iterations: int | None = bounded(None, least=1, most=10_000)
     """Rounds of the search."""
     elites: int | None = bounded(None, least=1, most=2**20)
@@ -59,12 +59,10 @@ class PlannerOptions:
     (weighted with the probability of being alive)."""
     latent: Latent | None = None
     """z of imagined states: mean of the prior, or a sample."""
-    ensemble: Ensemble | None = None
-    """Several heads of Q: mean, or min."""
     optimiser: OptimiserName | None = None
     """The search: cem, icem, mppi or shooting (docs/planner.md)."""
     backend: BackendName | None = None
-    """Who computes: auto, eager, float32, bfloat16, int8 or compile (docs/planner.md)."""
+    """Implementation of the planner's networks: auto, eager, float32 or int8 (docs/planner.md)."""
 
     def apply(self, planner: PlannerConfig) -> PlannerConfig:
         """``planner`` with these changes.

@@ -90,12 +90,6 @@ STATE_DIM: Final = 74
 COMMAND_SLICE: Final = slice(6, 16)  # velocity 3, hands 6, height 1
 COMMAND_DIM: Final = 10
 
-#: Label of a row about what is on its way: y, z (m), time left (s), whether there is something
-#: (0 or 1), and whether this is known (0 or 1); and where in the picture it is: row and column of
-#: its middle, radius (pixels; 0: nowhere), depth of its surface (m).
-PASSING_DIM: Final = 9
-IN_PICTURE: Final = slice(5, 9)
-
 STATE_NAMES: Final = (
     *(f"angular_velocity.{a}" for a in "xyz"),
     *(f"projected_gravity.{a}" for a in "xyz"),
@@ -199,4 +193,4 @@ FEATURES: Final[dict[str, dict[str, object]]] = {
 
 # --- returns (paper eq. 9; DESIGN of the Monte Carlo target) ------------------------
 GAMMA: Final = 0.97
-RETURN_STEPS: Final = 50
+RETURN_STEPS: Final = 16

@@ -19,6 +19,7 @@ from draccus import cfgparsing
 
 from egovcp.bounds import OutOfBounds, as_flag_value
 from egovcp.errors import UsageError, did_you_mean
+from egovcp.removed_options import refuse_removed_flag
 
 _BOOLEANS: Final[Mapping[str, bool]] = {
     **dict.fromkeys(("true", "yes", "on"), True),
@@ -111,6 +112,7 @@ def build[C](
     options = {field.name: field for field in dataclasses.fields(config_class)}  # type: ignore[arg-type]
     for key in values:
         if key not in options:
+            refuse_removed_flag(f"{prefix}{key}")
             near = did_you_mean(f"{prefix}{key}", [f"{prefix}{name}" for name in options])
             raise WrongValue(f"unknown option {prefix}{as_flag_value(key)}{near}")
     found: dict[str, Any] = {}

@@ -85,8 +85,8 @@ class EvalConfig:
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     """Changes to the artefact's planner."""
     task: str = "ball"
-    """ball, wall, arch, all (these three), or sequence: several in one episode, by default an arch
-    and then a throw (--env.sequence.parts)."""
+    """ball, wall, arch, all (these three), or sequence: several in one episode, by default
+    [arch, ball] (--env.sequence.parts)."""
     episodes: int = bounded(80, least=1, most=10**6)
     """Scenarios per task."""
     seed: int = bounded(0, least=0)

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from egovcp.log.tick import Hand, ValueMap
 from egovcp.plan import hand_grid, value_map
-from egovcp.plan.choices import Ensemble
 from egovcp.plan.objective import Dynamics
 from egovcp.plan.value_map import HAND_AXES
 from egovcp.spec import ACTION_BOX
@@ -19,23 +18,21 @@ HANDS: Final[tuple[Hand, ...]] = ("left", "right")
 
 
 def value_maps[L](
-    model: Dynamics[L], carry: L, action: NDArray[np.floating], ensemble: Ensemble
+    model: Dynamics[L], carry: L, action: NDArray[np.floating]
 ) -> tuple[ValueMap, ...]:
-    """What the model thinks of each hand elsewhere in its box; one robot.
+    """Q of the planned action with each hand moved over its box; one robot.
 
     Args:
         model: the world model.
         carry: its filtered state (1, ...), before it advances.
         action: (7,) the planned action.
-        ensemble: what several heads of Q are worth together.
     """
     planned = torch.as_tensor(action, dtype=torch.float32, device=model.return_floor.device)
     target = ACTION_BOX.to_metric(np.asarray(action))
     maps = []
     for hand in HANDS:
         grid = hand_grid(hand)
-        of_hand = value_map(model, carry, planned[None], hand, grid, ensemble)
-        values = of_hand[0].float().cpu().numpy()
+        values = value_map(model, carry, planned[None], hand, grid)[0].float().cpu().numpy()
         y = float(np.float32(target[HAND_AXES[hand][1]]))
         maps.append(ValueMap(hand, grid.x, y, grid.z, values))
     return tuple(maps)

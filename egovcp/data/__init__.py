@@ -15,7 +15,7 @@ from egovcp.data.mix import Mix
 from egovcp.data.order import Shard
 from egovcp.data.provenance import Provenance
 from egovcp.data.reader import DatasetReader
-from egovcp.data.returns import MixedReturnConfig, ReturnConfig
+from egovcp.data.returns import ReturnConfig
 from egovcp.data.sample import sample_files
 from egovcp.data.store import EpisodeStore
 from egovcp.data.stream import SequenceStream, StreamConfig
@@ -34,7 +34,6 @@ __all__ = [
     "EpisodeIndex",
     "EpisodeStore",
     "Mix",
-    "MixedReturnConfig",
     "Provenance",
     "ReturnConfig",
     "SequenceStream",

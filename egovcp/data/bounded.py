@@ -8,7 +8,7 @@ state of the stream.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any, Final, Self
 
@@ -17,21 +17,16 @@ from numpy.typing import NDArray
 
 from egovcp.bounds import bounded, check_bounds
 from egovcp.data.digests import Digests, comparing
-from egovcp.data.episode import Episode
 from egovcp.data.index import EpisodeIndex
 from egovcp.data.mix import Mix, group
 from egovcp.data.order import EpisodeOrder, Shard
 from egovcp.data.returns import ReturnConfig
 from egovcp.data.store import EpisodeStore
 from egovcp.data.stream import PLAIN, StreamConfig, require_same
-from egovcp.data.survey import EventBound
 from egovcp.data.windows import Batch, draw_mirrored, finish, gather
 from egovcp.errors import DataError, UsageError
 
-type Label = Callable[[NDArray[np.uint16], NDArray[np.float32]], NDArray[np.float32]]
-
 _ONE_SHARD: Final = Shard()
-_LABELS_KEPT: Final = 20_000  # 60 MB; what is beyond is made again
 
 
 @dataclass(frozen=True)
@@ -59,8 +54,6 @@ class BoundedStream:
         shuffle: ShuffleConfig | None = None,
         shard: Shard = _ONE_SHARD,
         returns: ReturnConfig | None = None,
-        events: Mapping[str, EventBound] | None = None,
-        label: Label | None = None,
         checked: bool = True,
     ) -> None:
         """Make room; nothing is read before the first batch.
@@ -72,8 +65,6 @@ class BoundedStream:
             shuffle: the episodes in memory.
             shard: the part of the episodes that this stream reads.
             returns: the Monte Carlo target.
-            events: task -> which rewards are events; needed where they are drawn more often.
-            label: what makes ``passing`` (T, 5) of an episode's depth and state; None: zeros.
             checked: all episodes have been validated; if not, each is when it is first read.
 
         Raises:
@@ -82,14 +73,10 @@ class BoundedStream:
         self._shuffle = shuffle or ShuffleConfig()
         self._shuffle.check()
         config.check()
-        if config.event_fraction and events is None:
-            raise UsageError("event_fraction needs to know which rewards are events")
         self.index, self.config, self.mix, self.shard = index, config, mix, shard
-        self._returns, self._events, self._label = returns or ReturnConfig(), events, label
-        self._labels: dict[int, NDArray[np.float32]] = {}
+        self._returns = returns or ReturnConfig()
         self._checked = np.full(len(index), checked)
         groups = group(mix, index.dataset, index.tasks, index.length)
-        self._group = groups.of
         self._order = EpisodeOrder(index, groups, shard, config.seed)
         self._rng = np.random.default_rng([config.seed, shard.index])
         self._batches = 0
@@ -100,7 +87,6 @@ class BoundedStream:
         self._left: NDArray[np.int64] = np.zeros(
             slots, dtype=np.int64
         )  # windows that it has still to give
-        self._event_rows: list[NDArray[np.int64]] = [np.empty(0, dtype=np.int64)] * slots
 
     @property
     def episodes(self) -> NDArray[np.int64]:
@@ -199,50 +185,15 @@ class BoundedStream:
         store.fill(slot, episode, self._returns)
         store.length[slot] = len(episode)
         self._held[slot] = number
-        rows = slice(int(store.start[slot]), int(store.start[slot]) + len(episode))
-        if self._label is not None:
-            store.passing[rows] = self._labelled(number, episode)
-        if self._events is not None:
-            event = self._events[episode.task].marks(episode.reward) | store.terminal_next[rows]
-            self._event_rows[slot] = np.flatnonzero(event)
-
-    def _labelled(self, number: int, episode: Episode) -> NDArray[np.float32]:
-        """The label (T, 5) of an episode, made once: it takes longer than to read the episode."""
-        assert self._label is not None
-        found = self._labels.get(number)
-        if found is None:
-            found = self._label(episode.depth, episode.state)
-            if len(self._labels) < _LABELS_KEPT:
-                self._labels[number] = found
-        return found
 
     def _windows(self, slots: NDArray[np.int64]) -> Batch:
         """A window of each of these slots, at a place that is drawn."""
         config, rng, store = self.config, self._rng, self._slots
         span = config.burn_in + config.length
         row = (rng.random(len(slots)) * store.length[slots]).astype(np.int64)
-        if config.event_fraction:
-            slots, row = self._around_events(slots, row)
         place = rng.integers(config.burn_in, span, size=len(slots))
         latest = np.maximum(store.length[slots] - span, 0)
         first = np.clip(row - place, 0, latest)
         batch = gather(store, store.start[slots] + first, slots, span)
         batch["episode"] = self._held[slots]
         return batch
-
-    def _around_events(
-        self, slots: NDArray[np.int64], row: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Some of the windows moved to the events of their episodes.
-
-        The weights hold: the event is one of an episode in memory of the same dataset and task.
-        """
-        slots, row = slots.copy(), row.copy()
-        eventful = np.array([len(rows) > 0 for rows in self._event_rows])
-        kind = self._group[self._held]
-        for i in np.flatnonzero(self._rng.random(len(slots)) < self.config.event_fraction):
-            candidates = np.flatnonzero(eventful & (kind == kind[slots[i]]))
-            if len(candidates):
-                slots[i] = self._rng.choice(candidates)
-                row[i] = self._rng.choice(self._event_rows[slots[i]])
-        return slots, row

@@ -65,13 +65,3 @@ def mirror_state[F: np.floating](state: NDArray[F]) -> NDArray[F]:
 def mirror_action[F: np.floating](action: NDArray[F]) -> NDArray[F]:
     """Normalised action ``(..., 7)`` in the mirror; the action box is its own mirror image."""
     return np.asarray(action[..., ACTION_SOURCE] * ACTION_SIGN.astype(action.dtype))
-
-
-def mirror_passing(passing: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Label of what is on its way, (..., 9), of the mirrored scene: the other side, and the other
-    end of the picture's row."""
-    out = passing.copy()
-    out[..., 0] *= -1.0
-    column, radius = passing[..., 6], passing[..., 7]
-    out[..., 6] = np.where(radius > 0, spec.DEPTH_COLS - 1 - column, column)
-    return out

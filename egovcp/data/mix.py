@@ -91,12 +91,8 @@ class Pools:
         self._count = np.bincount(group_of_rows, minlength=groups)
         self._first = self._count.cumsum() - self._count
 
-    def has(self, group: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Whether there are rows in these groups."""
-        return self._count[group] > 0
-
     def pick(self, rng: np.random.Generator, group: NDArray[np.int64]) -> NDArray[np.int64]:
-        """A row of each of these groups, drawn uniformly; anything where a group has none."""
+        """A row of each of these groups, drawn uniformly. None may be empty."""
         place = (rng.random(len(group)) * self._count[group]).astype(np.int64)
         at = np.minimum(self._first[group] + place, len(self._rows) - 1)
         return np.asarray(self._rows[at])

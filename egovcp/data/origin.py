@@ -32,16 +32,6 @@ def parts_of(origin: Provenance) -> list[Provenance]:
     ] or [origin]
 
 
-def origin_of(origin: Provenance, facts: Mapping[str, Any]) -> Provenance:
-    """The provenance of an episode with these ``metadata``.
-
-    Raises:
-        DataError: it is not recorded.
-    """
-    parts = parts_of(origin)
-    return parts[source_of(len(parts), facts)]
-
-
 def source_of(count: int, facts: Mapping[str, Any]) -> int:
     """Which of ``count`` `parts_of` an episode with these ``metadata`` comes from.
 

@@ -28,21 +28,3 @@ class ReturnConfig:
     def check(self, flag: str = "--returns") -> None:
         """Raise `UsageError`, which names options of ``flag``, for values that make no sense."""
         check_bounds(self, f"{flag}.")
-
-    def steps_of(self, dataset: int) -> int:
-        """Horizon K of the rows of one of several datasets, by its number."""
-        del dataset  # all have the same
-        return self.steps
-
-
-@dataclass(frozen=True)
-class MixedReturnConfig(ReturnConfig):
-    """The same with a horizon for each dataset: what an action leads to is seen after a second at a
-    wall, after three at an arch."""
-
-    steps_each: tuple[int, ...] = bounded((), least=1)
-    """Horizon K of each dataset, in their order."""
-
-    def steps_of(self, dataset: int) -> int:
-        """Horizon K of the rows of one of several datasets, by its number."""
-        return self.steps_each[dataset]

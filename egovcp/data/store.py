@@ -42,11 +42,6 @@ class EpisodeStore:
     """(N,)."""
     mc_valid: NDArray[np.bool_]
     """(N,)."""
-    passing: NDArray[np.float32]
-    """(N, 9) what is on its way: where it will pass the plane before the robot (y, z in m) and
-    in how long (s), whether anything is, and whether that is known; where in the picture it is
-    (row, column and radius in pixels, depth in m; radius 0: nowhere). Zeros, not known, until
-    somebody labels them."""
     start: NDArray[np.int64]
     """(E,) first frame of each episode."""
     length: NDArray[np.int64]
@@ -121,10 +116,9 @@ class EpisodeStore:
         self.prev_action[first] = 0.0
         self.prev_action[first + 1 : rows.stop] = episode.action[:-1]
         self.terminal_next[rows] = targets.is_terminal(episode.done, episode.truncated)
-        steps = config.steps_of(int(self.dataset[number]))
-        self.mc_return[rows] = targets.mc_return(episode.reward, config.gamma, steps)
+        self.mc_return[rows] = targets.mc_return(episode.reward, config.gamma, config.steps)
         self.mc_valid[rows] = targets.mc_valid(
-            len(episode), episode.time_limit, steps, config.keep_truncated
+            len(episode), episode.time_limit, config.steps, config.keep_truncated
         )
 
     @property
@@ -151,5 +145,4 @@ def _allocate(frames: int) -> dict[str, NDArray[Any]]:
         "terminal_next": np.empty(frames, dtype=np.bool_),
         "mc_return": np.empty(frames, dtype=np.float32),
         "mc_valid": np.empty(frames, dtype=np.bool_),
-        "passing": np.zeros((frames, spec.PASSING_DIM), dtype=np.float32),
     }

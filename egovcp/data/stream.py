@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 
 from egovcp.data.mix import Mix, Pools, group
 from egovcp.data.store import EpisodeStore
-from egovcp.data.survey import EventBound
 from egovcp.data.windows import Batch, draw_mirrored, finish, gather
 from egovcp.errors import DataError, UsageError
 
@@ -36,10 +35,6 @@ class StreamConfig:
     """Rows that count in each window."""
     burn_in: int = 0
     """Rows before them that only warm up the memory: valid only where the episode starts."""
-    event_fraction: float = 0.0
-    """Share of windows placed around an event, which a uniform choice would rarely meet."""
-    event_quantile: float = 0.98
-    """At most the rows beyond this quantile of the reward's distance from its median count."""
     mirror: bool = True
     """Reflect half of the windows left to right."""
     seed: int = 0
@@ -51,11 +46,6 @@ class StreamConfig:
             raise UsageError(
                 f"batch_size {self.batch_size}, length {self.length}, burn_in {self.burn_in}: "
                 "expected at least 1, 1 and 0"
-            )
-        if not (0 <= self.event_fraction <= 1 and 0 <= self.event_quantile < 1):
-            raise UsageError(
-                f"event_fraction {self.event_fraction} and event_quantile {self.event_quantile}: "
-                "expected shares between 0 and 1"
             )
 
 
@@ -69,7 +59,7 @@ class SequenceStream:
         mix: Mix = PLAIN,
         rows: slice = ALL_ROWS,
     ) -> None:
-        """Find the events and seed the generator.
+        """Seed the generator.
 
         Args:
             store: the episodes.
@@ -90,11 +80,9 @@ class SequenceStream:
         self._batches = 0
         self._fingerprint = store.fingerprint
         self._episode_of = np.repeat(np.arange(len(store.length)), store.length)
-        self._events = event_rows(store, config.event_quantile)
         self._groups = group(mix, store.dataset, store.tasks, store.length)
         of_rows, count = self._groups.of[self._episode_of], len(self._groups.share)
         self._row_pools = Pools(np.arange(store.num_frames), of_rows, count)
-        self._event_pools = Pools(self._events, of_rows[self._events], count)
 
     def __iter__(self) -> Iterator[Batch]:
         return self
@@ -148,24 +136,14 @@ class SequenceStream:
         return np.clip(rows - place, first, latest), episode
 
     def _draw_rows(self) -> NDArray[np.int64]:
-        """A row for each window, (B,), all alike."""
-        config, rng = self.config, self._rng
-        rows = rng.integers(self.store.num_frames, size=config.batch_size)
-        if len(self._events):
-            events = rng.choice(self._events, size=config.batch_size)
-            rows = np.where(rng.random(config.batch_size) < config.event_fraction, events, rows)
-        return rows
+        """A row for each window, (B,), all equally likely."""
+        return self._rng.integers(self.store.num_frames, size=self.config.batch_size)
 
     def _draw_mixed_rows(self) -> NDArray[np.int64]:
-        """A row for each window, (B,): first its group, then a row or an event of that group."""
-        config, rng, share = self.config, self._rng, self._groups.share
-        groups = rng.choice(len(share), size=config.batch_size, p=share)
-        rows = self._row_pools.pick(rng, groups)
-        if len(self._events):
-            wanted = rng.random(config.batch_size) < config.event_fraction
-            events = self._event_pools.pick(rng, groups)
-            rows = np.where(wanted & self._event_pools.has(groups), events, rows)
-        return rows
+        """A row for each window, (B,): first its group, then a row of that group."""
+        share = self._groups.share
+        groups = self._rng.choice(len(share), size=self.config.batch_size, p=share)
+        return self._row_pools.pick(self._rng, groups)
 
 
 def require_same(then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
@@ -173,14 +151,3 @@ def require_same(then: Mapping[str, Any], now: Mapping[str, Any]) -> None:
     changed = [f"{k} {then.get(k)} -> {v}" for k, v in now.items() if then.get(k) != v]
     if changed:
         raise UsageError(f"cannot resume the data stream with {', '.join(changed)}")
-
-
-def event_rows(store: EpisodeStore, quantile: float) -> NDArray[np.int64]:
-    """Rows with an exceptional reward for their task (see `EventBound`), and those that end in
-    failure."""
-    task_of = np.repeat(np.array(store.tasks), store.length)
-    events = store.terminal_next.copy()
-    for task in set(store.tasks):
-        rows = np.flatnonzero(task_of == task)
-        events[rows] |= EventBound.of(store.reward[rows], quantile).marks(store.reward[rows])
-    return np.flatnonzero(events)

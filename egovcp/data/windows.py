@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.data.mirror import mirror_action, mirror_depth, mirror_passing, mirror_state
+from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
 from egovcp.data.store import EpisodeStore
 
 type Batch = dict[str, NDArray[Any]]
@@ -19,7 +19,7 @@ def gather(
     """Windows of ``span`` rows, each from one episode, as arrays ``[B, span, ...]``.
 
     Keys: depth (uint16 mm), state, action, prev_action, reward, done, success, is_first,
-    valid, mc_return, mc_valid, passing, terminal_next; episode [B] and t [B, span] for reports.
+    valid, mc_return, mc_valid, terminal_next; episode [B] and t [B, span] for reports.
     Past the episode's end the last row is repeated with ``valid``, ``mc_valid`` and the
     flags false.
     """
@@ -30,7 +30,7 @@ def gather(
     t = rows - store.start[episode][:, None]
     batch: Batch = {
         name: getattr(store, name)[rows]
-        for name in ("depth", "state", "action", "prev_action", "reward", "mc_return", "passing")
+        for name in ("depth", "state", "action", "prev_action", "reward", "mc_return")
     }
     for name in ("done", "success", "terminal_next", "mc_valid"):
         batch[name] = getattr(store, name)[rows] & valid
@@ -44,7 +44,6 @@ def mirror_rows(batch: Batch, rows: NDArray[np.intp]) -> None:
     batch["state"][rows] = mirror_state(batch["state"][rows])
     for name in ("action", "prev_action"):
         batch[name][rows] = mirror_action(batch[name][rows])
-    batch["passing"][rows] = mirror_passing(batch["passing"][rows])
 
 
 def draw_mirrored(count: int, mirror: bool, rng: np.random.Generator) -> NDArray[np.bool_]:

@@ -13,7 +13,7 @@ _STOPS: Final = np.array(
 )
 LEFT: Final = (230, 97, 1)
 RIGHT: Final = (94, 60, 153)
-BALL: Final = (214, 39, 40)
+SPHERE: Final = (214, 39, 40)
 OBSTACLE: Final = (150, 140, 120)
 
 

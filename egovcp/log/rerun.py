@@ -18,7 +18,7 @@ import rerun as rr
 from egovcp.errors import EnvironmentFailure
 from egovcp.log import paths
 from egovcp.log.blueprint import blueprint, signals_blueprint
-from egovcp.log.colour import BALL, LEFT, OBSTACLE, RIGHT
+from egovcp.log.colour import LEFT, OBSTACLE, RIGHT, SPHERE
 from egovcp.log.destination import Destination, RrdFile
 from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.meshes import LinkMesh, link_meshes
@@ -173,7 +173,7 @@ def _times(ticks: Sequence[Tick]) -> list[rr.TimeColumn]:
 
 def _shape(thing: SceneObject) -> rr.Boxes3D | rr.Ellipsoids3D:
     if thing.shape == "sphere":
-        return rr.Ellipsoids3D(half_sizes=[thing.size], colors=[BALL], fill_mode="solid")
+        return rr.Ellipsoids3D(half_sizes=[thing.size], colors=[SPHERE], fill_mode="solid")
     return rr.Boxes3D(half_sizes=[thing.size], colors=[OBSTACLE], fill_mode="solid")
 
 

@@ -13,7 +13,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.colour import BALL, OBSTACLE
+from egovcp.log.colour import OBSTACLE, SPHERE
 from egovcp.log.meshes import LinkMesh
 from egovcp.log.pose import RobotPose, rotation_matrix
 from egovcp.log.tick import SceneObject
@@ -109,8 +109,9 @@ def scene_surface(scene: Iterable[SceneObject]) -> list[Surface]:
     """What stands in the scene; walls and posts let through what they would hide."""
     surfaces = []
     for thing in scene:
-        ball = thing.shape == "sphere"
-        shape, colour, opacity = (_sphere(), BALL, 1.0) if ball else (_box(), OBSTACLE, _GLASS)
+        shape, colour, opacity = _box(), OBSTACLE, _GLASS
+        if thing.shape == "sphere":
+            shape, colour, opacity = _sphere(), SPHERE, 1.0
         turned = (shape * thing.size) @ rotation_matrix(np.array(thing.quaternion_w)).T
         colours = np.tile(np.array(colour, np.float64), (len(shape), 1))
         surfaces.append(Surface(turned + thing.position_w, colours, opacity))

@@ -21,7 +21,7 @@ class SceneObject:
     """A thing in the simulated scene; known in simulation only."""
 
     name: str
-    """Unique within the scene, such as ``ball``."""
+    """Unique within the scene, such as ``wall``."""
     shape: Literal["sphere", "box"]
     position_w: tuple[float, float, float]
     """Centre, m, world frame."""
@@ -132,7 +132,7 @@ class Tick:
     base: BasePose | None = None
     scene: tuple[SceneObject, ...] = ()
     events: tuple[str, ...] = ()
-    """Human-readable lines: throws, contacts, faults."""
+    """Human-readable lines: start of the task, contacts, faults."""
     mode: str = ""
     """State of the runner's state machine, one of `MODES`; empty: there is none."""
     motors: MotorReadings | None = None

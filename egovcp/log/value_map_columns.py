@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from egovcp.log import paths
-from egovcp.log.colour import BALL, value_colours
+from egovcp.log.colour import SPHERE, value_colours
 from egovcp.log.tick import Hand, Tick, ValueMap
 from egovcp.spec import ACTION_BOX
 
@@ -21,7 +21,7 @@ _FIRST: Final = {"left": 0, "right": 3}  # of the hand's x, y, z in an action
 def log_value_map_styles(stream: rr.RecordingStream) -> None:
     """How the plan's target is drawn, once per recording."""
     for hand in HANDS:
-        dot = rr.Points2D.from_fields(colors=[BALL], radii=[0.6], draw_order=1.0)
+        dot = rr.Points2D.from_fields(colors=[SPHERE], radii=[0.6], draw_order=1.0)
         stream.log(f"{paths.VALUE_MAP}/{hand}/{paths.CHOSEN}", dot, static=True)
 
 

@@ -1,8 +1,9 @@
-"""What is foreseen several ticks ahead without looking, compared with what was then recorded.
+"""Losses of states imagined several ticks ahead, against what was then recorded.
 
-Equation 8 asks the prior to be right one tick ahead. An error of the path that is nothing after
-one tick is a ball's width after eight. So states are also imagined over many ticks, from some
-rows of a window and with the recorded actions, and the decoders are asked about those.
+Equation 8 compares prior and posterior one tick ahead only, where errors are small that grow
+over several ticks. So states are also imagined over many ticks, from some rows of a window and
+with the recorded actions, and their decoded images and proprioception are compared with the
+recorded ones.
 
 The same, at every tick and in the place of equation 8, is autoregressive training: from filtered
 states the model goes on with nothing but its own predictions,
@@ -22,10 +23,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from egovcp.model import flight
 from egovcp.model.carry import Carry
 from egovcp.model.config import LossConfig
-from egovcp.model.losses import Batch, Rollout, masked_mean, motion_error, motion_target, unbroken
+from egovcp.model.losses import Batch, Rollout, masked_mean, unbroken
 from egovcp.model.picture_error import picture_error
 from egovcp.model.recurrence import imagine_window
 from egovcp.model.world_model import WorldModel
@@ -40,11 +40,10 @@ class Imagined(NamedTuple):
 
 
 class Weights(NamedTuple):
-    """Of what is compared."""
+    """Weights of the two errors."""
 
     depth: float
     state: float
-    motion: float
 
 
 def foresight_losses(
@@ -54,7 +53,7 @@ def foresight_losses(
     weight: Tensor,
     first: int,
 ) -> dict[str, Tensor]:
-    """Picture, proprioception and what flies, of states imagined ``foresight_ahead`` ticks ahead.
+    """Picture and proprioception of states imagined ``foresight_ahead`` ticks ahead.
 
     Args:
         model: the world model.
@@ -64,7 +63,7 @@ def foresight_losses(
         first: row from which is imagined, see `first_row`.
     """
     config = model.config.loss
-    weights = Weights(config.foresight_depth, config.foresight_state, config.foresight_motion)
+    weights = Weights(config.foresight_depth, config.foresight_state)
     if not any(weights):
         return {}
     seen = imagine_ahead(model, rollout.carry, batch, config.foresight_ahead, first)
@@ -80,7 +79,7 @@ def autoregressive_losses(
 ) -> dict[str, Tensor]:
     """The same at each of ``autoregressive_steps`` ticks, weighted as the reconstruction is."""
     config = model.config.loss
-    weights = Weights(config.depth, config.state, config.motion)
+    weights = Weights(config.depth, config.state)
     seen = imagine_ahead(model, rollout.carry, batch, autoregressive_ticks(config), first)
     return _compare("autoregressive", model, seen, rollout, batch, weight, weights)
 
@@ -107,7 +106,7 @@ def imagine_ahead(
     ends = [max(first, length - max(k, min(ahead))) for k in range(1, max(ahead) + 1)]
     starts = [torch.arange(first, end, every, device=batch.state.device) for end in ends]
     found = _imagined(model, carry, batch, starts)
-    seen = [_rows(carry, found[k - 1], starts[k - 1], k) for k in ahead]
+    seen = [_rows(carry, found[k - 1], starts[k - 1]) for k in ahead]
     rows = torch.cat([starts[k - 1] + k for k in ahead])
     known = torch.cat([unbroken(batch, k)[:, starts[k - 1]] for k in ahead], 1)
     return Imagined(Carry.join(seen, lambda parts: torch.cat(parts, 1)), rows, known)
@@ -137,12 +136,11 @@ def _imagined(
     return imagine_window(model, Carry(h, z), action, [size * len(start) for start in starts])
 
 
-def _rows(carry: Carry, imagined: Carry, start: Tensor, ticks: int) -> Carry:
+def _rows(carry: Carry, imagined: Carry, start: Tensor) -> Carry:
     """The states (B, S, ...) that are imagined (S B, ...) from some rows of a carry (B, T, ...)."""
     shape = (len(start), len(carry.h))  # of no rows, where a window is too short
     h, z = (x.view(*shape, x.shape[-1]).transpose(0, 1) for x in (imagined.h, imagined.z))
-    memory = None if carry.flight is None else flight.later(carry.flight[:, start], ticks)
-    return Carry(h, z, memory)
+    return Carry(h, z)
 
 
 def _compare(
@@ -163,12 +161,7 @@ def _compare(
     picture = picture_error(image, near, weight[:, rows])
     foreseen = model.decode_state(carry.h, carry.z).float()
     state = 0.5 * (foreseen - rollout.state[:, rows]).square().mean(-1)
-    terms = {
+    return {
         f"{name}_depth": weights.depth * masked_mean(picture, known),
         f"{name}_state": weights.state * masked_mean(state, known),
     }
-    if weights.motion:
-        target = motion_target(batch, model.config.depth_max_m)[:, rows]
-        error = motion_error(model.motion(carry)[..., 0, :], target, known)
-        terms[f"{name}_motion"] = weights.motion * error
-    return terms

@@ -8,25 +8,20 @@ because it is not conditioned on an action and the terminal observation is not s
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from egovcp import spec
-from egovcp.model.camera_pose import CameraPose
 from egovcp.model.carry import Carry
 from egovcp.model.config import LossConfig
-from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, within
-from egovcp.model.flight import Sighting
-from egovcp.model.floor import Floor
+from egovcp.model.depth import highest_3x3, lowest_3x3, nearness
 from egovcp.model.gaussian import Gaussian, kl_divergence
-from egovcp.model.kept import constant
 from egovcp.model.picture_error import picture_error
 from egovcp.model.recurrence import filter_window
 from egovcp.model.shared import over_all_rows, row_noise
-from egovcp.model.world_model import PASSING_UNIT, Look, WorldModel
+from egovcp.model.world_model import WorldModel
 
 #: Pictures that are looked at together where no gradient is asked for: what the layers make of more
 #: no longer fits into a cache, nor into the memory that the allocator keeps.
@@ -45,7 +40,6 @@ class Batch(NamedTuple):
     mc_return: Tensor  # (B, T)
     mc_valid: Tensor  # (B, T) bool
     terminal_next: Tensor  # (B, T) bool: a_t ended the episode in failure
-    passing: Tensor  # (B, T, 9), see `egovcp.data.EpisodeStore`
     reward: Tensor  # (B, T), after a_t
 
 
@@ -57,7 +51,6 @@ class Rollout(NamedTuple):
     prior: Gaussian
     near: Tensor  # (B, T, 48, 64)
     state: Tensor  # (B, T, 74) standardised
-    embedding: Tensor  # (B, T, units) of the observation alone
 
 
 def filter_sequence(
@@ -79,19 +72,17 @@ def filter_sequence(
     state = model.standardise(batch.state)
     embedding = _embed(model, near, state.flatten(0, 1)).view(size, length, -1)
     carry = model.initial(size) if carry is None else carry
-    followed = _followed(model, batch, near, embedding, carry)
     if sample and noise is None:
         noise = latent_noise(model, batch, generator)
     states, posterior = filter_window(
         model, carry, batch.prev_action, batch.is_first, embedding, noise
     )
     return Rollout(
-        states._replace(flight=followed),
+        states,
         posterior,
         model.predict(states.h),
         near.view(size, length, *near.shape[1:]),
         state,
-        embedding,
     )
 
 
@@ -112,32 +103,6 @@ def _embed(model: WorldModel, near: Tensor, state: Tensor) -> Tensor:
 
 def _pieces(*rows: Tensor) -> Iterator[tuple[Tensor, ...]]:
     return zip(*(torch.split(x, _AT_ONCE) for x in rows), strict=True)
-
-
-def _followed(
-    model: WorldModel, batch: Batch, near: Tensor, embedding: Tensor, start: Carry
-) -> Tensor | None:
-    """What is remembered of a flight at every row, (B, T, ...)."""
-    memory = start.flight
-    if memory is None:
-        return None
-    # Metres in eight bits would be off by a hand's breadth.
-    with torch.autocast(near.device.type, enabled=False):
-        return _follow(model, batch, near, embedding.float(), memory)
-
-
-def _follow(
-    model: WorldModel, batch: Batch, near: Tensor, embedding: Tensor, memory: Tensor
-) -> Tensor:
-    size, length = batch.valid.shape
-    pieces = _pieces(near, batch.state.flatten(0, 1), embedding.flatten(0, 1))
-    looks = [[x for part in model.look(*piece) for x in part] for piece in pieces]
-    point, weight, axes, position, rate, ground, shown = (
-        torch.cat(column).view(size, length, *column[0].shape[1:])
-        for column in zip(*looks, strict=True)
-    )
-    look = Look(Sighting(point, weight), CameraPose(axes, position, rate), Floor(ground, shown))
-    return model.follow_all(memory, look, batch.is_first)
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
@@ -180,12 +145,7 @@ def first_image(every: int, batch: Batch, generator: torch.Generator | None = No
 
 
 def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
-    """How much each pixel of (B, T, H, W) nearness counts: 1, and more where something moves.
-
-    What flies is none of the decoder's business if it is painted over its picture. Else it is
-    weighted in a disc somewhat larger than itself, so that painting it beside its place is no
-    cheaper than not painting it.
-    """
+    """How much each pixel of (B, T, H, W) nearness counts: 1, and more where something moves."""
     config = model.config.loss
     weight = torch.ones_like(near)
     if config.moving > 0:
@@ -194,17 +154,6 @@ def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
         weight[:, 1:].add_(moving, alpha=config.moving)
     if config.near > 0:
         weight += config.near * (near > config.near_threshold)
-    place = batch.passing[..., spec.IN_PICTURE]
-    if not model.config.paint_flight and config.flight == 0:
-        return weight
-    # In few pictures anything flies, but who picks them waits for a GPU to say which.
-    rows: Any = place[..., 2] > 0 if near.device.type == "cpu" else slice(None)
-    seen = near[rows]
-    disc = within(seen.flatten(0, -3), place[rows].flatten(0, -2)).view_as(seen)
-    if model.config.paint_flight:
-        weight[rows] *= ~disc
-    else:
-        weight[rows] += config.flight * disc
     return weight
 
 
@@ -221,66 +170,6 @@ def _changed(near: Tensor, threshold: float) -> Tensor:
     changed = near[:, 1:] > high.add_(threshold)
     changed |= near[:, 1:] < low.sub_(threshold)
     return changed
-
-
-def motion_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
-    """Where in the picture something flies, now and some ticks ahead, and whether anything does.
-
-    In the image itself a distant ball is 10 of 3072 pixels, here it is the whole target. Asked
-    for the future too, the state must hold the path, not only the place, and keep it while
-    the ball is out of the picture. The encoder is asked as well: through a state that is not
-    yet worth reading it would learn late where to look.
-    """
-    target = motion_target(batch, model.config.depth_max_m)
-    losses = [motion_error(model.sight(rollout.embedding), target, batch.valid)]
-    length = batch.valid.shape[1]
-    outputs = model.motion(rollout.carry).unbind(-2)
-    for output, k in zip(outputs, model.config.motion_ahead, strict=True):
-        if k < length:
-            losses.append(motion_error(output[:, : length - k], target[:, k:], unbroken(batch, k)))
-    return torch.stack(losses).sum()
-
-
-def motion_target(batch: Batch, max_m: float) -> Tensor:
-    """(B, T, 5): column and row in half pictures, nearness, whether anything flies, whether that
-    is known."""
-    row, column, radius, depth = batch.passing[..., spec.IN_PICTURE].unbind(-1)
-    across, down = (2 / (size - 1) for size in (spec.DEPTH_COLS, spec.DEPTH_ROWS))
-    place = [column * across - 1, row * down - 1, 1 - depth / max_m]
-    return torch.stack([*place, radius > 0, batch.passing[..., 4] > 0], -1)
-
-
-def motion_error(output: Tensor, target: Tensor, counts: Tensor) -> Tensor:
-    """Error of the place, and cross entropy of there being any.
-
-    Args:
-        output: (..., 4), see `WorldModel.motion`.
-        target: (..., 5), see `motion_target`.
-        counts: (...,) bool, rows that count.
-    """
-    flies = target[..., 3]
-    known = counts & (target[..., 4] > 0)
-    # Linear beyond a few pixels: else what is far off says everything and a pixel nothing.
-    place = (
-        F.huber_loss(output[..., :3], target[..., :3], reduction="none", delta=0.1).sum(-1) / 0.1
-    )
-    presence = F.binary_cross_entropy_with_logits(output[..., 3], flies, reduction="none")
-    return masked_mean(place, known & (flies > 0)) + 0.3 * masked_mean(presence, known)
-
-
-def passing_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:
-    """Where and when something thrown will pass the plane before the robot, and if anything will.
-
-    Unlike a prediction some ticks ahead this stays the same target over a whole throw, seen
-    or unseen, and it is what a decision needs.
-    """
-    output = model.decode_passing(rollout.carry.h, rollout.carry.z).float()
-    place, on, known = batch.passing[..., :3], batch.passing[..., 3], batch.passing[..., 4] > 0
-    known = known & batch.valid
-    unit = constant(PASSING_UNIT, place)
-    error = F.huber_loss(output[..., :3], place / unit, reduction="none", delta=0.5).sum(-1)
-    presence = F.binary_cross_entropy_with_logits(output[..., 3], on, reduction="none")
-    return masked_mean(error, known & (on > 0)) + masked_mean(presence, known)
 
 
 def state_loss(model: WorldModel, rollout: Rollout, batch: Batch) -> Tensor:

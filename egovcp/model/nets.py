@@ -57,13 +57,6 @@ class SplitMlp(nn.Module):
             *layers, nn.LayerNorm(units), nn.SiLU(), nn.Linear(units, outputs)
         )
 
-    def restart(self) -> None:
-        """Forget everything and answer zero."""
-        for module in (self.first, *self.rest):
-            if isinstance(module, nn.Linear | nn.LayerNorm | SplitLinear):
-                module.reset_parameters()
-        self.start_at_zero()
-
     def start_at_zero(self) -> None:
         """Make the last layer zero."""
         last = self.rest[-1]
@@ -75,36 +68,6 @@ class SplitMlp(nn.Module):
         """One tensor (..., n_i) per input -> (..., outputs)."""
         outputs: Tensor = self.rest(self.first(*inputs))
         return outputs
-
-
-class ValueHead(nn.Module):
-    """(h, z) reduced to ``width`` numbers, then an MLP on those and the action.
-
-    A regression that sees all of (h, z) learns a few thousand episodes by heart, and what it
-    has learned by heart it takes for an effect of the action.
-    """
-
-    def __init__(self, state: Sequence[int], width: int, units: int, outputs: int = 1) -> None:
-        super().__init__()
-        self.reduce = SplitLinear(state, width) if width else None
-        inputs = (width,) if width else state
-        self.mlp = SplitMlp((*inputs, spec.ACTION_DIM), units, outputs, hidden_layers=2)
-
-    def restart(self) -> None:
-        """Forget everything and answer zero."""
-        if self.reduce is not None:
-            self.reduce.reset_parameters()
-        self.mlp.restart()
-
-    def start_at_zero(self) -> None:
-        """Make the last layer zero."""
-        self.mlp.start_at_zero()
-
-    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
-        """(..., hidden), (..., latent), (..., 7) -> (..., outputs)."""
-        state = (h, z) if self.reduce is None else (self.reduce(h, z),)
-        q: Tensor = self.mlp(*state, action)
-        return q
 
 
 class GruCell(nn.Module):
@@ -132,7 +95,7 @@ class DepthEncoder(nn.Module):
     """Image of nearness and validity (B, 2, 48, 64) -> features (B, C * 3 * 4).
 
     The stem reads overlapping 8 x 8 patches on a grid of 4 pixels: a third of the cost of
-    two stride-2 layers on a CPU, and a distant ball, 3 pixels wide, still fills a patch.
+    two stride-2 layers on a CPU, and an object 3 pixels wide still fills a patch.
     """
 
     def __init__(self, channels: tuple[int, int, int]) -> None:

@@ -26,10 +26,11 @@ from egovcp.model.foresight import (
 )
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.losses import Batch, Rollout
+from egovcp.model.nets import SplitMlp
 from egovcp.model.outcomes import value_and_termination_losses
 from egovcp.model.shared import WHOLE, present_share
 from egovcp.model.threads import beside
-from egovcp.model.world_model import QHeads, WorldModel
+from egovcp.model.world_model import WorldModel
 
 type Terms = dict[str, Tensor]
 type Part = Callable[[], Terms]
@@ -61,7 +62,7 @@ def world_model_loss(
     model: WorldModel,
     batch: Batch,
     chance: Draws | torch.Generator | None = None,
-    heads: QHeads | None = None,
+    head: SplitMlp | None = None,
 ) -> tuple[Tensor, Terms]:
     """Total loss of equation 6 and its terms (scalars, detached).
 
@@ -69,11 +70,11 @@ def world_model_loss(
         model: the world model.
         batch: windows.
         chance: what is drawn, or what draws it; None: torch's own generator.
-        heads: of Q, for its TD target (`egovcp.model.td`); None: the model's own.
+        head: of Q, for its TD target (`egovcp.model.td`); None: the model's own.
     """
     draws = chance if isinstance(chance, Draws) else draws_for(model, batch, chance)
     rollout = losses.filter_sequence(model, batch, noise=draws.noise)
-    told, foreseen = _parts(model, rollout, batch, draws, heads)
+    told, foreseen = _parts(model, rollout, batch, draws, head)
     terms = told() | foreseen()
     return _sum(terms), _named(terms)
 
@@ -82,7 +83,7 @@ def world_model_gradients(
     model: WorldModel,
     batch: Batch,
     draws: Draws,
-    heads: QHeads | None = None,
+    head: SplitMlp | None = None,
     precision: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> tuple[Tensor, Terms]:
     """`world_model_loss`, detached, and its gradient in the ``grad`` of the model's parameters, in
@@ -92,7 +93,7 @@ def world_model_gradients(
         model: the world model.
         batch: windows.
         draws: what is left to chance.
-        heads: as there.
+        head: as there.
         precision: a context in which the losses, not their gradients, are computed.
     """
     parameters = [p for p in model.parameters() if p.requires_grad]
@@ -110,7 +111,7 @@ def world_model_gradients(
             with torch.autocast(batch.state.device.type, enabled=False):
                 return terms, list(torch.autograd.grad(total, inputs, allow_unused=True))
 
-        told, foreseen = _parts(model, cut, batch, draws, heads)
+        told, foreseen = _parts(model, cut, batch, draws, head)
         first, second = partial(with_gradient, told), partial(with_gradient, foreseen)
         # Processes that share a batch meet at every mean, and so in one order.
         if batch.state.device.type == "cpu" and present_share() is WHOLE:
@@ -131,7 +132,7 @@ def _parts(
     rollout: Rollout,
     batch: Batch,
     draws: Draws,
-    heads: QHeads | None,
+    head: SplitMlp | None,
 ) -> tuple[Part, Part]:
     """What filtered states are asked for, and what is foreseen from them."""
     config = model.config.loss
@@ -142,15 +143,13 @@ def _parts(
         depth = losses.depth_loss(model, rollout, batch.valid, weight, every, draws.image)
         terms = {
             "depth": config.depth * depth,
-            "motion": config.motion * losses.motion_loss(model, rollout, batch),
-            "passing": config.passing * losses.passing_loss(model, rollout, batch),
             "state": config.state * losses.state_loss(model, rollout, batch),
         }
         if model.config.dynamics == "joint":
             terms |= losses.kl_losses(rollout, batch.valid, config)
         else:
             terms |= autoregressive_losses(model, rollout, batch, weight, draws.autoregressive)
-        return terms | value_and_termination_losses(model, rollout, batch, config, heads)
+        return terms | value_and_termination_losses(model, rollout, batch, config, head)
 
     def foreseen() -> Terms:
         return foresight_losses(model, rollout, batch, weight, draws.foresight)
@@ -174,7 +173,6 @@ def _cut(rollout: Rollout) -> tuple[Rollout, list[Tensor], list[Tensor]]:
         carry=Carry.map(rollout.carry, ending),
         posterior=Gaussian(*map(ending, rollout.posterior)),
         prior=Gaussian(*map(ending, rollout.prior)),
-        embedding=ending(rollout.embedding),
     )
     return cut, outer, inner
 

@@ -9,12 +9,13 @@ from torch import Tensor
 from egovcp.model.carry import Carry
 from egovcp.model.config import LossConfig
 from egovcp.model.losses import Batch, Rollout, masked_mean, unbroken
+from egovcp.model.nets import SplitMlp
 from egovcp.model.td import td_target
-from egovcp.model.world_model import QHeads, WorldModel
+from egovcp.model.world_model import WorldModel
 
 
 def value_target(
-    model: WorldModel, carry: Carry, batch: Batch, heads: QHeads | None = None
+    model: WorldModel, carry: Carry, batch: Batch, head: SplitMlp | None = None
 ) -> tuple[Tensor, Tensor]:
     """What Q is fitted to at each row (B, T), in deviations of the return from its mean, and the
     rows (B, T) at which that is known.
@@ -23,12 +24,12 @@ def value_target(
         model: says which target (`LossConfig.q_target`).
         carry: the filtered states (B, T, ...).
         batch: what was recorded.
-        heads: of Q, for the TD target; None: the model's own.
+        head: of Q, for the TD target; None: the model's own.
     """
     if model.config.loss.q_target == "mc":
         target, usable = batch.mc_return, batch.valid & batch.mc_valid
     else:
-        target, usable = td_target(model, carry, batch, heads)
+        target, usable = td_target(model, carry, batch, head)
     return (target - model.return_mean) / model.return_std, usable
 
 
@@ -37,7 +38,7 @@ def value_and_termination_losses(
     rollout: Rollout,
     batch: Batch,
     config: LossConfig,
-    heads: QHeads | None = None,
+    head: SplitMlp | None = None,
 ) -> dict[str, Tensor]:
     """Equations 9 and 7b, on the posterior and on states imagined from it.
 
@@ -46,7 +47,7 @@ def value_and_termination_losses(
     value is regressed on the target of row t + k. The reward, if it is predicted at all,
     is asked of the same states.
     """
-    target, usable = value_target(model, rollout.carry, batch, heads)
+    target, usable = value_target(model, rollout.carry, batch, head)
     error = model.value_error(rollout.carry, batch.action, target)
     losses = {"value": config.value * masked_mean(error, usable)}
     predicts_reward = model.reward_head is not None

@@ -1,14 +1,12 @@
-"""Who gets the processor's threads: two computations at once, or a single one.
+"""Two independent computations at once, each with a part of the processor's threads.
 
-Of many small operations a second thread helps with few. Two that have nothing to do with each other
-keep two busy.
+A second thread speeds up few of many small operations; two independent computations keep two busy.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, wait
-from contextlib import contextmanager
 from functools import cache
 
 import torch
@@ -36,18 +34,6 @@ def beside[A, B](first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]
         wait([task])  # nothing goes on behind the caller's back
         torch.set_num_threads(threads)
     return mine, task.result()
-
-
-@contextmanager
-def one_thread() -> Iterator[None]:
-    """What is computed within is too small to be shared: threads would wait for each other, and
-    beside another busy program for long."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @cache

@@ -1,9 +1,4 @@
-"""How a value head's outputs say a number, and what it costs to be wrong: one place for training,
-the final fit and planning.
-
-Outputs of several parts of a head add up before they are read: numbers under `mse`, log-odds of
-the bins under `two_hot`.
-"""
+"""Outputs of the value head: their number, the value they stand for, and the loss."""
 
 from __future__ import annotations
 
@@ -34,10 +29,3 @@ def error(outputs: Tensor, target: Tensor, kind: ValueLoss) -> Tensor:
     if kind == "mse":
         return (read(outputs, kind) - target).square()
     return two_hot.cross_entropy(outputs, target)
-
-
-def error_beyond(outputs: Tensor, known: Tensor, target: Tensor, kind: ValueLoss) -> Tensor:
-    """`error` of a part whose outputs add to the ``known`` (..., width) of a part that is done."""
-    if kind == "mse":
-        return error(outputs, target - read(known, kind), kind)
-    return error(known + outputs, target, kind)

@@ -16,20 +16,17 @@ on the robot and replay; `imagine` advances it without an observation.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.errors import UsageError
-from egovcp.model import flight, value
-from egovcp.model.camera_pose import CameraPose, camera_pose
+from egovcp.model import value
 from egovcp.model.carry import Carry
 from egovcp.model.config import WorldModelConfig
-from egovcp.model.depth import nearness, network_image, paint_ball, to_metres
-from egovcp.model.floor import Floor, floor
+from egovcp.model.depth import nearness, network_image, to_metres
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.nets import (
     DepthDecoder,
@@ -37,11 +34,7 @@ from egovcp.model.nets import (
     GruCell,
     SplitLinear,
     SplitMlp,
-    ValueHead,
 )
-
-#: The head's units of y, z (m) and of the time left (s): about their spread.
-PASSING_UNIT = (0.25, 0.25, 0.25)
 
 
 class PosteriorHead(nn.Module):
@@ -55,32 +48,6 @@ class PosteriorHead(nn.Module):
     def forward(self, h: Tensor, embedding: Tensor) -> Tensor:
         logits: Tensor = self.rest(self.project_h(h) + embedding)
         return logits
-
-
-class Look(NamedTuple):
-    """What N pictures show of a flight, and from where."""
-
-    sighting: flight.Sighting
-    pose: CameraPose
-    floor: Floor
-
-
-def _later(carry: Carry) -> Tensor | None:
-    return None if carry.flight is None else flight.later(carry.flight)
-
-
-class QHeads(NamedTuple):
-    """The heads of Q: each answers with the sum of a part of its own and one that all share."""
-
-    states: tuple[ValueHead, ...]
-    """Each reads (h, z) and the action."""
-    passing: SplitMlp | None
-    """Reads what is on its way and the action: few numbers, of which there are no two views."""
-
-    @property
-    def parts(self) -> tuple[ValueHead | SplitMlp, ...]:
-        """All of them, the shared one last."""
-        return (*self.states, *(() if self.passing is None else (self.passing,)))
 
 
 def _fill_discount(model: WorldModel, state: dict[str, Any], prefix: str, *unused: object) -> None:
@@ -112,15 +79,9 @@ class WorldModel(nn.Module):
         self.prior = SplitMlp((c.hidden,), c.units, 2 * c.latent)
         self.decode_depth = DepthDecoder(sum(state), c.channels[-1])
         self.decode_state = SplitMlp(state, c.units, spec.STATE_DIM)
-        self.decode_motion = SplitMlp(state, c.units, 4 * len(c.motion_ahead))
-        self.decode_sight = nn.Sequential(nn.LayerNorm(c.units), nn.SiLU(), nn.Linear(c.units, 4))
-        self.decode_passing = SplitMlp(state, c.units, 4)
         self.termination_head = SplitMlp(state, c.units, 1)
-        self.value_head = self._new_value_head()
-        self.passing_value_head = self._new_passing_value_head() if c.value_of_passing else None
-        more = (self._new_value_head() for _ in range(c.q_heads - 1))
-        self.more_value_heads = nn.ModuleList(more)
-        self.reward_head = ValueHead(state, c.value_state, c.units) if c.loss.reward > 0 else None
+        self.value_head = self._value_head(value.width(c.value_loss))
+        self.reward_head = self._value_head(1) if c.loss.reward > 0 else None
         self._start_at_zero()
         self.register_buffer("state_mean", torch.zeros(spec.STATE_DIM))
         self.register_buffer("state_std", torch.ones(spec.STATE_DIM))
@@ -130,22 +91,16 @@ class WorldModel(nn.Module):
         self.register_buffer("discount", torch.tensor(spec.GAMMA))
         self.register_load_state_dict_pre_hook(_fill_discount)  # type: ignore[no-untyped-call]
 
-    def _new_value_head(self) -> ValueHead:
+    def _value_head(self, outputs: int) -> SplitMlp:
         c = self.config
-        outputs = value.width(c.value_loss)
-        return ValueHead((c.hidden, c.latent), c.value_state, c.value_units or c.units, outputs)
-
-    def _new_passing_value_head(self) -> SplitMlp:
-        c = self.config
-        units, outputs = (c.value_units or c.units) // 2, value.width(c.value_loss)
-        return SplitMlp((4, spec.ACTION_DIM), units, outputs, hidden_layers=2)
+        return SplitMlp((c.hidden, c.latent, spec.ACTION_DIM), c.units, outputs, hidden_layers=2)
 
     def _start_at_zero(self) -> None:
         """Value and termination start as constants, so that early plans are not random."""
         self.termination_head.start_at_zero()
-        for head in (*self.q_heads.parts, self.reward_head):
-            if head is not None:
-                head.start_at_zero()
+        self.value_head.start_at_zero()
+        if self.reward_head is not None:
+            self.reward_head.start_at_zero()
 
     # --- observation -----------------------------------------------------------------
     def embed_near(self, near: Tensor, standardised: Tensor) -> Tensor:
@@ -165,7 +120,6 @@ class WorldModel(nn.Module):
         return Carry(
             reference.new_zeros(batch, self.config.hidden),
             reference.new_zeros(batch, self.config.latent),
-            reference.new_zeros(batch, flight.SIZE) if self.config.follows_flight else None,
         )
 
     def transition(self, carry: Carry, action: Tensor) -> Tensor:
@@ -205,34 +159,7 @@ class WorldModel(nn.Module):
         """The same from nearness (B, 48, 64)."""
         h = self.advance(carry, action, is_first)
         embedding = self.embed_near(near, self.standardise(state))
-        z, followed = self.infer(h, embedding).mean, carry.flight
-        if followed is not None:
-            seen = self.look(near, state, embedding)
-            followed = self.follow(followed, seen, is_first)
-        return Carry(h, z, followed)
-
-    @torch.no_grad()
-    def look(self, near: Tensor, state: Tensor, embedding: Tensor) -> Look:
-        """What pictures (N, 48, 64) of nearness show of a flight, and from where: raw state (N, 74)
-        and the embedding (N, units) of both."""
-        c = self.config
-        seen = flight.sighting(near, self.sight(embedding), c.depth_max_m, c.flight)
-        pose = camera_pose(state, c.flight.camera)
-        return Look(seen, pose, floor(near, pose, c.depth_max_m, c.flight.camera))
-
-    @torch.no_grad()
-    def follow(self, memory: Tensor, seen: Look, is_first: Tensor) -> Tensor:
-        """What is remembered of a flight (N, ...) after N pictures."""
-        return flight.follow(
-            memory, seen.pose, seen.sighting, seen.floor, is_first, self.config.flight
-        )
-
-    @torch.no_grad()
-    def follow_all(self, memory: Tensor, seen: Look, is_first: Tensor) -> Tensor:
-        """The same after each of T ticks, (N, T, ...): memory (N, ...) before, all else (N, T)."""
-        return flight.follow_all(
-            memory, seen.pose, seen.sighting, seen.floor, is_first, self.config.flight
-        )
+        return Carry(h, self.infer(h, embedding).mean)
 
     def advance(self, carry: Carry, action: Tensor, is_first: Tensor) -> Tensor:
         """h_t of equation 1, restarting from zeros where ``is_first`` (B,).
@@ -246,18 +173,18 @@ class WorldModel(nn.Module):
     def imagine(self, carry: Carry, action: Tensor) -> Carry:
         """Advance by one tick without an observation; z is the prior mean."""
         h = self.transition(carry, action)
-        return Carry(h, self.predict(h).mean, _later(carry))
+        return Carry(h, self.predict(h).mean)
 
     def imagine_sample(
         self, carry: Carry, action: Tensor, generator: torch.Generator | None = None
     ) -> Carry:
-        """The same, but z is drawn from the prior, with one noise (latent,) for all rows: what
-        differs between two candidates is what they do, not their luck."""
+        """The same, but z is drawn from the prior, with one noise (latent,) for all rows, so
+        that candidates differ by their actions alone."""
         h = self.transition(carry, action)
         prior = self.predict(h)
         size = (self.config.latent,)
         noise = torch.randn(size, generator=generator, device=prior.mean.device)
-        return Carry(h, prior.mean + prior.std * noise, _later(carry))
+        return Carry(h, prior.mean + prior.std * noise)
 
     @staticmethod
     def spread(carry: Carry) -> Carry:
@@ -269,51 +196,19 @@ class WorldModel(nn.Module):
         """Q(h, z, a) in units of return, (...,); equation 5."""
         return self.standardised_value(carry, action) * self.return_std + self.return_mean
 
-    def value_by(self, heads: QHeads, carry: Carry, action: Tensor) -> Tensor:
-        """The same by other heads than the model's own."""
-        q = self._read_values(self._value_outputs(carry, action, heads)).mean(0)
+    def value_by(self, head: SplitMlp, carry: Carry, action: Tensor) -> Tensor:
+        """Q by another head than the model's own, such as a target network, (...,)."""
+        q = value.read(head(carry.h, carry.z, action), self.config.value_loss)
         return q * self.return_std + self.return_mean
 
     def standardised_value(self, carry: Carry, action: Tensor) -> Tensor:
-        """Q in units of the return's deviation from its mean, (...,).
-
-        The sum of what an action is worth in view of what is on its way, and of what the rest
-        of the state adds. The first part sees little else than the action: a regression on
-        the whole state predicts the return better and ranks actions worse (`docs/log.md`).
-        """
-        return self._all_values(carry, action).mean(0)
-
-    def lowest_value(self, carry: Carry, action: Tensor) -> Tensor:
-        """What the most doubtful of the heads of Q says, in units of return, (...,)."""
-        q = self._all_values(carry, action).amin(0)
-        return q * self.return_std + self.return_mean
+        """(Q - mean of the returns) / standard deviation of the returns, (...,)."""
+        return value.read(self.value_head(carry.h, carry.z, action), self.config.value_loss)
 
     def value_error(self, carry: Carry, action: Tensor, target: Tensor) -> Tensor:
-        """Loss of Q beside the standardised return (...,), mean over the heads, (...,)."""
-        kind = self.config.value_loss
-        outputs = self._value_outputs(carry, action, self.q_heads)
-        return torch.stack([value.error(q, target, kind) for q in outputs]).mean(0)
-
-    @property
-    def q_heads(self) -> QHeads:
-        """The heads of Q."""
-        more: list[ValueHead] = list(self.more_value_heads)  # type: ignore[arg-type]
-        return QHeads((self.value_head, *more), self.passing_value_head)
-
-    def _all_values(self, carry: Carry, action: Tensor) -> Tensor:
-        """Of each head, in units of the return's deviation from its mean, (heads, ...)."""
-        return self._read_values(self._value_outputs(carry, action, self.q_heads))
-
-    def _read_values(self, outputs: Sequence[Tensor]) -> Tensor:
-        return torch.stack([value.read(q, self.config.value_loss) for q in outputs])
-
-    def _value_outputs(self, carry: Carry, action: Tensor, heads: QHeads) -> list[Tensor]:
-        """Of each head, (..., width of `egovcp.model.value`)."""
-        outputs = [head(carry.h, carry.z, action) for head in heads.states]
-        if heads.passing is None:
-            return outputs
-        shared = heads.passing(self.passing(carry), action)
-        return [q + shared for q in outputs]
+        """Loss of Q against the standardised return (...,), (...,)."""
+        outputs = self.value_head(carry.h, carry.z, action)
+        return value.error(outputs, target, self.config.value_loss)
 
     def reward(self, carry: Carry, action: Tensor) -> Tensor:
         """The reward that a (..., 7) earns at this state, in units of reward, (...,).
@@ -332,20 +227,6 @@ class WorldModel(nn.Module):
         r: Tensor = self.reward_head(carry.h, carry.z, action)
         return r.squeeze(-1).float()
 
-    def passing(self, carry: Carry) -> Tensor:
-        """Is something on its way, and if so where and when will it pass, (..., 4).
-
-        Where a flight is followed: how sure its path is, y, z and time left in
-        `PASSING_UNIT`, zeros without one. Else the probability p that something comes, and p times
-        these: a smooth summary that is zero where nothing does.
-        """
-        if carry.flight is not None:
-            return flight.told(carry.flight, PASSING_UNIT)
-        out: Tensor = self.decode_passing(carry.h, carry.z)
-        out = out.detach()  # what is on its way is learned from labels, not from returns
-        coming = torch.sigmoid(out[..., 3:])
-        return torch.cat([coming, coming * out[..., :3]], -1)
-
     def termination_logit(self, carry: Carry) -> Tensor:
         """Log-odds that the episode has failed at this state, (...,); equation 4."""
         d: Tensor = self.termination_head(carry.h, carry.z)
@@ -355,37 +236,10 @@ class WorldModel(nn.Module):
         """Probability that the episode has failed at this state, (...,)."""
         return torch.sigmoid(self.termination_logit(carry))
 
-    def motion(self, carry: Carry) -> Tensor:
-        """Where in the picture something flies, ``motion_ahead`` ticks ahead, (..., A, 4): column
-        and row of its middle in half pictures from the middle, nearness, log-odds that it does."""
-        out: Tensor = self.decode_motion(carry.h, carry.z).float()
-        return out.view(*out.shape[:-1], len(self.config.motion_ahead), 4)
-
-    def sight(self, embedding: Tensor) -> Tensor:
-        """What `motion` says of now, (..., 4), from one observation's embedding (..., units)."""
-        out: Tensor = self.decode_sight(embedding).float()
-        return out
-
     def picture(self, carry: Carry) -> Tensor:
-        """Nearness (B, 48, 64) of the picture at a state (B, ...); not clamped.
-
-        What flies is painted as a ball where `motion` says that it is: a network that paints
-        every pixel by itself learns late, and never sharply, to move ten of them.
-        """
-        image: Tensor = self.decode_depth(carry.features).float()
-        if not self.config.paint_flight:
-            return image
-        return paint_ball(image, self._place(carry), self.config.depth_max_m)
-
-    def _place(self, carry: Carry) -> Tensor:
-        """Where what flies is painted, (B, 4) as `motion`."""
-        place = self.motion(carry)[..., 0, :]
-        if carry.flight is None or carry.flight.shape[-1] < flight.SIZE:
-            return place
-        c = self.config
-        state = self.decode_state(carry.h, carry.z).float() * self.state_std + self.state_mean
-        followed = flight.in_picture(carry.flight, state, c.depth_max_m, c.flight)
-        return torch.where(followed[:, 3:] > 0, followed, place)
+        """Decoded nearness (B, 48, 64) of a state (B, ...); not clamped."""
+        image: Tensor = self.decode_depth(carry.features)
+        return image.float()
 
     def decode(self, carry: Carry) -> tuple[Tensor, Tensor]:
         """Carry (B, ...) -> depth (B, 48, 64) in metres, 0 = nothing in range; state (B, 74)."""

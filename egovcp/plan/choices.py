@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from egovcp.plan.config import PlannerConfig
 
 Latent = Literal["mean", "sample"]
-Ensemble = Literal["mean", "min"]
 
 
 @runtime_checkable
@@ -27,15 +26,6 @@ class Draws(Protocol):
         self, carry: Any, action: Tensor, generator: torch.Generator | None = None
     ) -> Any:
         """Advance by one tick under action (E, M, 7); one noise for all of them."""
-        ...
-
-
-@runtime_checkable
-class Doubts(Protocol):
-    """A model that judges more than once."""
-
-    def lowest_value(self, carry: Any, action: Tensor) -> Tensor:
-        """The least that it thinks of action (E, M, 7), (E, M)."""
         ...
 
 
@@ -98,10 +88,3 @@ def step_of[L](
             f"latent=sample: {type(model).__name__} has no imagine_sample; plan with latent=mean"
         )
     return partial(model.imagine_sample, generator=generator)
-
-
-def judge_of[L](
-    model: object, value: Callable[[L, Tensor], Tensor], ensemble: Ensemble
-) -> Callable[[L, Tensor], Tensor]:
-    """How an action is judged: ``value``, or the least of several if the model has them."""
-    return model.lowest_value if ensemble == "min" and isinstance(model, Doubts) else value

@@ -8,13 +8,13 @@ from typing import Literal
 from egovcp import spec
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError
-from egovcp.plan.choices import Ensemble, Latent
+from egovcp.plan.choices import Latent
 
 Objective = Literal["value", "reward", "td"]
 Process = Literal["walk", "ramp"]
 TerminationRule = Literal["paper", "shift", "survival"]
 OptimiserName = Literal["cem", "icem", "mppi", "shooting"]
-BackendName = Literal["auto", "eager", "float32", "bfloat16", "int8", "compile"]
+BackendName = Literal["auto", "eager", "float32", "int8"]
 
 
 @dataclass(frozen=True)
@@ -57,9 +57,6 @@ class PlannerConfig:
     latent: Latent = "mean"
     """z of imagined states. mean: the prior's; sample: drawn from the prior, anew in each
     iteration, with the same noise for all candidates."""
-    ensemble: Ensemble = "min"
-    """What several heads of Q are worth together (`q_heads`): the least of them, or their mean. A
-    search goes where Q is too high; their least is so only where all of them are."""
     optimiser: OptimiserName = "cem"
     """How candidates are drawn: cem (fitted to the elites), icem (with coloured noise, elites kept
     and fewer samples each round), mppi (all weighted by their value), shooting (uniform)."""
@@ -72,9 +69,9 @@ class PlannerConfig:
     sample_decay: float = bounded(1.25, least=1, most=1000)
     """icem: each round draws this many times fewer samples than the one before."""
     backend: BackendName = "auto"
-    """Who computes. eager: the world model itself; float32, bfloat16: its networks packed; int8: in
-    8-bit integers by a library compiled on first use (processors only); compile: float32 through
-    torch.compile, a minute at the start; auto: int8 where it is fast, else float32."""
+    """Implementation of the planner's networks. eager: the world model itself; float32: its layers
+    packed for planning; int8: 8-bit integers, in a C library compiled on first use (CPU only);
+    auto: int8 on CPUs with AVX2 or AVX-512 VNNI, else float32."""
 
     def __post_init__(self) -> None:
         check_bounds(self)

@@ -58,19 +58,14 @@ def require_affordable(model: WorldModelConfig, planner: PlannerConfig) -> None:
 
 def _products_per_step(c: WorldModelConfig) -> int:
     """Multiply-adds of imagining and judging one step of one candidate."""
-    state, outputs = c.hidden + c.latent, width(c.value_loss)
-    value_units = c.value_units or c.units
-    reduced = c.value_state or state
+    state = c.hidden + c.latent
     transition = (c.latent + spec.ACTION_DIM) * c.units + (c.units + c.hidden) * 3 * c.hidden
     prior = c.hidden * c.units + c.units * 2 * c.latent
-    head = state * c.value_state + (reduced + spec.ACTION_DIM) * value_units
-    head += value_units * (value_units + outputs)
-    others = 2 * (state * c.units + c.units * 4)  # termination, and what is on its way
-    return transition + prior + c.q_heads * head + others
+    value = (state + spec.ACTION_DIM + c.units + width(c.value_loss)) * c.units
+    termination = (state + 1) * c.units
+    return transition + prior + value + termination
 
 
 def _floats_per_step(c: WorldModelConfig) -> int:
     """Intermediate results of one candidate, which are the memory that it takes, too."""
-    value_units = c.value_units or c.units
-    heads = c.q_heads * (3 * value_units + width(c.value_loss))
-    return 8 * c.hidden + 6 * c.units + 4 * c.latent + heads
+    return 8 * c.hidden + 9 * c.units + 4 * c.latent + width(c.value_loss)

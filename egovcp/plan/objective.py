@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from egovcp.plan.choices import earning, judge_of, step_of
+from egovcp.plan.choices import earning, step_of
 from egovcp.plan.config import PlannerConfig
 
 Worth = Callable[[Tensor, torch.Generator | None], Tensor]
@@ -153,11 +153,10 @@ def evaluate[L](
         UsageError: the model does not know what is asked of it.
     """
     account = Account(config, model, actions.shape[-2])
-    judge = judge_of(model, model.value, config.ensemble)
     states = _states(model, carry, actions, config, generator)
     for k, (state, action) in enumerate(zip(states, actions.unbind(-2), strict=True)):
         if account.asks_value(k):
-            account.value(judge(state, action))
+            account.value(model.value(state, action))
         else:
             account.reward(earning(model).reward(state, action))
         if account.asks_risk(k):

@@ -242,8 +242,7 @@ def blank_observation(num_envs: int) -> tuple[NDArray[np.uint16], Array]:
 
 def _finite_rows(carry: Carry) -> Tensor:
     """(E,) whether all numbers of a robot's carry (E, ...) are finite."""
-    parts = [part for part in carry if part is not None]
-    return torch.stack([part.isfinite().flatten(1).all(1) for part in parts]).all(0)
+    return torch.stack([part.isfinite().all(1) for part in carry]).all(0)
 
 
 def _choose_rows(rows: Tensor, chosen: Carry, other: Carry) -> Carry:

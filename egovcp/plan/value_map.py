@@ -1,4 +1,4 @@
-"""What the model thinks of putting one hand elsewhere: Q over the hand's x-z plane (fig. 7a).
+"""Q of the planned action with one hand moved over its x-z plane (fig. 7a).
 
     V(z, x) = Q(h_t, z_t, a with its hand at (x, z))
 
@@ -14,7 +14,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from egovcp.plan.choices import Ensemble, judge_of
 from egovcp.plan.objective import Dynamics
 from egovcp.spec import ACTION_BOX
 
@@ -46,18 +45,15 @@ def value_map[L](
     action: Tensor,
     hand: Literal["left", "right"],
     grid: HandGrid,
-    ensemble: Ensemble = "min",
 ) -> Tensor:
-    """Q (E, n, m) of action (E, 7) with its ``hand`` at each (z, x) of ``grid``, return units; of
-    several heads what a planner with ``ensemble`` makes of them."""
+    """Q (E, n, m) of action (E, 7) with its ``hand`` at each (z, x) of ``grid``, return units."""
     axis_x, _, axis_z = HAND_AXES[hand]
     x = _normalised(grid.x, axis_x, action)
     z = _normalised(grid.z, axis_z, action)
     actions = action[:, None, None, :].repeat(1, len(z), len(x), 1)  # (E, n, m, 7)
     actions[..., axis_x] = x
     actions[..., axis_z] = z[:, None]
-    judge = judge_of(model, model.value, ensemble)
-    values = judge(model.spread(carry), actions.flatten(1, 2))
+    values = model.value(model.spread(carry), actions.flatten(1, 2))
     return values.reshape(len(action), len(z), len(x))
 
 

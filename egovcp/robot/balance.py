@@ -128,7 +128,7 @@ def _positions(row: StanceRow, height: Array, moment: Array) -> Array:
 def _reference(m: Balance, row: StanceRow, moment: Array, momentum: Array) -> Array:
     """(B, 47) this tick's reference row; rates by differences.
 
-    The arms' momentum p throws pelvis and waist back by M_r^-1 p. What of that the
+    The arms' momentum p pushes pelvis and waist back by M_r^-1 p. What of that the
     reference does not already contain is the recoil that the filter must expect.
     """
     positions = _positions(row, m.height, moment)

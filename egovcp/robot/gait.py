@@ -203,7 +203,7 @@ def _tick(
 ) -> None:
     """Turn the clock on, or set it to where the first step begins.
 
-    A step that is wanted begins with the weight on the leg that will swing, which throws it
+    A step that is wanted begins with the weight on the leg that will swing, which shifts it
     onto the other one; a robot that tips over swings at once, on the side it falls to.
     """
     leftwards = command[:, 1] + 0.3 * command[:, 2] - 0.3 * rate[:, 0] >= 0

@@ -3,10 +3,9 @@
 A target may pass the end of a joint's range. The servo makes torque from the difference between
 target and position, so a joint that carries load near its stop needs a target beyond it: with
 29 N m/rad an ankle's target is 0.6 rad beyond its position to hold 17 N m. How far each joint's
-targets go was measured with ``benchmarks/joint_targets.py``: balls, walls with pushes, and walking
-under the arch, 16 robots of each, both controllers, falls left out. The greatest excess is in the
-comments (rad; 0.6 is where both controllers were trained and tuned to stop). Joints whose targets
-stay inside their range get 0.1.
+targets go was measured with ``benchmarks/joint_targets.py``: all three tasks, 16 robots of each,
+both controllers, falls left out. The greatest excess is in the comments (rad; 0.6 is where both
+controllers were trained and tuned to stop). Joints whose targets stay inside their range get 0.1.
 """
 
 from __future__ import annotations

@@ -29,7 +29,6 @@ def random_batch(size: int = 4, length: int = 8, seed: int = 0) -> Batch:
         mc_return=torch.randn(shape, generator=rng),
         mc_valid=torch.ones(shape, dtype=torch.bool),
         terminal_next=torch.zeros(shape, dtype=torch.bool),
-        passing=torch.rand((*shape, spec.PASSING_DIM), generator=rng).round(),
         reward=torch.randn(shape, generator=rng),
     )
 
@@ -52,5 +51,4 @@ def memory_batch(size: int = 32, length: int = 6, seed: int = 0) -> Batch:
         depth=depth,
         state=torch.zeros_like(batch.state),
         mc_return=side + batch.action[..., 0],
-        passing=torch.zeros_like(batch.passing),
     )

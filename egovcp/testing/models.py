@@ -7,7 +7,6 @@ from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.model import PRESETS, Carry, WorldModel, WorldModelConfig
-from egovcp.model.nets import ValueHead
 from egovcp.reactive import ReactiveConfig, ReactiveNetwork, tensor_shapes
 
 
@@ -20,12 +19,11 @@ def toy_model(preset: str | WorldModelConfig = "debug", seed: int = 0) -> WorldM
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = WorldModel(PRESETS[preset] if isinstance(preset, str) else preset)
-        for head in (*model.q_heads.parts, model.termination_head, model.reward_head):
-            if head is None:
-                continue
-            last = (head.mlp if isinstance(head, ValueHead) else head).rest[-1]
-            assert isinstance(last, nn.Linear)
-            nn.init.normal_(last.weight, std=0.3)
+        for head in (model.value_head, model.termination_head, model.reward_head):
+            if head is not None:
+                last = head.rest[-1]
+                assert isinstance(last, nn.Linear)
+                nn.init.normal_(last.weight, std=0.3)
     return model.eval()
 
 
@@ -75,8 +73,6 @@ class CountingModel(WorldModel):
     def value(self, carry: Carry, action: Tensor) -> Tensor:
         last = carry.z[..., : spec.ACTION_DIM]
         return -(action - last - self.drift).square().sum(-1)
-
-    lowest_value = value
 
     def termination(self, carry: Carry) -> Tensor:
         return torch.zeros_like(carry.h[..., 0])

@@ -62,10 +62,7 @@ class TrainingConfig:
     """Further flags of egovcp-train."""
     task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Flags after those for the models of one task (all: of the multi-task model), '{wall:
-    [--sampling.event_fraction=0.7]}'; a task that is not named keeps what the scale says of it."""
-    return_steps: dict[str, int] = bounded({}, least=1, most=100_000)
-    """Task -> horizon of the returns of its data, ticks, in its own model and in the multi-task
-    one, '{arch: 50}'; where a task is not named, that of `egovcp-train --returns.steps`."""
+    [--batch_size=32]}'."""
 
     @property
     def budget(self) -> str:
@@ -91,8 +88,7 @@ class PlayConfig:
     """Further flags of egovcp-eval; studies that play take those of the planner, too."""
     task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Flags after those where the model of one task plays (all: the multi-task model), '{ball:
-    [--planner.process=ramp]}'; a task that is not named keeps what the scale says of it, '{ball:
-    []}' is without."""
+    [--planner.process=ramp]}'."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +193,6 @@ class ExperimentConfig:
         for option, given, known in (
             ("tasks", self.tasks, TASKS),
             ("data.roots", self.data.roots, TASKS),
-            ("train.return_steps", self.train.return_steps, TASKS),
             ("train.policies", self.train.policies, models),
             ("train.task_flags", self.train.task_flags, models),
             ("play.task_flags", self.play.task_flags, models),

@@ -91,28 +91,27 @@ class Grid:
         """The training itself, whose figures are those on held-out episodes."""
         config = self.config.train
         tasks = self.config.tasks if task == ALL else (task,)
-        own = config.return_steps
         data: dict[str, Any] = {"dataset.root": self.data(tasks[0])}
-        horizon = {"returns.steps": str(own[tasks[0]])} if tasks[0] in own else {}
         if len(tasks) > 1:
-            horizons = ({"return_steps": own[one]} if one in own else {} for one in tasks)
-            each = zip(map(self.data, tasks), horizons, strict=True)
-            data, horizon = {"datasets": [{"root": root, **steps} for root, steps in each]}, {}
+            data = {"datasets": [{"root": self.data(one)} for one in tasks]}
         flags = {**data, "preset": config.preset, "steps": config.steps, "seed": seed}
         if config.max_minutes:
             flags["max_minutes"] = config.max_minutes
-        extra = (*config.flags, *config.task_flags.get(task, ()))
-        named = _named(extra)
         cell = Cell(
             name or f"train-{task}-{model.name}-s{seed}",
             TRAIN,
-            {**flags, **named, **horizon, **model.flags},
+            {**flags, **self._trained_with(task), **model.flags},
         )
         return self.add(cell)
 
+    def _trained_with(self, task: str) -> dict[str, str]:
+        """Flags of egovcp-train for the models of ``task``, or `ALL`, by the configuration."""
+        config = self.config.train
+        return _named((*config.flags, *config.task_flags.get(task, ())))
+
     def play(self, task: str, seed: int, variant: Variant, learned_from: str = "") -> Cell:
         """The planner in closed loop. A variant that asks for what is done anyway is the default:
-        by the flags of egovcp-eval or, of a model that is there already, by its own options.
+        by the flags of egovcp-eval or by the planner options of the model.
 
         Args:
             task: what is played.
@@ -124,17 +123,24 @@ class Grid:
         policy = self.model(teacher, seed, variant.model)
         own = _named(self.config.play.task_flags.get(teacher, ()))
         flags = {**self.scenarios(task), **own, "controllers": "planner", "policy.path": policy}
-        anyway = {**_brought(policy), **flags}
+        anyway = {**self._planner_of(policy, teacher), **flags}
         changes = {
             name: value
             for name, value in variant.play.items()
             if name not in anyway or _written(anyway[name]) != _written(value)
         }
-        if anyway.get("policy.q_heads") == 1:  # the least of one is its mean
-            changes.pop("planner.ensemble", None)
         differs = changes or variant.model.flags or teacher != task
         name = f"play-{task}-{variant.name if differs else DEFAULT}-s{seed}"
         return self.add(Cell(name, PLAY, {**flags, **changes}))
+
+    def _planner_of(self, policy: Output | Given, task: str) -> Flags:
+        """Planner options of a model of ``task``, or `ALL`, that are known before it is trained."""
+        if isinstance(policy, Output):
+            return _planner_flags(self._trained_with(task))
+        if not (Path(policy.path) / CONFIG).is_file():
+            return {}
+        _, planner = read_options(Path(policy.path))
+        return {f"planner.{name}": value for name, value in asdict(planner).items()}
 
     def references(
         self,
@@ -162,8 +168,7 @@ class Grid:
         """Flags that change the planner of the model of ``task``, or `ALL`, for studies that
         play."""
         config = self.config.play
-        given = _named((*config.flags, *config.task_flags.get(task, ())))
-        return {name: value for name, value in given.items() if name.startswith("planner.")}
+        return _planner_flags(_named((*config.flags, *config.task_flags.get(task, ()))))
 
     def scenarios(self, task: str) -> Flags:
         """Flags of egovcp-eval that say what is played, by whoever it is."""
@@ -182,13 +187,8 @@ def _written(value: Any) -> Any:
     return value if any(references(value)) else text(value)
 
 
-def _brought(policy: Output | Given) -> Flags:
-    """What is known of a model before anything is run: its planner's options, and its heads."""
-    if isinstance(policy, Output) or not (Path(policy.path) / CONFIG).is_file():
-        return {}
-    model, planner = read_options(Path(policy.path))
-    options = {f"planner.{name}": value for name, value in asdict(planner).items()}
-    return {**options, "policy.q_heads": model.q_heads}
+def _planner_flags(flags: Flags) -> Flags:
+    return {name: value for name, value in flags.items() if name.startswith("planner.")}
 
 
 def _named(flags: Sequence[str]) -> dict[str, str]:

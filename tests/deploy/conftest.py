@@ -52,4 +52,4 @@ def short() -> list[str]:
 
 #: Of random weights any step is good; short ones leave the robot standing, so that what is tested
 #: is what surrounds the planner.
-_PLANNER = PlannerConfig(samples=16, horizon=3, iterations=2, elites=4, eta=0.02)
+_PLANNER = PlannerConfig(samples=16, horizon=3, iterations=2, elites=4, eta=0.004)

@@ -51,7 +51,7 @@ def trained() -> Callable[[str, float], Mapping[str, Any]]:
     def make(task: str, r2: float) -> Mapping[str, Any]:
         errors = {str(k): {"model_mm": 1.0, "repeat_mm": 4.0} for k in (4, 8)}
         found = {
-            "depth": dict.fromkeys(("ball_watched", "near", "valid"), errors),
+            "depth": dict.fromkeys(("moving", "near", "valid"), errors),
             "state": {"joint_position": {"4": {"model": 2.0, "repeat": 3.0}}},
             "termination": {"5": {"auc": None}},
             "value": {"r2": r2, "slope": 1.0},

@@ -8,11 +8,8 @@ from pathlib import Path
 import pytest
 
 from egovcp import packages
-from egovcp.cli import parse_config
-from egovcp_experiment.command import main, scale_of
-from egovcp_experiment.config import ExperimentConfig
+from egovcp_experiment.command import main
 from egovcp_experiment.experiments import EXPERIMENTS
-from egovcp_experiment.scales import SCALES
 
 
 def test_help_lists_every_experiment(capsys: pytest.CaptureFixture[str]) -> None:
@@ -41,7 +38,7 @@ def test_help_lists_every_experiment(capsys: pytest.CaptureFixture[str]) -> None
         (["table1", "--output_dir=x", "--data.parts=[0]"], "--data.parts=[0.0]"),
         (["table1", "--output_dir=x", "--data.roots={bal: y}"], "did you mean 'ball'"),
         (["table1", "--output_dir=x", "--train.policies={wal: y}"], "did you mean 'wall'"),
-        (["table1", "--output_dir=x", "--train.return_steps={arch: 0}"], "expected at least 1"),
+        (["table1", "--output_dir=x", "--train.compared_steps=0"], "expected at least 1"),
     ],
 )
 def test_misuse_ends_with_2_before_anything_is_written(
@@ -84,27 +81,19 @@ def test_a_dataset_or_policy_that_cannot_be_used_is_refused_before_any_cell_runs
     assert not (tmp_path / "out" / "logs").exists()
 
 
-def test_a_flag_takes_from_one_task_what_the_scale_gives_it() -> None:
-    argv = ["--scale=small", "--play.task_flags={ball: []}"]
-    config = parse_config(ExperimentConfig, argv, "test", defaults=scale_of)
-    given = SCALES["small"]().play.task_flags
-    assert given.keys() >= {"ball", "wall"}
-    assert config.play.task_flags == {**given, "ball": ()}
-
-
 def test_an_experiment_from_end_to_end(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Collects, trains and reports through the real commands; again, nothing is left to do."""
     out = tmp_path / "out"
     argv = ["ablations", "--scale=smoke", f"--output_dir={out}", "--tasks=[ball]"]
-    argv += ["--only=[two_hot]", "--data.episodes.ball=10", "--data.flags=[--num_workers=1]"]
+    argv += ["--only=[value_mse]", "--data.episodes.ball=10", "--data.flags=[--num_workers=1]"]
     assert main(argv) == 0
     content = json.loads((out / "ablations.json").read_text())
-    assert list(content["cells"]) == ["collect-ball-10", "ablate-ball-two_hot-s0"]
+    assert list(content["cells"]) == ["collect-ball-10", "ablate-ball-value_mse-s0"]
     assert content["missing"] == []
     assert content["cells"]["collect-ball-10"]["figures"]["episodes"] == 10
-    assert "policy.value_loss=two_hot" in (out / "ablations.md").read_text()
-    model = out / "work" / "ablate-ball-two_hot-s0" / "checkpoints" / "last" / "pretrained_model"
-    assert json.loads((model / "config.json").read_text())["world_model"]["value_loss"] == "two_hot"
+    assert "policy.value_loss=mse" in (out / "ablations.md").read_text()
+    model = out / "work" / "ablate-ball-value_mse-s0" / "checkpoints" / "last" / "pretrained_model"
+    assert json.loads((model / "config.json").read_text())["world_model"]["value_loss"] == "mse"
     capsys.readouterr()
     assert main(argv) == 0
     assert "2 cells, 2 complete" in capsys.readouterr().out

@@ -14,7 +14,6 @@ import pytest
 from egovcp.artefact import save_artefact
 from egovcp.cli import parse_config
 from egovcp.errors import UsageError
-from egovcp.model import PRESETS
 from egovcp.plan import PlannerConfig
 from egovcp.testing import toy_model
 from egovcp_experiment.cell import Cell, Flags, Found, Given, Output, filled, in_order, written
@@ -41,7 +40,7 @@ def test_variants_share_data_and_models() -> None:
     for seed in (0, 1):
         grid.play("ball", seed, Variant("plain"))
         grid.play("ball", seed, Variant("long", play={"planner.horizon": 6}))
-        grid.play("ball", seed, Variant("other", Model("other", {"policy.q_heads": 5})))
+        grid.play("ball", seed, Variant("other", Model("other", {"policy.hidden": 64})))
     tools = [cell.tool for cell in grid.cells]
     assert (tools.count(COLLECT), tools.count(TRAIN), tools.count(PLAY)) == (1, 4, 6)
     assert in_order(grid.cells) == tuple(grid.cells)
@@ -67,21 +66,29 @@ def test_a_variant_that_asks_for_what_is_done_anyway_is_the_default() -> None:
     assert grid.play("wall", 0, ramp).name == "play-wall-process_ramp-s0"
 
 
+def test_a_variant_with_the_planner_that_is_trained_for_is_the_default() -> None:
+    training = TrainingConfig(
+        flags=("--planner.process=ramp",), task_flags={"wall": ("--planner.process=walk",)}
+    )
+    grid = Grid(ExperimentConfig(train=training))
+    ramp = Variant("ramp", play={"planner.process": "ramp"})
+    assert grid.play("ball", 0, ramp) == grid.play("ball", 0, Variant("default"))
+    assert grid.play("wall", 0, ramp).name == "play-wall-ramp-s0"
+
+
 @pytest.mark.parametrize(
-    ("heads", "asked", "known"),
+    ("asked", "known"),
     [
-        (1, {"planner.horizon": 5}, True),
-        (1, {"planner.horizon": 4}, False),
-        (1, {"planner.termination_rule": "shift"}, True),
-        (1, {"planner.ensemble": "mean"}, True),
-        (2, {"planner.ensemble": "mean"}, False),
+        ({"planner.horizon": 5}, True),
+        ({"planner.horizon": 4}, False),
+        ({"planner.termination_rule": "shift"}, True),
     ],
 )
 def test_what_a_model_that_is_there_does_by_itself_is_the_default(
-    tmp_path: Path, heads: int, asked: Flags, known: bool
+    tmp_path: Path, asked: Flags, known: bool
 ) -> None:
-    model = toy_model(replace(PRESETS["debug"], q_heads=heads))
-    save_artefact(tmp_path / "p", model, PlannerConfig(horizon=5), {"controller_id": "stance"})
+    planner = PlannerConfig(horizon=5)
+    save_artefact(tmp_path / "p", toy_model(), planner, {"controller_id": "stance"})
     grid = Grid(ExperimentConfig(train=TrainingConfig(policies={"ball": str(tmp_path / "p")})))
     variant = Variant("asked", play=asked)
     assert grid.play("ball", 0, variant).name == f"play-ball-{'default' if known else 'asked'}-s0"
@@ -138,16 +145,6 @@ def test_a_task_has_the_last_word_on_how_its_models_play() -> None:
     assert grid.play("arch", 0, varied).flags["planner.elites"] == 2
 
 
-def test_the_horizon_of_a_task_goes_with_its_data() -> None:
-    training = TrainingConfig(flags=("--returns.steps=20",), return_steps={"arch": 50})
-    grid = Grid(ExperimentConfig(train=training))
-    for learned_from in ("ball", "arch", ALL):
-        grid.play("arch", 0, Variant("plain"), learned_from=learned_from)
-    ball, arch, mixed = [cell.flags for cell in grid.cells if cell.tool is TRAIN]
-    assert [f["returns.steps"] for f in (ball, arch, mixed)] == ["20", "50", "20"]
-    assert [d.get("return_steps") for d in mixed["datasets"]] == [None, None, 50]
-
-
 @pytest.mark.parametrize("name", ["interpret", "multitask", "planners", "variance"])
 def test_studies_plan_as_egovcp_eval_does(name: str) -> None:
     config = replace(
@@ -176,8 +173,6 @@ def test_unknown_variants_and_tasks_are_named() -> None:
         ExperimentConfig("x", train=TrainingConfig(task_flags={"wal": ()})).check()
     with pytest.raises(UsageError, match=r"--play\.task_flags; did you mean 'wall'"):
         ExperimentConfig("x", play=PlayConfig(task_flags={"wal": ()})).check()
-    with pytest.raises(UsageError, match=r"--train\.return_steps; did you mean 'wall'"):
-        ExperimentConfig("x", train=TrainingConfig(return_steps={"wal": 20})).check()
 
 
 def test_every_cell_has_flags_that_its_command_takes() -> None:

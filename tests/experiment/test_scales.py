@@ -1,38 +1,29 @@
-"""What README and Makefile tell people to type plans as the scale does whose reports they show."""
+"""README and Makefile train with the planner options of the scale whose reports they show."""
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import pytest
 
-from egovcp.spec import TASKS
-from egovcp_experiment.scales import small
+from egovcp_experiment.scales import PLANNER, SCALES, small
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def planner_flags(command: str) -> dict[str, str]:
-    return dict(re.findall(r"--planner\.(\w+)=([^\s\"]+)", command))
+@pytest.mark.parametrize("name", ["README.md", "Makefile"])
+def test_the_documented_training_has_the_planner_of_the_reports(name: str) -> None:
+    text = (ROOT / name).read_text().replace("\\\n", " ")
+    assert " ".join(PLANNER) in " ".join(text.split())
 
 
-def chosen(task: str) -> dict[str, str]:
-    play = small().play
-    return planner_flags(" ".join((*play.flags, *play.task_flags.get(task, ()))))
+def test_the_planner_is_stored_in_the_trained_policy() -> None:
+    config = small()
+    assert set(PLANNER) <= set(config.train.flags)
+    assert not [flag for flag in config.play.flags if flag.startswith("--planner.")]
 
 
-@pytest.mark.parametrize("task", TASKS)
-def test_readme_trains_a_task_with_the_planner_of_the_reports(task: str) -> None:
-    readme = (ROOT / "README.md").read_text()
-    variables = dict(re.findall(r'^(\w+)="([^"]*)"$', readme, re.MULTILINE))
-    (line,) = re.findall(
-        rf"^egovcp-train \$train .*--output_dir=runs/{task}$", readme, re.MULTILINE
-    )
-    command = re.sub(r"\$(\w+)", lambda name: variables[name[1]], line)
-    assert planner_flags(command) == chosen(task)
-
-
-def test_quickstart_trains_the_ball_with_the_planner_of_the_reports() -> None:
-    (line,) = re.findall(r"^PLANNER := .*$", (ROOT / "Makefile").read_text(), re.MULTILINE)
-    assert planner_flags(line) == chosen("ball")
+@pytest.mark.parametrize("name", SCALES)
+def test_all_tasks_have_the_same_options(name: str) -> None:
+    config = SCALES[name]()
+    assert config.train.task_flags == config.play.task_flags == {}

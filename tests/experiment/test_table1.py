@@ -175,7 +175,7 @@ def test_the_models_stand_beside_each_other_on_held_out_episodes(trained: Traine
     rows = {row[1]: dict(zip(table.head, row, strict=True)) for row in table.rows}
     assert list(rows) == ["joint embedding", "Q by TD"]
     assert rows["joint embedding"]["Q R2"] == "0.3 ± 0.1"
-    assert rows["joint embedding"]["ball, 8 (x)"] == "4 ± 0"
+    assert rows["joint embedding"]["moving, 8 (x)"] == "4 ± 0"
     assert rows["Q by TD"]["Q R2"] == "0.1"
     assert rows["Q by TD"]["AUC within 5"] == "-"
     assert found.figures["models"]["ball"]["joint embedding"]["Q R2"] == pytest.approx([0.2, 0.4])

@@ -6,7 +6,7 @@ import pytest
 from lerobot.datasets import LeRobotDatasetMetadata
 
 from egovcp.data import DatasetWriter, Provenance, ReturnConfig
-from egovcp.model import LossConfig, WorldModelConfig
+from egovcp.model import WorldModelConfig
 from egovcp.plan import PlannerConfig
 from egovcp.robot.stance import StanceController
 from egovcp.testing import random_episode
@@ -46,10 +46,6 @@ def artefact(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
         "batch_size": 2,
         "sampling.length": 6,
         "returns.steps": RETURNS.steps,
-        "value_fit.steps": 2,
-        "value_fit.passes": 0,
-        "value_fit.told_steps": 2,
-        "value_fit.rows": 16,
         "planner.samples": 16,
         "planner.elites": 4,
         "tensorboard": "false",
@@ -63,11 +59,10 @@ def artefact(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Pa
 @pytest.fixture
 def config() -> EgovcpConfig:
     """A policy to train from scratch, of debug size."""
-    loss = LossConfig(passing=0.0)
     return EgovcpConfig(
         device="cpu",
         push_to_hub=False,
-        world_model=WorldModelConfig(32, 8, 32, (4, 8, 8), value_of_passing=False, loss=loss),
+        world_model=WorldModelConfig(32, 8, 32, (4, 8, 8)),
         planner=PlannerConfig(samples=16, elites=4),
         returns=RETURNS,
         sequence_length=6,

@@ -31,8 +31,9 @@ def _weights(output: Path) -> dict[str, torch.Tensor]:
     return load_file(output / WEIGHTS)
 
 
-def _slow(output: Path) -> dict[str, torch.Tensor]:
-    found: dict[str, torch.Tensor] = load_training_state(output)["learner"]["slow"]
+def _target(output: Path) -> dict[str, torch.Tensor]:
+    """The target network of Q in the last checkpoint."""
+    found: dict[str, torch.Tensor] = load_training_state(output)["learner"]["target"]
     return found
 
 
@@ -70,41 +71,30 @@ def test_a_stopped_variant_that_is_resumed_equals_an_uninterrupted_one(
     assert one.keys() == two.keys()
     assert all(torch.equal(one[name], two[name]) for name in one)
     if "policy__loss__q_target" in options:
-        first, second = _slow(straight), _slow(halting)
+        first, second = _target(straight), _target(halting)
         assert all(torch.equal(first[name], second[name]) for name in first)
     assert any(not torch.equal(one[n], x) for n, x in _weights(plain).items() if n in one)
 
 
-def test_the_slow_heads_stay_in_the_checkpoint(
+def test_target_network_is_in_the_checkpoint_and_not_in_the_policy(
     arguments: Arguments, plain: Path, tmp_path: Path
 ) -> None:
     assert main(arguments(tmp_path / "td", **TD)) == 0
     assert _weights(tmp_path / "td").keys() == _weights(plain).keys()
-    assert "slow" not in load_training_state(plain)["learner"]
+    assert "target" not in load_training_state(plain)["learner"]
     model = load_training_state(tmp_path / "td")["learner"]["model"]
-    heads = {name: value for name, value in model.items() if name.startswith("value_head.")}
-    slow = _slow(tmp_path / "td")
-    behind = [slow[name.replace("value_head.", "_states.0.")] - x for name, x in heads.items()]
-    assert any(difference.any() for difference in behind)
+    network = _target(tmp_path / "td")
+    own = {name: model[name.replace("head.", "value_head.", 1)] for name in network}
+    assert len(own) == sum(name.startswith("value_head.") for name in model)
+    assert any(not torch.equal(network[name], x) for name, x in own.items())
 
 
-def test_a_run_that_kept_no_slow_heads_cannot_go_on_with_them(
+def test_resume_with_td_needs_a_checkpoint_with_a_target_network(
     arguments: Arguments, plain: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = [f"--output_dir={plain}", "--resume", "--steps=8", "--policy.loss.q_target=td"]
     assert main(argv) == 4
     assert "does not fit the options" in capsys.readouterr().err
-
-
-def test_the_final_fit_under_td_differs_from_that_to_returns(
-    arguments: Arguments, tmp_path: Path
-) -> None:
-    """With targets from the trained Q; the reward is the same at every row of an episode."""
-    for steps in (0, 4):
-        assert main(arguments(tmp_path / f"fit{steps}", value_fit__steps=steps, **TD)) == 0
-    bare, fitted = _weights(tmp_path / "fit0"), _weights(tmp_path / "fit4")
-    changed = {n.split(".")[0] for n, x in bare.items() if not torch.equal(x, fitted[n])}
-    assert changed == {"value_head", "more_value_heads", "passing_value_head"}
 
 
 def test_the_artefact_says_what_it_is_and_plans(arguments: Arguments, tmp_path: Path) -> None:

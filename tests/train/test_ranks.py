@@ -118,5 +118,5 @@ def test_what_is_refused_is_said_once(arguments: Arguments, tmp_path: Path) -> N
     code, out, err = _launch(arguments(tmp_path / "run", dataset__root=tmp_path / "nothing"))
     assert code != 0
     assert out == ""
-    assert err.count("egovcp-train: error: no dataset at") == 1
+    assert err.count("egovcp-train: error: no such folder") == 1
     assert not (tmp_path / "run").exists()

@@ -23,7 +23,6 @@ from egovcp_train.checkpoint import load_training_state, new_checkpoint
 from egovcp_train.config import TrainConfig
 from egovcp_train.loop import Budget, Learner
 from egovcp_train.train import main
-from egovcp_train.value_fit import fit_value
 
 type Arguments = Callable[..., list[str]]
 
@@ -92,28 +91,20 @@ def test_a_stopped_run_that_is_resumed_equals_an_uninterrupted_one(
     assert (output / weights).read_bytes() == (finished / weights).read_bytes()
 
 
-def test_a_signal_in_the_last_step_or_the_final_fit_loses_nothing(
+def test_signal_in_the_last_step_does_not_change_the_finished_policy(
     arguments: Arguments,
     finished: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def interrupted(*args: Any) -> None:
-        signal.raise_signal(signal.SIGINT)
-        fit_value(*args)
-
+    output = tmp_path / "run"
+    with monkeypatch.context() as patched:
+        _stop_after(patched, 6, signal.SIGINT)
+        assert main(arguments(output)) == 0
+    assert "done at step 6" in capsys.readouterr().out
     weights = "checkpoints/last/pretrained_model/model.safetensors"
-    for name in ("step", "fit"):
-        output = tmp_path / name
-        with monkeypatch.context() as patched:
-            if name == "step":
-                _stop_after(patched, 6, signal.SIGINT)
-            else:
-                patched.setattr("egovcp_train.train.fit_value", interrupted)
-            assert main(arguments(output)) == 0
-        assert "done at step 6" in capsys.readouterr().out
-        assert (output / weights).read_bytes() == (finished / weights).read_bytes()
+    assert (output / weights).read_bytes() == (finished / weights).read_bytes()
 
 
 # --- other places -----------------------------------------------------------------------------
@@ -286,6 +277,20 @@ def test_resuming_with_what_does_not_fit_is_refused(
     _refused([f"--output_dir={output}", "--resume", flag], code, capsys, message)
     assert (output / "train_config.yaml").read_bytes() == kept
     assert _equal(_state(output), _state(finished))
+
+
+def test_run_of_a_version_with_a_ball_tracker_is_not_resumed(
+    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = Path(shutil.copytree(finished, tmp_path / "run", symlinks=True))
+    with (output / "train_config.yaml").open("a", encoding="utf-8") as file:
+        file.write("passing: {horizon: 3}\nvalue_fit: {steps: 0}\n")
+    capsys.readouterr()
+    assert main([f"--output_dir={output}", "--resume"]) == 4
+    (line,) = capsys.readouterr().err.splitlines()
+    assert f"{output / 'train_config.yaml'} has options that were removed: passing (" in line
+    assert "value_fit (" in line
+    assert line.endswith("start a new one")
 
 
 def test_resuming_with_a_config_file_is_refused(

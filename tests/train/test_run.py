@@ -230,18 +230,6 @@ def test_a_place_that_cannot_be_written_is_a_matter_of_the_surroundings(
         ({"planner__elites": 99}, "elites"),
         ({"sampling__length": 0}, "length"),
         ({"stpes": 3}, "did you mean '--steps'"),
-        (
-            {
-                "value_fit__mirror": "flights",
-                "policy__value_of_passing": "false",
-                "policy__paint_flight": "false",
-                "policy__flight__enabled": "false",
-            }
-            | {
-                f"policy__loss__{x}": 0 for x in ("passing", "flight", "motion", "foresight_motion")
-            },
-            "--value_fit.mirror=flights",
-        ),
         ({"config_path": "absent.yaml"}, "--preset=debug and --config_path=absent.yaml"),
     ],
 )
@@ -376,13 +364,12 @@ def test_the_controller_of_the_data_goes_into_the_artefact(
     assert load_artefact(str(folder)).controller_id == "walker-7"
 
 
-def test_the_paper_preset_adds_nothing_to_the_paper() -> None:
-    """Also outside the world model; a single flag still overrides it."""
+def test_paper_preset_sets_the_options_of_the_paper_outside_the_world_model_too() -> None:
+    """A single flag still overrides it."""
     argv = ["--output_dir=x", "--preset=paper", "--planner.samples=64", "--optimizer.ema=0.9"]
     config = parse_config(TrainConfig, argv, "egovcp-train", "", option_defaults)
     assert config.policy.world_model() == PRESETS["paper"]
     assert not config.sampling.mirror
-    assert config.value_fit.steps == 0
     assert config.returns.keep_truncated
     assert config.planner.termination_rule == "paper"
     assert (config.planner.samples, config.optimizer.ema) == (64, 0.9)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,13 +10,10 @@ import torch
 from numpy.typing import NDArray
 
 from egovcp.data import EpisodeStore, ReturnConfig
-from egovcp.data.windows import gather, mirror_rows
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
 from egovcp.model.statistics import set_statistics
-from egovcp_train.value_fit import Mirrored
 
-EPISODES_AT_ONCE = 32
 DEFAULT_RETURNS = ReturnConfig()
 
 
@@ -27,37 +24,6 @@ def to_tensors(arrays: Mapping[str, NDArray[Any]], device: torch.device) -> Batc
     return Batch(depth=depth, **rest)._replace(
         **{k: v.to(device, non_blocking=True) for k, v in {"depth": depth, **rest}.items()}
     )
-
-
-def whole_episodes(
-    store: EpisodeStore, device: torch.device, mirror: Mirrored = "none", limit: int | None = None
-) -> Iterator[Batch]:
-    """Whole episodes from their start, as a robot lives through them, padded to the longest of a
-    batch: episodes of one task are often several times as long as those of another.
-
-    Args:
-        mirror: and then the mirror images of these.
-        limit: at most this many episodes, the first ones; None: all.
-    """
-    # A GPU is as fast with many as with few.
-    at_once = EPISODES_AT_ONCE * (1 if device.type == "cpu" else 8)
-    count = len(store.length) if limit is None else min(limit, len(store.length))
-    everyone, images = np.arange(count), mirrored_episodes(store, mirror, count)
-    for group in (everyone, images):
-        for first in range(0, len(group), at_once):
-            which = group[first : first + at_once]
-            arrays = gather(store, store.start[which], which, int(store.length[which].max()))
-            if group is images:
-                mirror_rows(arrays, np.arange(len(which)))
-            yield to_tensors(arrays, device)
-
-
-def mirrored_episodes(store: EpisodeStore, mirror: Mirrored, count: int) -> NDArray[np.intp]:
-    """Which of the first ``count`` episodes are shown in the mirror as well."""
-    if mirror == "flights":
-        flies = np.maximum.reduceat(store.passing[:, 3], store.start)
-        return np.flatnonzero(flies[:count] > 0)
-    return np.arange(count if mirror == "all" else 0)
 
 
 def set_normalisation(

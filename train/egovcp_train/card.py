@@ -29,8 +29,6 @@ _METRICS: Final = {
     "value/slope": "regression of the return on Q; 1 is calibrated",
     "depth/moving_h": "RMS error on moving pixels, m, that many ticks ahead without observation",
     "depth/repeat_h": "the same for repeating the last image",
-    "passing/seen": "share of the rows in which it is right whether anything is on its way",
-    "passing/r2_": "share of the variance of where and when something will pass that is foreseen",
     "latent/active": "dimensions of z that carry information",
     "latent/kl": "KL divergence of posterior and prior, nats per step",
     "termination/": "how well falls are foreseen",

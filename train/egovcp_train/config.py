@@ -7,15 +7,13 @@ from typing import Any, Literal
 
 from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
-from egovcp.data import MixedReturnConfig, ReturnConfig, ShuffleConfig
+from egovcp.data import ReturnConfig, ShuffleConfig
 from egovcp.errors import UsageError
 from egovcp.hub import RetryPolicy, is_repo_id
 from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_answers
 from egovcp.plan.cost import require_affordable
-from egovcp_train.labels.config import PassingConfig
-from egovcp_train.value_fit import ValueFitConfig
 from egovcp_train.wandb_records import WandbConfig
 
 
@@ -43,8 +41,6 @@ class SamplingConfig:
     """Ticks per window."""
     burn_in: int = bounded(0, least=0, most=100_000)
     """Leading ticks of a window that only fill the memory and are not trained on."""
-    event_fraction: float = bounded(0.0, least=0, most=1)
-    """Share of windows that are placed around events instead of anywhere."""
     mirror: bool = True
     """Left-right mirror half of the windows (the robot is symmetric)."""
     tasks: dict[str, float] = field(default_factory=dict)
@@ -64,7 +60,7 @@ class LoadingConfig:
     """Shuffle window of mode stream."""
     sample_files: int = bounded(16, least=1, most=65_536)
     """Files of each task that are fetched before the first step where the data comes from the Hub:
-    the episodes in them give the scale of the returns, are evaluated on, and Q is fitted to."""
+    the episodes in them give the scale of the returns, and are evaluated on."""
     network: RetryPolicy = field(default_factory=RetryPolicy)
     """How long the Hub is asked for a file before the run ends; its checkpoints remain."""
 
@@ -114,8 +110,7 @@ class TrainConfig:
     """Dataset to train on."""
     datasets: tuple[WeightedDatasetConfig, ...] = ()
     """Several datasets to train on instead, '[{root: data/ball, weight: 2}, {repo_id: me/wall,
-    weight: 1}]'; without weights every frame counts alike; one with return_steps has returns over
-    its own horizon."""
+    weight: 1}]'; without weights every frame counts alike."""
     preset: Literal["default", "paper", "debug"] = "default"
     """Starting point of all options; paper: equal weights, nothing added to the paper."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
@@ -124,16 +119,12 @@ class TrainConfig:
     """Planner settings stored in the artefact."""
     returns: ReturnConfig = field(default_factory=ReturnConfig)
     """Monte Carlo target of Q."""
-    passing: PassingConfig = field(default_factory=PassingConfig)
-    """Labels of what is on its way."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
     """Batches."""
     loading: LoadingConfig = field(default_factory=LoadingConfig)
     """Episodes in memory or on disk."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
     """Optimiser."""
-    value_fit: ValueFitConfig = field(default_factory=ValueFitConfig)
-    """Final fit of Q."""
     steps: int = bounded(20_000, least=1)
     """Gradient steps."""
     max_minutes: float = bounded(0.0, least=0)
@@ -167,15 +158,6 @@ class TrainConfig:
     wandb: WandbConfig = field(default_factory=WandbConfig)
     """Weights & Biases."""
 
-    @property
-    def targets(self) -> ReturnConfig:
-        """`returns`, where datasets have horizons of their own with these."""
-        own = [dataset.return_steps for dataset in self.datasets]
-        if own == [None] * len(own):
-            return self.returns
-        each = tuple(self.returns.steps if steps is None else steps for steps in own)
-        return MixedReturnConfig(**vars(self.returns), steps_each=each)
-
     def __post_init__(self) -> None:
         require_answers(self.policy, self.planner)
         require_affordable(self.policy, self.planner)
@@ -189,14 +171,13 @@ class TrainConfig:
             require_longer(self.sampling.length, loss.autoregressive_steps, "--sampling.length")
 
 
-#: What a preset says beyond the world model itself (`egovcp.model.PRESETS`). The paper knows no
-#: mirrored episodes, averaged weights or final fit, keeps returns that the time limit cuts short
-#: (their bias is that of its section III-D), and sets the values after a termination to zero.
+#: Options of a preset beside the world model itself (`egovcp.model.PRESETS`). The paper mirrors no
+#: episodes and averages no weights, keeps returns that the time limit cuts short (their bias is
+#: that of its section III-D), and sets the values after a termination to zero.
 TRAINING_PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "sampling": {"mirror": False},
         "optimizer": {"ema": 0.0},
-        "value_fit": {"steps": 0},
         "returns": {"keep_truncated": True},
         "planner": {"termination_rule": "paper"},
     },

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
-from itertools import chain
 from typing import Any, Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from egovcp import spec
@@ -34,27 +31,17 @@ from egovcp.data.schema import INFO_PATH
 from egovcp.data.source import is_local, local_root
 from egovcp.errors import DataError, UsageError
 from egovcp.hardware import available_bytes
-from egovcp.model import Batch, WorldModel
-from egovcp_train.batches import (
-    EPISODES_AT_ONCE,
-    fix_normalisation,
-    mirrored_episodes,
-    set_normalisation,
-    whole_episodes,
-)
+from egovcp.model import WorldModel
+from egovcp_train.batches import fix_normalisation, set_normalisation
 from egovcp_train.config import TrainConfig
-from egovcp_train.labels.passing import label, label_episode
 from egovcp_train.output import CONFIG_FILE
 from egovcp_train.ranks import ALONE, Ranks
 from egovcp_train.return_scale import ReturnScale, on_task_scales, task_scales
-from egovcp_train.value_fit import Mirrored
 
 EVALUATION_EPISODES = 64  # of each task
-FIT_EPISODES = 2048  # of a dataset that is not in memory: half a GB of states to fit Q to
 FRAME_BYTES = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (spec.STATE_DIM + 2 * spec.ACTION_DIM + 8)
 
-type Learning = EpisodeStore | EpisodeIndex
-type Built = tuple[Learning, Ahead, EpisodeStore, Learning, Mapping[str, ReturnScale]]
+type Built = tuple[Ahead, EpisodeStore, Mapping[str, ReturnScale]]
 
 
 @dataclass(frozen=True)
@@ -65,32 +52,12 @@ class Material:
     """The datasets."""
     config: TrainConfig
     """The options, ``loading.mode`` no longer auto."""
-    learning: Learning
-    """Episodes to train on."""
     stream: Ahead
     """Batches of their windows."""
     heldout: EpisodeStore
     """Episodes to evaluate on."""
-    fitting: Learning
-    """Those training episodes that the final fit of Q may draw from."""
     return_scales: Mapping[str, ReturnScale]
     """Task -> the scale that its returns are on, under `returns.scale=per_task`; else empty."""
-
-    @property
-    def training_count(self) -> int:
-        """How many `training_episodes` there are, mirror images included; at most, where which of
-        those on the disk have any shows only when they are read."""
-        mirror = mirrored(self.config)
-        if isinstance(self.fitting, EpisodeIndex):
-            return min(len(self.fitting), FIT_EPISODES) * (1 if mirror == "none" else 2)
-        count = len(self.fitting.length)
-        return count + len(mirrored_episodes(self.fitting, mirror, count))
-
-    def training_episodes(self, device: torch.device) -> Iterator[Batch]:
-        """Whole training episodes, and their mirror images; a random part of a large dataset."""
-        if isinstance(self.fitting, EpisodeIndex):
-            return _from_disk(self.fitting, self.config, device)
-        return whole_episodes(self.fitting, device, mirrored(self.config))
 
 
 def prepare(config: TrainConfig, model: WorldModel, ranks: Ranks = ALONE) -> Material:
@@ -118,13 +85,7 @@ def _prepare(config: TrainConfig, model: WorldModel, ranks: Ranks) -> Material:
     mix, sampling = mix_of(config), stream_config(config)
     sampling.check()
     config.loading.shuffle.check()
-    config.targets.check()
-    if mirrored(config) == "flights" and not needs_labels(config):
-        raise UsageError(
-            "--value_fit.mirror=flights asks in which episodes something flies, and nothing looks "
-            "for that: --policy.loss.passing, .flight, .motion and .foresight_motion are 0; raise "
-            "one of them, or choose all or none"
-        )
+    config.returns.check()
     readers = open_readers(config)
     config = pinned(_decided(config, readers, ranks), readers)
     if config.loading.mode == "ram" and any(reader.is_remote for reader in readers):
@@ -245,21 +206,9 @@ def stream_config(config: TrainConfig) -> StreamConfig:
         batch_size=config.batch_size,
         length=sampling.length,
         burn_in=sampling.burn_in,
-        event_fraction=sampling.event_fraction,
         mirror=sampling.mirror,
         seed=config.seed,
     )
-
-
-def mirrored(config: TrainConfig) -> Mirrored:
-    """Whose mirror images the last fit of Q goes over as well."""
-    return config.value_fit.mirror if config.sampling.mirror else "none"
-
-
-def needs_labels(config: TrainConfig) -> bool:
-    """Whether a loss asks what is on its way."""
-    loss = config.policy.loss
-    return max(loss.passing, loss.flight, loss.motion, loss.foresight_motion) > 0
 
 
 def _decided(config: TrainConfig, readers: Sequence[DatasetReader], ranks: Ranks) -> TrainConfig:
@@ -280,7 +229,7 @@ def _in_memory(
     ranks: Ranks,
 ) -> Built:
     learning, heldout = (
-        EpisodeStore.load(readers, split, config.targets) for split in ("train", "heldout")
+        EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
     )
     scales: dict[str, ReturnScale] = {}
     if config.returns.scale == "per_task":
@@ -288,14 +237,11 @@ def _in_memory(
         learning, heldout = (on_task_scales(store, scales) for store in (learning, heldout))
     complete = np.bincount(np.repeat(learning.dataset, learning.length), weights=learning.mc_valid)
     _require_returns(readers, learning.dataset, complete)
-    set_normalisation(model, learning, config.targets)
-    heldout = label(heldout, config.passing)
-    if needs_labels(config):
-        learning = label(learning, config.passing, torch.get_num_threads())
+    set_normalisation(model, learning, config.returns)
     rows = ranks.rows(sampling.batch_size)
     sampling = dataclasses.replace(sampling, batch_size=ranks.count * sampling.batch_size)
     stream = Ahead(SequenceStream(learning, sampling, mix, rows))
-    return learning, stream, heldout, learning, scales
+    return stream, heldout, scales
 
 
 def _on_disk(
@@ -317,31 +263,25 @@ def _on_disk(
         sample, unseen = sample_files(learning, unseen, config.loading.sample_files)
         for part in (sample, unseen):
             part.bring()
-    heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.targets)
-    heldout = label(heldout, config.passing)
+    heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.returns)
     if learning.is_remote:
-        facts = survey_sample(learning, sample, config.targets, sampling.event_quantile)
+        facts = survey_sample(learning, sample, config.returns)
     else:
-        facts = survey(learning, config.targets, sampling.event_quantile)
+        facts = survey(learning, config.returns)
     _require_returns(readers, sample.dataset, facts.complete)
     longest = int(learning.length.max())
     state = facts.state_mean, facts.state_std
-    fix_normalisation(model, *state, facts.returns, longest, config.targets)
-    labelling = None
-    if needs_labels(config):
-        labelling = partial(label_episode, config=config.passing)
+    fix_normalisation(model, *state, facts.returns, longest, config.returns)
     stream = BoundedStream(
         learning,
         sampling,
         mix,
         config.loading.shuffle,
         Shard(ranks.rank, ranks.count),
-        returns=config.targets,
-        events=facts.events,
-        label=labelling,
+        returns=config.returns,
         checked=not learning.is_remote,
     )
-    return learning, Ahead(stream), heldout, sample, {}
+    return Ahead(stream), heldout, {}
 
 
 def _require_returns(
@@ -358,21 +298,6 @@ def _require_returns(
     if without and complete.any():
         raise DataError(
             f"{readers[without[0]].root}: no row has a complete Monte Carlo return, though rows of "
-            "other datasets have: its episodes are not longer than that; give it a horizon of "
-            "its own, --datasets='[{root: ..., return_steps: 20}, ...]', or lower --returns.steps"
+            "other datasets have: its episodes are not longer than --returns.steps; lower it, "
+            "or leave the dataset out"
         )
-
-
-def _from_disk(index: EpisodeIndex, config: TrainConfig, device: torch.device) -> Iterator[Batch]:
-    """Whole episodes of at most `FIT_EPISODES`, a few in memory at a time."""
-    order = torch.randperm(len(index), generator=torch.Generator().manual_seed(config.seed))
-    chosen = order[:FIT_EPISODES].sort().values.numpy()
-
-    def batches(first: int) -> Iterator[Batch]:
-        part = index.select(chosen[first : first + EPISODES_AT_ONCE])
-        store = EpisodeStore.read(part, config.targets)
-        if needs_labels(config):
-            store = label(store, config.passing)
-        yield from whole_episodes(store, device, mirrored(config))
-
-    return chain.from_iterable(map(batches, range(0, len(chosen), EPISODES_AT_ONCE)))

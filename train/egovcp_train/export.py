@@ -99,13 +99,13 @@ def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:
         ArtefactError: a network does not say what the original says, or the planner would ask for
             more than they say.
     """
-    model, ensemble = artefact.world_model, artefact.planner.ensemble
+    model = artefact.world_model
     _require_exportable(artefact)
-    for name, network in networks_of(model, ensemble).items():
+    for name, network in networks_of(model).items():
         write_graph(network(model), golden_inputs(model, _TRACED_ROWS, 1), folder / f"{name}.onnx")
     inputs = golden_inputs(model, _ROWS)
     golden = {f"inputs/{name}": tensor for name, tensor in inputs.items()}
-    for name, outputs in reference(model, inputs, ensemble).items():
+    for name, outputs in reference(model, inputs).items():
         golden |= {f"outputs/{name}/{key}": tensor for key, tensor in outputs.items()}
     write_bytes(folder / GOLDEN, save({name: t.contiguous() for name, t in golden.items()}))
     errors = verify(folder)
@@ -177,8 +177,8 @@ def _largest_error(folder: Path, name: str, golden: Mapping[str, torch.Tensor]) 
 def _report(artefact: Artefact, folder: Path, golden: dict[str, torch.Tensor]) -> dict[str, Any]:
     """What another runtime must know besides the graphs."""
 
-    model, ensemble = artefact.world_model, artefact.planner.ensemble
-    networks = {name: network(model) for name, network in networks_of(model, ensemble).items()}
+    model = artefact.world_model
+    networks = {name: network(model) for name, network in networks_of(model).items()}
 
     def described(key: str) -> dict[str, Any]:
         tensor = golden[key]

@@ -16,7 +16,7 @@ from egovcp.cuda_graphs import Recorded
 from egovcp.errors import DataError
 from egovcp.model import Batch, Draws, WorldModel, draws_for, world_model_gradients
 from egovcp.model.shared import sharing
-from egovcp.model.td import SlowHeads
+from egovcp.model.td import TargetNetwork
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.device import precision
 from egovcp_train.ranks import ALONE, Ranks
@@ -30,7 +30,7 @@ type Found = tuple[tuple[str, ...], Tensor, tuple[Tensor | None, ...]]
 
 class Learner:
     """Model, averaged model, optimiser, the random stream of the latent noise, and under
-    ``q_target=td`` the slow heads of Q.
+    ``q_target=td`` the target network of Q.
 
     A step is some thousand small kernels. On a GPU calling them takes longer than they do, so that
     there its gradient is recorded and replayed (`egovcp.cuda_graphs`).
@@ -50,7 +50,7 @@ class Learner:
         self.ranks = ranks
         self.bf16 = bf16
         self.averaged = copy.deepcopy(model).requires_grad_(False)
-        self.slow = SlowHeads(model) if model.config.loss.q_target == "td" else None
+        self.target = TargetNetwork(model) if model.config.loss.q_target == "td" else None
         self.optimizer = torch.optim.AdamW(
             model.parameters(), lr=config.lr, weight_decay=config.weight_decay, fused=True
         )
@@ -84,16 +84,16 @@ class Learner:
         if self._finite(norm + terms["loss/total"]):
             self.optimizer.step()
             self._average()
-            if self.slow:
-                self.slow.follow(self.model, self.model.config.loss.td_decay)
+            if self.target:
+                self.target.update(self.model, self.model.config.loss.td_decay)
         self.step += 1
         return {**terms, "grad_norm": norm}
 
     def _find(self, batch: Batch, draws: Draws) -> Found:
-        heads = self.slow.heads if self.slow else None
+        head = self.target.head if self.target else None
         in_precision = partial(precision, batch.state.device, self.bf16)
         with torch.enable_grad():
-            loss, terms = world_model_gradients(self.model, batch, draws, heads, in_precision)
+            loss, terms = world_model_gradients(self.model, batch, draws, head, in_precision)
         terms = {**terms, "loss/total": loss}
         gradients = tuple(parameter.grad for parameter in self._parameters)
         return tuple(terms), torch.stack(list(terms.values())), gradients
@@ -141,7 +141,7 @@ class Learner:
             "averaged": self.averaged.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
-            **({"slow": self.slow.state_dict()} if self.slow else {}),
+            **({"target": self.target.state_dict()} if self.target else {}),
         }
 
     def load_state_dict(self, state: dict[str, object]) -> None:
@@ -150,8 +150,8 @@ class Learner:
         self.averaged.load_state_dict(state["averaged"])  # type: ignore[arg-type]
         self.optimizer.load_state_dict(state["optimizer"])  # type: ignore[arg-type]
         self.generator.set_state(state["generator"])  # type: ignore[arg-type]
-        if self.slow:
-            self.slow.load_state_dict(state["slow"])  # type: ignore[arg-type]
+        if self.target:
+            self.target.load_state_dict(state["target"])  # type: ignore[arg-type]
 
 
 class Budget:

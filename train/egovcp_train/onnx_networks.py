@@ -6,10 +6,6 @@
     termination  h, z                                  ->  termination
     reward       h, z, action                          ->  reward         if it is predicted
 
-A model that follows flights (`egovcp.model.flight`) has a third part of its memory, `flight`, which
-observe, imagine and value read and the first two hand on.
-
-Of several heads of Q, `value` is their mean or the least of them, as the artefact's planner has it.
 Normalisation is inside: depth comes in millimetres, proprioception in SI units, and values go out
 in units of return. A planner repeats the row of a robot for each of its candidates.
 """
@@ -27,10 +23,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from egovcp import spec
-from egovcp.model import Carry, WorldModel, flight
-from egovcp.model.camera_pose import camera_pose
-from egovcp.model.floor import Floor
-from egovcp.plan.choices import Ensemble, judge_of
+from egovcp.model import Carry, WorldModel
 
 OPSET: Final = 17
 
@@ -48,70 +41,37 @@ class Network(nn.Module):
         self.model = model
 
 
-class Following(Network):
-    """A graph whose last input, if the model follows flights, is ``flight``."""
-
-    def __init__(self, model: WorldModel) -> None:
-        super().__init__(model)
-        if model.config.follows_flight:
-            self.inputs = (*self.inputs, "flight")
-
-
-class Advancing(Following):
-    """One that hands it on, too."""
-
-    def __init__(self, model: WorldModel) -> None:
-        super().__init__(model)
-        if model.config.follows_flight:
-            self.outputs = (*self.outputs, "flight_next")
-
-
-class Observe(Advancing):
+class Observe(Network):
     """`WorldModel.observe`: depth (B, 48, 64) mm as float32, whole numbers, 0 = not measured."""
 
     inputs = ("h", "z", "action", "depth", "state", "is_first")
     outputs = ("h_next", "z_next")
 
     def forward(
-        self,
-        h: Tensor,
-        z: Tensor,
-        action: Tensor,
-        depth: Tensor,
-        state: Tensor,
-        is_first: Tensor,
-        *flight: Tensor,
-    ) -> tuple[Tensor, ...]:
+        self, h: Tensor, z: Tensor, action: Tensor, depth: Tensor, state: Tensor, is_first: Tensor
+    ) -> Carry:
         near = pooled_nearness(depth, self.model.config.depth_max_m)
-        carry = Carry(h, z, *flight)
-        return _parts(self.model.observe_near(carry, action, near, state, is_first))
+        return self.model.observe_near(Carry(h, z), action, near, state, is_first)
 
 
-class Imagine(Advancing):
+class Imagine(Network):
     """`WorldModel.imagine`."""
 
     inputs = ("h", "z", "action")
     outputs = ("h_next", "z_next")
 
-    def forward(self, h: Tensor, z: Tensor, action: Tensor, *flight: Tensor) -> tuple[Tensor, ...]:
-        return _parts(self.model.imagine(Carry(h, z, *flight), action))
+    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Carry:
+        return self.model.imagine(Carry(h, z), action)
 
 
-class Value(Following):
+class Value(Network):
     """`WorldModel.value`, (B,)."""
 
     inputs = ("h", "z", "action")
     outputs = ("value",)
 
-    def forward(self, h: Tensor, z: Tensor, action: Tensor, *flight: Tensor) -> Tensor:
-        return self.model.value(Carry(h, z, *flight), action)
-
-
-class LeastValue(Value):
-    """`WorldModel.lowest_value`, (B,)."""
-
-    def forward(self, h: Tensor, z: Tensor, action: Tensor, *flight: Tensor) -> Tensor:
-        return self.model.lowest_value(Carry(h, z, *flight), action)
+    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
+        return self.model.value(Carry(h, z), action)
 
 
 class Termination(Network):
@@ -134,24 +94,18 @@ class Reward(Network):
         return self.model.reward(Carry(h, z), action)
 
 
-def _parts(carry: Carry) -> tuple[Tensor, ...]:
-    return tuple(part for part in carry if part is not None)
-
-
 NETWORKS: Final[Mapping[str, type[Network]]] = {
     "observe": Observe,
     "imagine": Imagine,
     "value": Value,
     "termination": Termination,
 }
-LEAST: Final[Mapping[str, type[Network]]] = {"value": LeastValue}
 REWARD: Final[Mapping[str, type[Network]]] = {"reward": Reward}
 
 
-def networks_of(model: WorldModel, ensemble: Ensemble) -> Mapping[str, type[Network]]:
-    """What there is of this model, by name; `value` is that which the planner asks for."""
-    least = LEAST if ensemble == "min" else {}
-    return {**NETWORKS, **least, **({} if model.reward_head is None else REWARD)}
+def networks_of(model: WorldModel) -> Mapping[str, type[Network]]:
+    """The networks of this model, by name."""
+    return {**NETWORKS, **({} if model.reward_head is None else REWARD)}
 
 
 def pooled_nearness(depth_mm: Tensor, max_m: float) -> Tensor:
@@ -175,7 +129,7 @@ def golden_inputs(model: WorldModel, batch: int, seed: int = 0) -> Tensors:
 
     image = (spec.DEPTH_ROWS, spec.DEPTH_COLS)
     depth = (uniform(*image) * 1.2e3 * model.config.depth_max_m).floor()
-    inputs = {
+    return {
         "h": normal(model.config.hidden).tanh(),
         "z": normal(model.config.latent),
         "action": 2.0 * uniform(spec.ACTION_DIM) - 1.0,
@@ -183,31 +137,12 @@ def golden_inputs(model: WorldModel, batch: int, seed: int = 0) -> Tensors:
         "state": model.state_mean + 3.0 * model.state_std * normal(spec.STATE_DIM),
         "is_first": torch.arange(batch) % 3 == 0,
     }
-    if model.config.follows_flight:
-        inputs["flight"] = _golden_memory(model, batch, seed)
-    return inputs
 
 
 @torch.no_grad()
-def _golden_memory(model: WorldModel, batch: int, seed: int) -> Tensor:
-    """What is remembered after some sightings of things at random places."""
-    generator = torch.Generator().manual_seed(seed + 1)
-    memory = torch.zeros(batch, flight.SIZE)
-    pose = camera_pose(model.state_mean.expand(batch, -1), model.config.flight.camera)
-    floor = Floor(torch.zeros(batch, 2, 3), torch.zeros(batch, 2))  # none is seen
-    for tick in range(4):
-        place = torch.tensor([3.0 - 0.16 * tick, 0.0, 0.5])
-        point = place + 0.3 * torch.randn(batch, 3, generator=generator)
-        seen = flight.Sighting(point, torch.full((batch,), 1e3))
-        first = torch.full((batch,), tick == 0)
-        memory = flight.follow(memory, pose, seen, floor, first, model.config.flight)
-    return memory
-
-
-@torch.no_grad()
-def reference(model: WorldModel, inputs: Tensors, ensemble: Ensemble) -> dict[str, Tensors]:
-    """Network -> its outputs, computed by the world model itself, not by what is exported."""
-    carry = Carry(inputs["h"], inputs["z"], inputs.get("flight"))
+def reference(model: WorldModel, inputs: Tensors) -> dict[str, Tensors]:
+    """Network -> its outputs, computed by the world model itself, not by the exported modules."""
+    carry = Carry(inputs["h"], inputs["z"])
     depth = inputs["depth"].to(torch.int32)  # as on the robot
     action, state, is_first = inputs["action"], inputs["state"], inputs["is_first"]
     observed = model.observe(carry, action, depth, state, is_first)
@@ -215,7 +150,7 @@ def reference(model: WorldModel, inputs: Tensors, ensemble: Ensemble) -> dict[st
     answers = {
         "observe": _named(observed),
         "imagine": _named(imagined),
-        "value": {"value": judge_of(model, model.value, ensemble)(carry, action)},
+        "value": {"value": model.value(carry, action)},
         "termination": {"termination": model.termination(carry)},
     }
     if model.reward_head is not None:
@@ -224,8 +159,7 @@ def reference(model: WorldModel, inputs: Tensors, ensemble: Ensemble) -> dict[st
 
 
 def _named(carry: Carry) -> Tensors:
-    named = zip(("h_next", "z_next", "flight_next"), carry, strict=True)
-    return {name: part for name, part in named if part is not None}
+    return {"h_next": carry.h, "z_next": carry.z}
 
 
 def write_graph(network: Network, inputs: Tensors, path: Path) -> None:

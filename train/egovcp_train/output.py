@@ -10,6 +10,7 @@ from typing import Any
 from egovcp.errors import ArtefactError, UsageError
 from egovcp.flags import read_config
 from egovcp.outputs import require_writable
+from egovcp.removed_options import RemovedOptionError, refuse_removed_options
 from egovcp.values import build
 from egovcp_train.checkpoint import load_training_state
 
@@ -51,9 +52,14 @@ def saved_options(config_class: type, output: Path) -> dict[str, Any]:
         return {}
     try:
         options = read_config(saved)
+        refuse_removed_options(options, str(saved))
         build(config_class, options, "--")
     except OSError as error:
         raise ArtefactError(f"{saved}: cannot be read: {error.strerror}; {_LOST}") from error
+    except RemovedOptionError as error:
+        raise ArtefactError(
+            f"{error}; a run of an older version cannot go on: start a new one"
+        ) from error
     except (UsageError, ValueError) as error:
         raise ArtefactError(f"{saved}: {error}; {_LOST}") from error
     return options

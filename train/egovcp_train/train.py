@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -19,7 +18,7 @@ from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.errors import UsageError
 from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
-from egovcp.model import PRESETS, Batch, WorldModel
+from egovcp.model import PRESETS, WorldModel
 from egovcp.model.weights import tensor_shapes
 from egovcp.plan.backends import judge_of_model
 from egovcp.stop_signals import stop_on_signal
@@ -59,7 +58,6 @@ from egovcp_train.output import (
 from egovcp_train.publish import publish_trained, reserve_policy
 from egovcp_train.ranks import Ranks, join
 from egovcp_train.records import Everywhere, Recorder, Records
-from egovcp_train.value_fit import fit_value
 from egovcp_train.wandb_records import WandbRecorder, require_wandb
 
 PROG = "egovcp-train"
@@ -170,7 +168,7 @@ class Run:
             finished = self._learn(stopped)
             final = checkpoint_dir(self.output, learner.step)
             if learner.step > start or not self.ranks.decided(final.exists()):
-                self.finish(fit=finished)
+                self.finish(finished)
         if self.ranks.is_first:
             self._conclude(final, finished)
         self.ranks.close()
@@ -232,29 +230,18 @@ class Run:
         if report is not None:
             self.show(report)
 
-    def finish(self, fit: bool) -> None:
-        """Fit Q on the states of the finished model, measure, save what is shipped, and show it.
+    def finish(self, finished: bool) -> None:
+        """Measure the model, save it, and show what was measured.
 
         A launcher leaves its processes 30 s to stop: there an unfinished model is only saved.
         """
         shipped, report = self.learner.averaged, None
-        if self.ranks.is_first and (fit or self.ranks.count == 1):
-            shipped = copy.deepcopy(shipped)
-            if fit:
-                fit_value(shipped, self._states(), self.config.value_fit, self.config.seed)
+        if self.ranks.is_first and (finished or self.ranks.count == 1):
             report = self.measure(shipped)
         self.save(shipped)
         if report is not None:  # after the model is safe: pictures may fail, of a full disk or else
             self.show(report)
             record(report, self.output, shipped.config.depth_max_m)
-
-    def _states(self) -> Iterator[Batch]:
-        """Whole training episodes, with a bar: to filter them all takes minutes."""
-        total = self.material.training_count
-        with tqdm(total=total, unit="ep", desc="states for Q", mininterval=1.0) as bar:
-            for batch in self.material.training_episodes(self.device):
-                yield batch
-                bar.update(len(batch.valid))
 
     def measure(self, model: WorldModel) -> Report:
         """Measure a model on held-out episodes, and in simulation if that is asked for."""

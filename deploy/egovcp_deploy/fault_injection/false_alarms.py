@@ -1,8 +1,7 @@
 """The control loop on a healthy simulated robot: nothing may be rejected, and nothing held.
 
-The robot walks where an operator steers it, blocks balls, braces against walls after pushes and
-walks under arches, in lock-step and with the simulator's noise. Its readings pass the same checks
-as those that come over the wire.
+The robot walks where an operator steers it and plays all tasks, in lock-step and with the
+simulator's noise. Its readings pass the same checks as those that come over the wire.
 """
 
 from __future__ import annotations

@@ -183,8 +183,7 @@ class Thinker:
         film = self._imagining.imagine(reply.step.plan, self._imagine)
         maps: tuple[ValueMap, ...] = ()
         if isinstance(policy := self._policy, Policy):
-            action, ensemble = reply.step.action[0], policy.config.ensemble
-            maps = value_maps(policy.model, policy.carry, action, ensemble)
+            maps = value_maps(policy.model, policy.carry, reply.step.action[0])
         decoded = Decoded(self._imagining.reconstruct()[0], film[0], maps)
         return replace(reply, decoded=decoded)
 

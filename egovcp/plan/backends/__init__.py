@@ -1,8 +1,6 @@
-"""Ways to compute what plans are worth, behind one switch; `objective` says what is right."""
+"""Implementations of the plan evaluation behind one switch; `objective` is the reference."""
 
 from __future__ import annotations
-
-import torch
 
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
@@ -19,8 +17,8 @@ def judge_of_model(model: WorldModel, config: PlannerConfig) -> Judge[Carry]:
     """The judge that ``config.backend`` names, made from the model's weights as they are now.
 
     If ``auto`` cannot use int8 on a processor that is fast at it, a line on stderr says why.
-    A subclass of the world model may think differently from its networks: under ``auto`` it is
-    asked step by step.
+    A subclass of the world model may override its methods: under ``auto`` it is evaluated step by
+    step.
 
     Raises:
         UsageError: the model does not know what the planner asks; int8 is asked for and the model
@@ -39,8 +37,7 @@ def judge_of_model(model: WorldModel, config: PlannerConfig) -> Judge[Carry]:
                 return _integers(model, config)
         except UsageError as error:
             library.warn_float32(str(error))
-    dtype = torch.bfloat16 if backend == "bfloat16" else torch.float32
-    return FloatJudge(model, config, dtype, compiled=backend == "compile")
+    return FloatJudge(model, config)
 
 
 def _integers(model: WorldModel, config: PlannerConfig) -> IntegerJudge:

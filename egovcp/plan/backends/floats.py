@@ -1,7 +1,4 @@
-"""The planning network's layers in floating point, on any device.
-
-Products in ``dtype``; states, narrow inputs and sums in float32.
-"""
+"""The planning network's layers in float32, on any device."""
 
 from __future__ import annotations
 
@@ -15,20 +12,22 @@ from egovcp.plan.backends.layers import GruLayer, HiddenLayer
 class FloatHidden:
     """One hidden layer, and the linear layer on top if it is the last one."""
 
-    def __init__(self, layer: HiddenLayer, dtype: torch.dtype) -> None:
-        self._dtype = dtype
-        self._wide = None if layer.wide is None else layer.wide.to(dtype).t().contiguous()
+    def __init__(self, layer: HiddenLayer) -> None:
+        self._wide = None if layer.wide is None else layer.wide.t().contiguous()
         self._narrow = None if layer.narrow is None else layer.narrow.t().contiguous()
         self._gamma, self._beta = layer.norm.weight.detach(), layer.norm.bias.detach()
         self._epsilon = layer.norm.eps
         if layer.last is not None:
             self._last, self._bias = layer.last.weight.detach(), layer.last.bias.detach()
 
-    def _outputs(self, wide: Tensor | None, narrow: Tensor | None, add: Tensor | None) -> Tensor:
+    def __call__(
+        self, wide: Tensor | None = None, narrow: Tensor | None = None, add: Tensor | None = None
+    ) -> Tensor:
+        """The layer's outputs (..., units); ``add`` is a sum that all rows share."""
         total = add
         if wide is not None:
             assert self._wide is not None
-            part = (wide @ self._wide).float()
+            part = wide @ self._wide
             total = part if total is None else total + part
         if narrow is not None:
             assert self._narrow is not None
@@ -38,48 +37,23 @@ class FloatHidden:
         normal = F.layer_norm(total, self._gamma.shape, self._gamma, self._beta, self._epsilon)
         return F.silu(normal)
 
-    def between(self, wide: Tensor | None, narrow: Tensor | None, add: Tensor | None) -> Tensor:
-        """The layer's outputs, for a further layer; ``add`` is a sum that all rows share."""
-        return self._outputs(wide, narrow, add).to(self._dtype)
-
-    def last(self, wide: Tensor | None, narrow: Tensor | None, add: Tensor | None) -> Tensor:
+    def last(self, wide: Tensor | None = None, narrow: Tensor | None = None) -> Tensor:
         """(..., outputs) of the linear layer on top."""
-        return F.linear(self._outputs(wide, narrow, add), self._last, self._bias)
+        return F.linear(self(wide, narrow), self._last, self._bias)
 
 
 class FloatRecurrence:
     """The GRU."""
 
-    def __init__(self, layer: GruLayer, dtype: torch.dtype) -> None:
-        self._dtype = dtype
-        self._x = layer.wide_x.to(dtype).t().contiguous()
-        self._h = layer.wide_h.to(dtype).t().contiguous()
+    def __init__(self, layer: GruLayer) -> None:
+        self._x, self._h = layer.wide_x.t().contiguous(), layer.wide_h.t().contiguous()
         self._layer = layer
 
-    def __call__(
-        self, x: Tensor, wide_h: Tensor | None, add: Tensor | None, h: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """The next h, in float32 and as a wide input; the part of h comes from ``wide_h`` or is
-        in ``add``."""
-        total = (x @ self._x).float()
-        if wide_h is not None:
-            total = total + (wide_h @ self._h).float()
-        if add is not None:
-            total = total + add
+    def __call__(self, x: Tensor, h: Tensor, gates: Tensor | None = None) -> Tensor:
+        """The next h (..., hidden); ``gates`` is the sum h W_h if it is already known."""
+        total = x @ self._x + (h @ self._h if gates is None else gates)
         layer = self._layer
         normal = F.layer_norm(total, layer.gamma.shape, layer.gamma, layer.beta, layer.epsilon)
         reset, candidate, update = normal.chunk(3, -1)
         candidate = torch.tanh(torch.sigmoid(reset) * candidate)
-        after = torch.lerp(h.expand_as(candidate), candidate, torch.sigmoid(update))
-        return after, after.to(self._dtype)
-
-
-class FloatLinear:
-    """A linear layer of few outputs on h and z, from its weights (outputs, n) of each."""
-
-    def __init__(self, h: Tensor, z: Tensor) -> None:
-        self._h, self._z = h.t().contiguous(), z.t().contiguous()
-
-    def __call__(self, h: Tensor, z: Tensor) -> Tensor:
-        """(..., outputs)."""
-        return h @ self._h + z @ self._z
+        return torch.lerp(h.expand_as(candidate), candidate, torch.sigmoid(update))

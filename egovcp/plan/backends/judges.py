@@ -10,10 +10,8 @@ from torch import Tensor
 
 from egovcp.cuda_graphs import Recorded
 from egovcp.model import Carry, WorldModel
-from egovcp.plan.backends.compiled import compiled as compile_function
 from egovcp.plan.backends.integers import IntegerNetwork
 from egovcp.plan.backends.network import PlanningNetwork
-from egovcp.plan.backends.reading import noise_of
 from egovcp.plan.backends.root import Root, root_of
 from egovcp.plan.config import PlannerConfig
 from egovcp.plan.objective import Worth
@@ -25,24 +23,14 @@ class FloatJudge:
     Args:
         model: is packed as it is now.
         config: of the planner.
-        dtype: of the wide products.
-        compiled: through torch.compile, which takes a minute at the first plan.
     """
 
-    def __init__(
-        self,
-        model: WorldModel,
-        config: PlannerConfig,
-        dtype: torch.dtype = torch.float32,
-        compiled: bool = False,
-    ) -> None:
+    def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
         self._model, self._config = model, config
         self._root: Callable[[Carry], Root] = partial(root_of, model)
         self._worth: Callable[[Root, Tensor, Tensor | None], Tensor]
-        self._worth = PlanningNetwork(model, config, dtype).worth
-        if compiled:
-            self._worth = compile_function(self._worth)
-        elif model.state_mean.device.type == "cuda":
+        self._worth = PlanningNetwork(model, config).worth
+        if model.state_mean.device.type == "cuda":
             self._root, self._worth = Recorded(self._root), Recorded(self._worth)
 
     @property
@@ -57,7 +45,7 @@ class FloatJudge:
 
         @torch.no_grad()
         def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:
-            noise = noise_of(self._model, self._config, actions.shape[-2], generator)
+            noise = _noise(self._model, self._config, actions.shape[-2], generator)
             return self._worth(root, actions, noise)
 
         return worth
@@ -89,8 +77,19 @@ class IntegerJudge:
 
         @torch.no_grad()
         def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:
-            noise = noise_of(self._model, self._config, actions.shape[-2], generator)
+            noise = _noise(self._model, self._config, actions.shape[-2], generator)
             each = zip(robots, actions, strict=True)
             return torch.stack([self._network.worth(robot, plans, noise) for robot, plans in each])
 
         return worth
+
+
+def _noise(
+    model: WorldModel, config: PlannerConfig, horizon: int, generator: torch.Generator | None
+) -> Tensor | None:
+    """Noise (horizon - 1, latent) of the imagined states under ``latent=sample``."""
+    if config.latent == "mean":
+        return None
+    size, device = (model.config.latent,), model.state_mean.device
+    drawn = [torch.randn(size, generator=generator, device=device) for _ in range(horizon - 1)]
+    return torch.stack(drawn) if drawn else None

@@ -1,7 +1,7 @@
 """The layers that a planning network is made of, taken out of a world model.
 
 A layer's inputs are of two kinds. *Wide* ones (h, and what a hidden layer gives to the next) carry
-nearly all of the arithmetic. *Narrow* ones (z, the action, and what is told of a ball) are few.
+nearly all of the arithmetic. *Narrow* ones (z and the action) are few.
 What all candidates share is a sum that is ready when they come (`egovcp.plan.backends.root`).
 """
 
@@ -58,18 +58,14 @@ def linears_of(mlp: SplitMlp) -> list[nn.Linear]:
     return [m for m in mlp.rest if isinstance(m, nn.Linear)]
 
 
-def hidden_layers(
-    mlp: SplitMlp, first_is_state: bool, outputs: int | None = None
-) -> list[HiddenLayer]:
+def hidden_layers(mlp: SplitMlp, outputs: int | None = None) -> list[HiddenLayer]:
     """The layers of a network.
 
     Args:
-        mlp: its first input is h if ``first_is_state``; all others are narrow.
-        first_is_state: see there.
+        mlp: its first input is h; all others are narrow.
         outputs: how many of its last layer's outputs are wanted; None: all.
     """
-    weights = [weight_of(part) for part in mlp.first.parts]
-    wide = weights.pop(0) if first_is_state else None
+    wide, *weights = map(weight_of, mlp.first.parts)
     narrow = torch.cat(weights, 1) if weights else None
     *between, last = linears_of(mlp)
     norms = norms_of(mlp)

@@ -66,24 +66,25 @@ class Layer(ctypes.Structure):
     )
 
 
-class Linear(ctypes.Structure):
+class Dot(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int32) for name in ("inputs", "outputs")),
-        *((name, ctypes.c_void_p) for name in ("weight", "scale", "bias")),
+        ("inputs", ctypes.c_int32),
+        ("weight", ctypes.c_void_p),
+        *((name, ctypes.c_float) for name in ("scale", "bias")),
     )
 
 
-class Mlp(ctypes.Structure):
-    _fields_ = (("first", Layer), ("second", Layer), ("top", Linear))
+class Top(ctypes.Structure):
+    _fields_ = (("outputs", ctypes.c_int32), ("wide", Wide), ("bias", ctypes.c_void_p))
 
 
 class Head(ctypes.Structure):
-    _fields_ = (("reduce_h", Linear), ("reduce_z", Narrow), ("state", Mlp))
+    _fields_ = (("first", Layer), ("second", Layer), ("one", Dot), ("many", Top))
 
 
 class Reading(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int32) for name in ("objective", "rule", "lowest", "bins")),
+        *((name, ctypes.c_int32) for name in ("objective", "rule", "bins")),
         ("each", ctypes.c_void_p),
         *((name, ctypes.c_float) for name in ("mean", "std", "floor", "threshold", "discount")),
     )
@@ -91,16 +92,12 @@ class Reading(ctypes.Structure):
 
 class Network(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int32) for name in ("hidden", "latent", "actions", "heads")),
-        *((name, Layer) for name in ("mix", "gru", "prior", "termination", "told")),
-        ("prior_top", Wide),
-        ("prior_bias", ctypes.c_void_p),
-        ("prior_outputs", ctypes.c_int32),
-        *((name, Linear) for name in ("termination_top", "told_top")),
+        *((name, ctypes.c_int32) for name in ("hidden", "latent", "actions")),
+        *((name, Layer) for name in ("mix", "gru", "prior", "termination")),
+        ("prior_top", Top),
+        ("termination_top", Dot),
         ("min_std", ctypes.c_float),
-        ("head", ctypes.c_void_p),
-        ("reward", Head),
-        ("passing", Mlp),
+        *((name, Head) for name in ("value", "reward")),
         ("silu", ctypes.c_void_p),
         ("tanh", ctypes.c_void_p),
         ("reading", Reading),
@@ -109,18 +106,15 @@ class Network(ctypes.Structure):
 
 class Root(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("h", "mix", "gates", "values", "passing", "told")),
+        *((name, ctypes.c_void_p) for name in ("h", "mix", "gates", "value", "reward")),
         ("nothing", ctypes.c_float),
     )
 
 
 class Start(ctypes.Structure):
     _fields_ = (
-        *(
-            (name, ctypes.c_int32)
-            for name in ("hidden", "latent", "gates", "values", "mix", "passing")
-        ),
-        *((name, ctypes.c_void_p) for name in ("of_h", "of_z", "of_told")),
+        *((name, ctypes.c_int32) for name in ("hidden", "latent", "gates", "heads", "mix")),
+        *((name, ctypes.c_void_p) for name in ("of_h", "of_z")),
     )
 
 
@@ -132,7 +126,7 @@ class Job(ctypes.Structure):
     _fields_ = (
         ("network", ctypes.c_void_p),
         ("root", ctypes.c_void_p),
-        *((name, ctypes.c_int32) for name in ("rows", "steps", "width")),
+        *((name, ctypes.c_int32) for name in ("rows", "steps")),
         *((name, ctypes.c_void_p) for name in ("actions", "noise", "worth")),
         ("crew", Crew),
     )
@@ -219,7 +213,7 @@ def library() -> ctypes.CDLL:
     kernel.learn.argtypes = [i, i, i, i, f, p, p, p, p, p, p, p]
     for function in (kernel.draw, kernel.walk, kernel.learn):
         function.restype = None
-    kernel.start.argtypes = [p, p, p, p, p, p]
+    kernel.start.argtypes = [p, p, p, p, p]
     kernel.start.restype = f
     kernel.lacking.argtypes = [p, i]
     kernel.lacking.restype = i

@@ -1,62 +1,40 @@
-"""What all candidate plans of a robot share: the sums of first layers, computed once a plan."""
+"""Sums of first layers that all candidate plans of a robot share, computed once a plan."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 
-from egovcp.model import Carry, WorldModel, flight
-from egovcp.model.nets import SplitMlp, ValueHead
-from egovcp.model.world_model import PASSING_UNIT
+from egovcp.model import Carry, WorldModel
+from egovcp.model.nets import SplitMlp
 
 
 class Root(NamedTuple):
     """(E, 1, ...) for E robots."""
 
     h: Tensor
-    mix: Tensor  # sums of the first layer that leads to the GRU
-    gates: Tensor  # sums of the GRU's gates
-    values: tuple[Tensor, ...]  # sums of the first layers of `heads_of`
-    passing: Tensor | None  # and of the part that they share
-    flight: Tensor | None  # what is remembered of a flight
-
-    def told(self, k: int) -> Tensor | None:
-        """(E, 1, 4) what Q is told of it at step k, whatever the robot does meanwhile."""
-        if self.flight is None:
-            return None
-        return flight.told(flight.later(self.flight, k), PASSING_UNIT)
-
-
-def told_along(memory: Tensor, steps: int) -> Tensor:
-    """(steps, 4) `Root.told` at all of them, of a flight remembered as (1, n)."""
-    ticks = torch.arange(steps, device=memory.device)[:, None]
-    return flight.told(flight.told_later(memory.expand(steps, -1), ticks), PASSING_UNIT)
-
-
-def heads_of(model: WorldModel) -> list[ValueHead]:
-    """Q's heads, and after them the one of the reward, if the model has one."""
-    reward = model.reward_head
-    return [*model.q_heads.states, *([] if reward is None else [reward])]
+    mix: Tensor  # of the layer before the GRU, from z
+    gates: Tensor  # of the GRU's gates, from h
+    value: Tensor  # of the value head, from h and z
+    reward: Tensor | None  # of the reward head, from h and z; None: the model has none
 
 
 def root_of(model: WorldModel, carry: Carry) -> Root:
     """From the robots' states (E, ...)."""
     carry = model.spread(carry)
-    state = (carry.h, carry.z)
-    values: list[Tensor] = []
-    for head in heads_of(model):
-        reduce = head.reduce
-        values.append(_but_action(head.mlp, *(state if reduce is None else [reduce(*state)])))
-    shared = model.q_heads.passing
-    passing = None if shared is None else _but_action(shared, model.passing(carry))
-    mix, gates = model.mix.parts[0](carry.z), model.gru.project.parts[1](carry.h)
-    followed = None if shared is None else carry.flight
-    return Root(carry.h, mix, gates, tuple(values), passing, followed)
+    reward = None if model.reward_head is None else _state_sums(model.reward_head, carry)
+    return Root(
+        carry.h,
+        model.mix.parts[0](carry.z),
+        model.gru.project.parts[1](carry.h),
+        _state_sums(model.value_head, carry),
+        reward,
+    )
 
 
-def _but_action(mlp: SplitMlp, *state: Tensor) -> Tensor:
-    """The first layer's sums without those of its last input, the action."""
-    *parts, _ = mlp.first.parts
-    return torch.stack([part(x) for part, x in zip(parts, state, strict=True)]).sum(0)
+def _state_sums(head: SplitMlp, carry: Carry) -> Tensor:
+    """The first layer of a head over (h, z, a), without the part of the action."""
+    of_h, of_z, _ = head.first.parts
+    sums: Tensor = of_h(carry.h) + of_z(carry.z)
+    return sums

@@ -48,17 +48,19 @@ def _give_an_option_another_type(folder: Path, rng: Random) -> str:
 
 
 def _give_a_size_an_absurd_number(folder: Path, rng: Random) -> str:
-    sizes = ["hidden", "latent", "units", "q_heads", "channels", "motion_ahead", "value_units"]
-
     def change(content: Json) -> None:
-        name = pick(rng, [*sizes, "value_state"])
+        name = pick(rng, ["hidden", "latent", "units", "channels", "loss"])
         number = pick(rng, [10**6, 20_000, 10**9, 10**30, 10**400, -1, 1e30, 1.5, None])
         network = content["world_model"]
-        if name in ("channels", "motion_ahead"):
-            long = name == "motion_ahead" and rng.random() < 0.5
-            network[name] = list(range(100_000)) if long else [number, 8, 8]
-        else:
-            network[name] = number
+        match name:
+            case "loss":
+                long = rng.random() < 0.5
+                ahead = list(range(1, 100_000)) if long else [number, 8, 12]
+                network["loss"]["foresight_ahead"] = ahead
+            case "channels":
+                network[name] = [number, 8, 8]
+            case _:
+                network[name] = number
 
     return edit_json(folder, CONFIG, change)
 
@@ -71,10 +73,8 @@ def _give_a_size_another_number(folder: Path, rng: Random) -> str:
             "hidden": 8192,
             "units": 8192,
             "latent": 9,
-            "q_heads": 64,
-            "value_units": 1024,
+            "channels": [1024, 1024, 1024],
         }
-        changes |= {"channels": [1024, 1024, 1024], "motion_ahead": [0, 1], "value_state": 0}
         for name in rng.permutation(list(changes))[: int(rng.integers(1, 4))]:
             content["world_model"][str(name)] = changes[name]
 
@@ -90,32 +90,6 @@ def _ask_for_a_huge_plan(folder: Path, rng: Random) -> str:
     return edit_json(folder, CONFIG, change)
 
 
-def _misplace_the_camera(folder: Path, rng: Random) -> str:
-    changes: list[tuple[str, Any]] = [
-        ("vertical_fov", 1e-9),
-        ("vertical_fov", 3.14159),
-        ("vertical_fov", -1.0),
-        ("pitch", 1e6),
-        ("position", [0.0, 0.0, 1e9]),
-        ("position", [0.0, 0.0]),
-        ("picture_ages", [0.02, 0.04, 0.06, 1e9]),
-        ("picture_ages", [-0.02, 0.0, 0.0, 0.0]),
-        ("picture_ages", [0.0] * 100),
-        ("age_deviation", 0.0),
-        ("age_memory", 2.0),
-        ("plane", -1.0),
-        ("prior", [[0.0, 0.0, 1.0, 5.0, 1.0]] * 3),
-        ("aim", [[0.0, 0.0], [0.0, -1.0]]),
-    ]
-
-    def change(content: Json) -> None:
-        name, value = pick(rng, changes)
-        flight = content["world_model"]["flight"]
-        (flight["camera"] if name in flight["camera"] else flight)[name] = value
-
-    return edit_json(folder, CONFIG, change)
-
-
 def _drop_or_add_an_option(folder: Path, rng: Random) -> str:
     def change(content: Json) -> None:
         match int(rng.integers(4)):
@@ -126,7 +100,7 @@ def _drop_or_add_an_option(folder: Path, rng: Random) -> str:
             case 2:
                 content["type"] = pick(rng, ["act", "", 7, None, "EGOVCP"])
             case 3:
-                content["world_model"]["flight"]["__class__"] = "os.system"
+                content["world_model"]["loss"]["__class__"] = "os.system"
 
     return edit_json(folder, CONFIG, change)
 
@@ -193,7 +167,6 @@ TEXT_MUTATIONS: Final[tuple[Mutate, ...]] = (
     _give_a_size_an_absurd_number,
     _give_a_size_another_number,
     _ask_for_a_huge_plan,
-    _misplace_the_camera,
     _drop_or_add_an_option,
     _write_a_constant_that_is_no_json,
     _nest_json,

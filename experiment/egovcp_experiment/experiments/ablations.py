@@ -31,19 +31,11 @@ CHOICES: Final[dict[str, Flags]] = {
     "state_summed": {"policy.loss.state": spec.STATE_DIM},
     "state_1": {"policy.loss.state": 1, "policy.loss.foresight_state": 1},
     "no_moving": {"policy.loss.moving": 0},
-    "no_flight": {"policy.loss.flight": 0},
     "no_foresight": {"policy.loss.foresight_depth": 0, "policy.loss.foresight_state": 0},
     "no_near": {"policy.loss.near": 0},
-    "no_paint_flight": {"policy.paint_flight": False},
-    "not_followed": {"policy.flight.enabled": False},
-    "no_motion": {
-        "policy.flight.enabled": False,
-        "policy.paint_flight": False,
-        "policy.loss.motion": 0,
-    },
     "raw_returns": {"returns.scale": "none"},
-    "two_hot": {"policy.value_loss": "two_hot"},
-    "five_q_heads": {"policy.q_heads": 5},
+    "value_mse": {"policy.value_loss": "mse"},
+    "value_weight_1": {"policy.loss.value": 1, "policy.loss.imagined_value": 1},
     "q_of_posterior_only": {"policy.loss.imagined_steps": 0},
     "reward_head": {"policy.loss.reward": 1},
     "arwm": {"policy.dynamics": "autoregressive"},
@@ -101,7 +93,7 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
 def _shows(task: str, rows: Mapping[str, Mapping[str, Sequence[float]]]) -> list[str]:
     """The best choice of the columns that matter most, and where the default stands."""
     lines = []
-    for column in ("ball, 8 (x)", "all pixels, 8 (x)", "Q R2"):
+    for column in ("moving, 8 (x)", "all pixels, 8 (x)", "Q R2"):
         means = {n: sum(row[column]) / len(row[column]) for n, row in rows.items() if row[column]}
         if len(means) > 1 and "default" in means:
             best = max(means, key=means.__getitem__)

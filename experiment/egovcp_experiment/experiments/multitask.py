@@ -60,7 +60,7 @@ def _cells(config: ExperimentConfig) -> list[Cell]:
 
 def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
     shows: list[str] = []
-    parts: list[str | Table | Plot] = [_training(config)]
+    parts: list[str | Table | Plot] = [f"{_lengths(config)}{_planners(config)}"]
     figures: dict[str, Any] = {}
     levels: dict[str, dict[str, float]] = {}
     for task, cells in _plays(config, Grid(config)).items():
@@ -89,15 +89,6 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
         }
     title = "Multi-task: one model on mixed data against one for each task"
     return Report(title, tuple(shows), tuple(parts), figures)
-
-
-def _training(config: ExperimentConfig) -> str:
-    horizons = "".join(
-        f" Returns of {task} reach {steps} ticks, in its own model and in the mixed one."
-        for task, steps in config.train.return_steps.items()
-        if task in config.tasks and not {task, ALL} & config.train.policies.keys()
-    )
-    return f"{_lengths(config)}{horizons}{_planners(config)}"
 
 
 def _lengths(config: ExperimentConfig) -> str:

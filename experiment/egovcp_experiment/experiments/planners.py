@@ -25,7 +25,6 @@ RULES: Final[dict[str, Flags]] = {
     "process_walk": {"planner.process": "walk"},
     "process_ramp": {"planner.process": "ramp"},
     "latent_sample": {"planner.latent": "sample"},
-    "ensemble_mean": {"planner.ensemble": "mean"},
 }
 _REFERENCE: Final = "cem"
 
@@ -77,7 +76,7 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
         f"{config.play.budget_ms:g} ms on the machine below, by a timing of all of them in turns. "
         "Elites are as many as the planner has, and at most half of the candidates. "
         "`cem_1` and `cem_6` are `cem` with that many rounds instead of 3. "
-        "Rules: the artefact's own search; `ensemble_mean` differs only where Q has several heads."
+        "Rules: the artefact's own search."
     ]
     figures: dict[str, Any] = {}
     for task in config.tasks:

@@ -29,8 +29,8 @@ def _gain(errors: Mapping[str, float | None], model: str, repeat: str) -> float 
 
 
 COLUMNS: Final[Mapping[str, Column]] = {
-    "ball, 4 ahead (x)": lambda task: _depth(task, "ball_watched", 4),
-    "ball, 8 (x)": lambda task: _depth(task, "ball_watched", 8),
+    "moving, 4 ahead (x)": lambda task: _depth(task, "moving", 4),
+    "moving, 8 (x)": lambda task: _depth(task, "moving", 8),
     "near, 8 (x)": lambda task: _depth(task, "near", 8),
     "all pixels, 8 (x)": lambda task: _depth(task, "valid", 8),
     "joints, 4 (x)": lambda task: _gain(task["state"]["joint_position"]["4"], "model", "repeat"),

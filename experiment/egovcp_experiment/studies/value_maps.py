@@ -86,9 +86,7 @@ class _Maps(Watcher):
         )
         carry = moment.policy.carry.row(row)
         action = torch.as_tensor(moment.step.action[row : row + 1]).to(carry.h)
-        policy = moment.policy
-        ensemble = policy.config.ensemble
-        values = value_map(policy.model, carry, action, hand, hand_grid(hand), ensemble)
+        values = value_map(moment.policy.model, carry, action, hand, hand_grid(hand))
         first = 0 if hand == "left" else 3
         target = moment.step.action[row, [first, first + 2]]
         return _Map(

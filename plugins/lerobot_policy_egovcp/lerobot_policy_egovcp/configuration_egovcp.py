@@ -10,7 +10,7 @@ from lerobot.optim import AdamWConfig, CosineDecayWithWarmupSchedulerConfig
 from egovcp import spec
 from egovcp.data import ReturnConfig
 from egovcp.errors import DataError, UsageError
-from egovcp.model import LossConfig, WorldModelConfig
+from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_answers
 from egovcp.plan.cost import require_affordable
@@ -22,12 +22,6 @@ FEATURE_SHAPES = {
 }
 
 
-def _world_model() -> WorldModelConfig:
-    """The default without the labels of what is on its way, which take whole episodes to find."""
-    loss = LossConfig(passing=0.0, motion=0.0, flight=0.0, foresight_motion=0.0)
-    return WorldModelConfig(value_of_passing=False, paint_flight=False, loss=loss)
-
-
 def _no_normalisation() -> dict[str, NormalizationMode]:
     return dict.fromkeys(("VISUAL", "STATE", "ACTION"), NormalizationMode.IDENTITY)
 
@@ -37,12 +31,11 @@ def _no_normalisation() -> dict[str, NormalizationMode]:
 class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
     """World model, planner and training of an egovcp policy; the first two are the artefact's.
 
-    ``lerobot-train`` gives a plainer policy than ``egovcp-train``: no labels of what is on its
-    way, no averaged weights, no final fit of Q. They need whole episodes, or a place in the
-    training loop that LeRobot does not have.
+    ``lerobot-train`` saves the last weights, not averaged ones as ``egovcp-train`` does: its
+    training loop has no place for a second model.
     """
 
-    world_model: WorldModelConfig = field(default_factory=_world_model)
+    world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
     """World model and losses."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
     """Planner that turns the world model into actions."""

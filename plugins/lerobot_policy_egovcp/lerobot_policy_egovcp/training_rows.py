@@ -101,11 +101,10 @@ def to_batch(batch: Mapping[str, Tensor], targets: Targets) -> Batch:
         DataError: the depth is not in millimetres, or of another shape.
     """
     state, action = batch[spec.STATE_KEY], batch[spec.ACTION_KEY]
-    size, length = state.shape[:2]
     valid = ~batch[f"{spec.STATE_KEY}_is_pad"]
     is_first = torch.zeros_like(valid)
     is_first[:, 0] = batch[f"{spec.ACTION_KEY}_is_pad"][:, 0]  # nothing comes before it
-    rows = targets.window(batch["index"], length)
+    rows = targets.window(batch["index"], state.shape[1])
     return Batch(
         depth=to_millimetres(batch[spec.DEPTH_KEY]),
         state=state,
@@ -116,16 +115,12 @@ def to_batch(batch: Mapping[str, Tensor], targets: Targets) -> Batch:
         mc_return=rows["mc_return"],
         mc_valid=rows["mc_valid"] & valid,
         terminal_next=rows["terminal_next"] & valid,
-        passing=state.new_zeros(size, length, spec.PASSING_DIM),
         reward=rows["reward"],
     )
 
 
 def mirrored(rows: Batch, which: Tensor) -> Batch:
-    """The batch with the windows ``which`` (B,) bool as the robot would live them in a mirror.
-
-    ``passing`` stays as it is: it holds no labels here (see `to_batch`).
-    """
+    """The batch with the windows ``which`` (B,) bool mirrored left to right."""
 
     def swap(value: Tensor, source: NDArray[np.intp], sign: NDArray[np.float32]) -> Tensor:
         other = value[..., torch.from_numpy(source).to(value.device)]

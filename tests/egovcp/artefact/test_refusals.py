@@ -137,6 +137,16 @@ def test_options_of_another_version_are_refused(
         read_options(folder)
 
 
+@pytest.mark.parametrize(
+    ("option", "value"), [("flight", {}), ("value_state", 8), ("q_heads", 1), ("motion_ahead", [0])]
+)
+def test_a_policy_with_a_ball_tracker_is_refused(folder: Path, option: str, value: object) -> None:
+    edit(folder / CONFIG, lambda config: config["world_model"].update({option: value}))
+    sign(folder)
+    with pytest.raises(ArtefactError, match=r"older version with a ball tracker.*; train again$"):
+        load_artefact(str(folder))
+
+
 class _Bomb:
     def __reduce__(self) -> tuple[Callable[..., object], tuple[str]]:
         return (pytest.fail, ("a pickle was executed",))

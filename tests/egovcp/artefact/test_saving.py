@@ -1,7 +1,5 @@
 """What is written is what is loaded, and an old artefact is replaced whole or not at all."""
 
-import dataclasses
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +10,6 @@ from egovcp import artefact as module
 from egovcp import spec
 from egovcp.artefact import CONFIG, WEIGHTS, load_artefact, save_artefact
 from egovcp.errors import ArtefactError
-from egovcp.model import PRESETS, WorldModel
 from egovcp.plan import PlannerConfig, Policy
 from egovcp.testing import toy_model
 
@@ -65,41 +62,25 @@ def test_another_planner_can_be_asked_for(original: Path) -> None:
     assert load_artefact(str(original)).make_policy(planner=other).config == other
 
 
-def test_an_artefact_without_the_younger_options_loads_as_what_it_was(folder: Path) -> None:
-    """They are absent in files of an earlier version; their defaults change nothing."""
-    shutil.rmtree(folder)
-    model = WorldModel(dataclasses.replace(PRESETS["debug"], q_heads=1))
-    save_artefact(folder, model, PlannerConfig(), {"controller_id": "s-1"})
+def test_absent_options_have_their_defaults(folder: Path) -> None:
     expected = load_artefact(str(folder))
 
-    def forget(config: Json) -> None:
-        for name in ("value_loss", "q_heads", "value_units"):
-            del config["world_model"][name]
-        for name in ("near", "near_threshold", "free_nats_per", "reward"):
-            del config["world_model"]["loss"][name]
-        for name in ("latent", "ensemble"):
-            del config["planner"][name]
+    def remove(config: Json) -> None:
+        del config["world_model"]["value_loss"]
+        del config["world_model"]["loss"]["free_nats_per"]
+        del config["planner"]["latent"]
 
-    edit(folder / CONFIG, forget)
+    edit(folder / CONFIG, remove)
     sign(folder)
     found = load_artefact(str(folder))
-    assert (found.world_model.config, found.planner) == (
-        expected.world_model.config,
-        expected.planner,
-    )
-
-
-def test_a_model_from_before_flights_were_followed_does_not_follow_them(folder: Path) -> None:
-    assert load_artefact(str(folder)).world_model.config.follows_flight
-    edit(folder / CONFIG, lambda config: config["world_model"].pop("flight"))
-    sign(folder)
-    assert not load_artefact(str(folder)).world_model.config.follows_flight
+    assert found.world_model.config == expected.world_model.config
+    assert found.planner == expected.planner
 
 
 def test_options_that_the_weights_contradict_are_refused(folder: Path) -> None:
-    edit(folder / CONFIG, lambda config: config["world_model"].update(q_heads=3))
+    edit(folder / CONFIG, lambda config: config["world_model"]["loss"].update(reward=1.0))
     sign(folder)
-    with pytest.raises(ArtefactError, match=rf"{WEIGHTS}.*missing: more_value_heads"):
+    with pytest.raises(ArtefactError, match=rf"{WEIGHTS}.*missing: reward_head"):
         load_artefact(str(folder))
 
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egovcp import spec
 from egovcp.data import (
     BoundedStream,
     DatasetConfig,
@@ -19,7 +18,6 @@ from egovcp.data import (
     EpisodeIndex,
     EpisodeStore,
     Mix,
-    MixedReturnConfig,
     Provenance,
     ReturnConfig,
     SequenceStream,
@@ -28,7 +26,6 @@ from egovcp.data import (
     StreamConfig,
     survey,
 )
-from egovcp.data.stream import event_rows
 from egovcp.errors import DataError, UsageError
 
 from .conftest import MakeEpisode
@@ -111,12 +108,11 @@ def test_resuming_any_number_of_times_continues_with_exactly_the_next_batches(
     six: EpisodeIndex, batch_size: int
 ) -> None:
     """Across many epochs: six episodes yield about 16 windows in each."""
-    facts = survey(six, RETURNS)
-    config = _config(batch_size=batch_size, mirror=True, event_fraction=0.5, burn_in=1)
+    config = _config(batch_size=batch_size, mirror=True, burn_in=1)
 
     def make() -> BoundedStream:
         mix = Mix(tasks={"wall": 2.0})
-        return BoundedStream(six, config, mix, FEW, returns=RETURNS, events=facts.events)
+        return BoundedStream(six, config, mix, FEW, returns=RETURNS)
 
     straight, stopped = make(), make()
     for _ in range(8):
@@ -145,26 +141,6 @@ def test_other_options_or_data_are_not_resumed(six: EpisodeIndex, reader: Datase
         SequenceStream(store, _config()).load_state_dict(state)
     with pytest.raises(UsageError, match="bounded"):
         BoundedStream(six, _config()).load_state_dict(SequenceStream(store, _config()).state_dict())
-
-
-def test_event_windows_hold_an_event(six: EpisodeIndex, reader: DatasetReader) -> None:
-    store = EpisodeStore.load([reader], returns=RETURNS)
-    events = set(event_rows(store, 0.9).tolist())
-    facts = survey(six, RETURNS, 0.9)
-    config = _config(event_fraction=1.0)
-    everything = ShuffleConfig(episodes=6)
-    stream = BoundedStream(six, config, shuffle=everything, events=facts.events)
-    for batch in (next(stream) for _ in range(20)):
-        rows = store.start[batch["episode"]][:, None] + batch["t"]
-        assert all(events & set(r[v].tolist()) for r, v in zip(rows, batch["valid"], strict=True))
-
-
-def test_passing_is_what_the_label_says(six: EpisodeIndex) -> None:
-    def label(depth: np.ndarray, state: np.ndarray) -> np.ndarray:
-        return np.stack([state[:, 0]] * spec.PASSING_DIM, axis=1)
-
-    batch = next(BoundedStream(six, _config(), shuffle=FEW, label=label))
-    np.testing.assert_array_equal(batch["passing"][..., 2], batch["state"][..., 0])
 
 
 # --- several workers, several datasets --------------------------------------------------------
@@ -298,22 +274,9 @@ def test_a_survey_says_what_the_arrays_say(six: EpisodeIndex, reader: DatasetRea
     np.testing.assert_array_equal(facts.returns, store.mc_return[store.mc_valid])
 
 
-def test_each_dataset_has_the_returns_of_its_own_horizon(make_index: MakeIndex) -> None:
-    """From memory, in batches of a few episodes at a time, and in the survey."""
-    index, returns = make_index(6, 6), MixedReturnConfig(steps=9, steps_each=(2, 5))
-    store = EpisodeStore.read(index, returns)
-    for dataset, steps in enumerate(returns.steps_each):
-        alone = EpisodeStore.read(index.select(index.dataset == dataset), ReturnConfig(steps=steps))
-        rows = np.repeat(store.dataset, store.length) == dataset
-        np.testing.assert_array_equal(store.mc_return[rows], alone.mc_return)
-        np.testing.assert_array_equal(store.mc_valid[rows], alone.mc_valid)
-    facts = survey(index, returns)
-    np.testing.assert_array_equal(facts.returns, store.mc_return[store.mc_valid])
-    assert facts.complete.tolist() == [
-        int(store.mc_valid[np.repeat(store.dataset, store.length) == d].sum()) for d in (0, 1)
-    ]
-    stream = BoundedStream(index, _config(), shuffle=FEW, returns=returns)
-    for batch in islice(stream, 30):
-        rows, valid = store.start[batch["episode"]][:, None] + batch["t"], batch["valid"]
-        for name in ("mc_return", "mc_valid"):
-            np.testing.assert_array_equal(batch[name][valid], getattr(store, name)[rows][valid])
+def test_survey_counts_the_complete_returns_of_each_dataset(make_index: MakeIndex) -> None:
+    index = make_index(6, 3)
+    store = EpisodeStore.read(index, RETURNS)
+    dataset = np.repeat(store.dataset, store.length)
+    expected = [int(store.mc_valid[dataset == number].sum()) for number in (0, 1)]
+    assert survey(index, RETURNS).complete.tolist() == expected

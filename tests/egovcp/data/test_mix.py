@@ -16,7 +16,6 @@ from egovcp.data import (
     SequenceStream,
     StreamConfig,
 )
-from egovcp.data.stream import event_rows
 from egovcp.errors import UsageError
 
 from .conftest import MakeEpisode
@@ -58,18 +57,6 @@ def test_a_task_is_drawn_more_often_than_by_chance_by_its_weight(both: EpisodeSt
 def test_without_weights_every_frame_counts_alike(both: EpisodeStore) -> None:
     drawn = np.bincount(_windows(both, Mix()), minlength=len(both.length))
     np.testing.assert_allclose(drawn / drawn.sum(), both.length / both.num_frames, atol=0.03)
-
-
-def test_event_windows_keep_the_shares_and_hold_an_event(both: EpisodeStore) -> None:
-    config = StreamConfig(batch_size=32, length=4, mirror=False, event_fraction=1.0)
-    stream = SequenceStream(both, config, Mix(datasets=(1.0, 1.0)))
-    events = set(event_rows(both, config.event_quantile).tolist())
-    drawn: Counter[int] = Counter()
-    for batch in (next(stream) for _ in range(60)):
-        drawn.update(both.dataset[batch["episode"]].tolist())
-        rows = both.start[batch["episode"]][:, None] + batch["t"]
-        assert all(events & set(r[v].tolist()) for r, v in zip(rows, batch["valid"], strict=True))
-    assert drawn[0] / drawn.total() == pytest.approx(0.5, abs=0.05)
 
 
 def test_a_mixed_stream_resumes_with_exactly_the_next_batches(both: EpisodeStore) -> None:

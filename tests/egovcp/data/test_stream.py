@@ -1,5 +1,4 @@
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from egovcp.data import (
 )
 from egovcp.data.mirror import mirror_action, mirror_state
 from egovcp.data.split import in_split
-from egovcp.data.stream import event_rows
 from egovcp.errors import DataError, UsageError
 
 
@@ -81,7 +79,7 @@ def test_a_seed_gives_the_same_batches_and_another_seed_others(store: EpisodeSto
 
 
 def test_resuming_continues_with_exactly_the_next_batches(store: EpisodeStore) -> None:
-    config = _config(mirror=True, event_fraction=0.5, burn_in=2)
+    config = _config(mirror=True, burn_in=2)
     straight = SequenceStream(store, config)
     stopped = SequenceStream(store, config)
     for _ in range(7):
@@ -110,24 +108,6 @@ def test_burn_in_rows_count_only_at_the_start_of_an_episode(store: EpisodeStore)
         inside = batch["t"][:, 0] > 0
         assert not batch["valid"][inside, :3].any()
         assert batch["valid"][~inside, 0].all()
-
-
-def test_event_windows_hold_an_event(store: EpisodeStore) -> None:
-    events = set(event_rows(store, 0.9).tolist())
-    assert {int(store.start[e] + store.length[e] - 1) for e in (1, 3)} <= events
-    stream = SequenceStream(store, _config(event_fraction=1.0, event_quantile=0.9, burn_in=2))
-    for batch in (next(stream) for _ in range(20)):
-        rows = store.start[batch["episode"]][:, None] + batch["t"]
-        for row, valid in zip(rows, batch["valid"], strict=True):
-            assert events & set(row[valid].tolist())
-
-
-def test_the_outliers_of_a_dense_cost_are_no_events(store: EpisodeStore) -> None:
-    reward = -0.01 * np.random.default_rng(0).random(store.num_frames).astype(np.float32)
-    reward[[5, 15]] = [1.0, -1.0]  # one in either task
-    calm = np.zeros_like(store.terminal_next)
-    found = event_rows(replace(store, reward=reward, terminal_next=calm), 0.5)
-    assert found.tolist() == [5, 15]
 
 
 def test_mirrored_windows_are_reflections(store: EpisodeStore) -> None:
@@ -181,8 +161,10 @@ def test_datasets_of_different_controllers_do_not_mix(
     assert EpisodeStore.load([other, other]).num_frames == 24
 
 
-@pytest.mark.parametrize("changes", [{"length": 0}, {"batch_size": 0}, {"event_fraction": 1.5}])
-def test_senseless_settings_are_refused(store: EpisodeStore, changes: dict[str, object]) -> None:
+@pytest.mark.parametrize("changes", [{"length": 0}, {"batch_size": 0}, {"burn_in": -1}])
+def test_stream_refuses_settings_out_of_bounds(
+    store: EpisodeStore, changes: dict[str, object]
+) -> None:
     with pytest.raises(UsageError, match="expected"):
         SequenceStream(store, _config(**changes))
 

@@ -33,14 +33,14 @@ def _losses(model: WorldModel, batch: Batch) -> dict[str, Tensor]:
     )
 
 
-def test_predictions_take_the_place_of_the_kl_and_of_nothing_else(batch: Batch) -> None:
+def test_autoregressive_training_replaces_the_kl_terms_and_no_others(batch: Batch) -> None:
     draw = torch.Generator().manual_seed
     _, joint = world_model_loss(toy_model(), batch, draw(0))
     _, fed = world_model_loss(_model(), batch, draw(0))
     assert set(joint) - set(fed) == {"loss/kl_prior", "loss/kl_posterior"}
-    added = {"depth", "state", "motion"}
+    added = {"depth", "state"}
     assert set(fed) - set(joint) == {f"loss/autoregressive_{name}" for name in added}
-    for name in ("depth", "state", "passing", "value", "termination", "imagined_value"):
+    for name in ("depth", "state", "value", "termination", "imagined_value"):
         torch.testing.assert_close(fed[f"loss/{name}"], joint[f"loss/{name}"])
 
 

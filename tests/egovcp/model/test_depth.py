@@ -3,7 +3,7 @@ import torch
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.model.depth import approaching, nearness, network_image, to_metres
+from egovcp.model.depth import highest_3x3, lowest_3x3, nearness, network_image, to_metres
 
 MAX_M = spec.DEPTH_MAX_M
 SHAPE = (1, spec.DEPTH_ROWS, spec.DEPTH_COLS)
@@ -83,39 +83,8 @@ def test_the_network_sees_what_is_measured_and_that_it_is() -> None:
     assert torch.equal(near > 0, depth[0] > 0)
 
 
-# --- what approaches ----------------------------------------------------------------------
-def _scene(*columns: int | None, distance: float = 2.0, row: int = 20) -> Tensor:
-    """(1, T, H, W) nearness of a 3 x 3 block before a wall at 4 m; None: no block yet."""
-    near = torch.full((1, len(columns), spec.DEPTH_ROWS, spec.DEPTH_COLS), 1 - 4 / MAX_M)
-    for t, column in enumerate(columns):
-        if column is not None:
-            near[0, t, row : row + 3, column : column + 3] = 1 - distance / MAX_M
-    return near
-
-
-def test_what_appears_is_seen_where_it_is() -> None:
-    centre, seen = approaching(_scene(None, 50, None, 5))
-    assert seen.tolist() == [[False, True, False, True]]
-    x, y, near = centre[0, 1].tolist()
-    assert x == pytest.approx(2 * 51 / 63 - 1)
-    assert y == pytest.approx(2 * 21 / 47 - 1)
-    assert near == pytest.approx(1 - 2 / MAX_M)
-    assert centre[0, 3, 0].item() == pytest.approx(2 * 6 / 63 - 1)
-
-
-@pytest.mark.parametrize(
-    "scene",
-    [
-        _scene(30, 30, 30),  # still
-        _scene(30, 31, 30, 29),  # the robot sways by a pixel
-        _scene(30, None, None),  # gone
-        _scene(None, 30, distance=3.6),  # noise at the end of the range
-        _scene(None, 30, distance=0.6),  # the robot's own arm
-        _scene(30),  # one image alone
-    ],
-)
-def test_what_does_not_approach_is_not_seen(scene: Tensor) -> None:
-    centre, seen = approaching(scene)
-    assert centre.shape == (*scene.shape[:2], 3)
-    assert seen.shape == scene.shape[:2]
-    assert not seen.any()
+def test_extremes_of_a_neighbourhood_are_those_of_max_pooling() -> None:
+    x = torch.rand(2, 5, 6, generator=torch.Generator().manual_seed(0))
+    pooled = torch.nn.functional.max_pool2d(x, 3, stride=1, padding=1)
+    assert torch.equal(highest_3x3(x), pooled)
+    assert torch.equal(lowest_3x3(x), -torch.nn.functional.max_pool2d(-x, 3, stride=1, padding=1))

@@ -2,10 +2,8 @@
 
 import dataclasses
 
-import pytest
 import torch
 
-from egovcp import spec
 from egovcp.model import Batch, WorldModel
 from egovcp.model.foresight import foresight_losses
 from egovcp.model.losses import filter_sequence, pixel_weights
@@ -51,19 +49,3 @@ def test_nothing_is_foreseen_across_the_start_of_an_episode() -> None:
     torch.testing.assert_close(
         _losses(model, batch)["foresight_state"], _losses(model, other)["foresight_state"]
     )
-
-
-@pytest.mark.parametrize(("painted", "weighs"), [(False, 8.0), (True, 0.0)])
-def test_what_flies_weighs_more_around_its_place_unless_it_is_painted(
-    painted: bool, weighs: float
-) -> None:
-    model, batch = _model(moving=0.0, flight=7.0), random_batch(1, 3)
-    model.config = dataclasses.replace(model.config, paint_flight=painted)
-    batch.passing.zero_()
-    batch.passing[0, 1, spec.IN_PICTURE] = torch.tensor([20.0, 30.0, 2.0, 1.5])
-    near = torch.zeros((1, 3, spec.DEPTH_ROWS, spec.DEPTH_COLS))
-    weight = pixel_weights(near, batch, model)
-    assert weight[0, 1, 20, 30] == weighs
-    assert weight[0, 1, 20, 31] == weighs
-    assert weight[0, 1, 20, 33] == 1.0
-    assert (weight[0, [0, 2]] == 1.0).all()

@@ -22,7 +22,7 @@ from egovcp.model import (
     world_model_loss,
 )
 from egovcp.model.config import LossConfig
-from egovcp.model.threads import beside, one_thread
+from egovcp.model.threads import beside
 from egovcp.testing import CountingModel, random_batch, toy_model
 
 NOWHERE = FakeTensorMode()  # one for all: constants are kept for each device
@@ -32,12 +32,12 @@ CONFIGS = {
     "paper": PRESETS["paper"],
     "nothing foreseen": dataclasses.replace(
         PRESETS["debug"],
-        loss=LossConfig(foresight_depth=0.0, foresight_state=0.0, foresight_motion=0.0),
+        loss=LossConfig(foresight_depth=0.0, foresight_state=0.0),
     ),
     "rewards": dataclasses.replace(PRESETS["debug"], loss=LossConfig(reward=1.0)),
     "autoregressive": dataclasses.replace(PRESETS["debug"], dynamics="autoregressive"),
     "temporal differences": dataclasses.replace(PRESETS["debug"], loss=LossConfig(q_target="td")),
-    "bins": dataclasses.replace(PRESETS["debug"], value_loss="two_hot"),
+    "squared error of Q": dataclasses.replace(PRESETS["debug"], value_loss="mse"),
 }
 
 
@@ -132,12 +132,6 @@ def test_an_error_of_either_is_raised_when_both_have_ended(fails: int, threads: 
     assert torch.get_num_threads() == threads
 
 
-def test_what_is_too_small_to_be_shared_has_one_thread(threads: int) -> None:
-    with one_thread():
-        assert torch.get_num_threads() == 1
-    assert torch.get_num_threads() == threads
-
-
 class NoCopies(TorchDispatchMode):
     """Fails where something is copied from the processor to a GPU: so are the numbers of a list in
     brackets."""
@@ -159,7 +153,7 @@ class NoCopies(TorchDispatchMode):
     torch.cuda.is_available(), reason="what is kept for a device would be no tensor"
 )
 @pytest.mark.parametrize(
-    "name", ["rewards", "autoregressive", "temporal differences", "bins", "default"]
+    "name", ["rewards", "autoregressive", "temporal differences", "squared error of Q", "default"]
 )
 def test_nothing_of_a_loss_waits_for_a_gpu(name: str) -> None:
     """Tensors without numbers, on a device that is not there: what depends on a number fails."""

@@ -6,7 +6,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from egovcp import spec
 from egovcp.model import PRESETS, Batch, Carry, LossConfig, WorldModel, world_model_loss
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.losses import (
@@ -69,10 +68,9 @@ def test_a_seed_repeats_the_loss_bit_for_bit(model: WorldModel, batch: Batch) ->
     assert _loss(model, batch, seed=1) != _loss(model, batch, seed=2)
 
 
-def test_without_gradients_pictures_are_looked_at_in_pieces(
+def test_without_gradients_images_are_encoded_in_pieces(
     model: WorldModel, batch: Batch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert model.config.follows_flight
     with torch.no_grad():
         at_once = filter_sequence(model, batch, sample=False)
         seen: list[int] = []
@@ -128,18 +126,6 @@ def test_rows_without_a_complete_return_do_not_train_the_value(
     assert _loss(model, masked) != _loss(model, batch)
 
 
-def test_metres_are_never_in_eight_bits(model: WorldModel, batch: Batch) -> None:
-    """A path is followed in float32, whatever the precision of the products."""
-    with torch.autocast("cpu", torch.bfloat16):
-        followed = filter_sequence(model, batch).carry.flight
-    exact = filter_sequence(model, batch).carry.flight
-    assert followed is not None
-    assert exact is not None
-    assert followed.dtype == torch.float32
-    where = slice(8, 20)  # heading, axes and position of the camera: of proprioception alone
-    assert torch.equal(followed[..., where], exact[..., where])
-
-
 def test_burn_in_rows_fill_the_memory_but_are_not_trained_on(
     model: WorldModel, batch: Batch
 ) -> None:
@@ -179,7 +165,7 @@ def _counted(batch: Batch) -> Rollout:
     h[..., CountingModel.COUNT] = torch.arange(length)
     z = torch.zeros(size, length, model.config.latent)
     flat = Gaussian(z, torch.ones_like(z))
-    return Rollout(Carry(h, z), flat, flat, torch.zeros(1), batch.state, torch.zeros(1))
+    return Rollout(Carry(h, z), flat, flat, torch.zeros(1), batch.state)
 
 
 def test_termination_judges_the_state_that_the_action_has_produced() -> None:
@@ -214,7 +200,7 @@ def test_a_fall_after_row_t_pulls_only_the_state_imagined_from_row_t(t: int) -> 
     h = torch.randn(1, 5, model.config.hidden, requires_grad=True)
     z = torch.randn(1, 5, model.config.latent)
     flat = Gaussian(z, torch.ones_like(z))
-    rollout = Rollout(Carry(h, z), flat, flat, torch.zeros(1), batch.state, torch.zeros(1))
+    rollout = Rollout(Carry(h, z), flat, flat, torch.zeros(1), batch.state)
     fall = batch.terminal_next.clone()
     fall[0, t] = True
 
@@ -281,37 +267,6 @@ def test_a_window_of_one_row_is_trainable(model: WorldModel) -> None:
     assert all(torch.isfinite(torch.tensor(list(terms.values()))))
 
 
-@pytest.mark.filterwarnings("ignore:Initializing zero-element tensors")
-@pytest.mark.parametrize("ahead", [(), (0,), (2, 9), (9,)])
-def test_motion_may_be_foretold_for_any_ticks_ahead_or_none(ahead: tuple[int, ...]) -> None:
-    """Ticks beyond the window ask for nothing."""
-
-    def motion(ahead: tuple[int, ...]) -> float:
-        torch.manual_seed(0)
-        config = dataclasses.replace(PRESETS["debug"], motion_ahead=ahead, paint_flight=False)
-        model = WorldModel(config)
-        for parameter in model.decode_sight.parameters():
-            torch.nn.init.zeros_(parameter)
-        return _loss(model, random_batch(2, 4))["loss/motion"]
-
-    assert (motion(ahead) > motion(())) == any(k < 4 for k in ahead)
-
-
-def test_a_place_is_asked_for_only_where_something_is_known_to_fly() -> None:
-    batch = random_batch(2, 4)
-    batch.passing[..., 4] = 1.0
-    batch.passing[..., spec.IN_PICTURE] = torch.tensor([20.0, 30.0, 0.0, 2.0])
-    nowhere = _loss(toy_model(), batch)["loss/motion"]
-    batch.passing[..., 5] = 40.0  # another row
-    assert _loss(toy_model(), batch)["loss/motion"] == nowhere
-    batch.passing[:, 1, 7] = 3.0
-    somewhere = _loss(toy_model(), batch)["loss/motion"]
-    assert somewhere > nowhere
-    batch.passing[:, 1, 4] = 0.0
-    unknown = _loss(toy_model(), batch)["loss/motion"]
-    assert unknown < somewhere
-
-
 def _leaves(seed: int) -> Gaussian:
     rng = torch.Generator().manual_seed(seed)
     mean = torch.randn(2, 3, 4, generator=rng).requires_grad_()
@@ -323,7 +278,7 @@ def _leaves(seed: int) -> Gaussian:
 def test_each_kl_term_moves_one_side(term: str, moved: str) -> None:
     q, p = _leaves(0), _leaves(1)
     empty = torch.zeros(1)
-    rollout = Rollout(Carry(empty, empty), q, p, empty, empty, empty)
+    rollout = Rollout(Carry(empty, empty), q, p, empty, empty)
     losses = kl_losses(rollout, torch.ones(2, 3).bool(), LossConfig(free_nats=0.0))
     sides = {"posterior": q.mean, "prior": p.mean}
     gradients = torch.autograd.grad(losses[term], tuple(sides.values()), allow_unused=True)
@@ -335,7 +290,7 @@ def test_kl_below_the_free_nats_costs_its_floor_and_moves_nothing() -> None:
     q = _leaves(0)
     p = Gaussian((q.mean.detach() + 0.01).requires_grad_(), q.std.detach())
     empty = torch.zeros(1)
-    rollout = Rollout(Carry(empty, empty), q, p, empty, empty, empty)
+    rollout = Rollout(Carry(empty, empty), q, p, empty, empty)
     losses = kl_losses(rollout, torch.ones(2, 3).bool(), LossConfig(free_nats=1.0, kl_prior=1.0))
     assert losses["kl_prior"].item() == 1.0
     (gradient,) = torch.autograd.grad(losses["kl_prior"], p.mean)

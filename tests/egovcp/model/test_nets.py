@@ -1,49 +1,43 @@
-"""The heads of Q and what they are told."""
-
-import copy
+"""Initialisation of the networks, and the interface of the value head."""
 
 import pytest
 import torch
 
-from egovcp.errors import UsageError
-from egovcp.model import LossConfig, WorldModel, WorldModelConfig
-from egovcp.model.nets import SplitMlp
+from egovcp import spec
+from egovcp.model import PRESETS, WorldModel
+from egovcp.model.nets import SplitLinear, SplitMlp
 
 
-def test_a_restarted_mlp_starts_like_a_new_one():
-    """One Linear on all inputs: each part's weights stay below 1 / sqrt(7 + 2)."""
+def test_split_linear_is_a_linear_on_the_concatenated_inputs():
+    layer = SplitLinear((7, 2), 5)
+    joined = torch.nn.Linear(9, 5, bias=False)
+    joined.weight.data = torch.cat([part.weight for part in layer.parts], 1)
+    first, second = torch.randn(3, 7), torch.randn(3, 2)
+    torch.testing.assert_close(layer(first, second), joined(torch.cat([first, second], 1)))
+
+
+def test_split_linear_is_initialised_by_the_number_of_all_inputs():
+    """Like a Linear with 7 + 2 inputs: weights uniform within 1 / sqrt(9)."""
     torch.manual_seed(0)
-    mlp = SplitMlp((7, 2), 512, 1, hidden_layers=2)
-    before = copy.deepcopy(mlp.state_dict())
-    mlp.restart()
-    for new, old in zip(mlp.first.parts, SplitMlp((7, 2), 512, 1).first.parts, strict=True):
-        assert float(new.weight.detach().abs().max()) <= 1 / 3
-        assert float(new.weight.detach().std()) == pytest.approx(
-            float(old.weight.detach().std()), rel=0.1
-        )
-    assert not torch.equal(mlp.state_dict()["first.parts.0.weight"], before["first.parts.0.weight"])
-    assert not torch.equal(mlp.state_dict()["rest.2.weight"], before["rest.2.weight"])
-    assert not mlp(torch.randn(3, 7), torch.randn(3, 2)).any()
+    for part in SplitLinear((7, 2), 512).parts:
+        weight = part.weight.detach()
+        assert float(weight.abs().max()) <= 1 / 3
+        assert float(weight.std()) == pytest.approx(1 / 3 / 3**0.5, rel=0.1)
 
 
-def test_a_value_told_of_what_nothing_teaches_is_refused():
-    with pytest.raises(UsageError, match=r"value_of_passing.*loss\.passing"):
-        WorldModelConfig(loss=LossConfig(passing=0.0))
+def test_mlp_that_starts_at_zero_answers_zero():
+    mlp = SplitMlp((7, 2), 16, 3, hidden_layers=2)
+    inputs = torch.randn(4, 7), torch.randn(4, 2)
+    assert mlp(*inputs).any()
+    mlp.start_at_zero()
+    assert not mlp(*inputs).any()
 
 
-@pytest.mark.parametrize(
-    ("config", "message"),
-    [
-        ({"loss": LossConfig(motion=0.0)}, r"paint_flight.*loss\.motion"),
-        ({"motion_ahead": (3,)}, r"motion_ahead \[3\].*first must be 0"),
-    ],
-)
-def test_nothing_is_painted_where_nothing_teaches_the_place(config, message):
-    with pytest.raises(UsageError, match=message):
-        WorldModelConfig(**config)
-
-
-@pytest.mark.parametrize("told", [False, True])
-def test_q_has_a_part_for_what_is_on_its_way_only_if_told(told):
-    model = WorldModel(WorldModelConfig(value_of_passing=told))
-    assert (model.passing_value_head is not None) == told
+def test_value_head_reads_the_whole_state_and_the_action():
+    config = PRESETS["debug"]
+    head = WorldModel(config).value_head
+    assert [part.in_features for part in head.first.parts] == [
+        config.hidden,
+        config.latent,
+        spec.ACTION_DIM,
+    ]

@@ -39,13 +39,11 @@ def _config(**changes: object) -> WorldModelConfig:
 OPTIONS: dict[str, dict[str, object]] = {
     "no near": {"loss__near": 0.0},
     "dimension": {"loss__free_nats_per": "dimension"},
-    "two_hot": {"value_loss": "two_hot"},
-    "heads": {"q_heads": 3},
-    "heads without what is on its way": {"q_heads": 2, "value_of_passing": False},
+    "mse": {"value_loss": "mse"},
     "reward": {"loss__reward": 2.0},
     "autoregressive": {"dynamics": "autoregressive", "loss__autoregressive_steps": 3},
-    "td": {"loss__q_target": "td", "q_heads": 2},
-    "all": {"value_loss": "two_hot", "q_heads": 2, "loss__reward": 1.0, "value_state": 0},
+    "td": {"loss__q_target": "td"},
+    "td and reward": {"loss__q_target": "td", "loss__reward": 1.0},
 }
 
 
@@ -60,16 +58,15 @@ def test_every_option_trains_and_keeps_the_contract(name: str) -> None:
         assert tensor.grad.isfinite().all(), parameter
 
 
-def test_what_is_not_asked_for_adds_no_parameters_and_no_terms(batch: Batch) -> None:
-    model = toy_model(_config(q_heads=1))
-    names = {name.split(".")[0] for name in model.state_dict()}
-    assert not names & {"more_value_heads", "reward_head"}
+def test_model_has_a_reward_head_and_a_reward_loss_only_on_request(batch: Batch) -> None:
+    names = {name.split(".")[0] for name in toy_model().state_dict()}
+    assert "reward_head" not in names
     _, terms = world_model_loss(toy_model(), batch, torch.Generator().manual_seed(0))
     assert "loss/reward" not in terms
 
 
-@pytest.mark.parametrize("name", ["two_hot", "heads", "reward"])
-def test_options_of_the_heads_leave_the_rest_of_a_seed_alone(name: str) -> None:
+@pytest.mark.parametrize("name", ["mse", "reward"])
+def test_options_of_the_heads_do_not_change_the_other_initial_weights(name: str) -> None:
     one, two = toy_model(), toy_model(_config(**OPTIONS[name]))
     for part in ("encode_depth", "gru", "prior", "decode_depth"):
         first, second = (getattr(m, part).state_dict() for m in (one, two))
@@ -83,29 +80,6 @@ def _asked(model: WorldModel) -> tuple[Carry, torch.Tensor]:
         return filter_sequence(model, batch, sample=False).carry, batch.action
 
 
-def test_q_is_the_mean_of_its_heads_and_the_lowest_is_below() -> None:
-    model = toy_model(_config(q_heads=3))
-    model.return_mean.fill_(-2.0)
-    model.return_std.fill_(3.0)
-    carry, action = _asked(model)
-    with torch.no_grad():
-        states, shared = model.q_heads
-        assert shared is not None
-        both = shared(model.passing(carry), action)
-        alone = torch.stack([head(carry.h, carry.z, action) + both for head in states]).squeeze(-1)
-        torch.testing.assert_close(model.value(carry, action), 3.0 * alone.mean(0) - 2.0)
-        torch.testing.assert_close(model.lowest_value(carry, action), 3.0 * alone.amin(0) - 2.0)
-    assert len(alone) == 3
-    assert (alone.std(0) > 0).all()
-
-
-def test_one_head_has_no_second_opinion() -> None:
-    model = toy_model(_config(q_heads=1))
-    carry, action = _asked(model)
-    with torch.no_grad():
-        assert torch.equal(model.value(carry, action), model.lowest_value(carry, action))
-
-
 @pytest.mark.parametrize("kind", ["mse", "two_hot"])
 def test_a_new_q_is_the_mean_return(kind: str) -> None:
     model = WorldModel(_config(value_loss=kind)).eval()
@@ -114,11 +88,6 @@ def test_a_new_q_is_the_mean_return(kind: str) -> None:
     with torch.no_grad():
         value = model.value(carry, action)
     torch.testing.assert_close(value, torch.full_like(value, -2.0), atol=1e-4, rtol=0)
-
-
-def test_no_heads_at_all_are_refused() -> None:
-    with pytest.raises(UsageError, match="q_heads=0: expected"):
-        WorldModelConfig(q_heads=0)
 
 
 # --- reward -----------------------------------------------------------------------------
@@ -158,7 +127,6 @@ def test_the_reward_is_learned_on_filtered_and_imagined_states() -> None:
 # --- losses -----------------------------------------------------------------------------
 def test_near_pixels_count_more_and_only_they() -> None:
     batch = random_batch(1, 1)
-    batch.passing.zero_()
     near = torch.tensor([[[[0.9, 0.72, 0.68, 0.2]]]])
     loss = LossConfig(near=9.0, near_threshold=0.7, moving=0.0)
     model = WorldModel(dataclasses.replace(PRESETS["debug"], loss=loss))
@@ -170,9 +138,7 @@ def test_free_nats_are_for_the_step_or_for_each_dimension(per: str, expected: fl
     """All KL, 4 nats, in one of four dimensions: its share is one quarter of a nat."""
     mean = torch.tensor([[[8.0**0.5, 0.0, 0.0, 0.0]]])
     one, zero = torch.ones(1, 1, 4), torch.zeros(1)
-    rollout = Rollout(
-        Carry(zero, zero), Gaussian(mean, one), Gaussian(0 * mean, one), zero, zero, zero
-    )
+    rollout = Rollout(Carry(zero, zero), Gaussian(mean, one), Gaussian(0 * mean, one), zero, zero)
     config = LossConfig(free_nats=1.0, free_nats_per=per, kl_prior=1.0)  # type: ignore[arg-type]
     losses = kl_losses(rollout, torch.ones(1, 1).bool(), config)
     assert losses["kl_prior"].item() == pytest.approx(expected)

@@ -10,20 +10,18 @@ from egovcp.model import PRESETS, Batch, Carry, LossConfig, WorldModel, WorldMod
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.losses import Rollout
 from egovcp.model.outcomes import value_and_termination_losses, value_target
-from egovcp.model.td import SlowHeads, td_target
+from egovcp.model.td import TargetNetwork, td_target
 from egovcp.testing import random_batch, toy_model
 
 DEBUG = PRESETS["debug"]
 CHAINS, STEPS, RATE = 32, 500, 1e-2
-TD = LossConfig(q_target="td", passing=0.0, imagined_steps=0)
+TD = LossConfig(q_target="td", value=1.0, imagined_steps=0)
 CHAIN = WorldModelConfig(
     hidden=12,
     latent=2,
     units=32,
     channels=(4, 8, 8),
-    value_state=0,
-    q_heads=1,
-    value_of_passing=False,
+    value_loss="mse",
     loss=TD,
 )
 
@@ -47,7 +45,7 @@ def _states(model: WorldModel, batch: Batch, seed: int = 0) -> Carry:
 def _rollout(carry: Carry) -> Rollout:
     flat = Gaussian(carry.z, torch.ones_like(carry.z))
     none = torch.zeros(1)
-    return Rollout(carry, flat, flat, none, none, none)
+    return Rollout(carry, flat, flat, none, none)
 
 
 # --- targets --------------------------------------------------------------------------------
@@ -117,35 +115,34 @@ def test_no_gradient_goes_through_the_target() -> None:
     assert not found[0, 1:].any()
 
 
-# --- the slow copy --------------------------------------------------------------------------
-@pytest.mark.parametrize("change", [{}, {"q_heads": 3}, {"value_of_passing": False}])
-def test_the_slow_heads_answer_as_the_model_did(change: dict[str, object]) -> None:
-    model, batch = _model(**change), random_batch(2, 4)
-    carry, slow = _states(model, batch), SlowHeads(model)
+# --- the target network ---------------------------------------------------------------------
+@pytest.mark.parametrize("kind", ["mse", "two_hot"])
+def test_target_network_keeps_the_values_while_the_model_changes(kind: str) -> None:
+    model, batch = _model(value_loss=kind), random_batch(2, 4)
+    carry, network = _states(model, batch), TargetNetwork(model)
     with torch.no_grad():
         before = model.value(carry, batch.action)
-        for head in model.q_heads.states:
-            for parameter in head.parameters():
-                parameter.add_(0.1)
-        assert not torch.equal(model.value(carry, batch.action), before)
-        torch.testing.assert_close(model.value_by(slow.heads, carry, batch.action), before)
-        target, _ = td_target(model, carry, batch, slow.heads)
+        for parameter in model.value_head.parameters():
+            parameter.add_(0.1 * torch.randn_like(parameter))
+        assert not torch.allclose(model.value(carry, batch.action), before)
+        torch.testing.assert_close(model.value_by(network.head, carry, batch.action), before)
+        target, _ = td_target(model, carry, batch, network.head)
         torch.testing.assert_close(target[:, :-1], (batch.reward[:, :-1] + 0.9 * before[:, 1:]))
-    assert not any(p.requires_grad for p in slow.parameters())
+    assert not any(p.requires_grad for p in network.parameters())
 
 
 @pytest.mark.parametrize(("decay", "expected"), [(0.75, 1.0), (0.0, 4.0)])
-def test_the_slow_heads_follow_at_their_pace(decay: float, expected: float) -> None:
-    model = _model(q_heads=2)
-    live = [p for part in model.q_heads.parts for p in part.parameters()]
+def test_target_network_keeps_the_decay_of_each_weight(decay: float, expected: float) -> None:
+    model = _model()
+    live = list(model.value_head.parameters())
     with torch.no_grad():
         torch._foreach_zero_(live)
-        slow = SlowHeads(model)
+        network = TargetNetwork(model)
         torch._foreach_add_(live, 4.0)
-    slow.follow(model, decay)
-    for parameter in slow.parameters():
+    network.update(model, decay)
+    for parameter in network.parameters():
         torch.testing.assert_close(parameter, torch.full_like(parameter, expected))
-    assert len(list(slow.parameters())) == len(live)
+    assert len(list(network.parameters())) == len(live)
 
 
 # --- where it leads ---------------------------------------------------------------------------
@@ -163,7 +160,7 @@ def _learn(states: int, loop: bool, gamma: float) -> Tensor:
     torch.manual_seed(0)
     model = WorldModel(CHAIN)
     model.discount.fill_(gamma)
-    slow, recorded = SlowHeads(model), random_batch(CHAINS, 3)
+    network, recorded = TargetNetwork(model), random_batch(CHAINS, 3)
     optimizer = torch.optim.Adam(model.value_head.parameters(), lr=RATE)
     for step in range(STEPS):
         optimizer.param_groups[0]["lr"] = RATE * (1 - 0.95 * step / STEPS)
@@ -173,11 +170,11 @@ def _learn(states: int, loop: bool, gamma: float) -> Tensor:
         batch = recorded._replace(
             reward=last.float(), valid=~over, terminal_next=last & ~over & (not loop)
         )
-        losses = value_and_termination_losses(model, rollout, batch, TD, slow.heads)
+        losses = value_and_termination_losses(model, rollout, batch, TD, network.head)
         optimizer.zero_grad()
         losses["value"].backward()  # type: ignore[no-untyped-call]
         optimizer.step()
-        slow.follow(model, 0.8)
+        network.update(model, 0.8)
     carry = _walks(model, torch.arange(states), 1, states, loop).carry
     with torch.no_grad():
         return model.value(carry, torch.zeros(states, 1, 7)).flatten()

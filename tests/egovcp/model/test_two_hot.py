@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from egovcp.model import two_hot, value
+from egovcp.model import two_hot
 
 NUMBERS = [0.0, 0.03, -0.7, 1.0, 5.5, -20.0, 50.0]
 
@@ -37,14 +37,3 @@ def test_a_distribution_fitted_to_numbers_says_their_mean() -> None:
 def test_equal_log_odds_say_zero() -> None:
     """So that a head that starts at zero starts at the mean return."""
     assert two_hot.decode(torch.zeros(3, two_hot.BINS)).abs().max() < 1e-5
-
-
-@pytest.mark.parametrize("kind", ["mse", "two_hot"])
-def test_a_part_is_judged_together_with_what_is_known(kind: value.ValueLoss) -> None:
-    rng = torch.Generator().manual_seed(0)
-    outputs, known = (torch.randn(5, value.width(kind), generator=rng) for _ in range(2))
-    target = torch.randn(5, generator=rng)
-    torch.testing.assert_close(
-        value.error_beyond(outputs, known, target, kind), value.error(outputs + known, target, kind)
-    )
-    assert value.read(outputs, kind).shape == (5,)

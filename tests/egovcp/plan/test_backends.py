@@ -11,8 +11,8 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.errors import UsageError
-from egovcp.model import PRESETS, Carry, WorldModel, flight
-from egovcp.model.config import FlightConfig, LossConfig
+from egovcp.model import PRESETS, Carry, WorldModel
+from egovcp.model.config import LossConfig
 from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
 from egovcp.plan.backends import judge_of_model, library
 from egovcp.plan.backends.judges import FloatJudge, IntegerJudge
@@ -24,23 +24,16 @@ needs_compiler = pytest.mark.skipif(library.compiler() is None, reason="no C com
 EXACT, BYTES = 1e-5, 0.1  # largest error, in deviations of J
 TOLERANCES = [
     ("float32", EXACT),
-    ("bfloat16", BYTES),
     pytest.param("int8", BYTES, marks=needs_compiler),
 ]
 MODELS = [
     {},
-    {"value_state": 0},
-    {"value_of_passing": False},
-    {"flight": FlightConfig(enabled=False)},
-    {"q_heads": 3},
-    {"value_loss": "two_hot"},
-    {"value_loss": "two_hot", "q_heads": 2},
+    {"value_loss": "mse"},
     {"hidden": 48, "units": 64, "latent": 12},
 ]
 QUESTIONS = [
     {},
     {"latent": "sample"},
-    {"ensemble": "min"},
     {"termination_rule": "survival"},
     {"termination_rule": "paper"},
     {"objective": "reward"},
@@ -62,12 +55,7 @@ def _carry(model: WorldModel, robots: int = 3, seed: int = 0) -> Carry:
     rng = torch.Generator().manual_seed(seed)
     h = 2 * torch.rand(robots, model.config.hidden, generator=rng) - 1
     z = torch.randn(robots, model.config.latent, generator=rng)
-    if not model.config.follows_flight:
-        return Carry(h, z)
-    memory = torch.rand(robots, flight.SIZE, generator=rng)
-    memory[:, 3] *= 0.3  # s: some of it passes within the plan
-    memory[0, :4] = 0.0  # nothing flies at the first robot
-    return Carry(h, z, memory)
+    return Carry(h, z)
 
 
 def _actions(robots: int = 3, plans: int = 65, horizon: int = 4, seed: int = 1) -> Tensor:
@@ -109,18 +97,6 @@ def test_plans_are_worth_the_same(
 
 
 @pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
-def test_a_memory_without_a_flight_is_asked_what_the_state_says(
-    backend: BackendName, tolerance: float
-) -> None:
-    model, config = _model(), PlannerConfig(backend="eager")
-    carry, actions = _carry(model)._replace(flight=None), _actions()
-    expected = _values(model, config, carry, actions)
-    found = _values(model, dataclasses.replace(config, backend=backend), carry, actions)
-    error = (found - expected).abs().flatten().sort().values
-    assert error[: int(0.97 * len(error))].max() < tolerance * expected.std()
-
-
-@pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
 @pytest.mark.parametrize("horizon", [1, 2, 7])
 def test_any_horizon(backend: BackendName, tolerance: float, horizon: int) -> None:
     model = _model()
@@ -155,7 +131,7 @@ def test_a_robot_is_judged_the_same_alone_and_in_a_crowd(
     for e in range(3):
         row = carry.map(lambda x, e=e: x[e : e + 1])  # type: ignore[misc]
         alone = _values(model, config, row, actions[e : e + 1])
-        allowed = 0.0 if backend == "int8" else EXACT if backend == "float32" else BYTES
+        allowed = 0.0 if backend == "int8" else EXACT
         assert (together[e] - alone[0]).abs().max() <= allowed * together.std()
 
 
@@ -280,26 +256,14 @@ def test_a_model_that_thinks_for_itself_is_asked_step_by_step() -> None:
     assert isinstance(judge_of_model(CountingModel(), PlannerConfig()), StepByStep)
 
 
-@pytest.mark.slow
-def test_torch_compile_says_the_same() -> None:
-    model = _model()
-    carry, actions = _carry(model), _actions()
-    eager, compiled = (
-        _values(model, PlannerConfig(backend=name), carry, actions)  # type: ignore[arg-type]
-        for name in ("eager", "compile")
-    )
-    torch.testing.assert_close(compiled, eager, rtol=1e-4, atol=1e-4)
-
-
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-@pytest.mark.parametrize(("backend", "tolerance"), [("float32", 1e-3), ("bfloat16", BYTES)])
-def test_the_same_on_a_gpu(backend: BackendName, tolerance: float) -> None:
+def test_the_same_on_a_gpu() -> None:
     model = _model()
     carry, actions = _carry(model), _actions()
     expected = _values(model, PlannerConfig(backend="eager"), carry, actions)
     there = carry.map(lambda x: x.cuda())
     with torch.no_grad():
-        judge = judge_of_model(model.cuda(), PlannerConfig(backend=backend))
+        judge = judge_of_model(model.cuda(), PlannerConfig(backend="float32"))
         found = judge.at(there)(actions.cuda(), None).cpu()
-    assert (found - expected).abs().median() < tolerance * expected.std()
+    assert (found - expected).abs().median() < 1e-3 * expected.std()

@@ -79,8 +79,6 @@ def _model() -> WorldModel:
     model.return_std.fill_(2.0)
     model.return_floor.fill_(-4.0)
     model.discount.fill_(0.8)
-    with torch.no_grad():
-        model.termination_head.rest[-1].bias.sub_(2.0)  # type: ignore[operator, union-attr]
     return model
 
 
@@ -104,7 +102,7 @@ def _by_loop(model: WorldModel, carry: Carry, plan: Tensor, config: PlannerConfi
     for k in range(ends + 1):
         action = plan[k : k + 1]
         if k == n or config.objective == "value":
-            worth, worst = float(model.lowest_value(carry, action)), floor
+            worth, worst = float(model.value(carry, action)), floor
         else:
             worth, worst = float(model.reward(carry, action)), (1 - gamma) * floor
         weight = 1 / n if config.objective == "value" else gamma**k

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from egovcp_experiment.studies import open_loop, value_maps
 from egovcp_experiment.tools import read_json
@@ -34,6 +35,32 @@ def test_films_begin_with_what_was_filtered(flags: list[str], tmp_path: Path) ->
         assert np.shape(strip["foreseen"]) == np.shape(strip["seen"])
     assert found["errors_m"]["0"]["repeat"] == 0.0
     assert found["errors_m"]["16"]["model"] > 0.0
+
+
+def test_the_ball_is_measured_where_it_is_seen(flags: list[str], tmp_path: Path) -> None:
+    assert open_loop.main([*flags, "--task=ball"]) == 0
+    found = read_json(tmp_path / "out" / "result.json")
+    assert found["episodes"] == 2
+    first = found["errors_m"]["0"]
+    assert first["ball_images"] == 2
+    assert first["repeat_ball"] == 0.0
+    assert found["errors_m"]["4"]["repeat_ball"] > 0.3
+    assert first["model_ball"] > 0.0
+
+
+def test_errors_of_the_ball_are_those_of_its_pixels() -> None:
+    ball = np.zeros((48, 64), bool)
+    ball[10:14, 20:24] = True
+    truth = np.where(ball, 2.0, 4.0)
+    near, gone = truth + 0.1, np.zeros_like(truth)
+    triples = [(near, truth, gone), (gone, truth, gone), (near, truth, truth)]
+    found = open_loop.ball_errors(triples, [ball, ball, ball & False])
+    assert found["ball_images"] == 2  # the third does not show it
+    assert found["model_ball"] == pytest.approx((0.1 + 3.0) / 2)  # nothing in range: 5 m
+    assert found["repeat_ball"] == pytest.approx(3.0)
+    assert found["ball_detected"] == 0.5
+    none = open_loop.ball_errors([], [])
+    assert none["model_ball"] is none["ball_detected"] is None
 
 
 def test_films_follow_the_actions_that_were_sent() -> None:

@@ -20,8 +20,7 @@ def _group(task: str, seed: int) -> Recorded:
     batch = random_batch(3, 24, seed)
     fails = batch.terminal_next.clone()
     fails[0, -1] = task == "wall"
-    ball = torch.zeros(batch.depth.shape, dtype=torch.bool)
-    return Recorded(task, batch._replace(terminal_next=fails), ball)
+    return Recorded(task, batch._replace(terminal_next=fails))
 
 
 def test_tasks_are_judged_apart_and_groups_of_a_task_together() -> None:
@@ -72,14 +71,13 @@ def test_the_report_is_json_and_its_scalars_leave_out_what_is_unknown() -> None:
     found = scalars(tasks)
     assert found["ball/depth_valid_h4"] == tasks["ball"]["depth"]["valid"]["4"]["model_mm"]
     assert found["ball/value_slope"] == tasks["ball"]["value"]["slope"]
-    assert not any("termination" in name or "depth_ball" in name for name in found)
+    assert not any("termination" in name for name in found)
 
 
 def test_the_table_has_a_line_for_everything_that_was_measured() -> None:
     text = table(measure(toy_model(), [_group("ball", 0), _group("wall", 1)]).tasks)
     for words in ("ball: 3 episodes, 72 rows", "joint_velocity", "termination AUC  -", "R2"):
         assert words in text
-    assert "in flight" not in text
 
 
 def test_episodes_are_spread_evenly() -> None:

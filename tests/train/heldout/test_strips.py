@@ -15,12 +15,11 @@ from egovcp_train.heldout.report import Values
 from egovcp_train.heldout.strips import KEPT, STRIP, Strip, best, strips
 
 
-def _strips(batch: Batch, ball: torch.Tensor | None = None) -> list[Strip]:
+def _strips(batch: Batch) -> list[Strip]:
     model = toy_model()
-    none = torch.zeros(batch.depth.shape, dtype=torch.bool)
     with torch.no_grad():
         rollout = filter_sequence(model, batch, sample=False)
-        return strips(model, Recorded("ball", batch, none if ball is None else ball), rollout)
+        return strips(model, Recorded("ball", batch), rollout)
 
 
 def _still(length: int = 40) -> Batch:
@@ -37,14 +36,6 @@ def test_a_strip_starts_before_what_moves() -> None:
     assert len(seen) > 0
     assert np.allclose(seen, 0.8)
     assert first.foreseen.shape == (len(STRIP), spec.DEPTH_ROWS, spec.DEPTH_COLS)
-
-
-def test_a_thing_in_flight_comes_first_once_it_has_been_watched() -> None:
-    batch = _still()
-    batch.depth[3, 25:] = 1000
-    ball = torch.zeros(batch.depth.shape, dtype=torch.bool)
-    ball[1, 9:15, 20:22, 20:22] = True
-    assert _strips(batch, ball)[0].start == 9 + CONTEXT - 1
 
 
 def test_the_first_picture_is_filtered_and_the_others_are_imagined() -> None:

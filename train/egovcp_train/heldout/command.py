@@ -22,15 +22,13 @@ from egovcp.outputs import require_writable
 from egovcp.policy_options import PolicyOptions
 from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
-from egovcp.trained import returns_of, trained_with
+from egovcp.trained import returns_of
 from egovcp_train.device import choose_device
 from egovcp_train.heldout.episodes import recorded
 from egovcp_train.heldout.pictures import draw
 from egovcp_train.heldout.recording import record
 from egovcp_train.heldout.report import Report, measure
 from egovcp_train.heldout.table import table
-from egovcp_train.labels.config import PassingConfig
-from egovcp_train.labels.passing import label
 from egovcp_train.return_scale import ReturnScale, on_task_scales
 
 PROG: Final = "egovcp-eval-model"
@@ -52,9 +50,6 @@ class HeldoutConfig:
     """Policy to measure."""
     dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
     """Dataset with the episodes."""
-    return_steps: int | None = bounded(None, least=1, most=100_000)
-    """Horizon of the returns that Q is compared with, ticks; null: that of the training, if its
-    datasets had but one."""
     split: str = "heldout"
     """heldout, train or all; episodes are held out by a hash, the same ones in each training."""
     episodes: int = bounded(64, least=0, most=1_000_000)
@@ -92,10 +87,9 @@ def evaluate(config: HeldoutConfig) -> None:
     reader = DatasetReader.open(config.dataset)
     artefact = load_artefact(config.policy.path, config.policy.revision)
     require_same_controller(artefact, reader)
-    passing = trained_with(artefact, "passing", PassingConfig)
-    returns = returns_of(artefact, config.return_steps)
+    returns = returns_of(artefact)
     limit = config.episodes or None
-    store = label(EpisodeStore.load([reader], config.split, returns, per_task=limit), passing)
+    store = EpisodeStore.load([reader], config.split, returns, per_task=limit)
     if returns.scale == "per_task":
         store = on_task_scales(store, _return_scales(artefact))
     model = artefact.world_model.to(device)

@@ -12,33 +12,24 @@ State errors are mean absolute differences in standard deviations of the trainin
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Final, NamedTuple
+from typing import Final
 
 import torch
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.model import Carry, WorldModel
+from egovcp.model import Batch, Carry, WorldModel
 from egovcp.model.losses import Rollout, moving_pixels
 from egovcp_train.heldout.episodes import Recorded
 
 HORIZONS: Final = (1, 2, 4, 8, 12, 16)
 CONTEXT: Final = 4  # frames that are filtered before anything is foreseen
-REGIONS: Final = ("valid", "near", "moving", "ball", "ball_watched")
-NEAR_M: Final = 1.5  # m; nearer than this is "near": hands, a wall within reach, a ball on arrival
+REGIONS: Final = ("valid", "near", "moving")
+NEAR_M: Final = 1.5  # m; upper end of the region "near", about the reach of the hands
 _MOVING: Final = 0.04  # change of nearness, 0.2 m of 5 m, as in the loss
 _IMAGES_AT_ONCE: Final = 1024
 
 type Errors = dict[str, dict[str, dict[str, float | int | None]]]
-
-
-class Starts(NamedTuple):
-    """The rows from which a group of episodes is foreseen."""
-
-    rows: Tensor
-    """(S,) row of each start."""
-    watched: Tensor
-    """(B, S) frames, up to and with that row, since a thing in flight was first sighted."""
 
 
 class OpenLoop:
@@ -56,11 +47,11 @@ class OpenLoop:
 
     def add(self, model: WorldModel, episodes: Recorded, rollout: Rollout) -> None:
         """Foresee one group of episodes, filtered as ``rollout``."""
-        starts = _starts(episodes, self.stride)
-        batch, s = episodes.batch, starts.rows
+        batch = episodes.batch
+        s = _starts(batch, self.stride)
         if len(s) == 0:
             return
-        regions = _regions(episodes, rollout.near, model.config.depth_max_m)
+        regions = _regions(rollout.near, model.config.depth_max_m)
         carry = rollout.carry.map(lambda x: x[:, s])
         last = batch.valid.shape[1] - 1
         for k in range(1, max(HORIZONS) + 1):
@@ -68,7 +59,7 @@ class OpenLoop:
             if k in HORIZONS:
                 exists = batch.valid[:, (s + k).clamp_max(last)] & (s + k <= last)
                 b, i = torch.nonzero(exists, as_tuple=True)
-                self._compare(model, carry, rollout, regions, starts, k, b, i)
+                self._compare(model, carry, rollout, regions, s, k, b, i)
 
     def _compare(
         self,
@@ -76,19 +67,18 @@ class OpenLoop:
         carry: Carry,
         rollout: Rollout,
         regions: Mapping[str, Tensor],
-        starts: Starts,
+        starts: Tensor,
         k: int,
         b: Tensor,
         i: Tensor,
     ) -> None:
         """Add the errors of starts ``i`` of episodes ``b`` at horizon ``k``."""
-        found, then = carry.map(lambda x: x[b, i]), starts.rows[i] + k
-        truth, before = rollout.state[b, then], rollout.state[b, starts.rows[i]]
+        found, then = carry.map(lambda x: x[b, i]), starts[i] + k
+        truth, before = rollout.state[b, then], rollout.state[b, starts[i]]
         foreseen = model.decode_state(found.h, found.z).float()
         errors = torch.stack([(foreseen - truth).abs().sum(0), (before - truth).abs().sum(0)])
         self._state[k] += errors.double().cpu()
         self._rows[k] += len(b)
-        watched = starts.watched[b, i]
         for some in torch.split(torch.arange(len(b), device=b.device), _IMAGES_AT_ONCE):
             bs, ts = b[some], then[some]
             image = model.picture(_some(found, some)).clamp(0.0, 1.0)
@@ -96,7 +86,7 @@ class OpenLoop:
             wrong = (image - truth).abs()
             still = (rollout.near[bs, ts - k] - truth).abs()
             for name, pixels in regions.items():
-                inside = pixels[bs, ts] & _counts(name, watched[some])[:, None, None]
+                inside = pixels[bs, ts]
                 sums = [(wrong * inside).sum(), (still * inside).sum(), inside.sum()]
                 scale = torch.tensor([1e3 * model.config.depth_max_m] * 2 + [1.0])
                 self._depth[name, k] += torch.stack([x.double() for x in sums]).cpu() * scale
@@ -132,27 +122,17 @@ def _some(carry: Carry, rows: Tensor) -> Carry:
     return carry.map(lambda x: x[rows])
 
 
-def _starts(episodes: Recorded, stride: int) -> Starts:
-    batch = episodes.batch
+def _starts(batch: Batch, stride: int) -> Tensor:
+    """(S,) rows from which states are imagined."""
     end = max(CONTEXT - 1, batch.valid.shape[1] - 1)
-    rows = torch.arange(CONTEXT - 1, end, stride, device=batch.valid.device)
-    sighted = episodes.ball.flatten(2).any(-1)
-    since = (sighted.cumsum(1) > 0).long().cumsum(1)
-    return Starts(rows, since[:, rows])
+    return torch.arange(CONTEXT - 1, end, stride, device=batch.valid.device)
 
 
-def _regions(episodes: Recorded, near: Tensor, max_m: float) -> dict[str, Tensor]:
+def _regions(near: Tensor, max_m: float) -> dict[str, Tensor]:
     """(B, T, 48, 64) bool each."""
     valid = near > 0
     return {
         "valid": valid,
         "near": near > 1 - NEAR_M / max_m,
         "moving": valid & (moving_pixels(near, _MOVING) > 0),
-        "ball": valid & episodes.ball,
-        "ball_watched": valid & episodes.ball,
     }
-
-
-def _counts(region: str, watched: Tensor) -> Tensor:
-    """(n,) frames of the flight that were filtered -> (n,) whether the region is judged."""
-    return watched >= {"ball": 1, "ball_watched": CONTEXT}.get(region, 0)

@@ -10,14 +10,13 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from egovcp.model import Carry, WorldModel
+from egovcp.model import Batch, Carry, WorldModel
 from egovcp.model.losses import Rollout, moving_pixels
 from egovcp_train.heldout.episodes import Recorded
 from egovcp_train.heldout.open_loop import CONTEXT, HORIZONS
 
 STRIP: Final = tuple(range(0, max(HORIZONS) + 1, 2))  # horizons of the pictures; 0 is filtered
 KEPT: Final = 3  # strips per task
-_BALL_PIXEL: Final = 1e4  # moving pixels that a pixel in flight is worth, when strips are picked
 
 
 class Strip(NamedTuple):
@@ -40,10 +39,9 @@ def best(found: Sequence[Strip]) -> list[Strip]:
 def strips(model: WorldModel, episodes: Recorded, rollout: Rollout) -> list[Strip]:
     """The most interesting predictions of a group of episodes, at most one each.
 
-    One starts when a thing in flight has been watched for `CONTEXT` frames or, where nothing
-    flies, before the ticks in which most pixels move.
+    One starts before the rows in which most pixels move.
     """
-    start, interest = _starts(episodes, rollout.near)
+    start, interest = _starts(episodes.batch, rollout.near)
     order = torch.argsort(-interest, stable=True)[:KEPT]
     return [
         _strip(model, episodes, rollout, int(b), int(start[b]), float(interest[b]))
@@ -52,23 +50,18 @@ def strips(model: WorldModel, episodes: Recorded, rollout: Rollout) -> list[Stri
     ]
 
 
-def _starts(episodes: Recorded, near: Tensor) -> tuple[Tensor, Tensor]:
+def _starts(batch: Batch, near: Tensor) -> tuple[Tensor, Tensor]:
     """(B,) row of the start, and (B,) its interest, negative where the episode is too short."""
-    batch, ahead = episodes.batch, max(HORIZONS)
+    ahead = max(HORIZONS)
     latest = batch.valid.sum(1) - 1 - ahead
-    flying = episodes.ball.sum((-2, -1)).float()
     moving = (moving_pixels(near, 0.04).sum((-2, -1)) * batch.valid).cumsum(1)
     window = torch.full_like(moving, -1.0)
     window[:, :-ahead] = moving[:, ahead:] - moving[:, :-ahead]
     rows = torch.arange(window.shape[1], device=window.device)
     possible = (rows >= CONTEXT - 1) & (rows <= latest[:, None])
     window = window.masked_fill(~possible, -1.0)
-    lively = window.argmax(1)
-    watched = (flying > 0).long().argmax(1) + CONTEXT - 1
-    thrown = (flying.sum(1) > 0) & (watched <= latest)
-    start = torch.where(thrown, watched, lively)
-    interest = window.gather(1, start[:, None])[:, 0]
-    return start, interest + _BALL_PIXEL * flying.sum(1) * thrown
+    interest, start = window.max(1)
+    return start, interest
 
 
 def _strip(

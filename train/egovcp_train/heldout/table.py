@@ -11,8 +11,6 @@ _REGIONS = {
     "valid": "depth, all pixels",
     "near": "depth, nearer than 1.5 m",
     "moving": "depth, moving",
-    "ball": "depth, ball in flight",
-    "ball_watched": "depth, ball after 4 frames",
 }
 
 

@@ -33,13 +33,13 @@ static void bytes_of_z(const Few *z, int latent, Bytes *bytes) {
 /* z of the prior, with noise [latent] or (null) its mean; also as bytes. */
 static void next_z(const Network *net, const Bytes *h, const float *noise, Few *z, Bytes *bytes) {
     float out[ROWS * MOST_FEW];
-    const int latent = net->latent, outputs = net->prior_outputs;
+    const int latent = net->latent;
     Fixed x;
     Bytes between;
     hidden(net, &net->prior, (Inputs){.wide = h}, &x, &between);
-    wide_product(&net->prior_top, outputs, &between, net->prior_bias, 0, out);
+    top_product(&net->prior_top, &between, out);
     for (int r = 0; r < ROWS; r++) {
-        const float *mean = out + r * outputs;
+        const float *mean = out + r * net->prior_top.outputs;
         memcpy(z->values[r], mean, latent * sizeof(float));
         for (int i = 0; noise && i < latent; i++) {
             const float raw = mean[latent + i] + 0.54f;
@@ -50,28 +50,6 @@ static void next_z(const Network *net, const Bytes *h, const float *noise, Few *
     bytes_of_z(z, latent, bytes);
 }
 
-/* What is on its way, to `told` of each row: its probability, and that times where and when. */
-static void tell(const Network *net, const Bytes *h, const Bytes *z, float *told, int stride) {
-    Fixed x;
-    Few out = {{{0}}};
-    hidden(net, &net->told, (Inputs){.wide = h, .beside = z}, &x, 0);
-    linear(&net->told_top, &x, out.values[0], FEW_STRIDE);
-    for (int r = 0; r < ROWS; r++) {
-        const float coming = one_sigmoid(out.values[r][3]);
-        told[r * stride] = coming;
-        for (int i = 0; i < 3; i++) told[r * stride + 1 + i] = coming * out.values[r][i];
-    }
-}
-
-/* q [ROWS][stride] += the outputs of a network of two hidden layers. */
-static void mlp(const Network *net, const Mlp *m, Inputs in, float *q, int stride) {
-    Fixed x;
-    Bytes bytes;
-    hidden(net, &m->first, in, &x, &bytes);
-    hidden(net, &m->second, (Inputs){.wide = &bytes}, &x, 0);
-    linear(&m->top, &x, q, stride);
-}
-
 /* What a block carries from step to step. */
 typedef struct {
     Fixed h;
@@ -79,35 +57,49 @@ typedef struct {
     Bytes h_bytes, z_bytes, x;
 } Carry;
 
-/* both [ROWS][width] += what the heads share, at step k; `few` has the action. */
-static void shared_part(const Network *net, const Root *root, const Carry *at, int k, Few *few, float *both,
-                        int width) {
-    const int actions = net->actions;
-    Inputs in = {.few = few, .few_inputs = actions, .from = root->passing};
-    if (k > 0) {
-        in = (Inputs){.few = few, .few_inputs = actions + TOLD};
-        for (int r = 0; root->told && r < ROWS; r++)
-            memcpy(few->values[r] + actions, root->told + k * TOLD, TOLD * sizeof(float));
-        if (!root->told) tell(net, &at->h_bytes, &at->z_bytes, few->values[0] + actions, FEW_STRIDE);
-    }
-    mlp(net, &net->passing, in, both, width);
+/* The outputs [ROWS][outputs] of a head at step k, whose sums of h and z are `from` at k = 0. */
+static void head_outputs(const Network *net, const Head *head, const float *from, const Carry *at, int k,
+                         const Few *action, float *out) {
+    Inputs in = {.few = action, .few_inputs = net->actions, .from = from};
+    Fixed x;
+    Bytes bytes;
+    if (k > 0) in = (Inputs){&at->h_bytes, &at->z_bytes, action, net->actions, 0};
+    hidden(net, &head->first, in, &x, &bytes);
+    const int many = head->many.outputs;
+    hidden(net, &head->second, (Inputs){.wide = &bytes}, &x, many ? &bytes : 0);
+    if (many) top_product(&head->many, &bytes, out);
+    else dot_product(&head->one, &x, out);
 }
 
-/* q [ROWS][stride] += a head's own part, at step k; `few` has the action. */
-static void own_part(const Network *net, const Head *head, const float *from, const Carry *at, int k,
-                     Few *few, float *q, int stride) {
-    Inputs in = {.few = few, .few_inputs = net->actions, .from = k > 0 ? 0 : from};
-    const int reduced = head->reduce_h.outputs;
-    if (k > 0 && reduced) {
-        float *to = few->values[0] + net->actions;
-        for (int r = 0; r < ROWS; r++) memset(to + r * FEW_STRIDE, 0, reduced * sizeof(float));
-        linear(&head->reduce_h, &at->h, to, FEW_STRIDE);
-        add_narrow(&head->reduce_z, reduced, &at->z, to);
-        in.few_inputs = head->state.first.few.inputs;
-    } else if (k > 0) {
-        in.wide = &at->h_bytes, in.beside = &at->z_bytes;
+/* The mean of the distribution over bins whose logits are `outputs`. */
+static float mean_of_bins(const Reading *as, const float *outputs) {
+    const Floats most = all_floats(largest(outputs, as->bins));
+    Floats weights = {0}, sum = {0};
+    for (int i = 0; i < as->bins; i += LANES) {
+        Floats weight = exponential(load(outputs + i) - most);
+        if (as->bins - i < LANES) weight = first_floats(weight, as->bins - i);
+        weights += weight;
+        sum = fused(weight, load(as->each + i), sum);
     }
-    mlp(net, &head->state, in, q, stride);
+    return total(sum) / total(weights);
+}
+
+/* Q [ROWS] in units of return, at step k. */
+static void value(const Network *net, const Root *root, const Carry *at, int k, const Few *action, float *q) {
+    const Reading *as = &net->reading;
+    float outputs[ROWS * MOST_FEW];
+    head_outputs(net, &net->value, root->value, at, k, action, as->bins ? outputs : q);
+    for (int r = 0; r < ROWS; r++) {
+        if (as->bins) q[r] = mean_of_bins(as, outputs + r * net->value.many.outputs);
+        q[r] = as->mean + q[r] * as->std;
+    }
+}
+
+/* The reward [ROWS] in its own units, at step k. */
+static void reward(const Network *net, const Root *root, const Carry *at, int k, const Few *action,
+                   float *earned) {
+    head_outputs(net, &net->reward, root->reward, at, k, action, earned);
+    for (int r = 0; r < ROWS; r++) earned[r] *= net->reading.std;
 }
 
 /* Whether step k of a plan is asked for Q, else for its reward. */
@@ -115,35 +107,16 @@ static inline int asks_value(const Reading *as, int k, int steps) {
     return as->objective == VALUE || (as->objective == TD && k == steps - 1);
 }
 
-/* q [ROWS][stride], of which a row has the outputs [heads][width], += Q's heads at step k. */
-static void judged(const Network *net, const Root *root, const Carry *at, int k, Few *few, float *q, int width,
-                   int stride) {
-    const int shared = net->passing.top.outputs;
-    float both[ROWS * MOST_FEW] = {0}; /* [ROWS][width] */
-    if (shared) shared_part(net, root, at, k, few, both, width);
-    for (int i = 0; i < net->heads; i++, q += width) {
-        own_part(net, net->head + i, root->values[i], at, k, few, q, stride);
-        for (int r = 0; shared && r < ROWS; r++)
-            for (int j = 0; j < width; j++) q[r * stride + j] += both[r * width + j];
-    }
-}
-
-/* What heads say of a block, zero before: where Q is asked its outputs q [ROWS][steps][heads][width],
- * elsewhere rewards earned [ROWS][steps]; and the log-odds of a failure, dead [ROWS][steps]. */
-typedef struct {
-    float *q, *earned, *dead;
-} Answers;
-
-/* Everything of a block of plans, actions [ROWS][steps][actions]. */
+/* Everything of a block of plans, actions [ROWS][steps][actions]: Q or the reward, worth [steps][ROWS],
+ * and the log-odds of a failure, dead [steps][ROWS], of all steps but the first and the last. */
 static void block(const Network *net, const Root *root, int steps, const float *actions, const float *noise,
-                  int width, Answers to) {
+                  float *worth, float *dead) {
     Carry at;
     Fixed x;
-    Few few;
-    const int q_step = net->heads * width;
+    Few action;
     for (int k = 0; k < steps; k++) {
         for (int r = 0; r < ROWS; r++)
-            memcpy(few.values[r], actions + (r * steps + k) * net->actions, net->actions * sizeof(float));
+            memcpy(action.values[r], actions + (r * steps + k) * net->actions, net->actions * sizeof(float));
         if (k == 1)
             recur(net, (Inputs){.wide = &at.x, .from = root->gates}, root->h, 0, &at.h, &at.h_bytes);
         else if (k > 1)
@@ -151,15 +124,15 @@ static void block(const Network *net, const Root *root, int steps, const float *
                   &at.h_bytes);
         if (k > 0) next_z(net, &at.h_bytes, noise ? noise + (k - 1) * net->latent : 0, &at.z, &at.z_bytes);
         if (asks_value(&net->reading, k, steps))
-            judged(net, root, &at, k, &few, to.q + k * q_step, width, steps * q_step);
+            value(net, root, &at, k, &action, worth + k * ROWS);
         else
-            own_part(net, &net->reward, root->values[net->heads], &at, k, &few, to.earned + k, steps);
+            reward(net, root, &at, k, &action, worth + k * ROWS);
         if (k == steps - 1) break; /* nothing follows the last step */
         if (k > 0) {
             hidden(net, &net->termination, (Inputs){.wide = &at.h_bytes, .beside = &at.z_bytes}, &x, 0);
-            linear(&net->termination_top, &x, to.dead + k, steps);
+            dot_product(&net->termination_top, &x, dead + k * ROWS);
         }
-        const Inputs in = {.few = &few,
+        const Inputs in = {.few = &action,
                            .few_inputs = net->actions,
                            .beside = k > 0 ? &at.z_bytes : 0,
                            .from = k > 0 ? 0 : root->mix};
@@ -177,80 +150,46 @@ void layout(int32_t *depth, int32_t *lanes, int32_t *group) {
 typedef struct {
     const Network *net;
     const Root *root;
-    int32_t rows, steps, width; /* width: of a head's outputs, filled up to 16 if there are several */
+    int32_t rows, steps;
     const float *actions; /* [rows][steps][actions] */
     const float *noise;   /* [steps - 1][latent] or null */
     float *worth;         /* [rows] J */
     Crew crew;
 } Job;
 
-/* What a head says: its output, or the mean of the distribution whose log-odds its outputs are. */
-static float said(const Reading *as, const float *outputs) {
-    if (!as->bins) return outputs[0];
-    const Floats most = all_floats(largest(outputs, as->bins));
-    Floats weights = {0}, sum = {0};
-    for (int i = 0; i < as->bins; i += LANES) {
-        Floats weight = exponential(load(outputs + i) - most);
-        if (as->bins - i < LANES) weight = first_floats(weight, as->bins - i);
-        weights += weight;
-        sum = fused(weight, load(as->each + i), sum);
-    }
-    return total(sum) / total(weights);
-}
-
-/* Q in units of return, from the outputs of the heads [heads][width]. */
-static float value_of(const Network *net, const float *q, int width) {
-    const Reading *as = &net->reading;
-    float value = said(as, q);
-    for (int i = 1; i < net->heads; i++) {
-        const float one = said(as, q + i * width);
-        if (!as->lowest) value += one;
-        else if (one < value) value = one;
-    }
-    if (!as->lowest) value /= (float)net->heads;
-    return as->mean + value * as->std;
-}
-
-/* J of a plan, as `Account` sums it; `of` and `actions` are those of its row. */
-static float worth_of(const Job *job, Answers of, const float *actions) {
-    const Network *net = job->net;
-    const Reading *as = &net->reading;
+/* J of a plan, as `Account` sums it, from row r of what `block` says; actions are those of the row. */
+static float sum_of(const Job *job, int r, const float *worth, const float *dead, const float *actions) {
+    const Reading *as = &job->net->reading;
     const float base = as->rule == PAPER ? 0.0f : as->floor;
     float above = 0.0f, below = 0.0f, share = 1.0f, weight = 1.0f, nothing = job->root->nothing;
-    for (int k = 0; k < job->steps; k++, of.q += net->heads * job->width) {
+    for (int k = 0; k < job->steps; k++) {
         const int value = asks_value(as, k, job->steps);
-        const float worth = value ? value_of(net, of.q, job->width) : of.earned[k] * as->std;
         const float floor = value ? base : (1.0f - as->discount) * base;
-        above += weight * share * (worth - floor);
+        above += weight * share * (worth[k * ROWS + r] - floor);
         below += weight * floor;
         if (!value) weight *= as->discount;
-        if (k == 0) continue; /* the first state was seen alive */
-        const float risk = one_sigmoid(of.dead[k]);
+        if (k == 0 || k == job->steps - 1) continue; /* the first state was seen alive, and none follows */
+        const float risk = one_sigmoid(dead[k * ROWS + r]);
         share *= as->rule == SURVIVAL ? 1.0f - risk : risk <= as->threshold;
     }
-    for (int i = 0; i < job->steps * net->actions; i++) nothing += 0.0f * actions[i];
+    for (int i = 0; i < job->steps * job->net->actions; i++) nothing += 0.0f * actions[i];
     return (as->objective == VALUE ? above / (float)job->steps + base : above + below) + nothing;
 }
 
 /* A block of candidates from `row` on; rows beyond the last repeat the first. */
 static void judge_block(const Job *job, int row) {
     const int steps = job->steps, per_row = steps * job->net->actions;
-    const int q_row = steps * job->net->heads * job->width;
     const int count = row + ROWS <= job->rows ? ROWS : job->rows - row;
     const float *actions = job->actions + (int64_t)row * per_row;
-    float some[ROWS * per_row], q[ROWS * q_row], earned[ROWS * steps], dead[ROWS * steps];
-    memset(q, 0, sizeof q);
-    memset(earned, 0, sizeof earned);
-    memset(dead, 0, sizeof dead);
+    float some[ROWS * per_row], worth[steps * ROWS], dead[steps * ROWS];
     if (count < ROWS) {
         for (int r = 0; r < ROWS; r++)
             memcpy(some + r * per_row, actions + (r < count ? r : 0) * per_row, per_row * sizeof(float));
         actions = some;
     }
-    block(job->net, job->root, steps, actions, job->noise, job->width, (Answers){q, earned, dead});
+    block(job->net, job->root, steps, actions, job->noise, worth, dead);
     for (int r = 0; r < count; r++)
-        job->worth[row + r] = worth_of(job, (Answers){q + r * q_row, earned + r * steps, dead + r * steps},
-                                       actions + r * per_row);
+        job->worth[row + r] = sum_of(job, r, worth, dead, actions + r * per_row);
 }
 
 static void blocks(Job *job) {

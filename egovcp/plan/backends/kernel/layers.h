@@ -97,39 +97,17 @@ static void recur(const Network *net, Inputs in, const int16_t *before, int stri
     }
 }
 
-/* out [ROWS][stride] += x weight + bias. */
-static void linear(const Linear *l, const Fixed *x, float *out, int stride) {
-    if (l->outputs == 1) {
-        for (int r = 0; r < ROWS; r++) {
-            Ints sum = {0};
-            for (int n = 0; n < l->inputs; n += WORDS)
-                sum = pairs(sum, load_words(x->values[r] + n), load_words(l->weight + n));
-            out[r * stride] += total(__builtin_convertvector(sum, Floats)) * l->scale[0] + l->bias[0];
-        }
-        return;
-    }
-    const int16_t *weight = l->weight;
-    for (int j = 0; j < l->outputs; j += LANES) {
-        Ints sum[ROWS] = {{0}};
-        for (int n = 0; n < l->inputs; n += 2, weight += WORDS) {
-            const Words w = load_words(weight);
-            for (int r = 0; r < ROWS; r++) sum[r] = pairs(sum[r], w, again(x->values[r] + n));
-        }
-        for (int r = 0; r < ROWS; r++) {
-            float *to = out + r * stride + j;
-            const Floats start = load(to) + load(l->bias + j);
-            store(to, fused(__builtin_convertvector(sum[r], Floats), load(l->scale + j), start));
-        }
+/* out [ROWS] = x weight + bias. */
+static void dot_product(const Dot *d, const Fixed *x, float *out) {
+    for (int r = 0; r < ROWS; r++) {
+        Ints sum = {0};
+        for (int n = 0; n < d->inputs; n += WORDS)
+            sum = pairs(sum, load_words(x->values[r] + n), load_words(d->weight + n));
+        out[r] = total(__builtin_convertvector(sum, Floats)) * d->scale + d->bias;
     }
 }
 
-/* out [ROWS][FEW_STRIDE] += x weight. */
-static void add_narrow(const Narrow *l, int outputs, const Few *x, float *out) {
-    for (int j = 0; j < outputs; j += LANES)
-        for (int r = 0; r < ROWS; r++) {
-            Floats sum = load(out + r * FEW_STRIDE + j);
-            for (int k = 0; k < l->inputs; k++)
-                sum = fused(all_floats(x->values[r][k]), load(l->weight + k * outputs + j), sum);
-            store(out + r * FEW_STRIDE + j, sum);
-        }
+/* out [ROWS][outputs] = x weight + bias. */
+static void top_product(const Top *t, const Bytes *x, float *out) {
+    wide_product(&t->wide, t->outputs, x, t->bias, 0, out);
 }

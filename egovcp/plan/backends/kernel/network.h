@@ -2,7 +2,7 @@
 #pragma once
 #include "words.h"
 
-enum { WIDEST = 1024, MOST_FEW = 128, TOLD = 4, FEW_STRIDE = MOST_FEW + LANES };
+enum { WIDEST = 1024, MOST_FEW = 128, FEW_STRIDE = MOST_FEW + LANES };
 #if defined(TILES)
 enum { ROWS = 16, COLUMNS = 4, DEPTH = 64 }; /* a tile: rows, and inputs; and tiles that sum up */
 #elif defined(HALF_VECTORS)
@@ -37,29 +37,28 @@ typedef struct {
     float epsilon;
 } Layer;
 
-typedef struct { /* of few outputs, from words; weights in words, of which no sum leaves 32 bits */
-    int32_t inputs, outputs; /* outputs: 1 or a multiple of 16; 0: there is no such layer */
-    const int16_t *weight;   /* [outputs/LANES][inputs/2][LANES][2]; of one output [inputs filled up to 32] */
-    const float *scale;      /* [outputs] of a sum of products */
-    const float *bias;       /* [outputs] */
-} Linear;
+typedef struct { /* one output, from words; weights in words, of which no sum leaves 32 bits */
+    int32_t inputs;
+    const int16_t *weight; /* [inputs filled up to 32] */
+    float scale, bias;
+} Dot;
 
-typedef struct {
+typedef struct { /* many outputs, from the bytes of a hidden layer */
+    int32_t outputs; /* a multiple of 16 */
+    Wide wide;
+    const float *bias; /* [outputs] */
+} Top;
+
+typedef struct { /* two hidden layers over h, z and the action, with one output or with many */
     Layer first, second;
-    Linear top;
-} Mlp;
-
-typedef struct {
-    Linear reduce_h; /* to what `state` reads in place of h and z, if it does */
-    Narrow reduce_z;
-    Mlp state;
+    Dot one;
+    Top many; /* if it has outputs */
 } Head;
 
-typedef struct { /* from what heads say to J */
+typedef struct { /* from the outputs of the heads to J */
     int32_t objective; /* what is added up: as `Objective` */
     int32_t rule;      /* after a failure: as `Rule` */
-    int32_t lowest;    /* of several heads; else their mean */
-    int32_t bins;      /* of the distribution whose log-odds a head's outputs are; 0: its one output is Q */
+    int32_t bins;      /* of the distribution whose logits are the outputs of Q; 0: Q is the one output */
     const float *each; /* [bins filled up to 16] their values */
     float mean, std, floor, threshold, discount;
 } Reading;
@@ -68,16 +67,13 @@ enum Objective { VALUE, REWARD, TD };
 enum Rule { PAPER, SHIFT, SURVIVAL };
 
 typedef struct {
-    int32_t hidden, latent, actions, heads;
-    Layer mix, gru, prior, termination, told;
-    Wide prior_top;         /* [outputs] means, then raw deviations if they are wanted */
-    const float *prior_bias; /* [MOST_FEW] */
-    int32_t prior_outputs;  /* a multiple of 16 */
-    Linear termination_top, told_top;
+    int32_t hidden, latent, actions;
+    Layer mix, gru, prior, termination;
+    Top prior_top; /* means, then raw deviations if they are wanted */
+    Dot termination_top;
     float min_std;
-    const Head *head; /* [heads] of Q */
-    Head reward;      /* if it is foreseen */
-    Mlp passing;      /* reads what is on its way, is added to each head; none if its top has no outputs */
+    Head value;
+    Head reward; /* only if the objective adds up rewards */
     const int16_t *silu, *tanh; /* [2][NODES] each, see `Lines` */
     Reading reading;
 } Network;
@@ -86,10 +82,9 @@ typedef struct {
     const int16_t *h;    /* [hidden + 16] words */
     const float *mix;    /* sums of the first layers that do not depend on the candidate */
     const float *gates;
-    const float *const *values; /* of the heads, then of the reward's */
-    const float *passing;       /* of what they share */
-    const float *told;          /* [steps][TOLD] what is on its way, if it is followed; else null */
-    float nothing;              /* 0, or not a number where the state is not: bytes know no such thing */
+    const float *value;
+    const float *reward;
+    float nothing; /* 0, or not a number where the state is not: bytes know no such thing */
 } Root;
 
 typedef struct {

@@ -1,0 +1,35 @@
+"""Commands refuse the options that they had in older versions."""
+
+import pytest
+
+from egovcp.flags import flags_of
+from egovcp.removed_options import REMOVED_OPTIONS
+
+from .listing import all_commands
+
+
+def test_no_option_of_a_command_is_listed_as_removed() -> None:
+    flags = {flag for command in all_commands() for flag in flags_of(command.config_class)}
+    assert not {f"--{name}" for name in REMOVED_OPTIONS} & flags
+
+
+@pytest.mark.parametrize(
+    ("prog", "flag", "remedy"),
+    [
+        ("egovcp-train", "--value_fit.steps=0", "--policy.loss.value"),
+        ("egovcp-train", "--policy.flight.enabled=false", "leave it out"),
+        ("egovcp-train", "--datasets=[{root: x, return_steps: 9}]", "--returns.steps"),
+        ("egovcp-train", "--planner.ensemble=min", "leave it out"),
+        ("egovcp-eval", "--planner.ensemble=min", "leave it out"),
+        ("egovcp-eval-model", "--return_steps=16", "leave it out"),
+    ],
+)
+def test_command_refuses_a_removed_option_in_one_line(
+    prog: str, flag: str, remedy: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (command,) = (c for c in all_commands() if c.prog == prog)
+    assert command.main([*command.arguments, "--output_dir=x", flag]) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"{prog}: error: option --")
+    assert " was removed: " in line
+    assert remedy in line
