@@ -34,10 +34,6 @@ test: install
 # that stay for a while where the walk puts them show what that is worth.
 WALK := --eta=1 --step_ticks="[5,15]"
 SCENES := --env.controller=stance --env.ball_episode.ticks=46 --env.ball_episode.event_ticks="[4,10]"
-# The artefact keeps how it plans: few candidates, as two cores like it, which go to one place and
-# rest there like the data's hands, and pay for steps and for hands away from the neutral pose
-# (docs/planner.md).
-PLANNER := --planner.samples=64 --planner.elites=4 --planner.process=ramp --planner.hands_cost=0.02 --planner.step_cost=0.2
 POLICY := $(OUT)/policy/checkpoints/last/pretrained_model
 
 quickstart: install
@@ -45,7 +41,7 @@ quickstart: install
 	egovcp-collect --task=ball --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
 	  --episodes=5000 --seed=0 $(WALK) $(SCENES)
 	egovcp-train --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
-	  --output_dir=$(OUT)/policy --policy.value_loss=two_hot --returns.steps=16 --max_minutes=6.5 --seed=0 $(PLANNER)
+	  --output_dir=$(OUT)/policy --max_minutes=6.5 --seed=0
 	egovcp-eval --policy.path=$(POLICY) --task=ball --episodes=80 \
 	  --output_dir=$(OUT)/eval $(SCENES) --env.ball_episode.empty_probability=0 | tee $(OUT)/table.txt
 	egovcp-deploy --policy.path=$(POLICY) --robot.type=sim --task=ball --episodes=1 \

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.model import Batch, LossConfig, WorldModel
-from egovcp.model.nets import SplitLinear, SplitMlp
+from egovcp.model.networks import SplitLinear, SplitMlp
 from egovcp.model.two_hot import REACH
 from egovcp_train.config import OptimizerConfig
 
@@ -115,11 +115,11 @@ def pixel_weights(near: Tensor, batch: Batch, loss: LossConfig) -> Tensor:
     """Weight of every pixel, (B, T, H, W)."""
     before = near[:, :-1].flatten(0, 1)
     high, low = (x.view_as(near[:, 1:]) for x in (widest(before), -widest(-before)))
-    threshold = loss.moving_threshold
+    threshold = loss.motion_threshold
     moving = (near[:, 1:] > high + threshold) | (near[:, 1:] < low - threshold)
     moving = F.pad(moving, (0, 0, 0, 0, 1, 0)) & ~batch.is_first[..., None, None]
-    close = near > loss.near_threshold
-    return 1 + loss.moving * moving.float() + loss.near * close.float()
+    close = near > loss.proximity_threshold
+    return 1 + loss.motion_weight * moving.float() + loss.proximity_weight * close.float()
 
 
 def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> Tensor:
@@ -150,7 +150,7 @@ def plain_loss(model: PlainModel, batch: Batch, generator: torch.Generator) -> T
 
     weight = pixel_weights(near, batch, loss)
     error = (0.5 * (model.decode_state(features) - state) ** 2).mean(-1)
-    foreseen = foresight_terms(model, (h, z), near, state, weight, batch, generator)
+    foreseen = multistep_terms(model, (h, z), near, state, weight, batch, generator)
     terms = [
         loss.depth * depth_loss(model, features, near, weight, batch, generator),
         loss.state * mean_where(error, batch.valid),
@@ -226,7 +226,7 @@ def value_terms(model: PlainModel, h: Tensor, z: Tensor, batch: Batch) -> list[T
     ]
 
 
-def foresight_terms(
+def multistep_terms(
     model: PlainModel,
     states: tuple[Tensor, Tensor],
     near: Tensor,
@@ -236,8 +236,8 @@ def foresight_terms(
     generator: torch.Generator,
 ) -> list[Tensor]:
     loss, length = model.config.loss, near.shape[1]
-    ahead = [k for k in loss.foresight_ahead if k < length]
-    every = min(loss.foresight_every, length - min(ahead))
+    ahead = [k for k in loss.multistep_horizons if k < length]
+    every = min(loss.multistep_stride, length - min(ahead))
     first = int(torch.randint(every, (), generator=generator))
     start = torch.arange(first, length - min(ahead), every)
     h, z = (x[:, start] for x in states)
@@ -256,8 +256,8 @@ def foresight_terms(
     picture = (0.5 * weight[:, at] * (image - near[:, at]) ** 2).mean((-2, -1))
     proprioception = (0.5 * (model.decode_state(features) - state[:, at]) ** 2).mean(-1)
     return [
-        loss.foresight_depth * mean_where(picture, valid),
-        loss.foresight_state * mean_where(proprioception, valid),
+        loss.multistep_depth * mean_where(picture, valid),
+        loss.multistep_state * mean_where(proprioception, valid),
     ]
 
 

@@ -22,10 +22,10 @@ from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.model import Carry, WorldModel, WorldModelConfig
-from egovcp.plan import Judge, PlannerConfig, Policy, make_plan, optimiser_of
-from egovcp.plan.backends import judge_of_model
+from egovcp.plan import PlanEvaluator, PlannerConfig, Policy, make_plan, optimiser_of
+from egovcp.plan.action_parameterization import reflect
+from egovcp.plan.backends import make_evaluator
 from egovcp.plan.config import BackendName
-from egovcp.plan.process import reflect
 
 SIDE = 1024  # of the matrices of the plain product
 
@@ -47,7 +47,7 @@ def plain_plan(
         values, alive = [], torch.ones(m)
         for k in range(n):
             action = reflect(action + config.eta * deltas[:, k])
-            values.append(alive * (model.value(state, action) - model.return_floor))
+            values.append(alive * (model.value(state, action) - model.min_return))
             if k > 0:
                 alive = alive * (model.termination(state) <= config.termination_threshold)
             state = model.imagine(state, action)
@@ -84,18 +84,18 @@ def gpu_plans(
     there, start = deepcopy(model).cuda(), executed.cuda()
     state = carry.map(lambda x: x.cuda())
 
-    def planned(judge: Judge[Carry]) -> Callable[[], Tensor]:
+    def planned(evaluator: PlanEvaluator[Carry]) -> Callable[[], Tensor]:
         def run() -> Tensor:
             generator = torch.Generator("cuda").manual_seed(1)
             search = optimiser_of(config, "cuda")
-            plan = make_plan(judge, search, state, start, config, generator)
+            plan = make_plan(evaluator, search, state, start, config, generator)
             return plan.actions[0, 0].cpu()  # waits for it
 
         return run
 
     names: tuple[BackendName, ...] = ("eager", "float32")
     return {
-        f"gpu_{name}": planned(judge_of_model(there, PlannerConfig(backend=name))) for name in names
+        f"gpu_{name}": planned(make_evaluator(there, PlannerConfig(backend=name))) for name in names
     }
 
 
@@ -127,16 +127,16 @@ def main() -> None:
     carry = Carry(h, z)
     executed = torch.zeros(1, spec.ACTION_DIM)
 
-    def planned(judge: Judge[Carry]) -> Callable[[], Tensor]:
+    def planned(evaluator: PlanEvaluator[Carry]) -> Callable[[], Tensor]:
         def run() -> Tensor:
             generator = torch.Generator().manual_seed(1)
             search = optimiser_of(config)
-            return make_plan(judge, search, carry, executed, config, generator).actions[0, 0]
+            return make_plan(evaluator, search, carry, executed, config, generator).actions[0, 0]
 
         return run
 
     names: tuple[BackendName, ...] = ("auto", "eager", "float32", "int8")
-    plans = {name: planned(judge_of_model(model, PlannerConfig(backend=name))) for name in names}
+    plans = {name: planned(make_evaluator(model, PlannerConfig(backend=name))) for name in names}
 
     def plain() -> Tensor:
         return plain_plan(model, carry, executed, config, 1)

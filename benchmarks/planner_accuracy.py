@@ -21,10 +21,10 @@ from egovcp import spec
 from egovcp.artefact import load_artefact
 from egovcp.data.arrays import open_dataset
 from egovcp.model import Carry, WorldModel
-from egovcp.plan import PlannerConfig, StepByStep, make_plan, optimiser_of
-from egovcp.plan.backends import judge_of_model
+from egovcp.plan import PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
+from egovcp.plan.action_parameterization import random_walk
+from egovcp.plan.backends import make_evaluator
 from egovcp.plan.config import BackendName
-from egovcp.plan.process import walk
 
 BACKENDS: tuple[BackendName, ...] = ("float32", "int8")
 BATCH = 8  # robots planned together
@@ -54,20 +54,20 @@ class Trial:
 
     def __init__(self, model: WorldModel, config: PlannerConfig, carry: Carry, executed: Tensor):
         self._model, self._config, self._executed, self._carry = model, config, executed, carry
-        self._reference = StepByStep(model, config)
+        self._reference = ReferenceEvaluator(model, config)
 
     def plans(self, backend: BackendName, seed: int) -> Tensor:
         """(S, N, 7)."""
-        judge = judge_of_model(self._model, PlannerConfig(backend=backend))
+        evaluator = make_evaluator(self._model, PlannerConfig(backend=backend))
         parts = []
         for rows in torch.arange(len(self._executed)).split(BATCH):
             carry = self._carry.map(lambda x, rows=rows: x[rows])
             search, rng = optimiser_of(self._config), torch.Generator().manual_seed(seed)
-            plan = make_plan(judge, search, carry, self._executed[rows], self._config, rng)
+            plan = make_plan(evaluator, search, carry, self._executed[rows], self._config, rng)
             parts.append(plan.actions)
         return torch.cat(parts)
 
-    def worth(self, plans: Tensor) -> Tensor:
+    def plan_value(self, plans: Tensor) -> Tensor:
         """J (S, n) of plans (S, n, N, 7) by the reference."""
         parts = []
         for rows in torch.arange(len(plans)).split(BATCH):
@@ -75,12 +75,12 @@ class Trial:
             parts.append(self._reference.at(carry)(plans[rows], None))
         return torch.cat(parts)
 
-    def spread(self) -> Tensor:
+    def expand_candidates(self) -> Tensor:
         """Deviation (S,) of J among plans of the data's own process."""
         rng = torch.Generator().manual_seed(0)
         steps = 2 * torch.rand(1, 256, self._config.horizon, spec.ACTION_DIM, generator=rng) - 1
         every = steps.expand(len(self._executed), -1, -1, -1)
-        return self.worth(walk(self._executed[:, None], every, self._config.eta)).std(1)
+        return self.plan_value(random_walk(self._executed[:, None], every, self._config.eta)).std(1)
 
 
 @torch.no_grad()
@@ -99,12 +99,12 @@ def main() -> None:
     config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))
     trial = Trial(model, config, *states(model, args.dataset, args.episodes, args.every))
     reference = trial.plans("eager", 1)
-    best, spread = trial.worth(reference[:, None])[:, 0], trial.spread()
+    best, spread = trial.plan_value(reference[:, None])[:, 0], trial.expand_candidates()
     figures: dict[str, object] = {"states": len(reference), "samples": args.samples}
     others = {name: trial.plans(name, 1) for name in BACKENDS}
     for name, plans in {**others, "other_draws": trial.plans("eager", 2)}.items():
         moved = (plans[:, 0] - reference[:, 0]).abs().mean(1)
-        lost = (best - trial.worth(plans[:, None])[:, 0]) / spread
+        lost = (best - trial.plan_value(plans[:, None])[:, 0]) / spread
         figures |= {
             f"{name}_action_moved_mean": float(moved.mean()),
             f"{name}_action_moved_p95": float(moved.quantile(0.95)),

@@ -38,7 +38,7 @@ from egovcp.log.mcap import McapSink
 from egovcp.log.rerun import RerunSink
 from egovcp.log.sink import Fanout, Sink
 from egovcp.log.tick import BasePose, Candidates, Tick
-from egovcp.plan import PlannerConfig, StepByStep, make_plan, optimiser_of
+from egovcp.plan import PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.spec import PLANNER_DT, PLANNER_HZ, STATE_DIM
 from egovcp.testing import toy_model
 from egovcp.testing.ports import free_port
@@ -143,7 +143,7 @@ def _planning() -> Callable[[], object]:
     model = toy_model()
     config = PlannerConfig(samples=64, elites=16)
     carry, executed = model.initial(1), torch.zeros(1, 7)
-    judge = StepByStep(model, config)
+    judge = ReferenceEvaluator(model, config)
 
     def plan() -> object:
         with torch.no_grad():

@@ -9,7 +9,13 @@ from egovcp.bounds import OutOfBounds, bounded
 from egovcp.errors import UsageError
 from egovcp.plan import PlannerConfig, require_answers
 from egovcp.plan.choices import Latent
-from egovcp.plan.config import BackendName, Objective, OptimiserName, Process, TerminationRule
+from egovcp.plan.config import (
+    ActionParameterization,
+    BackendName,
+    Objective,
+    OptimiserName,
+    TerminationRule,
+)
 from egovcp.plan.cost import require_affordable
 
 
@@ -51,7 +57,7 @@ class PlannerOptions:
     action (docs/planner.md)."""
     step_cost: float | None = bounded(None, least=0)
     """What moving costs a plan: so much return times its mean squared step."""
-    process: Process | None = None
+    action_parameterization: ActionParameterization | None = None
     """What candidates are made of: walk (a step in every tick), or ramp (to a place to rest at, as
     in data of a longer `egovcp-collect --step_ticks`)."""
     termination_rule: TerminationRule | None = None

@@ -1,4 +1,4 @@
-"""Options that older versions had, with the reason of the removal and what replaces them."""
+"""Options of older versions that were removed or renamed, and what replaces them."""
 
 from __future__ import annotations
 
@@ -39,6 +39,18 @@ REMOVED_OPTIONS: Final[Mapping[str, str]] = {
     "datasets.return_steps": "all datasets have one horizon of returns: use --returns.steps",
     # egovcp-eval-model
     "return_steps": "Q is compared with the returns that it was trained on: leave it out",
+}
+#: Option of older versions -> its present name.
+RENAMED_OPTIONS: Final[Mapping[str, str]] = {
+    "policy.loss.moving": "policy.loss.motion_weight",
+    "policy.loss.moving_threshold": "policy.loss.motion_threshold",
+    "policy.loss.near": "policy.loss.proximity_weight",
+    "policy.loss.near_threshold": "policy.loss.proximity_threshold",
+    "policy.loss.foresight_depth": "policy.loss.multistep_depth",
+    "policy.loss.foresight_state": "policy.loss.multistep_state",
+    "policy.loss.foresight_ahead": "policy.loss.multistep_horizons",
+    "policy.loss.foresight_every": "policy.loss.multistep_stride",
+    "planner.process": "planner.action_parameterization",
 }
 _INDEX: Final = re.compile(r"\[\d+\]")
 
@@ -84,4 +96,7 @@ def _reason(name: str) -> str | None:
     """The sentence about ``group.option``, or about the group that was removed as a whole."""
     parts = _INDEX.sub("", name).split(".")
     prefixes = (".".join(parts[:end]) for end in range(1, len(parts) + 1))
-    return next((REMOVED_OPTIONS[p] for p in prefixes if p in REMOVED_OPTIONS), None)
+    known = dict(REMOVED_OPTIONS) | {
+        old: f"it is now --{new}" for old, new in RENAMED_OPTIONS.items()
+    }
+    return next((known[p] for p in prefixes if p in known), None)

@@ -10,7 +10,11 @@ from numpy.typing import NDArray
 
 from egovcp.plan import PlannerConfig, Policy, PolicyStep
 
-_BACKENDS: Final = {"StepByStep": "eager", "FloatJudge": "float32", "IntegerJudge": "int8"}
+_BACKENDS: Final = {
+    "ReferenceEvaluator": "eager",
+    "FloatEvaluator": "float32",
+    "Int8Evaluator": "int8",
+}
 
 
 class RolloutPolicy(Protocol):
@@ -71,5 +75,5 @@ def backend_of(policy: RolloutPolicy) -> str:
         return ""
     if policy.config.backend != "auto":
         return policy.config.backend
-    judge = type(policy.prepare()).__name__
-    return _BACKENDS.get(judge, judge)
+    evaluator = type(policy.prepare()).__name__
+    return _BACKENDS.get(evaluator, evaluator)

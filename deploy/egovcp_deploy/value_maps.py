@@ -27,7 +27,7 @@ def value_maps[L](
         carry: its filtered state (1, ...), before it advances.
         action: (7,) the planned action.
     """
-    planned = torch.as_tensor(action, dtype=torch.float32, device=model.return_floor.device)
+    planned = torch.as_tensor(action, dtype=torch.float32, device=model.min_return.device)
     target = ACTION_BOX.to_metric(np.asarray(action))
     maps = []
     for hand in HANDS:

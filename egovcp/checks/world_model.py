@@ -19,7 +19,7 @@ class RecurrentModel(Protocol):
     """What filtering and planning need of a world model; shapes as in `WorldModel`."""
 
     @property
-    def return_floor(self) -> Tensor: ...
+    def min_return(self) -> Tensor: ...
 
     def initial(self, batch: int) -> Carry: ...
 
@@ -27,7 +27,7 @@ class RecurrentModel(Protocol):
         self, carry: Carry, action: Tensor, depth: Tensor, state: Tensor, is_first: Tensor
     ) -> Carry: ...
 
-    def spread(self, carry: Carry) -> Carry: ...
+    def expand_candidates(self, carry: Carry) -> Carry: ...
 
     def imagine(self, carry: Carry, action: Tensor) -> Carry: ...
 
@@ -103,7 +103,7 @@ def _check_rows(model: RecurrentModel, start: Carry, inputs: RandomInputs, batch
 def _check_planning(model: RecurrentModel, carry: Carry, plans: Tensor) -> None:
     """imagine, value and termination broadcast (E, 1, ...) states over (E, M, 7) actions."""
     robots, many = plans.shape[:2]
-    shared = model.spread(carry)
+    shared = model.expand_candidates(carry)
     before = copy.deepcopy(shared)
     ahead = model.imagine(shared, plans)
     _same("imagine changes its input carry", before, shared)
@@ -121,9 +121,7 @@ def _check_planning(model: RecurrentModel, carry: Carry, plans: Tensor) -> None:
         _require(bool(answer.isfinite().all()), f"{name} is not finite")
     dead = heads["termination of imagined states"]
     _require(bool(((dead >= 0) & (dead <= 1)).all()), "termination is not a probability")
-    _require(
-        bool(torch.as_tensor(model.return_floor).isfinite().all()), "return_floor is not finite"
-    )
+    _require(bool(torch.as_tensor(model.min_return).isfinite().all()), "min_return is not finite")
     alone = model.imagine(carry, plans[:, 0])
     _same(
         "imagine lets the candidates influence each other",

@@ -3,18 +3,23 @@
 from egovcp.model.carry import Carry
 from egovcp.model.config import PRESETS, LossConfig, WorldModelConfig
 from egovcp.model.losses import Batch
-from egovcp.model.objective import Draws, draws_for, world_model_gradients, world_model_loss
+from egovcp.model.objective import (
+    StepNoise,
+    sample_step_noise,
+    world_model_gradients,
+    world_model_loss,
+)
 from egovcp.model.world_model import WorldModel
 
 __all__ = [
     "PRESETS",
     "Batch",
     "Carry",
-    "Draws",
     "LossConfig",
+    "StepNoise",
     "WorldModel",
     "WorldModelConfig",
-    "draws_for",
+    "sample_step_noise",
     "world_model_gradients",
     "world_model_loss",
 ]

@@ -24,63 +24,59 @@ QTarget = Literal["mc", "td"]
 
 @dataclass(frozen=True)
 class LossConfig:
-    """Weights of the terms of equations 6 to 9, and what each averages over."""
+    """Weights of the loss terms (equations 6 to 9) and what each averages over."""
 
     depth: float = bounded(30.0, least=0)
-    """Weight of the depth reconstruction, per pixel mean of 0.5 (x - x_hat)^2."""
+    """Weight of the depth reconstruction, mean over pixels of 0.5 (x - x_hat)^2."""
     decode_every: int = bounded(2, least=1)
-    """Reconstruct every n-th image of a window, the first one drawn at random: the decoder is
-    the dearest part of a step, and neighbouring images teach it the same."""
-    moving: float = bounded(10.0, least=0)
-    """Extra weight of pixels that changed since the previous frame; 0: none."""
-    moving_threshold: float = bounded(0.04, least=0, most=1)
-    """Change of nearness (fraction of the depth range) that counts as moving."""
-    near: float = bounded(10.0, least=0)
+    """Reconstruct every n-th image of a window, starting at a random one."""
+    motion_weight: float = bounded(10.0, least=0)
+    """Extra weight of pixels that changed since the previous image; 0: none."""
+    motion_threshold: float = bounded(0.04, least=0, most=1)
+    """Change of nearness, as a fraction of the depth range, that counts as motion."""
+    proximity_weight: float = bounded(10.0, least=0)
     """Extra weight of near pixels; 0: none."""
-    near_threshold: float = bounded(0.7, least=0, most=1)
-    """Nearness (1 at the camera, 0 at the end of the depth range) beyond which a pixel is near."""
+    proximity_threshold: float = bounded(0.7, least=0, most=1)
+    """Nearness (1 at the camera, 0 at the end of the depth range) above which a pixel is near."""
     state: float = bounded(20.0, least=0)
     """Weight of the proprioception reconstruction, mean over the 74 standardised values."""
     kl_prior: float = bounded(0.1, least=0)
-    """Weight of KL(sg q || p), which pulls the prior to the posterior."""
+    """Weight of KL(sg q || p), which trains the prior."""
     kl_posterior: float = bounded(0.01, least=0)
-    """Weight of KL(q || sg p), which pulls the posterior to the prior."""
+    """Weight of KL(q || sg p), which regularises the posterior."""
     free_nats: float = bounded(1.0, least=0)
-    """KL below this many nats per step costs nothing."""
+    """Clip each KL term below at this many nats per step."""
     free_nats_per: FreeNatsPer = "step"
-    """step: the free nats are for the sum over z, however it is spread; dimension: each dimension
-    of z has an equal share of them to itself."""
+    """step: clip the sum over the dimensions of z; dimension: clip each one at an equal share."""
     termination: float = bounded(1.0, least=0)
-    """Weight of the termination cross entropy."""
+    """Weight of the termination cross-entropy."""
     value: float = bounded(20.0, least=0)
-    """Weight of (Q - its target)^2, in units of the return's standard deviation (see
-    `value_loss`)."""
+    """Weight of the value loss on filtered states, in standard deviations of the return."""
     q_target: QTarget = "mc"
-    """Target of Q. mc: the Monte Carlo return; td: r + gamma Q'(h', z', a') of the next row, with
-    the action that the data took there, and 0 in the place of Q' after a failure."""
+    """Target of Q. mc: Monte Carlo return; td: r + gamma Q'(h', z', a') with the next action of the
+    data, 0 instead of Q' after a failure."""
     td_decay: float = bounded(0.98, least=0, below=1)
-    """td: Q' is a copy of Q's heads that follows them with this decay per step; 0: the heads as
-    they are, without gradient."""
+    """td: decay per step of the target network Q'; 0: no target network."""
     imagined_steps: int = bounded(1, least=0, most=_FARTHEST)
-    """Also regress Q on states imagined this many steps ahead of the posterior; 0: never."""
+    """Also train Q on states imagined this many steps ahead of the posterior; 0: never."""
     imagined_value: float = bounded(20.0, least=0)
     """Weight of the value loss on imagined states."""
-    foresight_depth: float = bounded(30.0, least=0)
-    """Weight of the pictures of states imagined several ticks ahead; 0: none."""
-    foresight_state: float = bounded(10.0, least=0)
-    """Weight of the proprioception of states imagined several ticks ahead; 0: none."""
-    foresight_ahead: tuple[int, ...] = bounded(
+    multistep_depth: float = bounded(30.0, least=0)
+    """Weight of the depth reconstruction of states imagined several steps ahead; 0: none."""
+    multistep_state: float = bounded(10.0, least=0)
+    """Weight of the proprioception of states imagined several steps ahead; 0: none."""
+    multistep_horizons: tuple[int, ...] = bounded(
         (4, 8, 12), least=1, most=_FARTHEST, longest=_LONGEST
     )
-    """Ticks ahead at which they are compared with what was recorded."""
-    foresight_every: int = bounded(4, least=1)
-    """Imagine from every n-th row of a window only, the first one drawn at random."""
+    """Steps ahead at which imagined states are compared with the recorded observations."""
+    multistep_stride: int = bounded(4, least=1)
+    """Imagine from every n-th row of a window, starting at a random one."""
     autoregressive_steps: int = bounded(8, least=1, most=_FARTHEST)
-    """`dynamics` autoregressive: ticks over which predictions are fed back, all of them compared
-    with what was recorded; from the rows that `foresight_every` says."""
+    """Steps over which predictions are fed back under `dynamics=autoregressive`, from every
+    `multistep_stride`-th row."""
     reward: float = bounded(0.0, least=0)
-    """Weight of the reward predicted from (h, z, a), mean squared error in units of the return's
-    standard deviation, on the states that Q is trained on; 0: there is no such head."""
+    """Weight of the reward prediction from (h, z, a), squared error in standard deviations of the
+    return; 0: no reward head."""
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -99,18 +95,17 @@ class WorldModelConfig:
     channels: tuple[int, int, int] = bounded((32, 64, 64), least=1, most=_MOST_CHANNELS)
     """Channels of the three layers of the depth CNN; the decoder uses the last."""
     dynamics: Dynamics = "joint"
-    """How the dynamics are learned. joint: equation 8, prior and posterior are pulled to each
-    other; autoregressive: predictions are fed back for several ticks and compared with the
-    recorded observations instead (the baseline ARWM), with no KL at all."""
+    """joint: train prior and posterior by the KL terms of equation 8; autoregressive: feed
+    predictions back for several steps and compare them with the observations (ARWM), no KL."""
     value_loss: ValueLoss = "two_hot"
-    """mse: Q is a number, fitted by its squared error; two_hot: a distribution over bins of
-    symlog returns, fitted by cross entropy, whose mean is the number."""
+    """two_hot: Q is a distribution over bins of symlog returns, trained by cross-entropy; mse: Q is
+    a number, trained by its squared error."""
     min_std: float = bounded(0.1, least=1e-6, most=10)
-    """Floor of the latent standard deviation."""
+    """Smallest standard deviation of z."""
     update_bias: float = bounded(-1.0, least=-20, most=20)
-    """Bias of the GRU's update gate: memory is kept at the start of training."""
+    """Initial bias of the GRU's update gate; negative: keep the memory."""
     depth_max_m: float = bounded(spec.DEPTH_MAX_M, least=0.1, most=100)
-    """Depth, in metres, at which nearness is 0."""
+    """Depth at which nearness is 0, m."""
     loss: LossConfig = field(default_factory=LossConfig)
     """Loss weights."""
 
@@ -132,16 +127,16 @@ def require_longer(window: int, steps: int, flag: str) -> None:
 PAPER_LOSS = LossConfig(
     depth=float(spec.DEPTH_ROWS * spec.DEPTH_COLS),
     decode_every=1,
-    moving=0.0,
-    near=0.0,
+    motion_weight=0.0,
+    proximity_weight=0.0,
     state=float(spec.STATE_DIM),
     kl_prior=1.0,
     kl_posterior=1.0,
     free_nats=0.0,
     value=1.0,
     imagined_steps=0,
-    foresight_depth=0.0,
-    foresight_state=0.0,
+    multistep_depth=0.0,
+    multistep_state=0.0,
 )
 
 PRESETS = {

@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from egovcp.model.shared import row_noise
+from egovcp.model.data_parallel import row_noise
 
 SHIFT: Final = 0.54  #: softplus of it is 1
 

@@ -16,11 +16,11 @@ from torch import Tensor
 
 from egovcp.model.carry import Carry
 from egovcp.model.config import LossConfig
+from egovcp.model.data_parallel import over_all_rows, row_noise
 from egovcp.model.depth import highest_3x3, lowest_3x3, nearness
+from egovcp.model.fused_recurrence import filter_window
 from egovcp.model.gaussian import Gaussian, kl_divergence
-from egovcp.model.picture_error import picture_error
-from egovcp.model.recurrence import filter_window
-from egovcp.model.shared import over_all_rows, row_noise
+from egovcp.model.image_loss import image_error
 from egovcp.model.world_model import WorldModel
 
 #: Pictures that are looked at together where no gradient is asked for: what the layers make of more
@@ -108,7 +108,7 @@ def _pieces(*rows: Tensor) -> Iterator[tuple[Tensor, ...]]:
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Mean of x where mask; 0 where the mask is empty.
 
-    Of a batch that processes share (`egovcp.model.shared`): this one's part of the mean.
+    Of a batch that processes share (`egovcp.model.data_parallel`): this one's part of the mean.
     """
     weight = mask.to(x.dtype)
     return (x * weight).sum() / over_all_rows(weight.sum()).clamp_min(1.0)
@@ -135,7 +135,7 @@ def depth_loss(
     rows = (slice(None), slice(first, None, min(every, valid.shape[1])))
     near = rollout.near[rows]
     image = model.decode_depth(rollout.carry.features[rows].flatten(0, 1)).view_as(near)
-    return masked_mean(picture_error(image, near, weight[rows]), valid[rows])
+    return masked_mean(image_error(image, near, weight[rows]), valid[rows])
 
 
 def first_image(every: int, batch: Batch, generator: torch.Generator | None = None) -> int:
@@ -148,12 +148,12 @@ def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
     """How much each pixel of (B, T, H, W) nearness counts: 1, and more where something moves."""
     config = model.config.loss
     weight = torch.ones_like(near)
-    if config.moving > 0:
-        moving = _changed(near, config.moving_threshold)
+    if config.motion_weight > 0:
+        moving = _changed(near, config.motion_threshold)
         moving &= ~batch.is_first[:, 1:, None, None]
-        weight[:, 1:].add_(moving, alpha=config.moving)
-    if config.near > 0:
-        weight += config.near * (near > config.near_threshold)
+        weight[:, 1:].add_(moving, alpha=config.motion_weight)
+    if config.proximity_weight > 0:
+        weight += config.proximity_weight * (near > config.proximity_threshold)
     return weight
 
 

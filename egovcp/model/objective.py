@@ -18,50 +18,52 @@ from torch import Tensor
 
 from egovcp.model import losses
 from egovcp.model.carry import Carry
-from egovcp.model.foresight import (
+from egovcp.model.data_parallel import WHOLE, present_share
+from egovcp.model.gaussian import Gaussian
+from egovcp.model.losses import Batch, Rollout
+from egovcp.model.multistep import (
     autoregressive_losses,
     autoregressive_ticks,
     first_row,
-    foresight_losses,
+    multistep_losses,
 )
-from egovcp.model.gaussian import Gaussian
-from egovcp.model.losses import Batch, Rollout
-from egovcp.model.nets import SplitMlp
-from egovcp.model.outcomes import value_and_termination_losses
-from egovcp.model.shared import WHOLE, present_share
-from egovcp.model.threads import beside
+from egovcp.model.networks import SplitMlp
+from egovcp.model.parallel import run_parallel
+from egovcp.model.value_losses import value_and_termination_losses
 from egovcp.model.world_model import WorldModel
 
 type Terms = dict[str, Tensor]
 type Part = Callable[[], Terms]
 
 
-class Draws(NamedTuple):
+class StepNoise(NamedTuple):
     """What a step leaves to chance."""
 
     noise: Tensor  # (T, B, Z) with which z is sampled
     image: int  # the first that is decoded
-    foresight: int  # the first row from which is imagined
+    multistep: int  # the first row from which is imagined
     autoregressive: int  # the same of autoregressive training; 0 without it
 
 
-def draws_for(model: WorldModel, batch: Batch, generator: torch.Generator | None = None) -> Draws:
+def sample_step_noise(
+    model: WorldModel, batch: Batch, generator: torch.Generator | None = None
+) -> StepNoise:
     """For a batch of this shape; ``generator``: None is torch's own."""
     config = model.config.loss
     noise = losses.latent_noise(model, batch, generator)
-    foresight = first_row(config, config.foresight_ahead, batch, generator)
+    multistep = first_row(config, config.multistep_horizons, batch, generator)
     image = losses.first_image(config.decode_every, batch, generator)
     if model.config.dynamics == "joint":
-        return Draws(noise, image, foresight, 0)
-    return Draws(
-        noise, image, foresight, first_row(config, autoregressive_ticks(config), batch, generator)
+        return StepNoise(noise, image, multistep, 0)
+    return StepNoise(
+        noise, image, multistep, first_row(config, autoregressive_ticks(config), batch, generator)
     )
 
 
 def world_model_loss(
     model: WorldModel,
     batch: Batch,
-    chance: Draws | torch.Generator | None = None,
+    chance: StepNoise | torch.Generator | None = None,
     head: SplitMlp | None = None,
 ) -> tuple[Tensor, Terms]:
     """Total loss of equation 6 and its terms (scalars, detached).
@@ -70,9 +72,9 @@ def world_model_loss(
         model: the world model.
         batch: windows.
         chance: what is drawn, or what draws it; None: torch's own generator.
-        head: of Q, for its TD target (`egovcp.model.td`); None: the model's own.
+        head: of Q, for its TD target (`egovcp.model.value_losses`); None: the model's own.
     """
-    draws = chance if isinstance(chance, Draws) else draws_for(model, batch, chance)
+    draws = chance if isinstance(chance, StepNoise) else sample_step_noise(model, batch, chance)
     rollout = losses.filter_sequence(model, batch, noise=draws.noise)
     told, foreseen = _parts(model, rollout, batch, draws, head)
     terms = told() | foreseen()
@@ -82,7 +84,7 @@ def world_model_loss(
 def world_model_gradients(
     model: WorldModel,
     batch: Batch,
-    draws: Draws,
+    draws: StepNoise,
     head: SplitMlp | None = None,
     precision: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> tuple[Tensor, Terms]:
@@ -115,7 +117,7 @@ def world_model_gradients(
         first, second = partial(with_gradient, told), partial(with_gradient, foreseen)
         # Processes that share a batch meet at every mean, and so in one order.
         if batch.state.device.type == "cpu" and present_share() is WHOLE:
-            (terms, gradients), (more, others) = beside(first, second)
+            (terms, gradients), (more, others) = run_parallel(first, second)
         else:
             (terms, gradients), (more, others) = first(), second()
     for parameter in parameters:
@@ -131,7 +133,7 @@ def _parts(
     model: WorldModel,
     rollout: Rollout,
     batch: Batch,
-    draws: Draws,
+    draws: StepNoise,
     head: SplitMlp | None,
 ) -> tuple[Part, Part]:
     """What filtered states are asked for, and what is foreseen from them."""
@@ -152,7 +154,7 @@ def _parts(
         return terms | value_and_termination_losses(model, rollout, batch, config, head)
 
     def foreseen() -> Terms:
-        return foresight_losses(model, rollout, batch, weight, draws.foresight)
+        return multistep_losses(model, rollout, batch, weight, draws.multistep)
 
     return told, foreseen
 

@@ -35,7 +35,7 @@ def set_statistics(
         "state_std": np.maximum(state_std, STD_FLOOR),
         "return_mean": returns.mean(dtype=np.float64) if scaled else 0.0,
         "return_std": max(float(returns.std(dtype=np.float64)), 1e-6) if scaled else 1.0,
-        "return_floor": np.quantile(returns, WORST_RETURN_QUANTILE),
+        "min_return": np.quantile(returns, WORST_RETURN_QUANTILE),
         "discount": gamma,
     }
     for name, value in values.items():

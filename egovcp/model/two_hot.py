@@ -9,12 +9,11 @@ far outlier does not pull as it does on a squared error.
 from __future__ import annotations
 
 import math
+from functools import cache
 from typing import Final
 
 import torch
 from torch import Tensor
-
-from egovcp.model.kept import constant
 
 BINS: Final = 81
 REACH: Final = 4.0
@@ -27,7 +26,13 @@ _VALUES: Final = tuple(math.copysign(math.expm1(abs(x)), x) for x in _EVEN)
 
 def bins(like: Tensor) -> Tensor:
     """The values (BINS,), ascending, of ``like``'s device and in float32."""
-    return constant(_VALUES, like, torch.float32)
+    return _bins_on(like.device)
+
+
+@cache
+def _bins_on(device: torch.device) -> Tensor:
+    with torch.inference_mode(False):  # the cached tensor may be needed in training as well
+        return torch.tensor(_VALUES, dtype=torch.float32, device=device)
 
 
 def encode(x: Tensor) -> Tensor:

@@ -28,7 +28,7 @@ from egovcp.model.carry import Carry
 from egovcp.model.config import WorldModelConfig
 from egovcp.model.depth import nearness, network_image, to_metres
 from egovcp.model.gaussian import Gaussian
-from egovcp.model.nets import (
+from egovcp.model.networks import (
     DepthDecoder,
     DepthEncoder,
     GruCell,
@@ -62,7 +62,7 @@ class WorldModel(nn.Module):
     state_std: Tensor
     return_mean: Tensor
     return_std: Tensor
-    return_floor: Tensor
+    min_return: Tensor
     discount: Tensor
 
     def __init__(self, config: WorldModelConfig) -> None:
@@ -87,7 +87,7 @@ class WorldModel(nn.Module):
         self.register_buffer("state_std", torch.ones(spec.STATE_DIM))
         self.register_buffer("return_mean", torch.zeros(()))
         self.register_buffer("return_std", torch.ones(()))
-        self.register_buffer("return_floor", torch.zeros(()))
+        self.register_buffer("min_return", torch.zeros(()))
         self.register_buffer("discount", torch.tensor(spec.GAMMA))
         self.register_load_state_dict_pre_hook(_fill_discount)  # type: ignore[no-untyped-call]
 
@@ -187,7 +187,7 @@ class WorldModel(nn.Module):
         return Carry(h, prior.mean + prior.std * noise)
 
     @staticmethod
-    def spread(carry: Carry) -> Carry:
+    def expand_candidates(carry: Carry) -> Carry:
         """(E, ...) -> (E, 1, ...): one state that broadcasts over candidate actions."""
         return carry.map(lambda x: x[:, None])
 

@@ -1,8 +1,8 @@
-"""Planning in a learned model: sampling searches, ways to judge plans, and the policy of both."""
+"""Sampling-based planning in a learned model, and the policy that uses it."""
 
 from egovcp.plan.choices import require_answers
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.objective import Judge, StepByStep
+from egovcp.plan.objective import PlanEvaluator, ReferenceEvaluator
 from egovcp.plan.optimisers import optimiser_of
 from egovcp.plan.policy import Policy, PolicyStep, blank_observation
 from egovcp.plan.search import Optimiser, Plan, make_plan, until
@@ -10,13 +10,13 @@ from egovcp.plan.value_map import HandGrid, hand_grid, value_map
 
 __all__ = [
     "HandGrid",
-    "Judge",
     "Optimiser",
     "Plan",
+    "PlanEvaluator",
     "PlannerConfig",
     "Policy",
     "PolicyStep",
-    "StepByStep",
+    "ReferenceEvaluator",
     "blank_observation",
     "hand_grid",
     "make_plan",

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.search import Belief, best_of, draw, white
+from egovcp.plan.search import SearchState, best_of, draw, white
 
 
 @dataclass(frozen=True)
@@ -17,21 +17,21 @@ class CrossEntropy:
 
     config: PlannerConfig
 
-    def propose(self, belief: Belief, iteration: int, generator: torch.Generator) -> Tensor:
+    def propose(self, state: SearchState, iteration: int, generator: torch.Generator) -> Tensor:
         """See `Optimiser`; standing still is always among the candidates."""
-        noise = white(belief.mean, self.config.samples, generator)
-        return draw(belief.mean, belief.std, noise)
+        noise = white(state.mean, self.config.samples, generator)
+        return draw(state.mean, state.std, noise)
 
-    def learn(self, belief: Belief, deltas: Tensor, values: Tensor) -> Belief:
+    def learn(self, state: SearchState, deltas: Tensor, values: Tensor) -> SearchState:
         """See `Optimiser`."""
         elites, top = best_of(deltas, values, self.config.elites)
         usable = top.isfinite()
-        mean, std = refit(elites, usable, belief)
+        mean, std = refit(elites, usable, state)
         value = mean_value(top, usable)
-        return Belief(mean, std.clamp_min(self.config.min_std), elites, top, value)
+        return SearchState(mean, std.clamp_min(self.config.min_std), elites, top, value)
 
 
-def refit(elites: Tensor, usable: Tensor, belief: Belief) -> tuple[Tensor, Tensor]:
+def refit(elites: Tensor, usable: Tensor, state: SearchState) -> tuple[Tensor, Tensor]:
     """Mean and deviation (E, N, 7) of the usable elites (E, elites, N, 7); without any, the old."""
     if everything(usable):
         mean = elites.sum(1) / elites.shape[1]
@@ -42,8 +42,8 @@ def refit(elites: Tensor, usable: Tensor, belief: Belief) -> tuple[Tensor, Tenso
     fitted = (elites * weight).sum(1) / count.clamp_min(1.0)
     squares = (elites - fitted[:, None]).square() * weight
     spread = (squares.sum(1) / count.clamp_min(1.0)).sqrt()
-    mean = torch.where(count > 0, fitted, belief.mean)
-    return mean, torch.where(count > 0, spread, belief.std)
+    mean = torch.where(count > 0, fitted, state.mean)
+    return mean, torch.where(count > 0, spread, state.std)
 
 
 def mean_value(top: Tensor, usable: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ Latent = Literal["mean", "sample"]
 
 
 @runtime_checkable
-class Draws(Protocol):
+class StochasticModel(Protocol):
     """A model whose next state is uncertain."""
 
     def imagine_sample(
@@ -29,7 +29,7 @@ class Draws(Protocol):
         ...
 
 
-class Earns(Protocol):
+class RewardModel(Protocol):
     """A model that foresees rewards."""
 
     @property
@@ -42,7 +42,7 @@ class Earns(Protocol):
         ...
 
 
-def earning(model: object) -> Earns:
+def reward_model(model: object) -> RewardModel:
     """The model, which must foresee rewards.
 
     Raises:
@@ -52,7 +52,7 @@ def earning(model: object) -> Earns:
         raise UsageError(
             f"{type(model).__name__} has no reward and discount; plan with objective=value"
         )
-    return cast("Earns", model)  # isinstance does not see the buffers of a torch module
+    return cast("RewardModel", model)  # isinstance does not see the buffers of a torch module
 
 
 def require_answers(model: WorldModelConfig, planner: PlannerConfig) -> None:
@@ -83,7 +83,7 @@ def step_of[L](
     """
     if latent == "mean":
         return imagine
-    if not isinstance(model, Draws):
+    if not isinstance(model, StochasticModel):
         raise UsageError(
             f"latent=sample: {type(model).__name__} has no imagine_sample; plan with latent=mean"
         )

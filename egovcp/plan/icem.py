@@ -14,40 +14,40 @@ from torch import Tensor
 
 from egovcp.plan.cem import refit
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.search import Belief, best_of, draw
+from egovcp.plan.search import SearchState, best_of, draw
 
 
 @dataclass(frozen=True)
 class ImprovedCrossEntropy:
-    """``mean`` of the belief is the best plan so far; draws are made around the elites' mean."""
+    """``mean`` of the state is the best plan so far; draws are made around the elites' mean."""
 
     config: PlannerConfig
 
-    def propose(self, belief: Belief, iteration: int, generator: torch.Generator) -> Tensor:
+    def propose(self, state: SearchState, iteration: int, generator: torch.Generator) -> Tensor:
         """See `Optimiser`. From iteration 1 on, the best elites so far come first."""
         c = self.config
         samples = max(round(c.samples * c.sample_decay**-iteration), c.elites)
-        noise = coloured(belief.mean, samples, c.noise_exponent, generator)
+        noise = coloured(state.mean, samples, c.noise_exponent, generator)
         if iteration == 0:
-            return draw(belief.mean, belief.std, noise)
-        usable = belief.values.isfinite()
-        centre, _ = refit(belief.elites, usable, belief)
+            return draw(state.mean, state.std, noise)
+        usable = state.values.isfinite()
+        centre, _ = refit(state.elites, usable, state)
         kept = max(1, round(c.kept_elites * c.elites))
-        return torch.cat([belief.elites[:, :kept], draw(centre, belief.std, noise)], 1)
+        return torch.cat([state.elites[:, :kept], draw(centre, state.std, noise)], 1)
 
-    def learn(self, belief: Belief, deltas: Tensor, values: Tensor) -> Belief:
+    def learn(self, state: SearchState, deltas: Tensor, values: Tensor) -> SearchState:
         """See `Optimiser`."""
         elites, top = best_of(deltas, values, self.config.elites)
-        _, std = refit(elites, top.isfinite(), belief)
-        return keep_best(belief._replace(std=std.clamp_min(self.config.min_std)), elites, top)
+        _, std = refit(elites, top.isfinite(), state)
+        return keep_best(state._replace(std=std.clamp_min(self.config.min_std)), elites, top)
 
 
-def keep_best(belief: Belief, elites: Tensor, top: Tensor) -> Belief:
-    """The belief with these elites, whose first is the answer if it beats the one before."""
-    better = top[:, 0] > belief.value
-    mean = torch.where(better[:, None, None], elites[:, 0], belief.mean)
-    value = torch.where(better, top[:, 0], belief.value)
-    return belief._replace(mean=mean, elites=elites, values=top, value=value)
+def keep_best(state: SearchState, elites: Tensor, top: Tensor) -> SearchState:
+    """The state with these elites, whose first is the answer if it beats the one before."""
+    better = top[:, 0] > state.value
+    mean = torch.where(better[:, None, None], elites[:, 0], state.mean)
+    value = torch.where(better, top[:, 0], state.value)
+    return state._replace(mean=mean, elites=elites, values=top, value=value)
 
 
 def coloured(mean: Tensor, samples: int, exponent: float, generator: torch.Generator) -> Tensor:

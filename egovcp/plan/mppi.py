@@ -9,7 +9,7 @@ from torch import Tensor
 
 from egovcp.plan.cem import refit
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.search import Belief, best_of, draw, white
+from egovcp.plan.search import SearchState, best_of, draw, white
 
 
 @dataclass(frozen=True)
@@ -18,23 +18,23 @@ class PathIntegral:
 
     config: PlannerConfig
 
-    def propose(self, belief: Belief, iteration: int, generator: torch.Generator) -> Tensor:
+    def propose(self, state: SearchState, iteration: int, generator: torch.Generator) -> Tensor:
         """See `Optimiser`; standing still is always among the candidates."""
-        noise = white(belief.mean, self.config.samples, generator)
-        return draw(belief.mean, belief.std, noise)
+        noise = white(state.mean, self.config.samples, generator)
+        return draw(state.mean, state.std, noise)
 
-    def learn(self, belief: Belief, deltas: Tensor, values: Tensor) -> Belief:
+    def learn(self, state: SearchState, deltas: Tensor, values: Tensor) -> SearchState:
         """See `Optimiser`."""
         elites, top = best_of(deltas, values, self.config.elites)
         usable = values.isfinite()
         weight = weights(values, self.config.temperature)  # (E, M)
         any_usable = usable.any(1)
         mean = (weight[:, :, None, None] * deltas).sum(1)
-        mean = torch.where(any_usable[:, None, None], mean, belief.mean)
+        mean = torch.where(any_usable[:, None, None], mean, state.mean)
         value = (weight * values.masked_fill(~usable, 0.0)).sum(1)
         value = value.masked_fill(~any_usable, -torch.inf)
-        _, std = refit(elites, top.isfinite(), belief)
-        return Belief(mean, std.clamp_min(self.config.min_std), elites, top, value)
+        _, std = refit(elites, top.isfinite(), state)
+        return SearchState(mean, std.clamp_min(self.config.min_std), elites, top, value)
 
 
 def weights(values: Tensor, temperature: float) -> Tensor:

@@ -17,17 +17,17 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from egovcp.plan.choices import earning, step_of
+from egovcp.plan.choices import reward_model, step_of
 from egovcp.plan.config import PlannerConfig
 
-Worth = Callable[[Tensor, torch.Generator | None], Tensor]
+PlanValue = Callable[[Tensor, torch.Generator | None], Tensor]
 """J (E, M) of plans (E, M, N, 7); the generator is for the noise under ``latent=sample``."""
 
 
-class Judge[C](Protocol):
+class PlanEvaluator[C](Protocol):
     """Says what plans from a state are worth; several may compute the same in different ways."""
 
-    def at(self, carry: C) -> Worth:
+    def at(self, carry: C) -> PlanValue:
         """What all plans from the robots' states (E, ...) share is computed here, once."""
         ...
 
@@ -36,11 +36,11 @@ class Dynamics[L](Protocol):
     """What is needed of a world model; leading dimensions broadcast (E robots, M plans)."""
 
     @property
-    def return_floor(self) -> Tensor:
+    def min_return(self) -> Tensor:
         """The worst return of the data: what a failed plan is worth under rule ``shift``."""
         ...
 
-    def spread(self, carry: L) -> L:
+    def expand_candidates(self, carry: L) -> L:
         """(E, ...) -> (E, 1, ...): one state that all candidates of a robot share."""
         ...
 
@@ -57,22 +57,22 @@ class Dynamics[L](Protocol):
         ...
 
 
-class StepByStep[L](NamedTuple):
-    """The judge that asks a world model about every step: slow, and right by definition."""
+class ReferenceEvaluator[L](NamedTuple):
+    """The evaluator that asks a world model about every step: slow, and right by definition."""
 
     model: Dynamics[L]
     config: PlannerConfig
 
-    def at(self, carry: L) -> Worth:
-        """See `Judge`."""
+    def at(self, carry: L) -> PlanValue:
+        """See `PlanEvaluator`."""
 
-        def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:
+        def plan_value(actions: Tensor, generator: torch.Generator | None) -> Tensor:
             return evaluate(self.model, carry, actions, self.config, generator)
 
-        return worth
+        return plan_value
 
 
-class Account:
+class ReturnAccumulator:
     """J of plans, step by step: which head a step is asked for, and what it adds.
 
     A plan that has failed is worth the floor, or earns (1 - gamma) floor at each tick: for ever,
@@ -91,8 +91,8 @@ class Account:
     def __init__(self, config: PlannerConfig, model: Dynamics[Any], steps: int) -> None:
         self._config, self._steps = config, steps
         self._means = config.objective == "value"
-        self._discount = 1.0 if self._means else earning(model).discount
-        self._floor = 0.0 if config.termination_rule == "paper" else model.return_floor
+        self._discount = 1.0 if self._means else reward_model(model).discount
+        self._floor = 0.0 if config.termination_rule == "paper" else model.min_return
         self._weight: Tensor | float = 1.0
         self._share: Tensor | float = 1.0
         self._above: Tensor | float = 0.0
@@ -124,7 +124,7 @@ class Account:
         else:
             self._share = self._share * (dead <= self._config.termination_threshold)
 
-    def worth(self) -> Tensor:
+    def plan_value(self) -> Tensor:
         """J, (...)."""
         j = self._above + self._below
         if self._means:
@@ -132,8 +132,8 @@ class Account:
         assert isinstance(j, Tensor)
         return j
 
-    def _add(self, worth: Tensor, floor: Tensor | float) -> None:
-        self._above = self._above + self._weight * self._share * (worth - floor)
+    def _add(self, value: Tensor, floor: Tensor | float) -> None:
+        self._above = self._above + self._weight * self._share * (value - floor)
         self._below = self._below + self._weight * floor
 
 
@@ -152,16 +152,16 @@ def evaluate[L](
     Raises:
         UsageError: the model does not know what is asked of it.
     """
-    account = Account(config, model, actions.shape[-2])
+    accumulator = ReturnAccumulator(config, model, actions.shape[-2])
     states = _states(model, carry, actions, config, generator)
     for k, (state, action) in enumerate(zip(states, actions.unbind(-2), strict=True)):
-        if account.asks_value(k):
-            account.value(model.value(state, action))
+        if accumulator.asks_value(k):
+            accumulator.value(model.value(state, action))
         else:
-            account.reward(earning(model).reward(state, action))
-        if account.asks_risk(k):
-            account.risk(model.termination(state))
-    return account.worth()
+            accumulator.reward(reward_model(model).reward(state, action))
+        if accumulator.asks_risk(k):
+            accumulator.risk(model.termination(state))
+    return accumulator.plan_value()
 
 
 def _states[L](
@@ -173,7 +173,7 @@ def _states[L](
 ) -> Iterator[L]:
     """At which each of the actions is taken: the robots' own, then the imagined ones."""
     imagine = step_of(model, model.imagine, config.latent, generator)
-    carry = model.spread(carry)
+    carry = model.expand_candidates(carry)
     yield carry
     for action in actions.unbind(-2)[:-1]:
         carry = imagine(carry, action)

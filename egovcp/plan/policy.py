@@ -13,11 +13,11 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
-from egovcp.plan.backends import judge_of_model
+from egovcp.plan.action_parameterization import shift
+from egovcp.plan.backends import make_evaluator
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.objective import Judge
+from egovcp.plan.objective import PlanEvaluator
 from egovcp.plan.optimisers import optimiser_of
-from egovcp.plan.process import shift
 from egovcp.plan.search import make_plan
 
 type Array = NDArray[np.float32]
@@ -62,7 +62,7 @@ class Policy:
         self.config = config
         self.num_envs = num_envs
         self._seed = seed
-        self._judge: Judge[Carry] | None = None
+        self._judge: PlanEvaluator[Carry] | None = None
         self.skipped: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
         """(E,) whether the last observation of each robot was skipped."""
         self.reset()
@@ -179,7 +179,7 @@ class Policy:
             self.act(*blank_observation(self.num_envs))
         self.reset()
 
-    def prepare(self) -> Judge[Carry]:
+    def prepare(self) -> PlanEvaluator[Carry]:
         """Pack the planner now and not at the first observation: it may have to be compiled.
 
         Raises:
@@ -187,7 +187,7 @@ class Policy:
             EnvironmentFailure: the backend cannot be built here.
         """
         if self._judge is None:
-            self._judge = judge_of_model(self.model, self.config)
+            self._judge = make_evaluator(self.model, self.config)
         return self._judge
 
     def advance(self, sent: NDArray[np.floating]) -> None:

@@ -1,4 +1,4 @@
-"""Value-guided sampling MPC (paper section III-D): draw plans, judge them, draw better ones.
+"""Value-guided sampling MPC (paper section III-D): draw plans, evaluator them, draw better ones.
 
 Candidates live in the action process of the data, a_k = a_{k-1} + eta * delta_k with
 delta in [-1, 1]^7 starting at the last executed action (where the data rests between its steps, in
@@ -16,12 +16,12 @@ import torch
 from torch import Tensor
 
 from egovcp import spec
+from egovcp.plan.action_parameterization import random_walk, target_steps
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.objective import Judge
-from egovcp.plan.process import ramp, walk
+from egovcp.plan.objective import PlanEvaluator
 
 
-class Belief(NamedTuple):
+class SearchState(NamedTuple):
     """What a search knows about good plans of E robots."""
 
     mean: Tensor  # (E, N, 7) deltas; what it would answer now
@@ -34,11 +34,11 @@ class Belief(NamedTuple):
 class Optimiser(Protocol):
     """Draws candidates and learns from what they are worth."""
 
-    def propose(self, belief: Belief, iteration: int, generator: torch.Generator) -> Tensor:
-        """(E, M, N, 7) deltas; the first candidate is ``belief.mean`` in iteration 0."""
+    def propose(self, state: SearchState, iteration: int, generator: torch.Generator) -> Tensor:
+        """(E, M, N, 7) deltas; the first candidate is ``state.mean`` in iteration 0."""
         ...
 
-    def learn(self, belief: Belief, deltas: Tensor, values: Tensor) -> Belief:
+    def learn(self, state: SearchState, deltas: Tensor, values: Tensor) -> SearchState:
         """After the ``values`` (E, M) of these candidates; -inf where J was not a number."""
         ...
 
@@ -47,8 +47,8 @@ class Optimiser(Protocol):
 class Walker(Protocol):
     """An optimiser that also makes actions of its draws."""
 
-    def walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
-        """`process.walk`, to the same bits and sooner: (E, M, N, 7) from (E, 1, 7)."""
+    def random_walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
+        """Same bits as the module function, but faster: (E, M, N, 7) from (E, 1, 7)."""
         ...
 
 
@@ -63,7 +63,7 @@ class Plan(NamedTuple):
     iterations: int
 
 
-class Pace:
+class Deadline:
     """Says whether another iteration ends before the deadline, judged by the slowest so far.
 
     Args:
@@ -91,7 +91,7 @@ def until(deadline_s: float) -> Callable[[], float]:
 
 
 def make_plan[C](
-    judge: Judge[C],
+    evaluator: PlanEvaluator[C],
     optimiser: Optimiser,
     carry: C,
     executed: Tensor,
@@ -109,24 +109,24 @@ def make_plan[C](
         remaining: seconds until an answer is due. The search stops where a further iteration,
             were it as slow as the slowest so far, would end later; one is always made.
     """
-    pace = Pace(remaining)
-    belief = _start(executed, config, warm)
-    worth = judge.at(carry)
-    follow = optimiser.walk if isinstance(optimiser, Walker) else walk
+    pace = Deadline(remaining)
+    state = _start(executed, config, warm)
+    plan_value = evaluator.at(carry)
+    follow = optimiser.random_walk if isinstance(optimiser, Walker) else random_walk
     start = executed[:, None]  # (E, 1, 7)
     for iteration in range(config.iterations):
-        deltas = optimiser.propose(belief, iteration, generator)  # (E, M, N, 7)
-        if config.process == "ramp":
-            deltas = ramp(start, deltas, config.eta)
+        deltas = optimiser.propose(state, iteration, generator)  # (E, M, N, 7)
+        if config.action_parameterization == "target":
+            deltas = target_steps(start, deltas, config.eta)
         actions = follow(start, deltas, config.eta)
-        values = _less_effort(worth(actions, generator), actions, deltas, config)
+        values = _less_effort(plan_value(actions, generator), actions, deltas, config)
         values = values.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
-        belief = optimiser.learn(belief, deltas, values)
+        state = optimiser.learn(state, deltas, values)
         if not pace.goes_on():
             break
-    best = follow(start, belief.elites, config.eta)
-    chosen = follow(start, belief.mean[:, None], config.eta)[:, 0]
-    return Plan(chosen, belief.mean, belief.value, best, belief.values, iteration + 1)
+    best = follow(start, state.elites, config.eta)
+    chosen = follow(start, state.mean[:, None], config.eta)[:, 0]
+    return Plan(chosen, state.mean, state.value, best, state.values, iteration + 1)
 
 
 def _less_effort(values: Tensor, actions: Tensor, deltas: Tensor, config: PlannerConfig) -> Tensor:
@@ -139,14 +139,14 @@ def _less_effort(values: Tensor, actions: Tensor, deltas: Tensor, config: Planne
     return values - cost if isinstance(cost, Tensor) else values
 
 
-def _start(executed: Tensor, config: PlannerConfig, warm: Tensor | None) -> Belief:
+def _start(executed: Tensor, config: PlannerConfig, warm: Tensor | None) -> SearchState:
     robots = executed.shape[0]
     shape = (robots, config.actions, spec.ACTION_DIM)
     mean = executed.new_zeros(shape) if warm is None else warm
     nothing = executed.new_full((robots, config.elites), -torch.inf)
     elites = mean[:, None].expand(-1, config.elites, -1, -1)
     std = torch.full_like(mean, 3.0**-0.5)  # of U(-1, 1)
-    return Belief(mean, std, elites, nothing, nothing[:, 0])
+    return SearchState(mean, std, elites, nothing, nothing[:, 0])
 
 
 def draw(mean: Tensor, std: Tensor, noise: Tensor, still: bool = True) -> Tensor:

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from egovcp.plan.config import PlannerConfig
 from egovcp.plan.icem import keep_best
-from egovcp.plan.search import Belief, best_of
+from egovcp.plan.search import SearchState, best_of
 
 
 @dataclass(frozen=True)
@@ -18,9 +18,9 @@ class Shooting:
 
     config: PlannerConfig
 
-    def propose(self, belief: Belief, iteration: int, generator: torch.Generator) -> Tensor:
+    def propose(self, state: SearchState, iteration: int, generator: torch.Generator) -> Tensor:
         """See `Optimiser`; uniform steps, after the best plan so far and standing still."""
-        mean = belief.mean
+        mean = state.mean
         size = (1, self.config.samples, *mean.shape[1:])
         uniform = 2 * torch.rand(size, generator=generator, device=mean.device) - 1
         deltas = uniform.repeat(mean.shape[0], 1, 1, 1)
@@ -29,6 +29,6 @@ class Shooting:
             deltas[:, 1] = 0.0
         return deltas.clamp_(-1.0, 1.0)
 
-    def learn(self, belief: Belief, deltas: Tensor, values: Tensor) -> Belief:
+    def learn(self, state: SearchState, deltas: Tensor, values: Tensor) -> SearchState:
         """See `Optimiser`."""
-        return keep_best(belief, *best_of(deltas, values, self.config.elites))
+        return keep_best(state, *best_of(deltas, values, self.config.elites))

@@ -53,7 +53,7 @@ def value_map[L](
     actions = action[:, None, None, :].repeat(1, len(z), len(x), 1)  # (E, n, m, 7)
     actions[..., axis_x] = x
     actions[..., axis_z] = z[:, None]
-    values = model.value(model.spread(carry), actions.flatten(1, 2))
+    values = model.value(model.expand_candidates(carry), actions.flatten(1, 2))
     return values.reshape(len(action), len(z), len(x))
 
 

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from egovcp.testing.environments import CountingEnv, ToyObservation, ToyStep
     from egovcp.testing.episodes import random_episode
     from egovcp.testing.models import CountingModel, toy_model, toy_reactive
-    from egovcp.testing.planning import Point, PointWorld, ScriptedWorld
+    from egovcp.testing.planning import Point, PointWorld, ScriptedWorld, plain_planner
     from egovcp.testing.recordings import AgainRecorder
 
 __all__ = [
@@ -26,6 +26,7 @@ __all__ = [
     "ToyObservation",
     "ToyStep",
     "memory_batch",
+    "plain_planner",
     "random_batch",
     "random_episode",
     "toy_model",
@@ -45,6 +46,7 @@ _HOME = {
     "Point": "planning",
     "PointWorld": "planning",
     "ScriptedWorld": "planning",
+    "plain_planner": "planning",
     "AgainRecorder": "recordings",
 }
 

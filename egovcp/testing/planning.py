@@ -3,13 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from egovcp import spec
+from egovcp.plan import PlannerConfig
+
+
+def plain_planner(**changes: Any) -> PlannerConfig:
+    """A planner whose candidates are random walks without action costs: J alone decides."""
+    plain = {"samples": 1024, "elites": 64, "hands_cost": 0.0, "step_cost": 0.0}
+    return PlannerConfig(**(plain | {"action_parameterization": "random_walk"} | changes))
 
 
 class Point(NamedTuple):
@@ -28,14 +35,14 @@ class PointWorld:
 
     def __init__(self, cliff: float = np.inf, floor: float = -100.0) -> None:
         self.cliff = cliff
-        self.return_floor = torch.tensor(floor)
+        self.min_return = torch.tensor(floor)
 
     @staticmethod
     def start(executed: Tensor, goal: Tensor) -> Point:
         """Robots at their last executed actions (E, 7), each with a goal (E, 7)."""
         return Point(executed, goal.expand_as(executed))
 
-    def spread(self, carry: Point) -> Point:
+    def expand_candidates(self, carry: Point) -> Point:
         return Point(carry.position[:, None], carry.goal[:, None])
 
     def imagine(self, carry: Point, action: Tensor) -> Point:
@@ -65,13 +72,13 @@ class ScriptedWorld:
     ) -> None:
         self.values, self.deaths = torch.tensor(values), torch.tensor(deaths)
         self.rewards, self.discount = torch.tensor(rewards), torch.tensor(gamma)
-        self.return_floor = torch.tensor(floor)
+        self.min_return = torch.tensor(floor)
 
     def start(self, robots: int = 1) -> Tensor:
         """Tick 0 for every robot, (E,)."""
         return torch.zeros(robots, dtype=torch.long)
 
-    def spread(self, carry: Tensor) -> Tensor:
+    def expand_candidates(self, carry: Tensor) -> Tensor:
         return carry[:, None]
 
     def imagine(self, carry: Tensor, action: Tensor) -> Tensor:

@@ -88,7 +88,7 @@ class PlayConfig:
     """Further flags of egovcp-eval; studies that play take those of the planner, too."""
     task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
     """Flags after those where the model of one task plays (all: the multi-task model), '{ball:
-    [--planner.process=ramp]}'."""
+    [--planner.action_parameterization=target]}'."""
 
 
 @dataclass(frozen=True)

@@ -3,14 +3,15 @@
 import pytest
 
 from egovcp.flags import flags_of
-from egovcp.removed_options import REMOVED_OPTIONS
+from egovcp.removed_options import REMOVED_OPTIONS, RENAMED_OPTIONS
 
 from .listing import all_commands
 
 
 def test_no_option_of_a_command_is_listed_as_removed() -> None:
     flags = {flag for command in all_commands() for flag in flags_of(command.config_class)}
-    assert not {f"--{name}" for name in REMOVED_OPTIONS} & flags
+    assert not {f"--{name}" for name in (*REMOVED_OPTIONS, *RENAMED_OPTIONS)} & flags
+    assert {f"--{name}" for name in RENAMED_OPTIONS.values()} <= flags
 
 
 @pytest.mark.parametrize(
@@ -21,6 +22,8 @@ def test_no_option_of_a_command_is_listed_as_removed() -> None:
         ("egovcp-train", "--datasets=[{root: x, return_steps: 9}]", "--returns.steps"),
         ("egovcp-train", "--planner.ensemble=min", "leave it out"),
         ("egovcp-eval", "--planner.ensemble=min", "leave it out"),
+        ("egovcp-eval", "--planner.process=ramp", "--planner.action_parameterization"),
+        ("egovcp-train", "--policy.loss.near=0", "--policy.loss.proximity_weight"),
         ("egovcp-eval-model", "--return_steps=16", "leave it out"),
     ],
 )

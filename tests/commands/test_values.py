@@ -45,7 +45,7 @@ VALUES = [
 #: Integers that cost only time, or nothing.
 UNBOUNDED = {
     *("seed", "seeds", "steps", "compared_steps", "told_steps", "warmup_steps", "attempts"),
-    *("log_freq", "eval_freq", "save_freq", "decode_every", "foresight_every", "stride"),
+    *("log_freq", "eval_freq", "save_freq", "decode_every", "multistep_stride", "stride"),
     *("episode", "count", "max_problems", "moments", "most", "mode"),
 }
 

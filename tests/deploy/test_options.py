@@ -63,9 +63,11 @@ def test_planner_options_change_only_what_they_name() -> None:
     other = PlannerOptions(optimiser="icem", backend="float32").apply(own)
     assert (other.optimiser, other.backend, other.samples) == ("icem", "float32", 512)
     assert PlannerOptions(min_std=0.05).apply(own) == replace(own, min_std=0.05)
-    assert PlannerOptions(process="ramp").apply(own) == replace(own, process="ramp")
+    assert PlannerOptions(action_parameterization="target").apply(own) == replace(
+        own, action_parameterization="target"
+    )
     with pytest.raises(UsageError):
-        PlannerOptions(samples=8).apply(own)  # fewer than the elites
+        PlannerOptions(samples=2).apply(own)  # fewer than the elites
     with pytest.raises(UsageError, match="min_std=-1: expected at least 0"):
         PlannerOptions(min_std=-1).apply(own)
 

@@ -22,15 +22,15 @@ def test_a_backend_that_was_asked_for_is_the_one_that_is_named(
 
 
 @pytest.mark.parametrize(
-    ("judge", "name"),
-    [("IntegerJudge", "int8"), ("FloatJudge", "float32"), ("StepByStep", "eager")],
+    ("evaluator", "name"),
+    [("Int8Evaluator", "int8"), ("FloatEvaluator", "float32"), ("ReferenceEvaluator", "eager")],
 )
 def test_auto_is_named_by_what_it_took(
-    artefact_dir: Path, monkeypatch: pytest.MonkeyPatch, judge: str, name: str
+    artefact_dir: Path, monkeypatch: pytest.MonkeyPatch, evaluator: str, name: str
 ) -> None:
     policy = load_artefact(str(artefact_dir)).make_policy(1, 0)
     assert policy.config.backend == "auto"
-    monkeypatch.setattr(policy, "prepare", type(judge, (), {}))
+    monkeypatch.setattr(policy, "prepare", type(evaluator, (), {}))
     assert backend_of(policy) == name
 
 

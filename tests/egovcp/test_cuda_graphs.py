@@ -10,8 +10,8 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.cuda_graphs import MOST_RECORDINGS, Recorded
 from egovcp.model import PRESETS, Carry
-from egovcp.plan import PlannerConfig, StepByStep
-from egovcp.plan.backends.judges import FloatJudge
+from egovcp.plan import PlannerConfig, ReferenceEvaluator
+from egovcp.plan.backends.evaluators import FloatEvaluator
 from egovcp.testing import AgainRecorder, toy_model
 
 
@@ -116,8 +116,8 @@ def test_results_that_are_not_copied_are_those_of_the_last_call() -> None:
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_on_a_gpu_a_replayed_judge_says_what_the_model_says() -> None:
     model = toy_model(PRESETS["debug"]).cuda()
-    judge = FloatJudge(model, PlannerConfig())
-    reference = StepByStep(model, PlannerConfig())
+    evaluator = FloatEvaluator(model, PlannerConfig())
+    reference = ReferenceEvaluator(model, PlannerConfig())
     rng = torch.Generator().manual_seed(0)
     with torch.no_grad():
         for _ in range(3):
@@ -125,6 +125,6 @@ def test_on_a_gpu_a_replayed_judge_says_what_the_model_says() -> None:
             h = torch.rand(start.h.shape, generator=rng).cuda()
             carry = Carry(h, torch.randn(start.z.shape, generator=rng).cuda())
             actions = 2 * torch.rand(2, 65, 4, spec.ACTION_DIM, generator=rng).cuda() - 1
-            found, expected = (j.at(carry)(actions, None) for j in (judge, reference))
+            found, expected = (j.at(carry)(actions, None) for j in (evaluator, reference))
             torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3)
-    assert judge.shapes == 2  # nothing was computed without a recording
+    assert evaluator.shapes == 2  # nothing was computed without a recording

@@ -158,14 +158,14 @@ def test_multitask_says_which_models_are_played_otherwise() -> None:
     assert "played with" not in str(report("multitask", 1.0).parts[0])
     small = SCALES["small"]()
     flags = {
-        "wall": ("--planner.process=walk", "--planner.hands_cost=0.3"),
+        "wall": ("--planner.action_parameterization=random_walk", "--planner.hands_cost=0.3"),
         "all": ("--planner.elites=8",),
     }
     unlike = replace(small, play=replace(small.play, task_flags=flags))
     found = EXPERIMENTS["multitask"].report(unlike, records("multitask", 1.0))
     assert str(found.parts[0]).endswith(
         "The model of wall alone is played with "
-        "`--planner.process=walk --planner.hands_cost=0.3`. "
+        "`--planner.action_parameterization=random_walk --planner.hands_cost=0.3`. "
         "The model on mixed data is played with `--planner.elites=8`."
     )
 

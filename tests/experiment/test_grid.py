@@ -58,20 +58,23 @@ def test_what_differs_in_nothing_is_played_once_for_all_experiments() -> None:
 
 
 def test_a_variant_that_asks_for_what_is_done_anyway_is_the_default() -> None:
-    play = PlayConfig(task_flags={"ball": ("--planner.process=ramp",)})
+    play = PlayConfig(task_flags={"ball": ("--planner.action_parameterization=target",)})
     grid = Grid(ExperimentConfig(play=play))
-    ramp, walk = (Variant(f"process_{p}", play={"planner.process": p}) for p in ("ramp", "walk"))
-    assert grid.play("ball", 0, ramp) == grid.play("ball", 0, Variant("default"))
-    assert grid.play("ball", 0, walk).name == "play-ball-process_walk-s0"
-    assert grid.play("wall", 0, ramp).name == "play-wall-process_ramp-s0"
+    target, walk = (
+        Variant(p, play={"planner.action_parameterization": p}) for p in ("target", "random_walk")
+    )
+    assert grid.play("ball", 0, target) == grid.play("ball", 0, Variant("default"))
+    assert grid.play("ball", 0, walk).name == "play-ball-random_walk-s0"
+    assert grid.play("wall", 0, target).name == "play-wall-target-s0"
 
 
 def test_a_variant_with_the_planner_that_is_trained_for_is_the_default() -> None:
     training = TrainingConfig(
-        flags=("--planner.process=ramp",), task_flags={"wall": ("--planner.process=walk",)}
+        flags=("--planner.action_parameterization=target",),
+        task_flags={"wall": ("--planner.action_parameterization=random_walk",)},
     )
     grid = Grid(ExperimentConfig(train=training))
-    ramp = Variant("ramp", play={"planner.process": "ramp"})
+    ramp = Variant("ramp", play={"planner.action_parameterization": "target"})
     assert grid.play("ball", 0, ramp) == grid.play("ball", 0, Variant("default"))
     assert grid.play("wall", 0, ramp).name == "play-wall-ramp-s0"
 

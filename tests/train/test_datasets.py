@@ -111,7 +111,7 @@ def test_the_statistics_from_the_disk_are_those_from_memory(
         assert main(argv) == 0
         folder = tmp_path / mode / "checkpoints" / "last" / "pretrained_model"
         models.append(load_artefact(str(folder)).world_model.state_dict())
-    for name in ("state_mean", "state_std", "return_mean", "return_std", "return_floor"):
+    for name in ("state_mean", "state_std", "return_mean", "return_std", "min_return"):
         torch.testing.assert_close(models[0][name], models[1][name])
 
 

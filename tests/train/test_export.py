@@ -38,7 +38,7 @@ def _lively(model: WorldModel) -> WorldModel:
     model.state_std.uniform_(0.5, 2, generator=generator)
     model.return_mean.fill_(-3.0)
     model.return_std.fill_(2.0)
-    model.return_floor.fill_(-9.0)
+    model.min_return.fill_(-9.0)
     return model.eval()
 
 
@@ -146,7 +146,7 @@ def test_the_description_fits_the_files(exported: Path, artefact: Path) -> None:
     assert {path.name for path in exported.iterdir()} == FILES
     report = json.loads((exported / REPORT).read_text())
     assert report["controller_id"] == "s-1"
-    assert report["return_floor"] == -9.0
+    assert report["min_return"] == -9.0
     assert report["features"] == load_artefact(str(artefact)).manifest["features"]
     for name, entry in report["networks"].items():
         path = exported / entry["file"]

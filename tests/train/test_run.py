@@ -119,7 +119,7 @@ def test_the_statistics_are_those_of_the_training_episodes(
     assert model.state_mean.abs().max() < 0.5
     assert ((model.state_std - 1).abs() < 0.5).all()
     ceiling = sum(spec.GAMMA**i for i in range(5))
-    assert 0 <= model.return_floor <= model.return_mean <= ceiling
+    assert 0 <= model.min_return <= model.return_mean <= ceiling
 
 
 def test_a_preset_is_where_the_policy_options_start(arguments: Arguments, tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any, Literal
 
 from egovcp.bounds import MOST_PER_CORE, bounded
@@ -13,6 +13,7 @@ from egovcp.hub import RetryPolicy, is_repo_id
 from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_answers
+from egovcp.plan.config import PAPER_PLANNER
 from egovcp.plan.cost import require_affordable
 from egovcp_train.wandb_records import WandbConfig
 
@@ -179,6 +180,6 @@ TRAINING_PRESETS: dict[str, dict[str, Any]] = {
         "sampling": {"mirror": False},
         "optimizer": {"ema": 0.0},
         "returns": {"keep_truncated": True},
-        "planner": {"termination_rule": "paper"},
+        "planner": asdict(PAPER_PLANNER),
     },
 }

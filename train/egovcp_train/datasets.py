@@ -45,7 +45,7 @@ type Built = tuple[Ahead, EpisodeStore, Mapping[str, ReturnScale]]
 
 
 @dataclass(frozen=True)
-class Material:
+class TrainingData:
     """The episodes of a run."""
 
     readers: tuple[DatasetReader, ...]
@@ -60,7 +60,7 @@ class Material:
     """Task -> the scale that its returns are on, under `returns.scale=per_task`; else empty."""
 
 
-def prepare(config: TrainConfig, model: WorldModel, ranks: Ranks = ALONE) -> Material:
+def prepare(config: TrainConfig, model: WorldModel, ranks: Ranks = ALONE) -> TrainingData:
     """Open the datasets and fix the model's statistics.
 
     What is on disk is read and checked as a whole; of a dataset that is streamed from the Hub a
@@ -81,7 +81,7 @@ def prepare(config: TrainConfig, model: WorldModel, ranks: Ranks = ALONE) -> Mat
     return _prepare(dataclasses.replace(config, loading=loading), model, ranks)
 
 
-def _prepare(config: TrainConfig, model: WorldModel, ranks: Ranks) -> Material:
+def _prepare(config: TrainConfig, model: WorldModel, ranks: Ranks) -> TrainingData:
     mix, sampling = mix_of(config), stream_config(config)
     sampling.check()
     config.loading.shuffle.check()
@@ -91,7 +91,7 @@ def _prepare(config: TrainConfig, model: WorldModel, ranks: Ranks) -> Material:
     if config.loading.mode == "ram" and any(reader.is_remote for reader in readers):
         readers = open_readers(config)
     build = _in_memory if config.loading.mode == "ram" else _on_disk
-    return Material(readers, config, *build(readers, config, sampling, mix, model, ranks))
+    return TrainingData(readers, config, *build(readers, config, sampling, mix, model, ranks))
 
 
 def open_readers(config: TrainConfig) -> tuple[DatasetReader, ...]:

@@ -198,7 +198,7 @@ def _report(artefact: Artefact, folder: Path, golden: dict[str, torch.Tensor]) -
             for name, network in networks.items()
         },
         "golden": {"file": GOLDEN, "sha256": _sha256(folder / GOLDEN), "tolerance": TOLERANCE},
-        "return_floor": float(artefact.world_model.return_floor),
+        "min_return": float(artefact.world_model.min_return),
         "discount": float(artefact.world_model.discount),
         "planner": draccus.encode(artefact.planner),
         "controller_id": artefact.controller_id,

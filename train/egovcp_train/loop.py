@@ -14,15 +14,15 @@ from torch import Tensor
 
 from egovcp.cuda_graphs import Recorded
 from egovcp.errors import DataError
-from egovcp.model import Batch, Draws, WorldModel, draws_for, world_model_gradients
-from egovcp.model.shared import sharing
-from egovcp.model.td import TargetNetwork
+from egovcp.model import Batch, StepNoise, WorldModel, sample_step_noise, world_model_gradients
+from egovcp.model.data_parallel import sharing
+from egovcp.model.value_losses import TargetNetwork
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.device import precision
 from egovcp_train.ranks import ALONE, Ranks
 
 _MOST_GRAPHS: Final = 64
-"""One for each row or image that may be the first (`egovcp.model.Draws`): 8 of the default."""
+"""One for each row or image that may be the first (`egovcp.model.StepNoise`): 8 of the default."""
 
 type Found = tuple[tuple[str, ...], Tensor, tuple[Tensor | None, ...]]
 """Names and values (n,) of the terms, and the gradients of all parameters."""
@@ -59,7 +59,7 @@ class Learner:
         self.step = 0
         self._not_finite = 0
         self._parameters = list(model.parameters())
-        self._gradients: Callable[[Batch, Draws], Found] = self._find
+        self._gradients: Callable[[Batch, StepNoise], Found] = self._find
         if device.type == "cuda" and ranks.count == 1:
             self._gradients = Recorded(self._find, most=_MOST_GRAPHS, copies=False)
 
@@ -74,7 +74,7 @@ class Learner:
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(progress)
         with sharing(self.ranks.share):
-            draws = draws_for(self.model, batch, self.generator)
+            draws = sample_step_noise(self.model, batch, self.generator)
             names, values, gradients = self._gradients(batch, draws)
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
@@ -89,7 +89,7 @@ class Learner:
         self.step += 1
         return {**terms, "grad_norm": norm}
 
-    def _find(self, batch: Batch, draws: Draws) -> Found:
+    def _find(self, batch: Batch, draws: StepNoise) -> Found:
         head = self.target.head if self.target else None
         in_precision = partial(precision, batch.state.device, self.bf16)
         with torch.enable_grad():

@@ -17,7 +17,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from egovcp.errors import EnvironmentFailure
-from egovcp.model.shared import WHOLE, Share
+from egovcp.model.data_parallel import WHOLE, Share
 from egovcp.packages import require_packages
 
 type Terms = dict[str, Tensor]

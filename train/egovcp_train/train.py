@@ -20,7 +20,7 @@ from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
 from egovcp.model import PRESETS, WorldModel
 from egovcp.model.weights import tensor_shapes
-from egovcp.plan.backends import judge_of_model
+from egovcp.plan.backends import make_evaluator
 from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo, one_line
 from egovcp_train.allocation import keep_freed_memory
@@ -37,7 +37,7 @@ from egovcp_train.config import TRAINING_PRESETS, TrainConfig
 from egovcp_train.datasets import (
     EVALUATION_EPISODES,
     FRAME_BYTES,
-    Material,
+    TrainingData,
     prepare,
     require_datasets,
     require_same_content,
@@ -141,7 +141,7 @@ class Run:
         config: TrainConfig,
         output: Path,
         learner: Learner,
-        material: Material,
+        material: TrainingData,
         device: torch.device,
         provenance: dict[str, Any],
         simulation: ClosedLoop | None = None,
@@ -333,7 +333,7 @@ def _simulation(
 ) -> ClosedLoop | None:
     if not config.eval_closed_loop:
         return None
-    judge_of_model(model, config.planner)  # refuse a backend that cannot be used here before work
+    make_evaluator(model, config.planner)  # refuse a backend that cannot be used here before work
     tasks, controller = provenance["tasks"], provenance["controller_id"]
     return ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
 
@@ -347,7 +347,7 @@ def _records(config: TrainConfig, output: Path) -> Everywhere:
     return Everywhere(found)
 
 
-def _restore(output: Path, learner: Learner, material: Material) -> float:
+def _restore(output: Path, learner: Learner, material: TrainingData) -> float:
     """Continue from the last checkpoint; returns the seconds that the run has taken so far.
 
     Raises:
@@ -365,7 +365,7 @@ def _restore(output: Path, learner: Learner, material: Material) -> float:
         return float(state.get("seconds", 0.0))
 
 
-def _provenance(material: Material) -> dict[str, Any]:
+def _provenance(material: TrainingData) -> dict[str, Any]:
     readers = material.readers
     return {
         "controller_id": readers[0].controller_id,

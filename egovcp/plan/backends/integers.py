@@ -16,7 +16,7 @@ from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel, value
 from egovcp.model.config import ValueLoss
-from egovcp.model.nets import SplitMlp
+from egovcp.model.networks import SplitMlp
 from egovcp.plan.backends import library
 from egovcp.plan.backends.layers import first_outputs, gru_layer, linears_of, norms_of, weight_of
 from egovcp.plan.backends.tables import LEAST_SILU, ONE, UNIT, silu_table, tanh_table
@@ -36,7 +36,7 @@ RULES: Final = ("paper", "shift", "survival")
 class Shared(NamedTuple):
     """What the candidates of one robot share, as the kernel reads it; keeps its tensors alive."""
 
-    description: library.Root
+    description: library.SharedPrefix
     tensors: tuple[Tensor, ...]
 
 
@@ -67,14 +67,14 @@ class IntegerNetwork:
             ctypes.byref(self._start), h.data_ptr(), z.data_ptr(), words.data_ptr(), address
         )
         places = (address + 4 * place for place in self._places)  # mix, gates, value, reward
-        return Shared(library.Root(words.data_ptr(), *places, nothing), (words, sums))
+        return Shared(library.SharedPrefix(words.data_ptr(), *places, nothing), (words, sums))
 
-    def worth(self, shared: Shared, actions: Tensor, noise: Tensor | None) -> Tensor:
+    def plan_value(self, shared: Shared, actions: Tensor, noise: Tensor | None) -> Tensor:
         """J (M,) of plans (M, N, 7), by as many threads as there are."""
         plans, steps, _ = actions.shape
         values = torch.empty(plans)
         actions, noise = actions.contiguous(), None if noise is None else noise.contiguous()
-        self._threads.judge(
+        self._threads.evaluator(
             network=ctypes.addressof(self._packed.network),
             root=ctypes.addressof(shared.description),
             rows=plans,
@@ -119,7 +119,7 @@ class _Packed:
             OBJECTIVES.index(config.objective),
             RULES.index(config.termination_rule),
             *self._bins(c.value_loss),
-            *map(float, (model.return_mean, model.return_std, model.return_floor)),
+            *map(float, (model.return_mean, model.return_std, model.min_return)),
             config.termination_threshold,
             float(model.discount),
         )

@@ -2,7 +2,7 @@
 
 A layer's inputs are of two kinds. *Wide* ones (h, and what a hidden layer gives to the next) carry
 nearly all of the arithmetic. *Narrow* ones (z and the action) are few.
-What all candidates share is a sum that is ready when they come (`egovcp.plan.backends.root`).
+What all candidates share is computed once (`egovcp.plan.backends.shared_prefix`).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from egovcp.model.nets import GruCell, SplitMlp
+from egovcp.model.networks import GruCell, SplitMlp
 
 
 class HiddenLayer(NamedTuple):

@@ -13,12 +13,12 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from egovcp.model import WorldModel, value
-from egovcp.model.nets import SplitMlp
+from egovcp.model.networks import SplitMlp
 from egovcp.plan.backends.floats import FloatHidden, FloatRecurrence
 from egovcp.plan.backends.layers import HiddenLayer, gru_layer, hidden_layers, weight_of
-from egovcp.plan.backends.root import Root
+from egovcp.plan.backends.shared_prefix import SharedPrefix
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.objective import Account
+from egovcp.plan.objective import ReturnAccumulator
 
 
 class _Head:
@@ -56,32 +56,32 @@ class PlanningNetwork:
         self._value = _Head(model.value_head)
         self._reward = None if model.reward_head is None else _Head(model.reward_head)
 
-    def worth(self, root: Root, actions: Tensor, noise: Tensor | None) -> Tensor:
+    def plan_value(self, root: SharedPrefix, actions: Tensor, noise: Tensor | None) -> Tensor:
         """J (...) of plans (..., N, 7); noise (N - 1, latent) under ``latent=sample``."""
         each = actions.unbind(-2)
-        account = Account(self._config, self._model, len(each))
-        if account.asks_value(0):
-            account.value(self._q(self._value.start(root.value, each[0])))
+        accumulator = ReturnAccumulator(self._config, self._model, len(each))
+        if accumulator.asks_value(0):
+            accumulator.value(self._q(self._value.start(root.value, each[0])))
         else:
             assert self._reward is not None
             assert root.reward is not None
-            account.reward(self._r(self._reward.start(root.reward, each[0])))
+            accumulator.reward(self._r(self._reward.start(root.reward, each[0])))
         x = self._mix_start(narrow=each[0], add=root.mix)
         h = root.h
         for k in range(1, len(each)):
             h = self._recur(x, h, root.gates if k == 1 else None)
             z = self._next_z(h, None if noise is None else noise[k - 1])
             z_and_action = torch.cat([z, each[k]], -1)
-            if account.asks_value(k):
-                account.value(self._q(self._value.later(h, z_and_action)))
+            if accumulator.asks_value(k):
+                accumulator.value(self._q(self._value.later(h, z_and_action)))
             else:
                 assert self._reward is not None
-                account.reward(self._r(self._reward.later(h, z_and_action)))
+                accumulator.reward(self._r(self._reward.later(h, z_and_action)))
             if k == len(each) - 1:
                 break  # nothing follows the last step
-            account.risk(torch.sigmoid(self._termination.last(h, z)[..., 0]))
+            accumulator.risk(torch.sigmoid(self._termination.last(h, z)[..., 0]))
             x = self._mix(narrow=z_and_action)
-        return account.worth()
+        return accumulator.plan_value()
 
     def _next_z(self, h: Tensor, noise: Tensor | None) -> Tensor:
         out = self._prior.last(h)

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from egovcp.plan.backends import library
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.search import Belief, white
+from egovcp.plan.search import SearchState, white
 
 
 class KernelCrossEntropy:
@@ -25,9 +25,9 @@ class KernelCrossEntropy:
         self.config = config
         self._kernel = library.library()
 
-    def propose(self, belief: Belief, iteration: int, generator: torch.Generator) -> Tensor:
+    def propose(self, state: SearchState, iteration: int, generator: torch.Generator) -> Tensor:
         """See `Optimiser`; standing still is always among the candidates."""
-        mean, std = belief.mean.contiguous(), belief.std.contiguous()
+        mean, std = state.mean.contiguous(), state.std.contiguous()
         robots, horizon, actions = mean.shape
         noise = white(mean, self.config.samples, generator)
         deltas = torch.empty(robots, self.config.samples, horizon, actions)
@@ -36,7 +36,7 @@ class KernelCrossEntropy:
         self._kernel.draw(*sizes, *(x.data_ptr() for x in parts))
         return deltas
 
-    def walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
+    def random_walk(self, start: Tensor, deltas: Tensor, eta: float) -> Tensor:
         """See `Walker`."""
         start, deltas = start.contiguous(), deltas.contiguous()
         actions = torch.empty_like(deltas)
@@ -44,17 +44,17 @@ class KernelCrossEntropy:
         self._kernel.walk(*deltas.shape, eta, *(x.data_ptr() for x in parts))
         return actions
 
-    def learn(self, belief: Belief, deltas: Tensor, values: Tensor) -> Belief:
+    def learn(self, state: SearchState, deltas: Tensor, values: Tensor) -> SearchState:
         """See `Optimiser`."""
         count, (robots, samples, horizon, actions) = self.config.elites, deltas.shape
         deltas, values = deltas.contiguous(), values.contiguous()
         elites = torch.empty(robots, count, horizon, actions)
         top, value = torch.empty(robots, count), torch.empty(robots)
-        mean, std = belief.mean.clone(), belief.std.clamp_min(self.config.min_std)
+        mean, std = state.mean.clone(), state.std.clamp_min(self.config.min_std)
         parts = (deltas, values, elites, top, value, mean, std)
         sizes = (robots, samples, horizon * actions, count)
         self._kernel.learn(*sizes, self.config.min_std, *(x.data_ptr() for x in parts))
-        return Belief(mean, std, elites, top, value)
+        return SearchState(mean, std, elites, top, value)
 
 
 def is_at_hand() -> bool:

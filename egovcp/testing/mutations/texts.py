@@ -56,7 +56,7 @@ def _give_a_size_an_absurd_number(folder: Path, rng: Random) -> str:
             case "loss":
                 long = rng.random() < 0.5
                 ahead = list(range(1, 100_000)) if long else [number, 8, 12]
-                network["loss"]["foresight_ahead"] = ahead
+                network["loss"]["multistep_horizons"] = ahead
             case "channels":
                 network[name] = [number, 8, 8]
             case _:

@@ -22,8 +22,8 @@ RULES: Final[dict[str, Flags]] = {
     "rule_paper": {"planner.termination_rule": "paper"},
     "rule_shift": {"planner.termination_rule": "shift"},
     "rule_survival": {"planner.termination_rule": "survival"},
-    "process_walk": {"planner.process": "walk"},
-    "process_ramp": {"planner.process": "ramp"},
+    "random_walk": {"planner.action_parameterization": "random_walk"},
+    "target": {"planner.action_parameterization": "target"},
     "latent_sample": {"planner.latent": "sample"},
 }
 _REFERENCE: Final = "cem"

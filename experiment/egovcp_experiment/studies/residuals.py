@@ -27,7 +27,7 @@ from egovcp.artefact import Artefact
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
-from egovcp.plan.process import walk
+from egovcp.plan.action_parameterization import random_walk
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import StepResult, VectorEnv
 from egovcp.sim.policies import RandomWalk
@@ -59,7 +59,7 @@ class ResidualsConfig(WatchConfig):
     boundary: Literal["reflect", "clip"] = "reflect"
     """What keeps the walk inside the action box."""
 
-    def walk(self) -> RandomWalk:
+    def random_walk(self) -> RandomWalk:
         """The data's."""
         return RandomWalk(self.eta, self.boundary, self.step_ticks)
 
@@ -109,7 +109,7 @@ class _Points(Watcher):
         executed = torch.as_tensor(start, dtype=torch.float32)
         plans = {
             "planner": moment.step.plan[row].astype(np.float64),
-            "random": walk(executed, deltas, self._eta).double().numpy(),
+            "random": random_walk(executed, deltas, self._eta).double().numpy(),
         }
         carry = moment.policy.carry.row(row)
         values = {kind: _values(self._model, carry, plan) for kind, plan in plans.items()}
@@ -150,7 +150,7 @@ def measure(config: ResidualsConfig) -> None:
         for kind, plan in point.plans.items():
             rng = np.random.default_rng([config.seed, number])
             rngs = rng.spawn(STEPS * config.branches)
-            worth = _branches(config.env, point, plan, config.walk(), rngs, *returns)
+            worth = _branches(config.env, point, plan, config.random_walk(), rngs, *returns)
             found.setdefault(kind, []).append(Residuals(point.values[kind], *worth))
     finish(
         config,

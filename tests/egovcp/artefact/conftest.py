@@ -31,7 +31,7 @@ def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("artefact") / "policy"
     model = toy_model()
     model.state_mean.uniform_(-1, 1)
-    model.return_floor.fill_(-7.0)
+    model.min_return.fill_(-7.0)
     save_artefact(path, model, PLANNER, PROVENANCE)
     return path
 

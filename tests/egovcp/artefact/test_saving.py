@@ -37,7 +37,7 @@ def test_the_loaded_policy_acts_as_the_saved_one(original: Path) -> None:
 def test_weights_statistics_and_settings_survive(tmp_path: Path) -> None:
     model = toy_model()
     model.state_std.uniform_(0.5, 2)
-    model.return_floor.fill_(-7.0)
+    model.min_return.fill_(-7.0)
     save_artefact(tmp_path / "policy", model, PLANNER, PROVENANCE)
     loaded = load_artefact(str(tmp_path / "policy"))
     kept = loaded.world_model.state_dict()

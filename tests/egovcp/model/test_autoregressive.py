@@ -8,8 +8,8 @@ from torch import Tensor
 
 from egovcp.errors import UsageError
 from egovcp.model import PRESETS, Batch, Carry, LossConfig, WorldModel, world_model_loss
-from egovcp.model.foresight import autoregressive_losses
 from egovcp.model.losses import filter_sequence, pixel_weights
+from egovcp.model.multistep import autoregressive_losses
 from egovcp.testing import memory_batch, random_batch, toy_model
 
 DEBUG = PRESETS["debug"]
@@ -17,7 +17,7 @@ STEPS = 3
 
 
 def _config(**loss: object) -> LossConfig:
-    values = {"autoregressive_steps": STEPS, "foresight_every": 1, **loss}
+    values = {"autoregressive_steps": STEPS, "multistep_stride": 1, **loss}
     return dataclasses.replace(DEBUG.loss, **values)  # type: ignore[arg-type]
 
 
@@ -107,7 +107,7 @@ def test_imagination_is_learned_without_any_kl() -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         # a hundred steps are too few for pixels that count eleven times
-        model = WorldModel(_model(near=0.0).config)
+        model = WorldModel(_model(proximity_weight=0.0).config)
     data = memory_batch(256, 4, seed=0)
     optimizer = torch.optim.Adam(model.parameters(), lr=1e-2)
     draws = torch.Generator().manual_seed(0)

@@ -17,12 +17,12 @@ from egovcp.model import (
     PRESETS,
     Batch,
     WorldModel,
-    draws_for,
+    sample_step_noise,
     world_model_gradients,
     world_model_loss,
 )
 from egovcp.model.config import LossConfig
-from egovcp.model.threads import beside
+from egovcp.model.parallel import run_parallel
 from egovcp.testing import CountingModel, random_batch, toy_model
 
 NOWHERE = FakeTensorMode()  # one for all: constants are kept for each device
@@ -32,7 +32,7 @@ CONFIGS = {
     "paper": PRESETS["paper"],
     "nothing foreseen": dataclasses.replace(
         PRESETS["debug"],
-        loss=LossConfig(foresight_depth=0.0, foresight_state=0.0),
+        loss=LossConfig(multistep_depth=0.0, multistep_state=0.0),
     ),
     "rewards": dataclasses.replace(PRESETS["debug"], loss=LossConfig(reward=1.0)),
     "autoregressive": dataclasses.replace(PRESETS["debug"], dynamics="autoregressive"),
@@ -62,7 +62,7 @@ def test_it_is_the_gradient_of_the_loss(name: str, threads: int) -> None:
     loss, terms = world_model_loss(model, batch, torch.Generator().manual_seed(0))
     loss.backward()  # type: ignore[no-untyped-call]
     for _ in range(2):  # what a step before has left does not count
-        draws = draws_for(other, batch, torch.Generator().manual_seed(0))
+        draws = sample_step_noise(other, batch, torch.Generator().manual_seed(0))
         found, parts = world_model_gradients(other, batch, draws)
     assert not found.requires_grad
     torch.testing.assert_close(found, loss.detach())
@@ -78,7 +78,7 @@ def test_a_model_with_steps_of_its_own_learns_the_same_way() -> None:
     model, other = CountingModel().train(), CountingModel().train()
     other.load_state_dict(model.state_dict())
     world_model_loss(model, batch, torch.Generator().manual_seed(0))[0].backward()  # type: ignore[no-untyped-call]
-    draws = draws_for(other, batch, torch.Generator().manual_seed(0))
+    draws = sample_step_noise(other, batch, torch.Generator().manual_seed(0))
     world_model_gradients(other, batch, draws)
     torch.testing.assert_close(_gradients(other), _gradients(model), rtol=1e-3, atol=1e-5)
 
@@ -91,7 +91,7 @@ def test_gradients_are_the_same_numbers_each_time() -> None:
         found = []
         for _ in range(6):
             model = toy_model().train()
-            draws = draws_for(model, batch, torch.Generator().manual_seed(0))
+            draws = sample_step_noise(model, batch, torch.Generator().manual_seed(0))
             world_model_gradients(model, batch, draws, precision=BF16)
             found.append(_gradients(model))
     finally:
@@ -110,7 +110,7 @@ def test_they_share_the_threads_and_give_them_back(threads: int) -> None:
     def seen() -> tuple[int, bool]:
         return torch.get_num_threads(), current_thread() is main_thread()
 
-    first, second = beside(seen, seen)
+    first, second = run_parallel(seen, seen)
     shares = {1: (1, 1), 2: (1, 1), 3: (2, 1)}
     assert (first[0], second[0]) == shares[threads]
     assert (first[1], second[1]) == (True, threads == 1)
@@ -127,7 +127,7 @@ def test_an_error_of_either_is_raised_when_both_have_ended(fails: int, threads: 
         ended.append(number)
 
     with pytest.raises(ValueError, match=f"part {fails}"):
-        beside(partial(work, 0), partial(work, 1))
+        run_parallel(partial(work, 0), partial(work, 1))
     assert ended == ([] if threads == 1 and fails == 0 else [1 - fails])
     assert torch.get_num_threads() == threads
 
@@ -163,7 +163,7 @@ def test_nothing_of_a_loss_waits_for_a_gpu(name: str) -> None:
         with NOWHERE:
             return torch.empty_strided(x.size(), x.stride(), dtype=x.dtype, device="cuda")
 
-    drawn = draws_for(model, batch)
+    drawn = sample_step_noise(model, batch)
     draws = drawn._replace(noise=on_gpu(drawn.noise))
     for part in model.modules():
         for key, parameter in part.named_parameters(recurse=False):

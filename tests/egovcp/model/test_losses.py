@@ -14,7 +14,7 @@ from egovcp.model.losses import (
     kl_losses,
     moving_pixels,
 )
-from egovcp.model.outcomes import value_and_termination_losses
+from egovcp.model.value_losses import value_and_termination_losses
 from egovcp.testing import CountingModel, random_batch, toy_model
 
 
@@ -31,7 +31,7 @@ def _with_loss(config: LossConfig) -> WorldModel:
 
 
 #: Nothing left to chance but the noise of z: every image is reconstructed.
-EVERY_IMAGE = dataclasses.replace(PRESETS["debug"].loss, decode_every=1, foresight_every=1)
+EVERY_IMAGE = dataclasses.replace(PRESETS["debug"].loss, decode_every=1, multistep_stride=1)
 
 
 def _pad(batch: Batch, rows: int, garbage: bool) -> Batch:

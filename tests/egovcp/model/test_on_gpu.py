@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from egovcp.model import Batch, WorldModel, draws_for, losses, world_model_gradients
+from egovcp.model import Batch, WorldModel, losses, sample_step_noise, world_model_gradients
 from egovcp.testing import random_batch, toy_model
 
 pytestmark = [
@@ -17,7 +17,7 @@ pytestmark = [
 
 
 def _step(model: WorldModel, batch: Batch) -> tuple[dict[str, float], Tensor]:
-    total, terms = world_model_gradients(model, batch, draws_for(model, batch))
+    total, terms = world_model_gradients(model, batch, sample_step_noise(model, batch))
     gradients = [p.grad.flatten().cpu() for p in model.parameters() if p.grad is not None]
     named = {name: float(term) for name, term in {**terms, "total": total}.items()}
     return named, torch.cat(gradients)
@@ -35,7 +35,7 @@ def test_losses_and_gradients_are_those_of_the_cpu(
     monkeypatch.setattr(losses, "row_noise", same_noise)
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)
     model = toy_model(preset).train()
-    every = dataclasses.replace(model.config.loss, decode_every=1, foresight_every=1)
+    every = dataclasses.replace(model.config.loss, decode_every=1, multistep_stride=1)
     model.config = dataclasses.replace(model.config, loss=every)
     batch = random_batch(4, 16)
     expected, gradient = _step(model, batch)

@@ -23,7 +23,7 @@ from egovcp.model.losses import (
     kl_losses,
     pixel_weights,
 )
-from egovcp.model.outcomes import value_and_termination_losses
+from egovcp.model.value_losses import value_and_termination_losses
 from egovcp.testing import random_batch, toy_model
 
 DEBUG = PRESETS["debug"]
@@ -37,7 +37,7 @@ def _config(**changes: object) -> WorldModelConfig:
 
 
 OPTIONS: dict[str, dict[str, object]] = {
-    "no near": {"loss__near": 0.0},
+    "no near": {"loss__proximity_weight": 0.0},
     "dimension": {"loss__free_nats_per": "dimension"},
     "mse": {"value_loss": "mse"},
     "reward": {"loss__reward": 2.0},
@@ -128,7 +128,7 @@ def test_the_reward_is_learned_on_filtered_and_imagined_states() -> None:
 def test_near_pixels_count_more_and_only_they() -> None:
     batch = random_batch(1, 1)
     near = torch.tensor([[[[0.9, 0.72, 0.68, 0.2]]]])
-    loss = LossConfig(near=9.0, near_threshold=0.7, moving=0.0)
+    loss = LossConfig(proximity_weight=9.0, proximity_threshold=0.7, motion_weight=0.0)
     model = WorldModel(dataclasses.replace(PRESETS["debug"], loss=loss))
     assert pixel_weights(near, batch, model).flatten().tolist() == [10.0, 10.0, 1.0, 1.0]
 
@@ -147,7 +147,9 @@ def test_free_nats_are_for_the_step_or_for_each_dimension(per: str, expected: fl
 # --- imagination ------------------------------------------------------------------------
 def test_a_drawn_state_has_one_noise_for_all_candidates() -> None:
     model = toy_model()
-    carry = model.spread(Carry(torch.zeros(2, DEBUG.hidden), torch.zeros(2, DEBUG.latent)))
+    carry = model.expand_candidates(
+        Carry(torch.zeros(2, DEBUG.hidden), torch.zeros(2, DEBUG.latent))
+    )
     action = torch.zeros(2, 5, 7)
 
     def drawn(seed: int) -> torch.Tensor:

@@ -9,8 +9,12 @@ from torch import Tensor
 from egovcp.model import PRESETS, Batch, Carry, LossConfig, WorldModel, WorldModelConfig
 from egovcp.model.gaussian import Gaussian
 from egovcp.model.losses import Rollout
-from egovcp.model.outcomes import value_and_termination_losses, value_target
-from egovcp.model.td import TargetNetwork, td_target
+from egovcp.model.value_losses import (
+    TargetNetwork,
+    td_target,
+    value_and_termination_losses,
+    value_target,
+)
 from egovcp.testing import random_batch, toy_model
 
 DEBUG = PRESETS["debug"]

@@ -13,11 +13,11 @@ from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import PRESETS, Carry, WorldModel
 from egovcp.model.config import LossConfig
-from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
-from egovcp.plan.backends import judge_of_model, library
-from egovcp.plan.backends.judges import FloatJudge, IntegerJudge
+from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
+from egovcp.plan.action_parameterization import random_walk
+from egovcp.plan.backends import library, make_evaluator
+from egovcp.plan.backends.evaluators import FloatEvaluator, Int8Evaluator
 from egovcp.plan.config import BackendName
-from egovcp.plan.process import walk
 from egovcp.testing import CountingModel, toy_model
 
 needs_compiler = pytest.mark.skipif(library.compiler() is None, reason="no C compiler")
@@ -47,7 +47,7 @@ def _model(**change: object) -> WorldModel:
     model = toy_model(dataclasses.replace(PRESETS["debug"], **change))  # type: ignore[arg-type]
     model.return_mean.fill_(0.3)
     model.return_std.fill_(2.0)
-    model.return_floor.fill_(-4.0)
+    model.min_return.fill_(-4.0)
     return model
 
 
@@ -61,13 +61,13 @@ def _carry(model: WorldModel, robots: int = 3, seed: int = 0) -> Carry:
 def _actions(robots: int = 3, plans: int = 65, horizon: int = 4, seed: int = 1) -> Tensor:
     rng = torch.Generator().manual_seed(seed)
     deltas = 2 * torch.rand(robots, plans, horizon, spec.ACTION_DIM, generator=rng) - 1
-    return walk(torch.zeros(robots, 1, spec.ACTION_DIM), deltas, spec.ACTION_ETA)
+    return random_walk(torch.zeros(robots, 1, spec.ACTION_DIM), deltas, spec.ACTION_ETA)
 
 
 def _values(model: WorldModel, config: PlannerConfig, carry: Carry, actions: Tensor) -> Tensor:
     generator = torch.Generator().manual_seed(2)
     with torch.no_grad():
-        return judge_of_model(model, config).at(carry)(actions, generator)
+        return make_evaluator(model, config).at(carry)(actions, generator)
 
 
 def _plan(model: WorldModel, backend: BackendName, carry: Carry) -> Plan:
@@ -75,8 +75,8 @@ def _plan(model: WorldModel, backend: BackendName, carry: Carry) -> Plan:
     executed = torch.zeros(len(carry.h), spec.ACTION_DIM)
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():
-        judge = judge_of_model(model, config)
-        return make_plan(judge, optimiser_of(config), carry, executed, config, generator)
+        evaluator = make_evaluator(model, config)
+        return make_plan(evaluator, optimiser_of(config), carry, executed, config, generator)
 
 
 @pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
@@ -150,13 +150,13 @@ def test_threads_change_nothing(threads: int, monkeypatch: pytest.MonkeyPatch) -
 def test_threads_that_have_left_come_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch, "get_num_threads", lambda: 3)
     model, config = _model(), PlannerConfig(backend="int8")
-    judge, actions = judge_of_model(model, config), _actions()
+    evaluator, actions = make_evaluator(model, config), _actions()
     with torch.no_grad():
-        worth = judge.at(_carry(model))
-        first = worth(actions, None)
+        plan_value = evaluator.at(_carry(model))
+        first = plan_value(actions, None)
         for pause in (0.0, 0.02, 0.001, 0.02):
             time.sleep(pause)
-            assert worth(actions, None).equal(first)
+            assert plan_value(actions, None).equal(first)
 
 
 @pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
@@ -239,21 +239,21 @@ def test_where_tiles_are_refused_vectors_say_exactly_the_same(
 def test_odd_sizes_are_refused_by_int8_and_left_to_float32_by_auto() -> None:
     model = _model(units=20)
     with pytest.raises(UsageError, match=r"20 units.*float32"):
-        judge_of_model(model, PlannerConfig(backend="int8"))
-    assert isinstance(judge_of_model(model, PlannerConfig(backend="auto")), FloatJudge)
+        make_evaluator(model, PlannerConfig(backend="int8"))
+    assert isinstance(make_evaluator(model, PlannerConfig(backend="auto")), FloatEvaluator)
 
 
 @needs_compiler
 def test_auto_takes_int8_where_the_processor_is_made_for_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    for fast, kind in ((True, IntegerJudge), (False, FloatJudge)):
+    for fast, kind in ((True, Int8Evaluator), (False, FloatEvaluator)):
         monkeypatch.setattr(library, "processor_is_fast", lambda fast=fast: fast)
-        assert isinstance(judge_of_model(toy_model(), PlannerConfig()), kind)
+        assert isinstance(make_evaluator(toy_model(), PlannerConfig()), kind)
 
 
 def test_a_model_that_thinks_for_itself_is_asked_step_by_step() -> None:
-    assert isinstance(judge_of_model(CountingModel(), PlannerConfig()), StepByStep)
+    assert isinstance(make_evaluator(CountingModel(), PlannerConfig()), ReferenceEvaluator)
 
 
 @pytest.mark.gpu
@@ -264,6 +264,6 @@ def test_the_same_on_a_gpu() -> None:
     expected = _values(model, PlannerConfig(backend="eager"), carry, actions)
     there = carry.map(lambda x: x.cuda())
     with torch.no_grad():
-        judge = judge_of_model(model.cuda(), PlannerConfig(backend="float32"))
-        found = judge.at(there)(actions.cuda(), None).cpu()
+        evaluator = make_evaluator(model.cuda(), PlannerConfig(backend="float32"))
+        found = evaluator.at(there)(actions.cuda(), None).cpu()
     assert (found - expected).abs().median() < 1e-3 * expected.std()

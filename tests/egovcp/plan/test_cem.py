@@ -10,14 +10,14 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import Carry
-from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
-from egovcp.plan.config import Process, TerminationRule
+from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
+from egovcp.plan.action_parameterization import random_walk, shift
+from egovcp.plan.config import ActionParameterization, TerminationRule
 from egovcp.plan.objective import Dynamics, evaluate
-from egovcp.plan.process import shift, walk
-from egovcp.testing import Point, PointWorld, toy_model
+from egovcp.testing import Point, PointWorld, plain_planner, toy_model
 
 ETA = spec.ACTION_ETA
-SMALL = PlannerConfig(samples=256, elites=32, iterations=4)
+SMALL = plain_planner(samples=256, elites=32, iterations=4)
 
 
 def _generator(seed: int = 0) -> torch.Generator:
@@ -32,8 +32,8 @@ def _search[L](
     generator: torch.Generator,
     warm: Tensor | None = None,
 ) -> Plan:
-    judge, optimiser = StepByStep(world, config), optimiser_of(config)
-    return make_plan(judge, optimiser, carry, executed, config, generator, warm)
+    evaluator, optimiser = ReferenceEvaluator(world, config), optimiser_of(config)
+    return make_plan(evaluator, optimiser, carry, executed, config, generator, warm)
 
 
 def _plan(
@@ -57,7 +57,7 @@ def _random(rows: int, seed: int, scale: float = 1.0) -> Tensor:
 def test_the_best_reachable_plan_is_found(seed: int) -> None:
     """A goal beyond one step: walk towards it as fast as the process allows, then stay."""
     executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.5)
-    plan = _plan(executed, goal, PlannerConfig(iterations=6), seed=seed)
+    plan = _plan(executed, goal, plain_planner(iterations=6), seed=seed)
     ideal = torch.tensor([ETA, 0.5, 0.5, 0.5])[None, :, None].expand(1, 4, 7)
     regret = evaluate(PointWorld(), Point(executed, goal), ideal[:, None], SMALL) - evaluate(
         PointWorld(), Point(executed, goal), plan.actions[:, None], SMALL
@@ -69,7 +69,7 @@ def test_the_best_reachable_plan_is_found(seed: int) -> None:
 def test_hands_that_cost_something_stay_nearer_to_neutral_and_the_height_goes_its_way() -> None:
     """In a world whose Q is -|a - goal|^2, J - c |hands|^2 / 6 is best at goal / (1 + c / 6)."""
     executed, goal = torch.full((1, 7), 0.4), torch.full((1, 7), 0.4)
-    config = PlannerConfig(samples=512, elites=16, iterations=8, min_std=0.02)
+    config = plain_planner(samples=512, elites=16, iterations=8, min_std=0.02)
     free = _plan(executed, goal, config).actions[0, -1]
     torch.testing.assert_close(free, goal[0], atol=0.05, rtol=0)
     price = dataclasses.replace(config, hands_cost=60.0)
@@ -85,10 +85,12 @@ class Indifferent(PointWorld):
         return torch.zeros(action.shape[:-1])
 
 
-@pytest.mark.parametrize("process", ["walk", "ramp"])
-def test_who_pays_for_steps_stays_where_nothing_is_to_be_gained(process: Process) -> None:
+@pytest.mark.parametrize("process", ["random_walk", "target"])
+def test_who_pays_for_steps_stays_where_nothing_is_to_be_gained(
+    process: ActionParameterization,
+) -> None:
     """Planned ten times over, each plan from where the one before it has led."""
-    config = PlannerConfig(samples=256, elites=4, iterations=3, process=process)
+    config = plain_planner(samples=256, elites=4, iterations=3, action_parameterization=process)
 
     def wandered(config: PlannerConfig) -> Tensor:
         at, warm = torch.zeros(8, 7), None
@@ -105,7 +107,9 @@ def test_who_pays_for_steps_still_goes_where_it_is_worth_the_way() -> None:
     """Q is -|a - goal|^2, so that one step a < eta into the first action loses 7 (goal - a)^2 of J
     and costs c (a / eta)^2 / 4, best at goal / (1 + c / (28 eta^2)): for the c below, half-way."""
     executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.3)
-    config = PlannerConfig(samples=512, elites=16, iterations=8, min_std=0.02, process="ramp")
+    config = plain_planner(
+        samples=512, elites=16, iterations=8, min_std=0.02, action_parameterization="target"
+    )
     free = _plan(executed, goal, config).actions[0, 0]
     torch.testing.assert_close(free, goal[0], atol=0.06, rtol=0)
     price = dataclasses.replace(config, step_cost=28 * ETA**2)
@@ -117,13 +121,13 @@ def test_who_pays_for_steps_still_goes_where_it_is_worth_the_way() -> None:
 @pytest.mark.parametrize("cost", [-0.1, math.inf, math.nan])
 def test_a_price_is_a_number_from_zero_up(name: str, cost: float) -> None:
     with pytest.raises(UsageError, match=f"{name}={cost}: expected"):
-        PlannerConfig(**{name: cost})
+        plain_planner(**{name: cost})
 
 
 def test_a_goal_within_reach_is_met_at_once() -> None:
     executed = _random(4, 2, scale=0.5)
     goal = executed + 0.1
-    plan = _plan(executed, goal, PlannerConfig(horizon=2, iterations=6))
+    plan = _plan(executed, goal, plain_planner(horizon=2, iterations=6))
     assert (plan.actions - goal[:, None]).abs().mean() < 0.04
 
 
@@ -141,7 +145,7 @@ def test_actions_stay_in_the_box_and_steps_within_eta() -> None:
         start = executed[:, None, None].expand(-1, actions.shape[1], 1, -1)
         steps = (actions - torch.cat([start, actions[:, :, :-1]], 2)).abs()
         assert steps.max() <= ETA + 1e-6
-    torch.testing.assert_close(walk(executed, plan.deltas, ETA), plan.actions)
+    torch.testing.assert_close(random_walk(executed, plan.deltas, ETA), plan.actions)
 
 
 def test_a_robots_plan_does_not_depend_on_the_others() -> None:
@@ -206,15 +210,15 @@ def test_the_elites_are_the_best_first_and_belong_to_their_values() -> None:
 def test_the_search_never_narrows_below_its_floor() -> None:
     executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.1)
     for floor in (0.1, 0.4):
-        config = PlannerConfig(samples=512, elites=64, iterations=10, min_std=floor)
+        config = plain_planner(samples=512, elites=64, iterations=10, min_std=floor)
         first_steps = _plan(executed, goal, config).candidates[:, :, 0] / ETA
         assert 0.5 * floor < first_steps.std(1).mean() < 1.5 * floor
 
 
 def test_a_warm_start_helps_a_short_search() -> None:
     executed, goal = _random(8, 17), _random(8, 18)
-    hasty = PlannerConfig(samples=32, elites=4, iterations=1)
-    best = _plan(executed, goal, PlannerConfig(iterations=6))
+    hasty = plain_planner(samples=32, elites=4, iterations=1)
+    best = _plan(executed, goal, plain_planner(iterations=6))
     cold = _plan(executed, goal, hasty)
     warm = _plan(executed, goal, hasty, warm=best.deltas)
     assert (warm.value > cold.value).all()
@@ -223,8 +227,8 @@ def test_a_warm_start_helps_a_short_search() -> None:
 def test_the_previous_plan_itself_is_a_candidate() -> None:
     """So that replanning never does worse than going on, as the model sees it."""
     executed, goal = _random(4, 19), _random(4, 20)
-    best = _plan(executed, goal, PlannerConfig(iterations=8))
-    again = _plan(executed, goal, PlannerConfig(samples=8, elites=1, iterations=1), best.deltas)
+    best = _plan(executed, goal, plain_planner(iterations=8))
+    again = _plan(executed, goal, plain_planner(samples=8, elites=1, iterations=1), best.deltas)
     world = PointWorld()
     kept = evaluate(world, world.start(executed, goal), best.actions[:, None], SMALL)[:, 0]
     assert (again.value >= kept - 1e-6).all()
@@ -238,13 +242,13 @@ def test_the_shifted_plan_drops_its_first_step_and_ends_at_rest() -> None:
 
 def test_a_single_candidate_is_the_warm_start() -> None:
     warm = torch.full((2, 4, 7), 0.25)
-    plan = _plan(torch.zeros(2, 7), torch.ones(2, 7), PlannerConfig(samples=1, elites=1), warm=warm)
+    plan = _plan(torch.zeros(2, 7), torch.ones(2, 7), plain_planner(samples=1, elites=1), warm=warm)
     torch.testing.assert_close(plan.deltas, warm)
 
 
 def test_a_horizon_of_one_is_greedy() -> None:
     executed, goal = _random(4, 21, scale=0.5), _random(4, 22, scale=0.5)
-    plan = _plan(executed, goal, PlannerConfig(horizon=1, iterations=6))
+    plan = _plan(executed, goal, plain_planner(horizon=1, iterations=6))
     nearest = executed + (goal - executed).clamp(-ETA, ETA)
     assert plan.actions.shape == (4, 1, 7)
     assert (plan.actions[:, 0] - nearest).abs().mean() < 0.03
@@ -264,14 +268,14 @@ def test_a_horizon_of_one_is_greedy() -> None:
 )
 def test_senseless_settings_are_refused(change: dict[str, int]) -> None:
     with pytest.raises(UsageError):
-        PlannerConfig(**change)  # type: ignore[arg-type]
+        plain_planner(**change)  # type: ignore[arg-type]
 
 
 # --- failures ---------------------------------------------------------------------------------
 @pytest.mark.parametrize("rule", ["shift", "survival"])
 def test_the_plan_stops_before_the_cliff(rule: TerminationRule) -> None:
     executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.9)
-    config = PlannerConfig(iterations=6, termination_rule=rule)
+    config = plain_planner(iterations=6, termination_rule=rule)
     bold = _plan(executed, goal, config)
     careful = _plan(executed, goal, config, world=PointWorld(cliff=0.5))
     assert bold.actions[0, 1, 0] > 0.55
@@ -295,7 +299,7 @@ class _Broken(PointWorld):
 @pytest.mark.parametrize("elites", [4, 200])
 def test_plans_without_a_finite_value_are_never_chosen(value: float, elites: int) -> None:
     """Even where fewer than the wanted elites have one."""
-    config = PlannerConfig(samples=256, elites=elites)
+    config = plain_planner(samples=256, elites=elites)
     plan = _plan(torch.zeros(1, 7), torch.full((1, 7), 0.5), config, world=_Broken(value))
     finite = plan.candidate_values.isfinite()
     assert finite.any()
@@ -306,7 +310,7 @@ def test_plans_without_a_finite_value_are_never_chosen(value: float, elites: int
 
 def test_a_region_without_finite_values_does_not_stop_the_search() -> None:
     goal = torch.full((1, 7), 0.3)
-    plan = _plan(torch.zeros(1, 7), goal, PlannerConfig(iterations=6), world=_Broken(math.nan))
+    plan = _plan(torch.zeros(1, 7), goal, plain_planner(iterations=6), world=_Broken(math.nan))
     assert plan.actions[..., 0].abs().max() < 0.15
     assert (plan.actions[..., 1:] - 0.3).abs().mean() < 0.1
 

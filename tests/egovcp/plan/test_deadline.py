@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.plan import Plan, PlannerConfig, Policy, StepByStep, make_plan, optimiser_of
-from egovcp.plan.objective import Worth
-from egovcp.plan.search import Pace
-from egovcp.testing import CountingModel, Point, PointWorld
+from egovcp.plan import Plan, Policy, ReferenceEvaluator, make_plan, optimiser_of
+from egovcp.plan.objective import PlanValue
+from egovcp.plan.search import Deadline
+from egovcp.testing import CountingModel, Point, PointWorld, plain_planner
 
-CONFIG = PlannerConfig(samples=64, elites=8, iterations=6)
+CONFIG = plain_planner(samples=64, elites=8, iterations=6)
 
 
 class _Clock:
@@ -25,17 +25,17 @@ class _Clock:
 
 
 class _Slow:
-    """A judge whose n-th answer takes ``costs[n]`` seconds of a clock."""
+    """A evaluator whose n-th answer takes ``costs[n]`` seconds of a clock."""
 
     def __init__(self, clock: _Clock, costs: list[float]) -> None:
         self._clock, self._costs = clock, iter(costs)
 
-    def at(self, carry: Point) -> Worth:
-        worth = StepByStep(PointWorld(), CONFIG).at(carry)
+    def at(self, carry: Point) -> PlanValue:
+        plan_value = ReferenceEvaluator(PointWorld(), CONFIG).at(carry)
 
         def slow(actions: Tensor, generator: torch.Generator | None) -> Tensor:
             self._clock.left -= next(self._costs)
-            return worth(actions, generator)
+            return plan_value(actions, generator)
 
         return slow
 
@@ -70,9 +70,9 @@ def test_no_iteration_is_begun_that_would_end_too_late(
 def test_a_search_cut_short_answers_as_a_shorter_one() -> None:
     cut = _plan(2.5, [1.0] * 6)
     executed = torch.zeros(1, 7)
-    config = PlannerConfig(samples=64, elites=8, iterations=cut.iterations)
+    config = plain_planner(samples=64, elites=8, iterations=cut.iterations)
     whole = make_plan(
-        StepByStep(PointWorld(), config),
+        ReferenceEvaluator(PointWorld(), config),
         optimiser_of(config),
         Point(executed, torch.full((1, 7), 0.3)),
         executed,
@@ -85,7 +85,7 @@ def test_a_search_cut_short_answers_as_a_shorter_one() -> None:
 
 
 def test_without_a_deadline_it_goes_on() -> None:
-    pace = Pace(None)
+    pace = Deadline(None)
     assert all(pace.goes_on() for _ in range(100))
 
 

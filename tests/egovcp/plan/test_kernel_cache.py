@@ -10,8 +10,8 @@ import pytest
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.plan import PlannerConfig
-from egovcp.plan.backends import judge_of_model, library
-from egovcp.plan.backends.judges import FloatJudge, IntegerJudge
+from egovcp.plan.backends import library, make_evaluator
+from egovcp.plan.backends.evaluators import FloatEvaluator, Int8Evaluator
 from egovcp.plan.config import BackendName
 from egovcp.testing import toy_model
 from egovcp.testing.limited import run_limited
@@ -40,7 +40,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def _judge(backend: BackendName) -> object:
     """What computes the plans in a process that has just started."""
     _forget()
-    return judge_of_model(toy_model(), PlannerConfig(backend=backend))
+    return make_evaluator(toy_model(), PlannerConfig(backend=backend))
 
 
 def _compiled(cache: Path) -> Path:
@@ -68,7 +68,7 @@ def test_the_kernel_is_compiled_once_into_a_private_folder(
     cache: Path, compilations: list[Path]
 ) -> None:
     for _ in range(2):
-        assert isinstance(_judge("int8"), IntegerJudge)
+        assert isinstance(_judge("int8"), Int8Evaluator)
     assert len(compilations) == 1
     assert cache.stat().st_mode & 0o777 == cache.parent.stat().st_mode & 0o777 == 0o700
     digest = f"{_compiled(cache)}.sha256"
@@ -82,7 +82,7 @@ def test_a_truncated_library_is_compiled_again(cache: Path, compilations: list[P
     for size in (0, 5000):
         with _compiled(cache).open("r+b") as file:
             file.truncate(size)
-        assert isinstance(_judge("int8"), IntegerJudge)
+        assert isinstance(_judge("int8"), Int8Evaluator)
     assert len(compilations) == 3
     assert _compiled(cache).stat().st_size > 5000
 
@@ -147,7 +147,7 @@ def test_a_library_planted_by_another_user_is_not_executed(
     open_up(cache)
     _forget()
     for _ in range(2):
-        assert isinstance(judge_of_model(toy_model(), PlannerConfig()), FloatJudge)
+        assert isinstance(make_evaluator(toy_model(), PlannerConfig()), FloatEvaluator)
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert reason in told
@@ -177,7 +177,7 @@ def test_a_user_without_account_and_home_plans_in_int8(
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.delenv("HOME", raising=False)
     monkeypatch.setattr(pwd, "getpwuid", unknown)
-    assert isinstance(_judge("auto"), IntegerJudge)
+    assert isinstance(_judge("auto"), Int8Evaluator)
     told = capsys.readouterr().err
     assert told.count("\n") == 1
     assert "the user has no home folder" in told
@@ -206,7 +206,7 @@ def test_an_unknown_user_id_plans_in_int8(home: str, monkeypatch: pytest.MonkeyP
 
     result = run_limited(run, seconds=60.0)
     assert not result.has_traceback, result.output
-    assert "IntegerJudge" in result.output
+    assert "Int8Evaluator" in result.output
     assert result.output.count("warning:") == 1
 
 
@@ -245,7 +245,7 @@ def _expect_float32(backend: BackendName, reason: str, capsys: pytest.CaptureFix
         told = str(caught.value)
     else:
         for _ in range(2):
-            assert isinstance(judge_of_model(toy_model(), PlannerConfig()), FloatJudge)
+            assert isinstance(make_evaluator(toy_model(), PlannerConfig()), FloatEvaluator)
         told = capsys.readouterr().err
         assert told.startswith("egovcp: warning: ")
         assert told.count("\n") == 1

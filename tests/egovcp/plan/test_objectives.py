@@ -11,11 +11,11 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import PRESETS, Carry, WorldModel
-from egovcp.plan import PlannerConfig, Policy, StepByStep, make_plan, optimiser_of
-from egovcp.plan.backends import judge_of_model
+from egovcp.plan import PlannerConfig, Policy, ReferenceEvaluator, make_plan, optimiser_of
+from egovcp.plan.backends import make_evaluator
 from egovcp.plan.choices import require_answers
 from egovcp.plan.objective import evaluate
-from egovcp.testing import Point, PointWorld, ScriptedWorld, toy_model
+from egovcp.testing import Point, PointWorld, ScriptedWorld, plain_planner, toy_model
 
 OBJECTIVES = ("value", "reward", "td")
 RULES = ("paper", "shift", "survival")
@@ -30,7 +30,7 @@ def _scripted(deaths: list[float], gamma: float, floor: float = -10.0) -> Script
 
 
 def _worth(world: ScriptedWorld, horizon: int, **config: Any) -> float:
-    planner = PlannerConfig(horizon=horizon, **config)
+    planner = plain_planner(horizon=horizon, **config)
     actions = torch.zeros(1, 1, planner.actions, spec.ACTION_DIM)
     return evaluate(world, world.start(), actions, planner).item()
 
@@ -77,7 +77,7 @@ def _model() -> WorldModel:
     model = toy_model(EARNING)
     model.return_mean.fill_(0.3)
     model.return_std.fill_(2.0)
-    model.return_floor.fill_(-4.0)
+    model.min_return.fill_(-4.0)
     model.discount.fill_(0.8)
     return model
 
@@ -96,7 +96,7 @@ def _plans(robots: int, plans: int, length: int) -> Tensor:
 def _by_loop(model: WorldModel, carry: Carry, plan: Tensor, config: PlannerConfig) -> float:
     """J of one plan (A, 7) of one robot, one number at a time."""
     n, gamma = config.horizon, float(model.discount)
-    floor = 0.0 if config.termination_rule == "paper" else float(model.return_floor)
+    floor = 0.0 if config.termination_rule == "paper" else float(model.min_return)
     total, share = 0.0, 1.0
     ends = n if config.objective == "td" else n - 1
     for k in range(ends + 1):
@@ -121,7 +121,7 @@ def test_all_plans_at_once_are_worth_what_each_is_alone(
     objective: Any, horizon: int, rule: Any
 ) -> None:
     model, robots, plans = _model(), 2, 5
-    config = PlannerConfig(
+    config = plain_planner(
         horizon=horizon, objective=objective, termination_rule=rule, termination_threshold=0.5
     )
     carry, actions = _carry(robots), _plans(robots, plans, config.actions)
@@ -138,7 +138,7 @@ def test_the_loop_has_met_failures_and_survivals() -> None:
     """Else the comparison above would say nothing of the rules."""
     model, actions = _model(), _plans(2, 5, 6)
     with torch.no_grad():
-        carry = model.spread(_carry(2))
+        carry = model.expand_candidates(_carry(2))
         dead = []
         for action in actions.unbind(-2):
             carry = model.imagine(carry, action)
@@ -163,10 +163,10 @@ class _Earning(PointWorld):
 def test_the_search_finds_the_plan_that_earns_most() -> None:
     executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.5)
     for objective, expected in (("reward", [0.32, 0.5]), ("td", [0.32, 0.5, 0.25])):
-        config = PlannerConfig(horizon=2, objective=objective, iterations=10)  # type: ignore[arg-type]
-        judge, rng = StepByStep(_Earning(), config), torch.Generator().manual_seed(0)
+        config = plain_planner(horizon=2, objective=objective, iterations=10)  # type: ignore[arg-type]
+        evaluator, rng = ReferenceEvaluator(_Earning(), config), torch.Generator().manual_seed(0)
         search = optimiser_of(config)
-        plan = make_plan(judge, search, Point(executed, goal), executed, config, rng)
+        plan = make_plan(evaluator, search, Point(executed, goal), executed, config, rng)
         best = torch.tensor(expected)[None, :, None].expand(1, -1, 7)
         torch.testing.assert_close(plan.actions, best, atol=0.06, rtol=0)
 
@@ -174,7 +174,7 @@ def test_the_search_finds_the_plan_that_earns_most() -> None:
 @pytest.mark.parametrize("objective", OBJECTIVES)
 @pytest.mark.parametrize("horizon", [1, 6])
 def test_a_policy_acts_by_every_objective_and_horizon(objective: Any, horizon: int) -> None:
-    config = PlannerConfig(samples=16, elites=4, iterations=2, horizon=horizon, objective=objective)
+    config = plain_planner(samples=16, elites=4, iterations=2, horizon=horizon, objective=objective)
     policy = Policy(_model(), config, num_envs=2)
     rng = np.random.default_rng(0)
     for _ in range(3):
@@ -191,15 +191,15 @@ def test_a_policy_acts_by_every_objective_and_horizon(objective: Any, horizon: i
 @pytest.mark.parametrize("objective", ["reward", "td"])
 def test_only_who_asks_for_it_is_judged_step_by_step(objective: Any) -> None:
     for backend, slow in (("auto", False), ("eager", True)):
-        config = PlannerConfig(objective=objective, backend=backend)  # type: ignore[arg-type]
-        assert isinstance(judge_of_model(_model(), config), StepByStep) == slow
+        config = plain_planner(objective=objective, backend=backend)  # type: ignore[arg-type]
+        assert isinstance(make_evaluator(_model(), config), ReferenceEvaluator) == slow
 
 
 @pytest.mark.parametrize("objective", ["reward", "td"])
 def test_a_model_that_foresees_no_rewards_is_refused(objective: Any) -> None:
-    config = PlannerConfig(objective=objective)
+    config = plain_planner(objective=objective)
     with pytest.raises(UsageError, match=r"--policy\.loss\.reward=1"):
-        judge_of_model(toy_model(), config)
+        make_evaluator(toy_model(), config)
     start = PointWorld().start(torch.zeros(1, 7), torch.zeros(1, 7))
     with pytest.raises(UsageError, match="PointWorld has no reward and discount"):
         evaluate(PointWorld(), start, torch.zeros(1, 2, config.actions, 7), config)
@@ -208,6 +208,6 @@ def test_a_model_that_foresees_no_rewards_is_refused(objective: Any) -> None:
 def test_draws_from_a_prior_that_was_only_trained_in_its_mean_are_refused() -> None:
     autoregressive = dataclasses.replace(DEBUG, dynamics="autoregressive")
     with pytest.raises(UsageError, match="plan with latent=mean"):
-        require_answers(autoregressive, PlannerConfig(latent="sample"))
-    require_answers(autoregressive, PlannerConfig())
-    require_answers(DEBUG, PlannerConfig(latent="sample"))
+        require_answers(autoregressive, plain_planner(latent="sample"))
+    require_answers(autoregressive, plain_planner())
+    require_answers(DEBUG, plain_planner(latent="sample"))

@@ -10,14 +10,14 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.errors import UsageError
-from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
+from egovcp.plan import Plan, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.plan.config import OptimiserName
 from egovcp.plan.icem import coloured
 from egovcp.plan.mppi import weights
 from egovcp.plan.objective import evaluate
 from egovcp.plan.optimisers import OPTIMISERS
-from egovcp.plan.search import Belief
-from egovcp.testing import Point, PointWorld
+from egovcp.plan.search import SearchState
+from egovcp.testing import Point, PointWorld, plain_planner
 
 ETA = spec.ACTION_ETA
 every = pytest.mark.parametrize("name", list(OPTIMISERS))
@@ -33,11 +33,11 @@ def _plan(
     **change: object,
 ) -> Plan:
     settings = {"samples": 256, "elites": 32, "iterations": 4, **change}
-    config = PlannerConfig(optimiser=name, **settings)  # type: ignore[arg-type]
+    config = plain_planner(optimiser=name, **settings)  # type: ignore[arg-type]
     world = world or PointWorld()
-    judge, carry = StepByStep(world, config), world.start(executed, goal)
+    evaluator, carry = ReferenceEvaluator(world, config), world.start(executed, goal)
     generator = torch.Generator().manual_seed(seed)
-    return make_plan(judge, optimiser_of(config), carry, executed, config, generator, warm)
+    return make_plan(evaluator, optimiser_of(config), carry, executed, config, generator, warm)
 
 
 def _random(rows: int, seed: int, scale: float = 1.0) -> Tensor:
@@ -46,7 +46,7 @@ def _random(rows: int, seed: int, scale: float = 1.0) -> Tensor:
 
 
 def _worth(executed: Tensor, goal: Tensor, actions: Tensor) -> Tensor:
-    return evaluate(PointWorld(), Point(executed, goal), actions[:, None], PlannerConfig())[:, 0]
+    return evaluate(PointWorld(), Point(executed, goal), actions[:, None], plain_planner())[:, 0]
 
 
 @every
@@ -84,11 +84,13 @@ def test_a_seed_repeats_a_plan_and_another_gives_another(name: OptimiserName) ->
 
 @every
 def test_the_first_candidate_is_the_warm_start(name: OptimiserName) -> None:
-    config = PlannerConfig(samples=16, elites=4, optimiser=name)
+    config = plain_planner(samples=16, elites=4, optimiser=name)
     warm = torch.full((2, 4, 7), 0.3)
     nothing = torch.full((2, 4), -math.inf)
-    belief = Belief(warm, warm.abs(), warm[:, None].expand(-1, 4, -1, -1), nothing, nothing[:, 0])
-    first = optimiser_of(config).propose(belief, 0, torch.Generator().manual_seed(0))
+    state = SearchState(
+        warm, warm.abs(), warm[:, None].expand(-1, 4, -1, -1), nothing, nothing[:, 0]
+    )
+    first = optimiser_of(config).propose(state, 0, torch.Generator().manual_seed(0))
     assert first.shape == (2, 16, 4, 7)
     assert torch.equal(first[:, 0], warm)
     assert not first[:, 1].any()
@@ -150,16 +152,16 @@ def test_searches_that_keep_the_best_never_lose_it(name: OptimiserName) -> None:
 
 
 def test_icem_draws_fewer_each_round_and_its_elites_again() -> None:
-    config = PlannerConfig(samples=100, elites=10, optimiser="icem", kept_elites=0.3)
+    config = plain_planner(samples=100, elites=10, optimiser="icem", kept_elites=0.3)
     elites = torch.rand(1, 10, 4, 7)
     values = torch.arange(10.0, 0.0, -1.0)[None]
-    belief = Belief(elites[:, 0], torch.ones(1, 4, 7), elites, values, values[:, 0])
+    state = SearchState(elites[:, 0], torch.ones(1, 4, 7), elites, values, values[:, 0])
     search, rng = optimiser_of(config), torch.Generator().manual_seed(0)
-    counts = [search.propose(belief, n, rng).shape[1] for n in range(4)]
+    counts = [search.propose(state, n, rng).shape[1] for n in range(4)]
     assert counts[0] == 100
     assert counts[1] == 80 + 3
     assert counts[1] > counts[2] > counts[3]
-    assert torch.equal(search.propose(belief, 1, rng)[:, :3], elites[:, :3])
+    assert torch.equal(search.propose(state, 1, rng)[:, :3], elites[:, :3])
 
 
 @pytest.mark.parametrize("exponent", [0.0, 2.0])
@@ -185,4 +187,4 @@ def test_mppi_weighs_by_value_whatever_the_unit() -> None:
 )
 def test_senseless_settings_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(UsageError):
-        dataclasses.replace(PlannerConfig(), **change)
+        dataclasses.replace(plain_planner(), **change)

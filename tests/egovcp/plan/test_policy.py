@@ -12,11 +12,11 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.model import Carry, WorldModel
-from egovcp.plan import Judge, Optimiser, Plan, PlannerConfig, Policy, PolicyStep, make_plan
-from egovcp.plan.process import shift
-from egovcp.testing import CountingModel, toy_model
+from egovcp.plan import Optimiser, Plan, PlanEvaluator, PlannerConfig, Policy, PolicyStep, make_plan
+from egovcp.plan.action_parameterization import shift
+from egovcp.testing import CountingModel, plain_planner, toy_model
 
-CONFIG = PlannerConfig(samples=64, elites=8, iterations=2)
+CONFIG = plain_planner(samples=64, elites=8, iterations=2)
 A = spec.ACTION_DIM
 
 
@@ -122,7 +122,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[_Asked]:
     calls: list[_Asked] = []
 
     def record(
-        judge: Judge[Carry],
+        evaluator: PlanEvaluator[Carry],
         optimiser: Optimiser,
         carry: Carry,
         executed: Tensor,
@@ -131,7 +131,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[_Asked]:
         warm: Tensor,
         remaining: Callable[[], float] | None,
     ) -> Plan:
-        plan = make_plan(judge, optimiser, carry, executed, config, generator, warm, remaining)
+        plan = make_plan(evaluator, optimiser, carry, executed, config, generator, warm, remaining)
         calls.append(_Asked(executed.clone(), warm.clone(), plan))
         return plan
 
@@ -217,7 +217,7 @@ def test_what_is_reported_has_its_shapes_and_stays_in_the_box() -> None:
 
 def test_the_plan_goes_on_from_the_one_before() -> None:
     """Warm start: with hardly any search, a drift is followed farther tick by tick."""
-    lazy = PlannerConfig(samples=32, elites=4, iterations=1)
+    lazy = plain_planner(samples=32, elites=4, iterations=1)
     policy = Policy(CountingModel(drift=0.25), lazy, num_envs=1, seed=1)
     values = []
     for tick in range(8):

@@ -6,33 +6,33 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.plan import PlannerConfig, optimiser_of
+from egovcp.plan.action_parameterization import random_walk
 from egovcp.plan.backends import library
 from egovcp.plan.backends.sampling import KernelCrossEntropy
 from egovcp.plan.cem import CrossEntropy
-from egovcp.plan.process import walk
-from egovcp.plan.search import Belief
+from egovcp.plan.search import SearchState
 
 pytestmark = pytest.mark.skipif(library.compiler() is None, reason="no C compiler")
 CONFIG = PlannerConfig(samples=60, horizon=3, elites=7)
 SHAPE = (CONFIG.horizon, spec.ACTION_DIM)
 
 
-def _belief(robots: int = 2) -> Belief:
+def _belief(robots: int = 2) -> SearchState:
     rng = torch.Generator().manual_seed(0)
     mean, std = torch.rand(2, robots, *SHAPE, generator=rng)
     nothing = torch.full((robots, CONFIG.elites), -torch.inf)
     elites = mean[:, None].expand(-1, CONFIG.elites, -1, -1)
-    return Belief(2.4 * mean - 1.2, std, elites, nothing, nothing[:, 0])
+    return SearchState(2.4 * mean - 1.2, std, elites, nothing, nothing[:, 0])
 
 
-def _learned(values: Tensor) -> tuple[Belief, Belief]:
+def _learned(values: Tensor) -> tuple[SearchState, SearchState]:
     """By the kernel, and by torch."""
     rng = torch.Generator().manual_seed(1)
     deltas = 2 * torch.rand(len(values), CONFIG.samples, *SHAPE, generator=rng) - 1
-    belief = _belief(len(values))
+    state = _belief(len(values))
     return (
-        KernelCrossEntropy(CONFIG).learn(belief, deltas, values),
-        CrossEntropy(CONFIG).learn(belief, deltas, values),
+        KernelCrossEntropy(CONFIG).learn(state, deltas, values),
+        CrossEntropy(CONFIG).learn(state, deltas, values),
     )
 
 
@@ -75,8 +75,10 @@ def test_its_walks_are_the_process_to_the_bit(size: int) -> None:
     start = 2 * torch.rand(3, 1, size, generator=rng) - 1
     deltas = 2 * torch.rand(3, 50, 4, size, generator=rng) - 1
     deltas[1, 2, 3, 4] = torch.nan
-    found = KernelCrossEntropy(CONFIG).walk(start, deltas, 0.9)
-    torch.testing.assert_close(found, walk(start, deltas, 0.9), rtol=0, atol=0, equal_nan=True)
+    found = KernelCrossEntropy(CONFIG).random_walk(start, deltas, 0.9)
+    torch.testing.assert_close(
+        found, random_walk(start, deltas, 0.9), rtol=0, atol=0, equal_nan=True
+    )
 
 
 def test_what_is_not_on_the_processor_or_not_for_the_kernel_is_left_to_torch() -> None:

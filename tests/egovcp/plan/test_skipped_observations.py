@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.errors import UsageError
-from egovcp.plan import PlannerConfig, Policy, PolicyStep
-from egovcp.testing import toy_model
+from egovcp.plan import Policy, PolicyStep
+from egovcp.testing import plain_planner, toy_model
 
-CONFIG = PlannerConfig(samples=32, elites=4, iterations=1, backend="float32")
+CONFIG = plain_planner(samples=32, elites=4, iterations=1, backend="float32")
 ROBOTS, TICKS, BAD_TICK, BAD_ROBOT = 3, 5, 2, 1
 GRAVITY = spec.STATE_SLICES["projected_gravity"]
 

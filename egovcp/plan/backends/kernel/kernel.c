@@ -10,7 +10,7 @@
  * what a layer activates, and h, is in 16-bit fixed point (`words.h`).
  * The weights of a normalised layer are centred (their mean over the outputs is zero), and so are its
  * sums. No state, no allocation. */
-#include "crew.h"
+#include "thread_pool.h"
 #include "layers.h"
 #include "search.h"
 #include "start.h"
@@ -85,7 +85,7 @@ static float mean_of_bins(const Reading *as, const float *outputs) {
 }
 
 /* Q [ROWS] in units of return, at step k. */
-static void value(const Network *net, const Root *root, const Carry *at, int k, const Few *action, float *q) {
+static void value(const Network *net, const SharedPrefix *root, const Carry *at, int k, const Few *action, float *q) {
     const Reading *as = &net->reading;
     float outputs[ROWS * MOST_FEW];
     head_outputs(net, &net->value, root->value, at, k, action, as->bins ? outputs : q);
@@ -96,7 +96,7 @@ static void value(const Network *net, const Root *root, const Carry *at, int k, 
 }
 
 /* The reward [ROWS] in its own units, at step k. */
-static void reward(const Network *net, const Root *root, const Carry *at, int k, const Few *action,
+static void reward(const Network *net, const SharedPrefix *root, const Carry *at, int k, const Few *action,
                    float *earned) {
     head_outputs(net, &net->reward, root->reward, at, k, action, earned);
     for (int r = 0; r < ROWS; r++) earned[r] *= net->reading.std;
@@ -109,7 +109,7 @@ static inline int asks_value(const Reading *as, int k, int steps) {
 
 /* Everything of a block of plans, actions [ROWS][steps][actions]: Q or the reward, worth [steps][ROWS],
  * and the log-odds of a failure, dead [steps][ROWS], of all steps but the first and the last. */
-static void block(const Network *net, const Root *root, int steps, const float *actions, const float *noise,
+static void block(const Network *net, const SharedPrefix *root, int steps, const float *actions, const float *noise,
                   float *worth, float *dead) {
     Carry at;
     Fixed x;
@@ -149,7 +149,7 @@ void layout(int32_t *depth, int32_t *lanes, int32_t *group) {
 /* Plans of one robot. */
 typedef struct {
     const Network *net;
-    const Root *root;
+    const SharedPrefix *root;
     int32_t rows, steps;
     const float *actions; /* [rows][steps][actions] */
     const float *noise;   /* [steps - 1][latent] or null */
@@ -157,7 +157,7 @@ typedef struct {
     Crew crew;
 } Job;
 
-/* J of a plan, as `Account` sums it, from row r of what `block` says; actions are those of the row. */
+/* J of a plan, as `ReturnAccumulator` sums it, from row r of what `block` says; actions are those of the row. */
 static float sum_of(const Job *job, int r, const float *worth, const float *dead, const float *actions) {
     const Reading *as = &job->net->reading;
     const float base = as->rule == PAPER ? 0.0f : as->floor;
@@ -200,7 +200,7 @@ static void blocks(Job *job) {
 }
 
 /* All plans of a job are judged when this returns. */
-void judge(Job *job) {
+void evaluator(Job *job) {
     open_job(&job->crew);
     blocks(job);
     close_job(&job->crew);

@@ -1,6 +1,6 @@
 /* Layers of a block of candidates. */
 #pragma once
-#include "products.h"
+#include "gemm.h"
 
 typedef struct { /* of a layer; null: not there, or in the sums that it starts from */
     const Bytes *wide, *beside;

@@ -1,6 +1,6 @@
 /* What Python says of a network (`library.py` has the same structures), and what a block carries. */
 #pragma once
-#include "words.h"
+#include "fixed_point.h"
 
 enum { WIDEST = 1024, MOST_FEW = 128, FEW_STRIDE = MOST_FEW + LANES };
 #if defined(TILES)
@@ -85,7 +85,7 @@ typedef struct {
     const float *value;
     const float *reward;
     float nothing; /* 0, or not a number where the state is not: bytes know no such thing */
-} Root;
+} SharedPrefix;
 
 typedef struct {
     Byte values[ROWS][WIDEST];

@@ -1,4 +1,4 @@
-/* The steps of a search between two calls of its judge: `draw`, `walk`, `best_of` and `refit` of
+/* The steps of a search between two calls of its evaluator: `draw`, `walk`, `best_of` and `refit` of
  * `egovcp.plan`. */
 #pragma once
 #include "vectors.h"

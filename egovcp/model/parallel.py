@@ -12,7 +12,7 @@ from functools import cache
 import torch
 
 
-def beside[A, B](first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
+def run_parallel[A, B](first: Callable[[], A], second: Callable[[], B]) -> tuple[A, B]:
     """Both results; one after the other where torch has a single thread.
 
     ``second`` is computed in a thread of its own, to which contexts (of autograd, of autocast) do

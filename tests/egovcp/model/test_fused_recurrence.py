@@ -141,7 +141,7 @@ def test_one_state_broadcasts_over_many_actions(model: WorldModel) -> None:
     carry = Carry(torch.randn(2, model.config.hidden), torch.randn(2, model.config.latent))
     actions = torch.rand(2, 5, 3, spec.ACTION_DIM) * 2 - 1
     with torch.no_grad():
-        shared = model.spread(carry)
+        shared = model.expand_candidates(carry)
         for k in range(3):
             values = model.value(shared, actions[:, :, k])
             shared = model.imagine(shared, actions[:, :, k])

@@ -12,12 +12,12 @@ from egovcp.cuda_graphs import Recorded
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.backends.integers import IntegerNetwork
 from egovcp.plan.backends.network import PlanningNetwork
-from egovcp.plan.backends.root import Root, root_of
+from egovcp.plan.backends.shared_prefix import SharedPrefix, shared_prefix
 from egovcp.plan.config import PlannerConfig
-from egovcp.plan.objective import Worth
+from egovcp.plan.objective import PlanValue
 
 
-class FloatJudge:
+class FloatEvaluator:
     """All candidates of all robots at once, on any device; on a GPU by CUDA graphs.
 
     Args:
@@ -27,31 +27,31 @@ class FloatJudge:
 
     def __init__(self, model: WorldModel, config: PlannerConfig) -> None:
         self._model, self._config = model, config
-        self._root: Callable[[Carry], Root] = partial(root_of, model)
-        self._worth: Callable[[Root, Tensor, Tensor | None], Tensor]
-        self._worth = PlanningNetwork(model, config).worth
+        self._root: Callable[[Carry], SharedPrefix] = partial(shared_prefix, model)
+        self._plan_value: Callable[[SharedPrefix, Tensor, Tensor | None], Tensor]
+        self._plan_value = PlanningNetwork(model, config).plan_value
         if model.state_mean.device.type == "cuda":
-            self._root, self._worth = Recorded(self._root), Recorded(self._worth)
+            self._root, self._plan_value = Recorded(self._root), Recorded(self._plan_value)
 
     @property
     def shapes(self) -> int:
         """Of how many shapes there are CUDA graphs."""
-        return sum(f.shapes for f in (self._root, self._worth) if isinstance(f, Recorded))
+        return sum(f.shapes for f in (self._root, self._plan_value) if isinstance(f, Recorded))
 
     @torch.no_grad()
-    def at(self, carry: Carry) -> Worth:
-        """See `Judge`."""
+    def at(self, carry: Carry) -> PlanValue:
+        """See `PlanEvaluator`."""
         root = self._root(carry)
 
         @torch.no_grad()
-        def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:
+        def plan_value(actions: Tensor, generator: torch.Generator | None) -> Tensor:
             noise = _noise(self._model, self._config, actions.shape[-2], generator)
-            return self._worth(root, actions, noise)
+            return self._plan_value(root, actions, noise)
 
-        return worth
+        return plan_value
 
 
-class IntegerJudge:
+class Int8Evaluator:
     """One robot after the other, its candidates shared by as many threads as torch uses.
 
     Args:
@@ -68,20 +68,22 @@ class IntegerJudge:
         self._network = IntegerNetwork(model, config)
 
     @torch.no_grad()
-    def at(self, carry: Carry) -> Worth:
-        """See `Judge`."""
+    def at(self, carry: Carry) -> PlanValue:
+        """See `PlanEvaluator`."""
         self._network.soon()
-        # One by one: what a robot's plans are worth does not depend on the robots beside it.
+        # One by one: the values of a robot's plans do not depend on the robots beside it.
         states = (carry.row(e) for e in range(len(carry.h)))
         robots = [self._network.shared(state) for state in states]
 
         @torch.no_grad()
-        def worth(actions: Tensor, generator: torch.Generator | None) -> Tensor:
+        def plan_value(actions: Tensor, generator: torch.Generator | None) -> Tensor:
             noise = _noise(self._model, self._config, actions.shape[-2], generator)
             each = zip(robots, actions, strict=True)
-            return torch.stack([self._network.worth(robot, plans, noise) for robot, plans in each])
+            return torch.stack(
+                [self._network.plan_value(robot, plans, noise) for robot, plans in each]
+            )
 
-        return worth
+        return plan_value
 
 
 def _noise(

@@ -5,14 +5,14 @@ import dataclasses
 import torch
 
 from egovcp.model import Batch, WorldModel
-from egovcp.model.foresight import foresight_losses
 from egovcp.model.losses import filter_sequence, pixel_weights
+from egovcp.model.multistep import multistep_losses
 from egovcp.testing import random_batch, toy_model
 
 
 def _model(**loss: object) -> WorldModel:
     model = toy_model()
-    changed = dataclasses.replace(model.config.loss, foresight_every=1, **loss)
+    changed = dataclasses.replace(model.config.loss, multistep_stride=1, **loss)
     model.config = dataclasses.replace(model.config, loss=changed)
     return model
 
@@ -20,11 +20,11 @@ def _model(**loss: object) -> WorldModel:
 def _losses(model: WorldModel, batch: Batch) -> dict[str, torch.Tensor]:
     rollout = filter_sequence(model, batch, sample=False)
     weight = pixel_weights(rollout.near, batch, model)
-    return foresight_losses(model, rollout, batch, weight, first=0)
+    return multistep_losses(model, rollout, batch, weight, first=0)
 
 
 def test_it_is_the_error_of_the_state_imagined_so_far_ahead() -> None:
-    model, batch = _model(foresight_ahead=(3,)), random_batch(2, 6)
+    model, batch = _model(multistep_horizons=(3,)), random_batch(2, 6)
     rollout = filter_sequence(model, batch, sample=False)
     errors = []
     for start in range(3):
@@ -33,19 +33,19 @@ def test_it_is_the_error_of_the_state_imagined_so_far_ahead() -> None:
             carry = model.imagine(carry, batch.action[:, start + k])
         wrong = model.decode_state(carry.h, carry.z) - rollout.state[:, start + 3]
         errors.append(0.5 * wrong.square().mean(-1))
-    expected = model.config.loss.foresight_state * torch.stack(errors).mean()
-    torch.testing.assert_close(_losses(model, batch)["foresight_state"], expected)
+    expected = model.config.loss.multistep_state * torch.stack(errors).mean()
+    torch.testing.assert_close(_losses(model, batch)["multistep_state"], expected)
 
 
 def test_no_window_shorter_than_the_foresight_is_judged() -> None:
-    assert _losses(_model(foresight_ahead=(8,)), random_batch(2, 6)) == {}
+    assert _losses(_model(multistep_horizons=(8,)), random_batch(2, 6)) == {}
 
 
 def test_nothing_is_foreseen_across_the_start_of_an_episode() -> None:
-    model, batch = _model(foresight_ahead=(2,)), random_batch(2, 6)
+    model, batch = _model(multistep_horizons=(2,)), random_batch(2, 6)
     batch.is_first[:, 4] = True
     other = batch._replace(state=batch.state.clone())
     other.state[:, 4:] += 5.0  # rows 4 and 5 could only be reached from the other episode
     torch.testing.assert_close(
-        _losses(model, batch)["foresight_state"], _losses(model, other)["foresight_state"]
+        _losses(model, batch)["multistep_state"], _losses(model, other)["multistep_state"]
     )

@@ -25,9 +25,9 @@ from torch import Tensor
 
 from egovcp.model.carry import Carry
 from egovcp.model.config import LossConfig
+from egovcp.model.fused_recurrence import imagine_window
+from egovcp.model.image_loss import image_error
 from egovcp.model.losses import Batch, Rollout, masked_mean, unbroken
-from egovcp.model.picture_error import picture_error
-from egovcp.model.recurrence import imagine_window
 from egovcp.model.world_model import WorldModel
 
 
@@ -46,14 +46,14 @@ class Weights(NamedTuple):
     state: float
 
 
-def foresight_losses(
+def multistep_losses(
     model: WorldModel,
     rollout: Rollout,
     batch: Batch,
     weight: Tensor,
     first: int,
 ) -> dict[str, Tensor]:
-    """Picture and proprioception of states imagined ``foresight_ahead`` ticks ahead.
+    """Picture and proprioception of states imagined ``multistep_horizons`` ticks ahead.
 
     Args:
         model: the world model.
@@ -63,11 +63,11 @@ def foresight_losses(
         first: row from which is imagined, see `first_row`.
     """
     config = model.config.loss
-    weights = Weights(config.foresight_depth, config.foresight_state)
+    weights = Weights(config.multistep_depth, config.multistep_state)
     if not any(weights):
         return {}
-    seen = imagine_ahead(model, rollout.carry, batch, config.foresight_ahead, first)
-    return _compare("foresight", model, seen, rollout, batch, weight, weights)
+    seen = imagine_ahead(model, rollout.carry, batch, config.multistep_horizons, first)
+    return _compare("multistep", model, seen, rollout, batch, weight, weights)
 
 
 def autoregressive_losses(
@@ -122,7 +122,7 @@ def first_row(
 
 def _every(config: LossConfig, ahead: Sequence[int], length: int) -> int:
     """n: at least one row is to be imagined from, if the window is long enough for any."""
-    return max(1, min(config.foresight_every, length - min(ahead, default=length)))
+    return max(1, min(config.multistep_stride, length - min(ahead, default=length)))
 
 
 def _imagined(
@@ -158,7 +158,7 @@ def _compare(
     carry, rows, known = seen
     near = rollout.near[:, rows]
     image = model.decode_depth(carry.features.flatten(0, 1)).view_as(near)
-    picture = picture_error(image, near, weight[:, rows])
+    picture = image_error(image, near, weight[:, rows])
     foreseen = model.decode_state(carry.h, carry.z).float()
     state = 0.5 * (foreseen - rollout.state[:, rows]).square().mean(-1)
     return {

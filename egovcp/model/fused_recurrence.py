@@ -26,16 +26,16 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from egovcp.model.carry import Carry
-from egovcp.model.gaussian import SHIFT, Gaussian
-from egovcp.model.recurrence_gradient import (
-    Found,
-    Kept,
+from egovcp.model.fused_backward import (
     Norm,
     Norms,
+    Outputs,
+    Saved,
     Weights,
+    backward,
     beginnings,
-    way_back,
 )
+from egovcp.model.gaussian import SHIFT, Gaussian
 from egovcp.model.world_model import WorldModel
 
 
@@ -154,7 +154,7 @@ def _run(
     first: Tensor | None = None,
     embedding: Tensor | None = None,
     noise: Tensor | None = None,
-) -> Found:
+) -> Outputs:
     kind = action.device.type
     product = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else action.dtype
     constants = _Constants(tuple(rows), model.config.min_std, product, torch.is_grad_enabled())
@@ -163,7 +163,7 @@ def _run(
         found = _Recurrence.apply(  # type: ignore[no-untyped-call]
             constants, start.h, start.z, projected, embedding, first, noise, *weights
         )
-    return Found(*found)
+    return Outputs(*found)
 
 
 class _Recurrence(torch.autograd.Function):
@@ -179,7 +179,7 @@ class _Recurrence(torch.autograd.Function):
         noise: Tensor | None,
         *weights: Tensor,
     ) -> tuple[Tensor, ...]:
-        found, kept, norms = _way_there(
+        found, kept, norms = _forward(
             constants, h, z, action, embedding, first, noise, Weights(*weights)
         )
         if kept is not None:
@@ -192,14 +192,14 @@ class _Recurrence(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, *outer: Tensor) -> tuple[Tensor | None, ...]:
         first, noise, *rest = ctx.saved_tensors
-        kept, rest = Kept(*rest[: len(Kept._fields)]), rest[len(Kept._fields) :]
+        kept, rest = Saved(*rest[: len(Saved._fields)]), rest[len(Saved._fields) :]
         norms = Norms(*(Norm(*rest[i : i + 4]) for i in (0, 4, 8)))
-        found = way_back(Found(*outer), kept, norms, Weights(*rest[12:]), ctx.rows, first, noise)
+        found = backward(Outputs(*outer), kept, norms, Weights(*rest[12:]), ctx.rows, first, noise)
         embedding = found.embedding if ctx.needs_input_grad[4] else None
         return (None, found.h, found.z, found.action, embedding, None, None, *found.weights)
 
 
-def _way_there(
+def _forward(
     constants: _Constants,
     h: Tensor,
     z: Tensor,
@@ -208,13 +208,13 @@ def _way_there(
     first: Tensor | None,
     noise: Tensor | None,
     w: Weights,
-) -> tuple[Found, Kept | None, list[Norm]]:
-    """Rows are those of `Found`: action (R, U), embedding (R, U), first (R, 1), noise (R, Z)."""
+) -> tuple[Outputs, Saved | None, list[Norm]]:
+    """Rows are those of `Outputs`: action (R, U), embedding (R, U), first (R, 1), noise (R, Z)."""
     p = constants.product
     mix, gru, head, out = (x.to(p).t() for x in (w.mix, w.gru, w.head, w.out))
     out_shift = w.out_shift.to(p)
-    found: list[Found] = []
-    kept: list[Kept] = []
+    found: list[Outputs] = []
+    kept: list[Saved] = []
     norms: list[Norms] = []
 
     def ticks(x: Tensor | None) -> Sequence[Any]:
@@ -224,7 +224,7 @@ def _way_there(
     seen = None if embedding is None else embedding.to(p)
     begun = beginnings(first, constants.rows)
     given = map(ticks, (action.to(p), seen, noise))
-    for act, look, luck, new in zip(*given, begun, strict=True):
+    for act, look, noise_t, new in zip(*given, begun, strict=True):
         h, z = h[: len(act)], z[: len(act)]
         if new is not None:  # replaced, not multiplied by zero: a reset heals NaN, too
             h, z = h.masked_fill(new, 0.0), z.masked_fill(new, 0.0)
@@ -242,15 +242,15 @@ def _way_there(
         hidden = F.silu(read.y).to(p)
         mean, spread = torch.addmm(out_shift, hidden, out).to(h.dtype).chunk(2, -1)
         std = F.softplus(spread + SHIFT) + constants.min_std
-        z = mean if luck is None else torch.addcmul(mean, std, luck)
-        found.append(Found(h, z, mean, std))
+        z = mean if noise_t is None else torch.addcmul(mean, std, noise_t)
+        found.append(Outputs(h, z, mean, std))
         if constants.keep:
             kept.append(
-                Kept(before, latent, inputs, reset, proposed, update, state, hidden, spread)
+                Saved(before, latent, inputs, reset, proposed, update, state, hidden, spread)
             )
             norms.append(Norms(mixed, gates, read))
-    whole = Found(*map(torch.cat, zip(*found, strict=True)))
+    whole = Outputs(*map(torch.cat, zip(*found, strict=True)))
     if not constants.keep:
         return whole, None, []
     several = [Norm(*map(torch.cat, zip(*norm, strict=True))) for norm in zip(*norms, strict=True)]
-    return whole, Kept(*map(torch.cat, zip(*kept, strict=True))), several
+    return whole, Saved(*map(torch.cat, zip(*kept, strict=True))), several

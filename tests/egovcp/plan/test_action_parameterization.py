@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.plan import Plan, PlannerConfig, StepByStep, make_plan, optimiser_of
+from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
+from egovcp.plan.action_parameterization import random_walk, reflect, target_steps
 from egovcp.plan.config import OptimiserName
-from egovcp.plan.process import ramp, reflect, walk
 from egovcp.testing import PointWorld
 
 ETA = spec.ACTION_ETA
@@ -22,7 +22,7 @@ def _uniform(*shape: int) -> Tensor:
 
 def test_the_walk_stays_in_the_box_and_steps_within_eta() -> None:
     start, deltas = _uniform(500, 7), _uniform(500, 6, 7)
-    actions = walk(start, deltas, ETA)
+    actions = random_walk(start, deltas, ETA)
     assert actions.abs().max() <= 1
     before = torch.cat([start[:, None], actions[:, :-1]], 1)
     assert (actions - before).abs().max() <= ETA + 1e-6
@@ -31,7 +31,7 @@ def test_the_walk_stays_in_the_box_and_steps_within_eta() -> None:
 def test_the_walk_far_from_the_walls_is_a_sum() -> None:
     deltas = torch.full((1, 3, 7), 0.5)
     steps = torch.arange(1, 4)[None, :, None] * 0.5 * ETA
-    torch.testing.assert_close(walk(torch.zeros(1, 7), deltas, ETA), steps.expand(1, 3, 7))
+    torch.testing.assert_close(random_walk(torch.zeros(1, 7), deltas, ETA), steps.expand(1, 3, 7))
 
 
 @pytest.mark.parametrize(("x", "inside"), [(1.2, 0.8), (-1.3, -0.7), (0.4, 0.4), (1.0, 1.0)])
@@ -43,8 +43,8 @@ def test_reflection_folds_at_the_walls(x: float, inside: float) -> None:
 @pytest.mark.parametrize("eta", [ETA, 0.05, 2.0])
 def test_a_ramp_goes_straight_to_one_place_and_rests_there(eta: float) -> None:
     start, deltas = _uniform(500, 7), _uniform(500, 6, 7)
-    steps = ramp(start, deltas, eta)
-    actions = walk(start, steps, eta)
+    steps = target_steps(start, deltas, eta)
+    actions = random_walk(start, steps, eta)
     assert actions.abs().max() <= 1 + 1e-6
     place = reflect((start + eta * deltas.sum(1)).clamp(-3, 3))
     left = torch.cat([(place - start)[:, None], place[:, None] - actions], 1)  # (500, 7, 7)
@@ -56,30 +56,32 @@ def test_a_ramp_goes_straight_to_one_place_and_rests_there(eta: float) -> None:
 
 def test_a_ramp_is_a_ramp_of_itself() -> None:
     start = _uniform(500, 7)
-    steps = ramp(start, _uniform(500, 4, 7), ETA)
-    torch.testing.assert_close(ramp(start, steps, ETA), steps, atol=1e-5, rtol=0)
+    steps = target_steps(start, _uniform(500, 4, 7), ETA)
+    torch.testing.assert_close(target_steps(start, steps, ETA), steps, atol=1e-5, rtol=0)
 
 
 def _plan(config: PlannerConfig, goal: Tensor) -> Plan:
     world, executed = PointWorld(), torch.zeros_like(goal)
-    judge, generator = StepByStep(world, config), torch.Generator().manual_seed(0)
+    evaluator, generator = ReferenceEvaluator(world, config), torch.Generator().manual_seed(0)
     carry = world.start(executed, goal)
-    return make_plan(judge, optimiser_of(config), carry, executed, config, generator)
+    return make_plan(evaluator, optimiser_of(config), carry, executed, config, generator)
 
 
 @pytest.mark.parametrize("optimiser", ["cem", "icem", "mppi", "shooting"])
 def test_every_search_judges_ramps(optimiser: OptimiserName) -> None:
-    config = PlannerConfig(samples=64, elites=8, optimiser=optimiser, process="ramp")
+    config = PlannerConfig(
+        samples=64, elites=8, optimiser=optimiser, action_parameterization="target"
+    )
     candidates = _plan(config, _uniform(16, 7)).candidates  # (16, 8, 4, 7), from 0
     steps = torch.diff(candidates, dim=2, prepend=torch.zeros(16, 8, 1, 7)) / ETA
-    torch.testing.assert_close(ramp(torch.zeros(7), steps, ETA), steps, atol=1e-5, rtol=0)
+    torch.testing.assert_close(target_steps(torch.zeros(7), steps, ETA), steps, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("reach", [0.2, 0.9])
 def test_the_first_action_of_a_ramp_is_found_with_fewer_candidates(reach: float) -> None:
     """The best first action is known: as far towards the goal as a tick allows."""
     goal, missed = reach * _uniform(64, 7), {}
-    for process in ("walk", "ramp"):
-        plan = _plan(PlannerConfig(samples=64, elites=4, process=process), goal)
+    for process in ("random_walk", "target"):
+        plan = _plan(PlannerConfig(samples=64, elites=4, action_parameterization=process), goal)
         missed[process] = float((plan.actions[:, 0] - goal.clamp(-ETA, ETA)).abs().mean())
-    assert missed["ramp"] < 0.6 * missed["walk"]
+    assert missed["target"] < 0.6 * missed["random_walk"]

@@ -5,7 +5,7 @@ import torch
 
 from egovcp import spec
 from egovcp.model import PRESETS, WorldModel
-from egovcp.model.nets import SplitLinear, SplitMlp
+from egovcp.model.networks import SplitLinear, SplitMlp
 
 
 def test_split_linear_is_a_linear_on_the_concatenated_inputs():

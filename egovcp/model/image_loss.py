@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 
-def picture_error(image: Tensor, near: Tensor, weight: Tensor) -> Tensor:
+def image_error(image: Tensor, near: Tensor, weight: Tensor) -> Tensor:
     """Mean over the pixels of half the squared error, weighted, (...,), in float32.
 
     Args:

@@ -1,4 +1,4 @@
-"""The gradient of the recurrence over a window (`egovcp.model.recurrence`), by hand.
+"""The gradient of the recurrence over a window (`egovcp.model.fused_recurrence`), by hand.
 
 From the last tick to the first, through products and norms. What h_t changes by with each gate does
 not depend on later ticks and is computed for all at once, and so is the gradient of every weight:
@@ -39,7 +39,7 @@ class Weights(NamedTuple):
     out_shift: Tensor  # (2Z,)
 
 
-class Found(NamedTuple):
+class Outputs(NamedTuple):
     """What the recurrence found, or the gradient of it: rows (R, ...) of one tick after the other,
     as many of each as of the one before or fewer."""
 
@@ -87,7 +87,7 @@ class Norm(NamedTuple):
         return [Norm(*part) for part in zip(*parts, strict=True)]
 
 
-class Kept(NamedTuple):
+class Saved(NamedTuple):
     """What is known of all ticks, (R, ...); what products are made of is in their type."""
 
     state: Tensor  # h_{t-1}
@@ -119,9 +119,9 @@ class Gradients(NamedTuple):
     weights: Weights
 
 
-def way_back(
-    outer: Found,
-    kept: Kept,
+def backward(
+    outer: Outputs,
+    kept: Saved,
     norms: Norms,
     w: Weights,
     rows: Sequence[int],
@@ -214,7 +214,7 @@ def _of_weight(gradient: Tensor, x: Tensor, like: Tensor) -> Tensor:
     return (gradient.t() @ x).to(like.dtype)
 
 
-def _gate_slopes(kept: Kept, y: Tensor) -> Tensor:
+def _gate_slopes(kept: Saved, y: Tensor) -> Tensor:
     """By how much h_t changes with each gate in ``y``, (R, 3H)."""
     by_sigmoid, by_tanh = torch.ops.aten.sigmoid_backward, torch.ops.aten.tanh_backward
     candidate = y.chunk(3, -1)[1]
@@ -224,11 +224,11 @@ def _gate_slopes(kept: Kept, y: Tensor) -> Tensor:
     return torch.cat([by_reset, through * kept.reset, by_update], -1)
 
 
-def _of_logits(outer: Found, spread: Tensor, noise: Tensor | None) -> tuple[Tensor, Tensor]:
+def _of_logits(outer: Outputs, spread: Tensor, noise: Tensor | None) -> tuple[Tensor, Tensor]:
     """What the gradient of the logits is if nothing comes of later ticks, and what it gains by the
     gradient of z from there, (R, 2Z) both."""
     slope = torch.sigmoid(spread + SHIFT)
-    luck = torch.zeros_like(slope) if noise is None else noise * slope
-    by_latent = torch.cat([torch.ones_like(slope), luck], -1)
+    noise_t = torch.zeros_like(slope) if noise is None else noise * slope
+    by_latent = torch.cat([torch.ones_like(slope), noise_t], -1)
     alone = torch.cat([outer.mean, outer.std * slope], -1)
     return alone.addcmul_(torch.cat([outer.z, outer.z], 1), by_latent), by_latent

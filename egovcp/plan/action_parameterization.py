@@ -1,4 +1,4 @@
-"""The action processes of the data: random walks in the box, folded back at its walls."""
+"""Action sequences of candidates: a random walk in the box, or steps towards a target."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ def reflect(x: Tensor) -> Tensor:
     return 2.0 * x.clamp(-1.0, 1.0) - x
 
 
-def walk(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
-    """Actions (..., N, 7) of the data's process from ``start`` (..., 7) by ``deltas``."""
+def random_walk(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
+    """Actions (..., N, 7) of a random walk from ``start`` (..., 7) by ``deltas``."""
     actions = []
     action = start
     for delta in deltas.unbind(-2):
@@ -21,11 +21,11 @@ def walk(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
     return torch.stack(actions, -2)
 
 
-def ramp(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
-    """Steps (..., N, 7) from ``start`` (..., 7) that go by ``eta`` a tick to where ``deltas`` would
-    lead in all, folded back into the box, and rest there: the process of data whose walk rests.
+def target_steps(start: Tensor, deltas: Tensor, eta: float) -> Tensor:
+    """Steps (..., N, 7) that move from ``start`` (..., 7) to one target at rate ``eta``, then stop.
 
-    Steps of this kind are returned as they are.
+    The target is where ``deltas`` (..., N, 7) add up to, reflected into the box. Steps that are
+    already of this kind are returned unchanged.
     """
     target = reflect((start + eta * deltas.sum(-2)).clamp(-3.0, 3.0))
     far = ((target - start) / eta)[..., None, :]

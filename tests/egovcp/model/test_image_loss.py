@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from egovcp.model.picture_error import picture_error
+from egovcp.model.image_loss import image_error
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])
@@ -13,7 +13,7 @@ def test_it_is_half_the_weighted_mean_of_squares_and_so_is_its_gradient(dtype: t
     image = image.to(dtype).requires_grad_()
     counts = torch.rand(2, 5, generator=rng)
     expected = (0.5 * weight * (image.float() - near).square()).mean((-2, -1))
-    found = picture_error(image, near, weight)
+    found = image_error(image, near, weight)
     assert found.dtype == torch.float32
     torch.testing.assert_close(found, expected)
     gradients = [
@@ -24,6 +24,4 @@ def test_it_is_half_the_weighted_mean_of_squares_and_so_is_its_gradient(dtype: t
 
 def test_its_gradient_is_that_of_small_differences() -> None:
     image, near, weight = torch.rand(3, 4, 3, 5, dtype=torch.float64)
-    assert torch.autograd.gradcheck(
-        lambda x: picture_error(x, near, weight), image.requires_grad_()
-    )
+    assert torch.autograd.gradcheck(lambda x: image_error(x, near, weight), image.requires_grad_())

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from egovcp.model import Batch, WorldModel, world_model_loss
-from egovcp.model.shared import Share, over_all_rows, row_noise, sharing
+from egovcp.model.data_parallel import Share, over_all_rows, row_noise, sharing
 from egovcp.testing import random_batch, toy_model
 
 ROWS = 2  # of each of two processes

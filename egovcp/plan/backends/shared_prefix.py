@@ -7,10 +7,10 @@ from typing import NamedTuple
 from torch import Tensor
 
 from egovcp.model import Carry, WorldModel
-from egovcp.model.nets import SplitMlp
+from egovcp.model.networks import SplitMlp
 
 
-class Root(NamedTuple):
+class SharedPrefix(NamedTuple):
     """(E, 1, ...) for E robots."""
 
     h: Tensor
@@ -20,11 +20,11 @@ class Root(NamedTuple):
     reward: Tensor | None  # of the reward head, from h and z; None: the model has none
 
 
-def root_of(model: WorldModel, carry: Carry) -> Root:
+def shared_prefix(model: WorldModel, carry: Carry) -> SharedPrefix:
     """From the robots' states (E, ...)."""
-    carry = model.spread(carry)
+    carry = model.expand_candidates(carry)
     reward = None if model.reward_head is None else _state_sums(model.reward_head, carry)
-    return Root(
+    return SharedPrefix(
         carry.h,
         model.mix.parts[0](carry.z),
         model.gru.project.parts[1](carry.h),
