@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Final
 
 import numpy as np
 
+from egovcp.bounds import bounded
 from egovcp.robot import arms
 from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS
 from egovcp.robot.kinematics import LINK_OFFSET, Array, rotate
@@ -34,6 +35,15 @@ class ReachConfig:
     the random walk topples a third of the robots within 10 s; at 8 none, and no hand is later."""
     lead: float = 1.0
     """Share of the servo's velocity lag (kd/kp) that is fed forward."""
+    frequency: float = bounded(0.0, least=0, most=25)
+    """rad/s: each reference follows its goal like a critically damped spring of this natural
+    frequency; bandwidth is not used then. 0: the first-order law of bandwidth."""
+
+    def __repr__(self) -> str:
+        """All options; frequency only if it is used, so that identities without it hold."""
+        shown = [f.name for f in fields(self) if f.name != "frequency" or self.frequency > 0]
+        values = ", ".join(f"{name}={getattr(self, name)!r}" for name in shown)
+        return f"{type(self).__qualname__}({values})"
 
 
 @dataclass
@@ -102,8 +112,12 @@ def nearest_reachable(hands: Array, heading: Array, torso: Array) -> Array:
 
 
 def _smooth(m: Reach, config: ReachConfig) -> None:
-    """Second-order reference: bounded speed and acceleration, no overshoot."""
-    wanted = config.bandwidth * (m.goal - m.joints)
+    """References of bounded speed and acceleration that do not overshoot, in place."""
+    w = config.frequency
+    if w > 0:
+        wanted = m.rate + DT * (w * w * (m.goal - m.joints) - 2 * w * m.rate)
+    else:
+        wanted = config.bandwidth * (m.goal - m.joints)
     wanted = np.minimum(np.maximum(wanted, -config.speed), config.speed)
     limit = config.acceleration * DT
     m.rate = m.rate + np.minimum(np.maximum(wanted - m.rate, -limit), limit)
