@@ -11,6 +11,7 @@ from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import ACTION_BOX, STATE_SLICES
 from egovcp_train.lowlevel import events, rewards
+from egovcp_train.lowlevel.camera import TorsoMotion
 from egovcp_train.lowlevel.commands import Commands, between
 from egovcp_train.lowlevel.env import LowLevelEnv, mirrored
 from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
@@ -53,7 +54,7 @@ def test_without_a_residual_it_stands_and_earns_nearly_everything():
 
 
 def test_told_to_walk_without_a_trained_residual_it_falls_and_starts_again():
-    env = _env(8, commands=CommandConfig(standing=0.0, interval=(10.0, 10.0)))
+    env = _env(8, commands=CommandConfig(standing=0.0, in_place=0.0, interval=(10.0, 10.0)))
     fell = 0
     for _ in range(200):
         _, reward, done, extras = env.step(_zero(env))
@@ -109,6 +110,23 @@ def test_a_push_is_a_change_of_the_horizontal_velocity():
     assert 0.3 < fastest < 0.7
 
 
+def test_steps_cost_nothing_for_a_while_after_a_push():
+    env = _env(2, commands=STANDING, disturbances=PLAIN)
+    env.step(_zero(env))
+    env.loop.walk.gait.amount[:] = 1.0
+    env.loop.pushed(np.array([1]))
+    terms = env.loop.judge(env.physics.snapshot())
+    assert terms["stepping"].tolist() == [1.0, 0.0]
+
+
+def test_episodes_end_at_different_times_once_they_are_spread():
+    env = _env(16, commands=STANDING, disturbances=PLAIN, episode=0.5)
+    env.spread_ends()
+    ended = [int(env.step(_zero(env))[2].sum()) for _ in range(25)]
+    assert sum(ended) == 16
+    assert max(ended) < 8
+
+
 def test_robots_differ_within_the_ranges():
     env = _env(64, disturbances=DisturbanceConfig(models=64))
     friction = env.physics.floor_friction
@@ -162,7 +180,8 @@ def test_commands_stay_in_their_ranges(difficulty):
     config = CommandConfig()
     c = _run_commands(config, difficulty)
     fastest = between(*config.forward, difficulty)[1]
-    assert -fastest / 2 - 1e-9 <= c[..., 0].min() < 0 < c[..., 0].max() <= fastest + 1e-9
+    back = between(*config.backward_speed, difficulty)[1]
+    assert -back - 1e-9 <= c[..., 0].min() < 0 < c[..., 0].max() <= fastest + 1e-9
     assert np.abs(c[..., 1]).max() <= difficulty * config.sideways + 1e-9
     assert np.abs(c[..., 2]).max() <= difficulty * config.turning + 1e-9
     low = between(*config.standing_height, difficulty)[0]
@@ -176,8 +195,28 @@ def test_velocities_change_no_faster_than_their_ramp():
     assert change <= config.acceleration / 50 + 1e-9
 
 
+def test_some_robots_only_turn_or_only_go_sideways():
+    config = CommandConfig(standing=0.0, in_place=1.0, acceleration=100.0)
+    v = _run_commands(config, 1.0)[..., :3]
+    assert not v[..., 0].any()
+    sideways, turns = v[..., 1] != 0, v[..., 2] != 0
+    assert sideways.any()
+    assert turns.any()
+    # at most one tick in which one command ramps down as the other one ramps up
+    assert (sideways & turns).mean() < 0.02
+
+
+def test_held_hands_move_at_the_rate_limit_and_rest():
+    config = CommandConfig(standing=1.0, still_hands=0.0, held_hands=1.0)
+    c = ACTION_BOX.to_normalised(_run_commands(config, 0.0)[..., 3:])[..., :6]
+    step = np.abs(np.diff(c[1::2], axis=0))
+    assert step.max() == pytest.approx(0.32, abs=1e-6)
+    assert 0.5 < (step.max(axis=2) < 1e-9).mean() < 0.9
+
+
 def test_hands_move_like_those_of_the_data_or_rest():
-    c = ACTION_BOX.to_normalised(_run_commands(CommandConfig(standing=1.0), 1.0)[..., 3:])
+    config = CommandConfig(standing=1.0, held_hands=0.0)
+    c = ACTION_BOX.to_normalised(_run_commands(config, 1.0)[..., 3:])
     step = np.abs(np.diff(c[1::2], axis=0))[..., :6]
     assert step.max() <= 0.32 + 1e-9
     assert (step.max(axis=2) == 0).mean() > 0.1
@@ -230,9 +269,11 @@ def _terms(env: LowLevelEnv, **change: np.ndarray) -> dict[str, np.ndarray]:
     n = env.num_envs
     action = np.zeros((n, ACTIONS))
     walk = env.loop.walk
-    motion = rewards.Motion(n)
+    motion, torso = rewards.Motion(n), TorsoMotion(n)
     for _ in range(100):
         motion.add(x)
+        torso.add(env.physics.snapshot())
+    torso.add(x)
     return rewards.terms(
         x,
         motion.average,
@@ -243,6 +284,8 @@ def _terms(env: LowLevelEnv, **change: np.ndarray) -> dict[str, np.ndarray]:
         walk.gait.amount,
         action,
         action,
+        torso,
+        np.zeros(n, dtype=bool),
     )
 
 
@@ -275,6 +318,8 @@ def test_what_is_wanted_earns_less_when_it_is_missed(stood, change, term):
         ({"feet": np.array([[[0, 0.02, 0.035], [0, -0.02, 0.035]]])}, "stance_width"),
         ({"feet_forward": np.array([[[0.8, 0.6, 0], [0.8, -0.6, 0.0]]])}, "foot_heading"),
         ({"torque": np.full((1, 29), 50.0)}, "torque"),
+        ({"quaternion": np.array([[0.9998, 0.02, 0.0, 0.0]])}, "torso_rate"),
+        ({"quaternion": np.array([[0.9998, 0.02, 0.0, 0.0]])}, "torso_change"),
     ],
 )
 def test_what_is_not_wanted_is_counted(stood, change, term):

@@ -292,6 +292,7 @@ def push(env: ManagerBasedRlEnv, env_ids: torch.Tensor) -> None:
     kick = events.pushes(
         len(env_ids), term.cfg.task.disturbances, term.loop.difficulty, term.loop.rng
     )
+    term.loop.pushed(env_ids.cpu().numpy())
     velocity = robot.data.root_link_vel_w[env_ids].clone()
     velocity[:, :2] += torch.from_numpy(kick).to(velocity)
     robot.write_root_link_velocity_to_sim(velocity, env_ids=env_ids)
