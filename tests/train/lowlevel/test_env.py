@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -14,6 +15,7 @@ from egovcp_train.lowlevel import events, rewards
 from egovcp_train.lowlevel.camera import TorsoMotion
 from egovcp_train.lowlevel.commands import Commands, between
 from egovcp_train.lowlevel.env import LowLevelEnv, mirrored
+from egovcp_train.lowlevel.physics import Physics, PhysicsOptions
 from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
 from egovcp_train.lowlevel.task import CommandConfig, DisturbanceConfig, LowLevelTask
 
@@ -98,6 +100,35 @@ def test_new_targets_act_after_the_delay():
     physics.step(target, np.array([0, 4]))
     moved = np.abs(physics.qvel[:, 6:]).max(axis=1)
     assert moved[0] > 3 * moved[1]
+
+
+def test_a_delay_may_be_longer_than_a_tick():
+    """Targets of 1, 2, 3 in turn; 30 ms late, 2 acts from the middle of the third tick on."""
+    physics = Physics(1, "points", PLAIN, 1, 0)
+    qpos = events.neutral(1)
+    physics.place(np.arange(1), qpos, np.zeros((1, 29)))
+    acting = []
+    for target in (1.0, 2.0, 3.0):
+        physics.step(np.full((1, 29), target), np.array([6]))
+        acting.append(physics._control[0, :, 0].tolist())
+    physics.close()
+    assert acting == [[0, 0, 0, 0], [0, 0, 1, 1], [1, 1, 2, 2]]
+
+
+@pytest.mark.parametrize(
+    "options", [PhysicsOptions(0.002), PhysicsOptions(cone="elliptic", integrator="Euler")]
+)
+def test_physics_takes_the_simulators_options(options):
+    physics = Physics(2, "stock", PLAIN, 1, 0, options)
+    option = physics._models[0].opt
+    assert option.timestep == options.timestep
+    assert (option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC) == (options.cone == "elliptic")
+    assert (option.integrator == mujoco.mjtIntegrator.mjINT_EULER) == (options.timestep == 0.005)
+    qpos = events.neutral(2)
+    physics.place(np.arange(2), qpos, qpos[:, 7:])
+    physics.step(qpos[:, 7:], np.zeros(2, dtype=np.intp))
+    assert physics.state[:, 0] == pytest.approx(0.02)  # s
+    physics.close()
 
 
 def test_a_push_is_a_change_of_the_horizontal_velocity():

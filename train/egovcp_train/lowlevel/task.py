@@ -81,7 +81,7 @@ class DisturbanceConfig:
     """Factor on the stiffness of every servo."""
     damping_scale: Range = bounded((0.8, 1.2), least=0.1, most=5)
     """Factor on the damping of every servo."""
-    delay: Range = bounded((0.0, 0.02), least=0, most=0.02)
+    delay: Range = bounded((0.0, 0.02), least=0, most=0.04)
     """s from a measurement to the new targets' effect, in physics steps."""
     models: int = bounded(64, least=1, most=4096)
     """Robots of different physical parameters."""

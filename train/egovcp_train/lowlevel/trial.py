@@ -23,7 +23,7 @@ from egovcp.spec import CONTROLLER_HZ, CONTROLLER_TICKS_PER_PLAN
 from egovcp_train.lowlevel import camera, events
 from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
 from egovcp_train.lowlevel.heat import relative_rms
-from egovcp_train.lowlevel.physics import Physics, Snapshot
+from egovcp_train.lowlevel.physics import Physics, PhysicsOptions, Snapshot
 from egovcp_train.lowlevel.sensing import measure
 from egovcp_train.lowlevel.skills import HOLD, SETTLED, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
@@ -96,6 +96,7 @@ def play(
     feet: FootModel = "stock",
     threads: int = 1,
     stopped: Callable[[], bool] = lambda: False,
+    options: PhysicsOptions | None = None,
 ) -> Outcome:
     """Run ``skill`` once with each of ``robots`` robots of different physical parameters.
 
@@ -108,9 +109,9 @@ def play(
     qpos = events.neutral(robots)
     std, record = noise_std(sensors), _Record()
     alive = np.ones((skill.ticks, robots), dtype=bool)
-    with closing(Physics(robots, feet, disturbances, threads, seed)) as physics:
+    with closing(Physics(robots, feet, disturbances, threads, seed, options)) as physics:
         physics.place(np.arange(robots), qpos, qpos[:, 7:])
-        delay = events.delays(robots, disturbances, rng)
+        delay = events.delays(robots, disturbances, rng, physics.options.timestep)
         x = physics.snapshot()
         controller.reset(measure(x, commands[0], std, rng))
         for tick, command in enumerate(commands):
