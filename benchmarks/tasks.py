@@ -1,88 +1,204 @@
-"""How hard the tasks are for a low-level controller: hands at rest against the scripted oracle.
+"""How hard the tasks are for a low-level controller: reference policies, and what they earn.
 
-Plays held-out scenarios of each task with `hold` and `oracle`, the wall at one push speed after
-another, the arch in both bands of clearance. A task is well set for a controller when hands at
-rest mostly fail and the oracle almost always succeeds; the last line says for which pushes that is
-so. Run it whenever the controller changes, and put the range into `egovcp.sim.config`:
+Plays held-out scenarios of each task with `hold` (neutral pose), `constant` (the best fixed action,
+searched on other scenarios), `random` (the paper's random walk) and `oracle`, both bands of the
+arch's clearance among them, and the wall at one push speed after another with `hold` and `oracle`.
+Prints success and reward per step with 95 % intervals, falls, and the way: 0 % is the reward of
+`random`, 100 % that of `oracle`. A task is well set for a controller when hands at rest mostly fail
+and go at most half of the way, and the oracle almost always succeeds; the last line says for which
+pushes that is so. Run it whenever the controller changes, and put the range into
+`egovcp.sim.config`:
 
     python benchmarks/tasks.py --controller stance
-    python benchmarks/tasks.py --controller walk
+    python benchmarks/tasks.py --controller walk --pushes
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import batched
 
 from report import parser, publish
 
-from egovcp.intervals import wilson
+from egovcp.intervals import Interval, wilson
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, eventful
+from egovcp.sim.scenario import Scenario
+from egovcp_deploy.constant_search import Action, search_constant
 from egovcp_deploy.episodes import Group, Setup, Stage
 from egovcp_deploy.scenarios import held_out
+from egovcp_deploy.scores import EpisodeScore, reward_interval, reward_per_step, success_rate
 
-PLAYERS = ("hold", "oracle")
+PLAYERS = ("hold", "constant", "random", "oracle")
+PUSHED = ("hold", "oracle")  # who plays the wall at one speed after another
 BANDS = {"default": (1.16, 1.24), "low": (1.08, 1.16)}
 MOST_AT_REST, LEAST_BY_ORACLE = 0.2, 0.9
 ENVS = 10
 
 
-def rates(env: EnvConfig, task: str, episodes: int, seed: int) -> dict[str, float]:
-    """Share of successes of each player."""
+@dataclass(frozen=True)
+class Result:
+    """What one player did on one task."""
+
+    success: float
+    success_ci95: Interval
+    reward: float
+    """Mean per step."""
+    reward_ci95: Interval
+    falls: float
+    """Share of the episodes that ended in a fall."""
+    action: Action = ()
+    """Of `constant`: forward, outward, up of the left hand, then of the right one, and height."""
+
+
+def result(scores: Sequence[EpisodeScore], action: Action = ()) -> Result:
+    """The figures of a player's episodes."""
+    rate = success_rate(scores)
+    return Result(
+        success=rate,
+        success_ci95=wilson(round(rate * len(scores)), len(scores)),
+        reward=reward_per_step(scores),
+        reward_ci95=reward_interval(scores),
+        falls=sum(score.terminated for score in scores) / len(scores),
+        action=action,
+    )
+
+
+def measure(
+    env: EnvConfig, task: str, players: Sequence[str], episodes: int, seed: int, workers: int
+) -> dict[str, Result]:
+    """Player -> figures."""
     scenarios = [held_out(task, seed, i) for i in range(episodes)]
-    groups = [Group(name, part) for name in PLAYERS for part in batched(scenarios, ENVS)]
-    won = dict.fromkeys(PLAYERS, 0)
-    with closing(Stage(Setup(env, seed=seed))) as stage:
-        for i, scores in stage.play(groups):
-            won[groups[i].controller] += sum(score.success for score in scores)
-    return {name: wins / episodes for name, wins in won.items()}
+    with closing(Stage(Setup(env, seed=seed), workers)) as stage:
+
+        def hold_each(
+            actions: Sequence[Action], scenarios: Sequence[Scenario]
+        ) -> list[EpisodeScore]:
+            parts = batched(zip(actions, scenarios, strict=True), ENVS)
+            return _play(
+                stage,
+                [Group("constant", tuple(s for _, s in p), tuple(a for a, _ in p)) for p in parts],
+            )
+
+        found = {}
+        for name in players:
+            action: Action = ()
+            if name == "constant":
+                action = search_constant(task, seed, hold_each).action
+            groups = [
+                Group(name, part, (action,) * len(part) if action else ())
+                for part in batched(scenarios, ENVS)
+            ]
+            found[name] = result(_play(stage, groups), action)
+    return found
 
 
-def show(name: str, found: dict[str, float], episodes: int) -> dict[str, float]:
-    """Print a row and name its figures."""
-    cells = []
-    for player, rate in found.items():
-        low, high = wilson(round(rate * episodes), episodes)
-        cells.append(f"{player} {rate:6.1%} ({low:.0%}-{high:.0%})")
-    print(f"{name:24s} " + "   ".join(cells), flush=True)
-    return {f"{name.replace(' ', '_')}_{player}": rate for player, rate in found.items()}
+def _play(stage: Stage, groups: Sequence[Group]) -> list[EpisodeScore]:
+    """Scores in the order of the groups' scenarios."""
+    parts = dict(stage.play(groups))
+    return [score for i in sorted(parts) for score in parts[i]]
+
+
+def way(player: str, found: dict[str, Result]) -> float | None:
+    """Share of the way from the reward of `random` (0) to that of `oracle` (1).
+
+    None if one of them did not play, or if the oracle does not earn more.
+    """
+    if not {"random", "oracle"} <= found.keys():
+        return None
+    low, high = found["random"].reward, found["oracle"].reward
+    return (found[player].reward - low) / (high - low) if high > low else None
+
+
+def rows(name: str, found: dict[str, Result]) -> list[str]:
+    """A line per player."""
+    lines = []
+    for player, r in found.items():
+        done = way(player, found)
+        (low, high), (least, most) = r.success_ci95, r.reward_ci95
+        line = (
+            f"{name:<14}{player:<9}{r.success:>7.1%} {f'({low:.0%}-{high:.0%})':<12}"
+            f"{r.reward:>+9.4f} {f'({least:+.4f} to {most:+.4f})':<22}{r.falls:>6.0%}"
+            f"{'' if done is None else f'{done:.0%}':>7}"
+        )
+        if r.action:
+            line += "  " + " ".join(f"{value:g}" for value in r.action)
+        lines.append(line)
+    return lines
+
+
+def figures(name: str, found: dict[str, Result]) -> dict[str, object]:
+    """Flat keys."""
+    prefix, out = name.replace(" ", "_"), dict[str, object]()
+    for player, r in found.items():
+        out[f"{prefix}_{player}"] = r.success
+        out[f"{prefix}_{player}_reward"] = r.reward
+        out[f"{prefix}_{player}_falls"] = r.falls
+        done = way(player, found)
+        if done is not None:
+            out[f"{prefix}_{player}_way"] = done
+        if r.action:
+            out[f"{prefix}_{player}_action"] = list(r.action)
+    return out
 
 
 def main() -> None:
     """Measure and print."""
-    options = parser(__doc__)
+    options = parser(__doc__, rounds=None)
     options.add_argument("--controller", default="walk", help="walk, stance, or a file")
-    options.add_argument("--episodes", type=int, default=100)
-    options.add_argument("--seed", type=int, default=0)
+    options.add_argument("--episodes", type=int, default=100, help="scenarios of each task")
+    options.add_argument("--seed", type=int, default=0, help="seed of the scenarios")
+    options.add_argument("--workers", type=int, default=0, help="processes; 0: one per core")
+    options.add_argument("--players", nargs="+", choices=PLAYERS, default=PLAYERS)
     options.add_argument(
-        "--pushes", type=float, nargs="*", default=[0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2]
+        "--tasks",
+        nargs="*",
+        choices=("ball", "arch", "wall"),
+        default=("ball", "arch", "wall"),
+        help="which tasks at their defaults, the arch in both bands of clearance",
+    )
+    options.add_argument(
+        "--pushes",
+        type=float,
+        nargs="*",
+        default=[0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0, 1.1, 1.2],
+        help="m/s, speeds at which the wall is also played",
     )
     args = options.parse_args()
     base = replace(eventful(), controller=args.controller)
-    n, figures = args.episodes, {}
+    published: dict[str, object] = {}
 
-    def measured(name: str, env: EnvConfig, task: str) -> dict[str, float]:
-        found = rates(env, task, n, args.seed)
-        figures.update(show(name, found, n))
+    def measured(name: str, env: EnvConfig, task: str, players: Sequence[str]) -> dict[str, Result]:
+        found = measure(env, task, players, args.episodes, args.seed, args.workers)
+        published.update(figures(name, found))
+        print("\n".join(rows(name, found)), flush=True)
         return found
 
-    print(f"controller {make_controller(args.controller).id}, {n} episodes each")
-    measured("ball", base, "ball")
-    for band, clearance in BANDS.items():
+    print(f"controller {make_controller(args.controller).id}, {args.episodes} episodes each")
+    print(
+        f"{'task':<14}{'player':<9}{'success':>7} {'95 %':<12}{'reward':>9} {'95 %, per step':<22}"
+        f"{'falls':>6}{'way':>7}  best constant action"
+    )
+    if "ball" in args.tasks:
+        measured("ball", base, "ball", args.players)
+    for band, clearance in BANDS.items() if "arch" in args.tasks else ():
         arch = replace(base.arch, clearance_range=clearance)
-        measured(f"arch {band}", replace(base, arch=arch), "arch")
-    measured("wall default", base, "wall")
+        measured(f"arch {band}", replace(base, arch=arch), "arch", args.players)
+    if "wall" in args.tasks:
+        measured("wall default", base, "wall", args.players)
     fair = []
     for speed in args.pushes:
         wall = replace(base.wall, push_speed_range=(speed, speed), away_probability=0.0)
-        found = measured(f"wall {speed:.2f} m/s", replace(base, wall=wall), "wall")
-        if found["hold"] <= MOST_AT_REST and found["oracle"] >= LEAST_BY_ORACLE:
+        found = measured(f"wall {speed:.2f} m/s", replace(base, wall=wall), "wall", PUSHED)
+        at_rest, oracle = (found[name].success for name in PUSHED)
+        if at_rest <= MOST_AT_REST and oracle >= LEAST_BY_ORACLE:
             fair.append(speed)
-    span = f"{min(fair)} to {max(fair)} m/s" if fair else "none of these"
-    print(f"pushes that hands must and can brace: {span}")
-    publish(figures, args.json)
+    if args.pushes:
+        span = f"{min(fair)} to {max(fair)} m/s" if fair else "none of these"
+        print(f"pushes that hands must and can brace: {span}")
+    publish(published, args.json)
 
 
 if __name__ == "__main__":

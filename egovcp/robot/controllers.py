@@ -29,6 +29,21 @@ def absolute_controller(which: str) -> str:
     return os.path.abspath(os.path.expanduser(which)) if is_controller_file(which) else which
 
 
+def load_walk_policy(which: str) -> WalkPolicy:
+    """The trained network of ``walk``, or of a ``walk.safetensors``.
+
+    Raises:
+        UsageError: neither.
+        ArtefactError: the file cannot be used.
+    """
+    if which == WALK:
+        with resources.as_file(resources.files("egovcp.robot").joinpath(_SHIPPED)) as path:
+            return WalkPolicy.load(path)
+    if which.endswith(".safetensors"):
+        return WalkPolicy.load(Path(os.path.expanduser(which)))
+    raise UsageError(f"no trained network {which!r}; expected walk or PATH.safetensors")
+
+
 def make_controller(which: str) -> LowLevelController:
     """``stance``, ``walk``, or the path of a ``walk.safetensors`` or of its export to ONNX.
 
@@ -41,11 +56,8 @@ def make_controller(which: str) -> LowLevelController:
     """
     if which == STANCE:
         return StanceController()
-    if which == WALK:
-        with resources.as_file(resources.files("egovcp.robot").joinpath(_SHIPPED)) as path:
-            return WalkingController(WalkPolicy.load(path))
-    if which.endswith(".safetensors"):
-        return WalkingController(WalkPolicy.load(Path(os.path.expanduser(which))))
+    if which == WALK or which.endswith(".safetensors"):
+        return WalkingController(load_walk_policy(which))
     if which.endswith(".onnx"):
         return WalkingController(OnnxPolicy(Path(os.path.expanduser(which))))
     raise UsageError(

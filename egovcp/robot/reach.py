@@ -35,7 +35,7 @@ class ReachConfig:
     the random walk topples a third of the robots within 10 s; at 8 none, and no hand is later."""
     lead: float = 1.0
     """Share of the servo's velocity lag (kd/kp) that is fed forward."""
-    frequency: float = bounded(0.0, least=0, most=40)
+    frequency: float = bounded(0.0, least=0, most=25)
     """rad/s: each reference follows its goal like a critically damped spring of this natural
     frequency; bandwidth is not used then. 0: the first-order law of bandwidth."""
 

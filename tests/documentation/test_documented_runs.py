@@ -25,8 +25,8 @@ _SHORT = [
     *(f"--env.{task}_episode.event_ticks=[2,3]" for task in ("ball", "wall", "arch")),
 ]
 _TRAIN = shlex.split(
-    "--preset=debug --steps=1 --batch_size=2 --sampling.length=6 --value_fit.steps=2 "
-    "--value_fit.passes=0 --value_fit.told_steps=2 --eval_freq=0 --tensorboard=false --threads=1 "
+    "--preset=debug --steps=1 --batch_size=2 --sampling.length=6 "
+    "--eval_freq=0 --tensorboard=false --threads=1 "
     "--device=cpu --planner.samples=16 --planner.elites=4"
 )
 #: Program -> options that follow the documented ones, and so replace them where they are the same.

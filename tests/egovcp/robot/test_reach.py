@@ -83,3 +83,22 @@ def test_momentum_is_the_time_derivative_of_the_first_moment() -> None:
     reach.follow(memory, hands, UPRIGHT, ReachConfig())
     np.testing.assert_allclose(memory.linear, (memory.moment - before) / DT, atol=1e-9)
     assert np.abs(memory.linear).max() > 0.1
+
+
+@pytest.mark.parametrize("frequency", [5.0, 20.0, 25.0])
+def test_a_critically_damped_reference_arrives_without_overshoot(frequency: float) -> None:
+    config = ReachConfig(speed=100.0, acceleration=1e4, frequency=frequency)
+    memory = reach.start(arms.REST.reshape(1, 14))
+    goal = arms.REST[None] + 0.3
+    memory.goal = goal
+    positions = []
+    for _ in range(150):
+        reach._smooth(memory, config)
+        positions.append(memory.joints[0, 0, 0])
+    assert np.all(np.diff(positions) >= -1e-12)
+    assert positions[-1] == pytest.approx(goal[0, 0, 0], abs=1e-3)
+
+
+def test_a_frequency_changes_the_identity_and_its_default_does_not() -> None:
+    assert "frequency" not in repr(ReachConfig())
+    assert repr(ReachConfig(frequency=20.0)) != repr(ReachConfig())

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import mujoco
 import numpy as np
 import pytest
 import torch
@@ -11,8 +12,10 @@ from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import ACTION_BOX, STATE_SLICES
 from egovcp_train.lowlevel import events, rewards
+from egovcp_train.lowlevel.camera import TorsoMotion
 from egovcp_train.lowlevel.commands import Commands, between
 from egovcp_train.lowlevel.env import LowLevelEnv, mirrored
+from egovcp_train.lowlevel.physics import Physics, PhysicsOptions
 from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
 from egovcp_train.lowlevel.task import CommandConfig, DisturbanceConfig, LowLevelTask
 
@@ -53,7 +56,7 @@ def test_without_a_residual_it_stands_and_earns_nearly_everything():
 
 
 def test_told_to_walk_without_a_trained_residual_it_falls_and_starts_again():
-    env = _env(8, commands=CommandConfig(standing=0.0, interval=(10.0, 10.0)))
+    env = _env(8, commands=CommandConfig(standing=0.0, in_place=0.0, interval=(10.0, 10.0)))
     fell = 0
     for _ in range(200):
         _, reward, done, extras = env.step(_zero(env))
@@ -99,6 +102,35 @@ def test_new_targets_act_after_the_delay():
     assert moved[0] > 3 * moved[1]
 
 
+def test_a_delay_may_be_longer_than_a_tick():
+    """Targets of 1, 2, 3 in turn; 30 ms late, 2 acts from the middle of the third tick on."""
+    physics = Physics(1, "points", PLAIN, 1, 0)
+    qpos = events.neutral(1)
+    physics.place(np.arange(1), qpos, np.zeros((1, 29)))
+    acting = []
+    for target in (1.0, 2.0, 3.0):
+        physics.step(np.full((1, 29), target), np.array([6]))
+        acting.append(physics._control[0, :, 0].tolist())
+    physics.close()
+    assert acting == [[0, 0, 0, 0], [0, 0, 1, 1], [1, 1, 2, 2]]
+
+
+@pytest.mark.parametrize(
+    "options", [PhysicsOptions(0.002), PhysicsOptions(cone="elliptic", integrator="Euler")]
+)
+def test_physics_takes_the_simulators_options(options):
+    physics = Physics(2, "stock", PLAIN, 1, 0, options)
+    option = physics._models[0].opt
+    assert option.timestep == options.timestep
+    assert (option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC) == (options.cone == "elliptic")
+    assert (option.integrator == mujoco.mjtIntegrator.mjINT_EULER) == (options.timestep == 0.005)
+    qpos = events.neutral(2)
+    physics.place(np.arange(2), qpos, qpos[:, 7:])
+    physics.step(qpos[:, 7:], np.zeros(2, dtype=np.intp))
+    assert physics.state[:, 0] == pytest.approx(0.02)  # s
+    physics.close()
+
+
 def test_a_push_is_a_change_of_the_horizontal_velocity():
     push = replace(PLAIN, push=(0.5, 0.5), push_interval=(0.1, 0.1))
     env = _env(16, commands=STANDING, disturbances=push)
@@ -107,6 +139,23 @@ def test_a_push_is_a_change_of_the_horizontal_velocity():
         env.step(_zero(env))
         fastest = max(fastest, float(np.linalg.norm(env.physics.qvel[:, :2], axis=1).max()))
     assert 0.3 < fastest < 0.7
+
+
+def test_steps_cost_nothing_for_a_while_after_a_push():
+    env = _env(2, commands=STANDING, disturbances=PLAIN)
+    env.step(_zero(env))
+    env.loop.walk.gait.amount[:] = 1.0
+    env.loop.pushed(np.array([1]))
+    terms = env.loop.judge(env.physics.snapshot())
+    assert terms["stepping"].tolist() == [1.0, 0.0]
+
+
+def test_episodes_end_at_different_times_once_they_are_spread():
+    env = _env(16, commands=STANDING, disturbances=PLAIN, episode=0.5)
+    env.spread_ends()
+    ended = [int(env.step(_zero(env))[2].sum()) for _ in range(25)]
+    assert sum(ended) == 16
+    assert max(ended) < 8
 
 
 def test_robots_differ_within_the_ranges():
@@ -162,7 +211,8 @@ def test_commands_stay_in_their_ranges(difficulty):
     config = CommandConfig()
     c = _run_commands(config, difficulty)
     fastest = between(*config.forward, difficulty)[1]
-    assert -fastest / 2 - 1e-9 <= c[..., 0].min() < 0 < c[..., 0].max() <= fastest + 1e-9
+    back = between(*config.backward_speed, difficulty)[1]
+    assert -back - 1e-9 <= c[..., 0].min() < 0 < c[..., 0].max() <= fastest + 1e-9
     assert np.abs(c[..., 1]).max() <= difficulty * config.sideways + 1e-9
     assert np.abs(c[..., 2]).max() <= difficulty * config.turning + 1e-9
     low = between(*config.standing_height, difficulty)[0]
@@ -176,8 +226,28 @@ def test_velocities_change_no_faster_than_their_ramp():
     assert change <= config.acceleration / 50 + 1e-9
 
 
+def test_some_robots_only_turn_or_only_go_sideways():
+    config = CommandConfig(standing=0.0, in_place=1.0, acceleration=100.0)
+    v = _run_commands(config, 1.0)[..., :3]
+    assert not v[..., 0].any()
+    sideways, turns = v[..., 1] != 0, v[..., 2] != 0
+    assert sideways.any()
+    assert turns.any()
+    # at most one tick in which one command ramps down as the other one ramps up
+    assert (sideways & turns).mean() < 0.02
+
+
+def test_held_hands_move_at_the_rate_limit_and_rest():
+    config = CommandConfig(standing=1.0, still_hands=0.0, held_hands=1.0)
+    c = ACTION_BOX.to_normalised(_run_commands(config, 0.0)[..., 3:])[..., :6]
+    step = np.abs(np.diff(c[1::2], axis=0))
+    assert step.max() == pytest.approx(0.32, abs=1e-6)
+    assert 0.5 < (step.max(axis=2) < 1e-9).mean() < 0.9
+
+
 def test_hands_move_like_those_of_the_data_or_rest():
-    c = ACTION_BOX.to_normalised(_run_commands(CommandConfig(standing=1.0), 1.0)[..., 3:])
+    config = CommandConfig(standing=1.0, held_hands=0.0)
+    c = ACTION_BOX.to_normalised(_run_commands(config, 1.0)[..., 3:])
     step = np.abs(np.diff(c[1::2], axis=0))[..., :6]
     assert step.max() <= 0.32 + 1e-9
     assert (step.max(axis=2) == 0).mean() > 0.1
@@ -230,9 +300,11 @@ def _terms(env: LowLevelEnv, **change: np.ndarray) -> dict[str, np.ndarray]:
     n = env.num_envs
     action = np.zeros((n, ACTIONS))
     walk = env.loop.walk
-    motion = rewards.Motion(n)
+    motion, torso = rewards.Motion(n), TorsoMotion(n)
     for _ in range(100):
         motion.add(x)
+        torso.add(env.physics.snapshot())
+    torso.add(x)
     return rewards.terms(
         x,
         motion.average,
@@ -243,6 +315,8 @@ def _terms(env: LowLevelEnv, **change: np.ndarray) -> dict[str, np.ndarray]:
         walk.gait.amount,
         action,
         action,
+        torso,
+        np.zeros(n, dtype=bool),
     )
 
 
@@ -275,6 +349,8 @@ def test_what_is_wanted_earns_less_when_it_is_missed(stood, change, term):
         ({"feet": np.array([[[0, 0.02, 0.035], [0, -0.02, 0.035]]])}, "stance_width"),
         ({"feet_forward": np.array([[[0.8, 0.6, 0], [0.8, -0.6, 0.0]]])}, "foot_heading"),
         ({"torque": np.full((1, 29), 50.0)}, "torque"),
+        ({"quaternion": np.array([[0.9998, 0.02, 0.0, 0.0]])}, "torso_rate"),
+        ({"quaternion": np.array([[0.9998, 0.02, 0.0, 0.0]])}, "torso_change"),
     ],
 )
 def test_what_is_not_wanted_is_counted(stood, change, term):

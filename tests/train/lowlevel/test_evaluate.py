@@ -6,15 +6,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
-from egovcp.spec import ACTION_BOX, ACTION_ETA
+from egovcp.spec import ACTION_BOX, ACTION_ETA, ACTION_RATE_LIMIT
 from egovcp_train.lowlevel import evaluate, skills, trial
 from egovcp_train.lowlevel.evaluate import main
 from egovcp_train.lowlevel.skills import SKILLS, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
-from egovcp_train.lowlevel.trial import _lag, _velocity_error, play
+from egovcp_train.lowlevel.trial import _directions, _lag, _rotation, _velocity_error, play
 
 
 def _rng() -> np.random.Generator:
@@ -27,7 +28,7 @@ def test_every_skill_commands_what_its_line_says(skill: Skill):
     assert commands.shape == (skill.ticks, 16, 10)
     hands = ACTION_BOX.to_normalised(commands[..., 3:])[..., :6]
     assert (np.abs(hands) <= 1 + 1e-9).all()
-    walks = skill.name in ("walk", "crouch", "low")
+    walks = skill.name in ("walk", "backward", "sideways", "turning", "crouch", "low")
     assert commands[..., :3].any() == walks
     ranges = {
         "squat": (0.50, 0.74),
@@ -65,6 +66,40 @@ def test_swinging_with_each_step_is_no_velocity_error_but_being_slow_is():
     assert error == pytest.approx([0.0, 0.1], abs=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("name", "axis", "speeds"),
+    [("backward", 0, {-0.3}), ("sideways", 1, {-0.2, 0.2}), ("turning", 2, {-0.6, 0.6})],
+)
+def test_skills_in_other_directions_have_one_velocity(name: str, axis: int, speeds: set[float]):
+    (skill,) = [s for s in SKILLS if s.name == name]
+    velocity = skill.script(skill.ticks, 32, _rng())[-1, :, :3]
+    assert set(np.round(velocity[:, axis], 9)) == speeds
+    assert not np.delete(velocity, axis, axis=1).any()
+
+
+def test_seldom_steps_are_far_at_the_rate_limit_and_then_held():
+    hands = ACTION_BOX.to_normalised(skills.seldom_walk(1000, 8, _rng())[..., 3:])[..., :6]
+    step = np.abs(np.diff(hands[::2], axis=0))
+    assert step.max() == pytest.approx(ACTION_RATE_LIMIT)
+    assert 0.5 < (step.max(axis=2) < 1e-9).mean() < 0.9
+
+
+def test_the_cameras_rotation_is_that_of_the_torso_between_planner_ticks():
+    yaw = 0.01 * np.arange(20)[:, None] * [1.0, 0.0]  # rad, robot 1 stays
+    torso = Rotation.from_euler("z", yaw.reshape(-1, 1)).as_matrix().reshape(20, 2, 3, 3)
+    counted = np.ones((20, 2), dtype=bool)
+    counted[15:, 0] = False
+    torso[15:, 0] = 0.0  # of a simulation that diverged
+    for apart in (1, 8):
+        found = _rotation(torso, counted, apart)
+        np.testing.assert_allclose(found, [[0, 0.433 * apart, 0], [0, 0, 0]], atol=1e-3)
+
+
+def test_a_push_along_the_heading_goes_forwards_or_backwards():
+    skill = Skill("trial", "", 1.0, skills.neutral, push=1.0, push_any=False)
+    assert set(_directions(skill, 32, _rng())) == {0.0, np.pi}
+
+
 def _play(script: str, seconds: float, **options: float):
     skill = Skill("trial", "", seconds, getattr(skills, script), **options)
     return play(make_controller("stance"), skill, 4, 0, DisturbanceConfig(models=4), SensorConfig())
@@ -76,6 +111,9 @@ def test_the_stance_law_stands_and_reaches():
     assert (outcome.hand_error < 0.03).all()
     assert (outcome.height_error < 0.02).all()
     assert np.isnan(outcome.velocity_error).all()
+    assert np.isnan(outcome.turning_error).all()
+    assert outcome.camera.shape == (4, 3)
+    assert (outcome.camera < outcome.camera_8).all()
 
 
 def test_a_robot_that_is_thrown_down_has_fallen():
@@ -104,9 +142,14 @@ def test_it_writes_a_line_per_skill(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert figures["squat"]["survival"] == 1.0
     assert figures["squat"]["height_error_m"] < 0.02
     assert figures["squat"]["velocity_error_mps"] is None
-    assert figures["squat"]["stepping"] == 0.0
+    assert figures["squat"]["stepping_share"] == 0.0
+    assert len(figures["squat"]["camera_px_per_step"]) == 3
+    assert len(figures["squat"]["camera_px_8_steps"]) == 3
     assert figures["_run"]["controller"] == make_controller("stance").id
-    assert "squat" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "squat" in out
+    rows = out[out.index("skill") : out.index("figures:")].splitlines()
+    assert max(len(row) for row in rows) <= 120
 
 
 def test_an_interrupted_evaluation_keeps_the_skills_that_were_played(

@@ -11,6 +11,7 @@ from egovcp.spec import (
     ACTION_BOX,
     ACTION_DIM,
     ACTION_ETA,
+    ACTION_RATE_LIMIT,
     CONTROLLER_HZ,
     CONTROLLER_TICKS_PER_PLAN,
     reflect,
@@ -20,6 +21,8 @@ from egovcp_train.lowlevel.task import CommandConfig, Range
 Array = NDArray[np.float64]
 _DT: Final = 1.0 / CONTROLLER_HZ
 _HEIGHT: Final = ACTION_DIM - 1
+_HELD_ETA: Final = 1.0  # box units, the steps of a random walk that steps seldom
+_HELD_TICKS: Final = (5, 15)  # planner ticks between them, inclusive
 
 
 def between(easy: Range, hard: Range, difficulty: float) -> Range:
@@ -37,6 +40,11 @@ class Commands:
         self.velocity = np.zeros((robots, 3))  # m/s, m/s, rad/s, ramped
         self._goal = np.zeros((robots, 3))
         self._action = np.zeros((robots, ACTION_DIM))  # as the planner would send it
+        self._wanted = np.zeros((robots, ACTION_DIM))  # where it is on its way to
+        self._held = np.zeros(robots, dtype=bool)  # which step seldom and far
+        self._rest: NDArray[np.intp] = np.zeros(
+            robots, dtype=np.intp
+        )  # planner ticks until their next step
         self._moves = np.zeros((robots, ACTION_DIM), dtype=bool)  # which follow the random walk
         self._low = np.full(robots, -1.0)  # of the height's action
         self._ticks_left = np.zeros(robots, dtype=np.intp)
@@ -55,8 +63,9 @@ class Commands:
     def reset(self, rows: NDArray[np.intp]) -> None:
         """New episodes: standing, neutral, and soon another command."""
         self.velocity[rows] = self._goal[rows] = 0.0
-        self._action[rows] = 0.0
-        self._moves[rows] = False
+        self._action[rows] = self._wanted[rows] = 0.0
+        self._moves[rows] = self._held[rows] = False
+        self._rest[rows] = 0
         self._ticks_left[rows] = self._rng.integers(5, 50, len(rows))
 
     def advance(self) -> None:
@@ -72,11 +81,16 @@ class Commands:
             self._walk_randomly()
 
     def _walk_randomly(self) -> None:
-        step = ACTION_ETA * self._rng.uniform(-1, 1, self._action.shape)
-        moved = self._action + np.where(self._moves, step, 0.0)
-        low = np.full(moved.shape, -1.0)
+        steps = ~self._held | (self._rest <= 0)
+        size = np.where(self._held, _HELD_ETA, ACTION_ETA) * steps
+        drawn = self._rng.integers(*_HELD_TICKS, len(steps), endpoint=True)
+        self._rest = np.where(self._held & steps, drawn, self._rest) - 1
+        step = size[:, None] * self._rng.uniform(-1, 1, self._action.shape)
+        low = np.full(step.shape, -1.0)
         low[:, _HEIGHT] = self._low
-        self._action[:] = reflect(moved, low)
+        self._wanted[:] = reflect(self._wanted + np.where(self._moves, step, 0.0), low)
+        limit = ACTION_RATE_LIMIT
+        self._action += np.clip(self._wanted - self._action, -limit, limit)
 
     def _draw(self, rows: NDArray[np.intp]) -> None:
         config, rng, n = self._config, self._rng, len(rows)
@@ -85,6 +99,8 @@ class Commands:
         walks = rng.random(n) > config.standing
         self._goal[rows] = np.where(walks[:, None], self._velocities(n), 0.0)
         self._moves[rows] = (rng.random(n) > config.still_hands)[:, None]
+        self._held[rows] = rng.random(n) < config.held_hands
+        self._wanted[rows] = self._action[rows]
         heights = np.where(
             walks,
             rng.uniform(*between(*config.walking_height, self.difficulty), n),
@@ -96,10 +112,15 @@ class Commands:
         config, rng = self._config, self._rng
         out = np.zeros((n, 3))
         out[:, 0] = rng.uniform(*between(*config.forward, self.difficulty), n)
-        out[:, 0] *= np.where(rng.random(n) < config.backward, -0.5, 1.0)
+        back = rng.uniform(*between(*config.backward_speed, self.difficulty), n)
+        out[:, 0] = np.where(rng.random(n) < config.backward, -back, out[:, 0])
+        in_place = rng.random(n) < config.in_place
+        out[in_place, 0] = 0.0
+        turns = rng.random(n) < 0.5  # of those in place
         for axis, most in ((1, config.sideways), (2, config.turning)):
             value = self.difficulty * most * rng.uniform(-1, 1, n)
-            out[:, axis] = np.where(rng.random(n) < 1 / 3, value, 0.0)
+            chosen = np.where(in_place, turns == (axis == 2), rng.random(n) < 1 / 3)
+            out[:, axis] = np.where(chosen, value, 0.0)
         return out
 
     def _set_height(self, rows: NDArray[np.intp], height: Array, walks: NDArray[np.bool_]) -> None:
@@ -113,4 +134,5 @@ class Commands:
         bound = np.clip(ACTION_BOX.to_normalised(metric)[:, _HEIGHT], -1.0, 1.0)
         self._moves[rows, _HEIGHT] = squats
         self._low[rows] = np.where(squats, bound, -1.0)
-        self._action[rows, _HEIGHT] = np.where(squats, self._action[rows, _HEIGHT], wanted)
+        kept = self._action[rows, _HEIGHT]
+        self._action[rows, _HEIGHT] = self._wanted[rows, _HEIGHT] = np.where(squats, kept, wanted)

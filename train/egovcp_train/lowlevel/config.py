@@ -41,14 +41,16 @@ class PpoConfig:
     """Of generalised advantage estimation."""
     clip_param: float = bounded(0.2, above=0)
     """Clipping of the probability ratio."""
-    entropy_coef: float = bounded(0.003, least=0)
-    """Weight of the entropy."""
+    entropy_coef: float = bounded(0.0, least=0)
+    """Weight of the entropy; with one, the exploration noise shakes the torso."""
 
 
 @dataclass(frozen=True)
 class CurriculumConfig:
     """When the task becomes harder."""
 
+    start: float = bounded(0.0, least=0, most=1)
+    """Difficulty of the first iteration."""
     step: float = bounded(0.004, least=0)
     """Change of the difficulty per iteration."""
     few_falls: float = bounded(0.02, least=0, most=1)

@@ -88,6 +88,12 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
             extras,
         )
 
+    def spread_ends(self) -> None:
+        """Let the running episodes end at different times, as if they had begun at random ones."""
+        age = self.rng.integers(0, self.max_episode_length, self.num_envs)
+        self.episode_length_buf[:] = torch.from_numpy(age)
+        self._schedule_push(np.arange(self.num_envs))
+
     def reseed(self, number: int) -> None:
         """Go on with other random numbers than at the start: those of ``number``."""
         self.rng.bit_generator.state = np.random.default_rng(
@@ -122,6 +128,7 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self.physics.qvel[rows, :2] += events.pushes(
             len(rows), self.task.disturbances, self.loop.difficulty, self.rng
         )
+        self.loop.pushed(rows)
         self._schedule_push(rows)
 
     def _weighted(self, earned: dict[str, Array]) -> Array:

@@ -36,9 +36,13 @@ _FIGURES: Final = {
     "hand_lag_s": "hand_lag",
     "height_error_m": "height_error",
     "velocity_error_mps": "velocity_error",
+    "turning_error_radps": "turning_error",
     "head_top_m": "head_top",
-    "stepping": "stepping",
+    "stepping_share": "stepping",
 }
+
+
+_CAMERA: Final = {"camera_px_per_step": "camera", "camera_px_8_steps": "camera_8"}
 
 
 @dataclass(frozen=True)
@@ -47,7 +51,10 @@ class LowLevelEvalConfig:
 
     Every skill is played by --episodes robots of different mass, friction and gains, with
     delay and sensor noise. A fall is a tilt of more than 1 rad or a pelvis below 0.35 m.
-    Errors, and the share of the time in which it steps, are means over the time before a fall.
+    Errors, and the share of the time in which it steps (the gait moves a foot), are means over the
+    time before a fall. The camera columns are the mean rotation of the head camera, one and eight
+    planner steps (of 40 ms) apart, in pixels of the depth image: up, across, and at the image's
+    edge by roll.
     The column torque is the RMS torque of the most loaded joint, relative to its motor's peak
     torque; lowlevel.json has all joints. The skill rest also compares the torques of the
     undisturbed robot with what gravity needs at its pose.
@@ -187,7 +194,7 @@ def _play(
 
 
 def _joined(parts: Sequence[Any]) -> dict[str, NDArray[Any]]:
-    names = ("survived", "torque_rms", *_FIGURES.values())
+    names = ("survived", "torque_rms", *_FIGURES.values(), *_CAMERA.values())
     return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
 
 
@@ -205,6 +212,9 @@ def _figures(skill: Skill, outcome: dict[str, NDArray[Any]], requested: int) -> 
     for key, name in _FIGURES.items():
         known = outcome[name][np.isfinite(outcome[name])]
         out[key] = float(known.mean()) if len(known) else None
+    for key, name in _CAMERA.items():
+        turned = outcome[name][np.isfinite(outcome[name]).all(axis=1)]
+        out[key] = turned.mean(axis=0).tolist() if len(turned) else None
     torque = outcome["torque_rms"]
     torque = torque[np.isfinite(torque).all(axis=1)]
     out["torque_rms_relative"] = (
@@ -234,32 +244,42 @@ def _standing_load(config: LowLevelEvalConfig) -> dict[str, Any]:
 
 
 def table(figures: dict[str, dict[str, Any]]) -> str:
-    """One line per skill."""
-    head = f"{'skill':<8}{'survival':>9}  {'95 %':<18}{'hand':>8}{'lag':>8}{'height':>9}"
-    lines = [head + f"{'velocity':>11}{'head top':>10}{'stepping':>10}  torque"]
+    """One line per skill, at most 120 characters."""
+    lines = [
+        f"{'skill':<9}{'surv.':>7}  {'95 %':<11}{'hand':>5}{'lag':>4}{'height':>7}{'vel.':>6}"
+        f"{'turn':>6}{'head':>6}{'steps':>6}  {'camera, px/step':<16}{'8 steps':<14}torque",
+        f"{'':<9}{'%':>7}  {'%':<11}{'cm':>5}{'ms':>4}{'cm':>7}{'m/s':>6}{'rad/s':>6}"
+        f"{'m':>6}{'%':>6}  {'up/across/roll':<16}{'':<14}%",
+    ]
     for name, f in figures.items():
         low, high = f["survival_ci95"]
         lines.append(
-            f"{name:<8}{f['survival']:>9.1%}  {f'{low:.1%} to {high:.1%}':<18}"
-            f"{_cell(f['hand_error_m'], 100, 'cm'):>8}{_cell(f['hand_lag_s'], 1000, 'ms', 0):>8}"
-            f"{_cell(f['height_error_m'], 100, 'cm'):>9}"
-            f"{_cell(f['velocity_error_mps'], 1, 'm/s', 2):>11}"
-            f"{_cell(f['head_top_m'], 1, 'm', 2):>10}{_cell(f['stepping'], 100, '%', 0):>10}"
-            f"  {_hottest(f['torque_rms_relative'])}"
+            f"{name:<9}{f['survival'] * 100:>7.1f}  {f'{100 * low:.1f}-{100 * high:.1f}':<11}"
+            f"{_cell(f['hand_error_m'], 100):>5}{_cell(f['hand_lag_s'], 1000, 0):>4}"
+            f"{_cell(f['height_error_m'], 100):>7}{_cell(f['velocity_error_mps'], 1, 2):>6}"
+            f"{_cell(f['turning_error_radps'], 1, 2):>6}{_cell(f['head_top_m'], 1, 2):>6}"
+            f"{_cell(f['stepping_share'], 100, 0):>6}"
+            f"  {_cells(f['camera_px_per_step'], 2):<16}{_cells(f['camera_px_8_steps'], 1):<14}"
+            f"{_hottest(f['torque_rms_relative'])}"
         )
-    return "\n".join(lines)
+    return "\n".join(line.rstrip() for line in lines)
 
 
 def _hottest(torques: dict[str, float] | None) -> str:
-    """The most loaded joint, such as ``9.7 % left_knee``."""
+    """The most loaded joint of either side, such as ``9.7 knee``."""
     if torques is None:
         return ""
     joint = max(torques, key=lambda name: torques[name])
-    return f"{torques[joint]:.1%} {joint.removesuffix('_joint')}"
+    name = joint.removesuffix("_joint").removeprefix("left_").removeprefix("right_")
+    return f"{100 * torques[joint]:.1f} {name}"
 
 
-def _cell(value: float | None, scale: float, unit: str, digits: int = 1) -> str:
-    return "" if value is None else f"{value * scale:.{digits}f} {unit}"
+def _cell(value: float | None, scale: float, digits: int = 1) -> str:
+    return "" if value is None else f"{value * scale:.{digits}f}"
+
+
+def _cells(values: Sequence[float] | None, digits: int) -> str:
+    return "" if values is None else "/".join(f"{value:.{digits}f}" for value in values)
 
 
 if __name__ == "__main__":

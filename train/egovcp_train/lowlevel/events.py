@@ -39,9 +39,11 @@ def standing(n: int, rng: np.random.Generator) -> Array:
     return qpos
 
 
-def delays(n: int, config: DisturbanceConfig, rng: np.random.Generator) -> NDArray[np.intp]:
-    """(n,) physics steps from a measurement to the new targets' effect."""
-    low, high = (round(seconds / PHYSICS_DT) for seconds in config.delay)
+def delays(
+    n: int, config: DisturbanceConfig, rng: np.random.Generator, timestep: float = PHYSICS_DT
+) -> NDArray[np.intp]:
+    """(n,) physics steps of ``timestep`` s from a measurement to the new targets' effect."""
+    low, high = (round(seconds / timestep) for seconds in config.delay)
     return rng.integers(low, high + 1, n)
 
 

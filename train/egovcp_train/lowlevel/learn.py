@@ -17,6 +17,7 @@ from egovcp.robot.walking import WalkConfig
 from egovcp.spec import CONTROLLER_HZ
 from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig, PpoConfig
 from egovcp_train.lowlevel.env import LowLevelEnv, mirrored
+from egovcp_train.lowlevel.warm_start import SymmetricStart
 
 
 class PpoLearner:
@@ -28,9 +29,13 @@ class PpoLearner:
         network: NetworkConfig,
         ppo: PpoConfig,
         curriculum: CurriculumConfig,
+        critic_warmup: int = 0,
     ) -> None:
         self.env, self.curriculum, self._ticks = env, curriculum, ppo.num_steps_per_env
         self.iteration = 0
+        self._start: SymmetricStart | None = None
+        self._critic_warmup = critic_warmup
+        env.loop.difficulty = curriculum.start
         with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints its networks
             self.ppo = PPO.construct_algorithm(
                 env.get_observations(), env, rsl_rl_config(network, ppo), "cpu"
@@ -43,13 +48,34 @@ class PpoLearner:
         """Ticks simulated so far, over all robots."""
         return self.iteration * self._ticks * self.env.num_envs
 
+    def start_from(self, policy: WalkPolicy) -> None:
+        """Begin with the network of a trained controller.
+
+        Raises:
+            UsageError: its layers have other sizes.
+        """
+        self._start = SymmetricStart(self.ppo.get_policy(), policy)
+
+    def _update(self, seen: list[torch.Tensor]) -> dict[str, float]:
+        """One update of PPO; at first of the critic alone, whose advantages mean nothing yet."""
+        warms_up = self.iteration < self._critic_warmup
+        actor = self.ppo.get_policy()
+        actor.requires_grad_(not warms_up)
+        self.ppo.schedule = "fixed" if warms_up else "adaptive"
+        losses: dict[str, float] = self.ppo.update()
+        actor.requires_grad_(True)
+        if warms_up and self._start is not None:
+            losses["symmetric_error"] = self._start.fit(self.env, torch.cat(seen))
+        return losses
+
     def iterate(self) -> dict[str, float]:
         """Collect, update, adapt the difficulty; returns scalars to log."""
         log: dict[str, list[float]] = defaultdict(list)
-        falls = 0.0
+        falls, seen = 0.0, []
         with torch.inference_mode():
             obs = self.env.get_observations()
             for _ in range(self._ticks):
+                seen.append(obs["policy"])
                 obs, reward, done, extras = self.env.step(self.ppo.act(obs))
                 self.ppo.process_env_step(obs, reward, done, extras)
                 falls += float((done.bool() & ~extras["time_outs"]).sum())
@@ -57,7 +83,7 @@ class PpoLearner:
                     log[name.removeprefix("/")].append(value)
                 log["reward/total"].append(float(reward.mean()) * CONTROLLER_HZ)
             self.ppo.compute_returns(obs)
-        losses = self.ppo.update()
+        losses = self._update(seen)
         self.iteration += 1
         scalars = {name: float(np.mean(values)) for name, values in log.items()}
         scalars["falls_per_second"] = falls * CONTROLLER_HZ / (self._ticks * self.env.num_envs)

@@ -6,18 +6,23 @@ environment (`env`) and the mjlab task (`mjlab_terms`) hold one each and bring p
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.sensors import noise_std
+from egovcp.spec import CONTROLLER_HZ
 from egovcp_train.lowlevel import rewards, sensing
+from egovcp_train.lowlevel.camera import TorsoMotion
 from egovcp_train.lowlevel.commands import Commands
 from egovcp_train.lowlevel.physics import Snapshot
 from egovcp_train.lowlevel.task import LowLevelTask
 
 Array = NDArray[np.float64]
+_RECOVERY_TICKS: Final = 2 * CONTROLLER_HZ  # after a push, in which steps cost nothing
 
 
 class Loop:
@@ -36,6 +41,8 @@ class Loop:
         self.walk = Walk(walk)
         self.fallen: NDArray[np.bool_] = np.zeros(robots, dtype=np.bool_)
         self._motion = rewards.Motion(robots)
+        self._torso = TorsoMotion(robots)
+        self._unpushed = np.full(robots, _RECOVERY_TICKS)  # ticks since the last push, up to that
         self._noise = noise_std(sensors)
         self._action: Array = np.zeros((robots, ACTIONS))
         self._last_action: Array = np.zeros((robots, ACTIONS))
@@ -61,6 +68,8 @@ class Loop:
         They are as wild as the state is; `rewards.earned` says what counts.
         """
         self._motion.add(x)
+        self._torso.add(x)
+        self._unpushed = np.minimum(self._unpushed + 1, _RECOVERY_TICKS)
         walk, gait = self.walk, self.walk.gait
         self.fallen = rewards.fallen(x, walk.height, walk.pitch)
         return rewards.terms(
@@ -73,12 +82,20 @@ class Loop:
             gait.amount,
             self._action,
             self._last_action,
+            self._torso,
+            self._unpushed < _RECOVERY_TICKS,
         )
+
+    def pushed(self, rows: NDArray[np.intp]) -> None:
+        """``rows`` have just been pushed: steps cost nothing for a while."""
+        self._unpushed[rows] = 0
 
     def restart(self, rows: NDArray[np.intp]) -> None:
         """``rows`` begin new episodes, in the posture that `observe` will find."""
         self.commands.reset(rows)
         self._motion.reset(rows)
+        self._torso.reset(rows)
+        self._unpushed[rows] = _RECOVERY_TICKS
         self._action[rows] = 0.0
         self._fresh[rows] = True
 

@@ -16,6 +16,7 @@ from mjlab.managers.action_manager import ActionTerm, ActionTermCfg
 from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from numpy.typing import NDArray
 
+from egovcp.errors import UsageError
 from egovcp.robot.walking import ACTIONS, WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import CONTROLLER_HZ, JOINT_NAMES
@@ -203,6 +204,11 @@ class Targets(ActionTerm):
     cfg: TargetsCfg
 
     def __init__(self, cfg: TargetsCfg, env: ManagerBasedRlEnv) -> None:
+        if cfg.disturbances.delay[1] > 1 / CONTROLLER_HZ:
+            raise UsageError(
+                f"delay: expected at most one tick of {1 / CONTROLLER_HZ} s in mjlab, "
+                f"found {cfg.disturbances.delay[1]}"
+            )
         super().__init__(cfg, env)
         self._term = loop_term(env)
         shape = (self.num_envs, len(JOINT_NAMES))
@@ -292,6 +298,7 @@ def push(env: ManagerBasedRlEnv, env_ids: torch.Tensor) -> None:
     kick = events.pushes(
         len(env_ids), term.cfg.task.disturbances, term.loop.difficulty, term.loop.rng
     )
+    term.loop.pushed(env_ids.cpu().numpy())
     velocity = robot.data.root_link_vel_w[env_ids].clone()
     velocity[:, :2] += torch.from_numpy(kick).to(velocity)
     robot.write_root_link_velocity_to_sim(velocity, env_ids=env_ids)

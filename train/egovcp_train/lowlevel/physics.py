@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, Literal
 
 import mujoco
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from egovcp.robot.mjcf import FootModel, robot_spec
 from egovcp.sim.scene import FLOOR, strip_visuals
-from egovcp.spec import JOINT_NAMES, PHYSICS_STEPS_PER_CONTROLLER_TICK
+from egovcp.spec import CONTROLLER_HZ, JOINT_NAMES, PHYSICS_DT
 from egovcp_train.lowlevel.task import DisturbanceConfig
 
 Array = NDArray[np.float64]
@@ -29,8 +29,29 @@ _SENSORS: Final = (
 
 
 @dataclass(frozen=True)
+class PhysicsOptions:
+    """Options of MuJoCo; by default those that controllers are trained with."""
+
+    timestep: float = PHYSICS_DT
+    """s; a divisor of a controller tick of 20 ms."""
+    integrator: Literal["implicitfast", "implicit", "Euler"] = "implicitfast"
+    cone: Literal["pyramidal", "elliptic"] = "pyramidal"
+
+    @property
+    def steps_per_tick(self) -> int:
+        """Physics steps per controller tick."""
+        return round(1 / (CONTROLLER_HZ * self.timestep))
+
+    def apply(self, spec: mujoco.MjSpec) -> None:
+        """Set the options of ``spec``."""
+        spec.option.timestep = self.timestep
+        spec.option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{self.integrator.upper()}")
+        spec.option.cone = getattr(mujoco.mjtCone, f"mjCONE_{self.cone.upper()}")
+
+
+@dataclass(frozen=True)
 class Snapshot:
-    """The true state of N robots, world frame; feet and palms as of 5 ms before."""
+    """The true state of N robots, world frame; feet and palms as of one physics step before."""
 
     position: Array  # (N, 3) pelvis, m
     quaternion: Array  # (N, 4) pelvis, wxyz
@@ -51,9 +72,16 @@ class Physics:
     """N robots; robot i has the physical parameters of model i modulo the number of models."""
 
     def __init__(
-        self, robots: int, feet: FootModel, config: DisturbanceConfig, threads: int, seed: int
+        self,
+        robots: int,
+        feet: FootModel,
+        config: DisturbanceConfig,
+        threads: int,
+        seed: int,
+        options: PhysicsOptions | None = None,
     ) -> None:
-        base = compile_model(feet)
+        self.options = options or PhysicsOptions()
+        base = compile_model(feet, self.options)
         rng = np.random.default_rng(seed)
         pool = [_randomised(base, config, rng) for _ in range(min(robots, config.models))]
         self._models = [pool[i % len(pool)] for i in range(robots)]
@@ -62,12 +90,13 @@ class Physics:
         self.state = np.zeros((robots, mujoco.mj_stateSize(base, _STATE)))
         self._nq, self._nv = base.nq, base.nv
         self._head_radius = float(base.geom(HEAD).size[0])
-        steps = PHYSICS_STEPS_PER_CONTROLLER_TICK
+        steps = self.options.steps_per_tick
         self._states = np.zeros((robots, steps, self.state.shape[1]))
         self._readings = np.zeros((robots, steps, base.nsensordata))
         self._control = np.zeros((robots, steps, base.nu))
         self._warm = np.zeros((robots, base.nv))
         self._target = np.zeros((robots, base.nu))
+        self._older = np.zeros((robots, base.nu))  # targets of the tick before
         self.floor_friction = np.array([m.geom_friction[_feet(m)[0], 0] for m in self._models])
 
     @property
@@ -84,13 +113,16 @@ class Physics:
         """Put robots at rest at ``qpos``, their servos holding ``target``."""
         self.state[rows] = 0.0
         self.qpos[rows] = qpos
-        self._target[rows] = target
+        self._target[rows] = self._older[rows] = target
 
     def step(self, target: Array, delay: NDArray[np.intp]) -> None:
-        """One controller tick: the new targets (N, J) act after ``delay`` (N,) physics steps."""
-        for k in range(self._control.shape[1]):
-            self._control[:, k] = np.where((k < delay)[:, None], self._target, target)
-        self._target = target.copy()
+        """One controller tick: the new targets (N, J) act after ``delay`` (N,) physics steps, which
+        are two ticks at most."""
+        steps = self._control.shape[1]
+        for k in range(steps):
+            last = np.where((k + steps < delay)[:, None], self._older, self._target)
+            self._control[:, k] = np.where((k < delay)[:, None], last, target)
+        self._older, self._target = self._target, target.copy()
         self._rollout.rollout(
             self._models,
             self._data,
@@ -133,9 +165,10 @@ class Physics:
         self._rollout.close()
 
 
-def compile_model(feet: FootModel) -> mujoco.MjModel:
+def compile_model(feet: FootModel, options: PhysicsOptions | None = None) -> mujoco.MjModel:
     """The robot on a floor, with the sensors that `Physics` reads."""
     spec = robot_spec(feet)
+    (options or PhysicsOptions()).apply(spec)
     strip_visuals(spec)
     for sensor in list(spec.sensors):
         spec.delete(sensor)

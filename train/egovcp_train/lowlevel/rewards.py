@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from egovcp.robot.g1 import EFFORT_LIMIT
 from egovcp.robot.reach import DT
 from egovcp.robot.stance_table import NU
+from egovcp_train.lowlevel.camera import TorsoMotion
 from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
 from egovcp_train.lowlevel.physics import Snapshot
 
@@ -19,6 +20,7 @@ _CONTACT: Final = 0.012  # m above that, below which a foot counts as standing
 _AVERAGED: Final = 0.3  # s
 _STANDS: Final = 0.05  # m/s and rad/s, a slower command asks to stand
 _LEAST_WIDTH: Final = 0.16  # m between the feet, across
+_MOST_ROTATION: Final = 10.0  # rad^2/s^2, bound of the terms of the torso's rotation
 _FALLEN_TILT: Final = 0.8  # rad off the natural pitch
 _FALLEN_HEIGHT: Final = 0.2  # m below the height's reference
 
@@ -56,6 +58,8 @@ def terms(
     gait: Array,
     action: Array,
     last_action: Array,
+    torso: TorsoMotion,
+    pushed: NDArray[np.bool_],
 ) -> dict[str, Array]:
     """All terms but the fall.
 
@@ -69,6 +73,8 @@ def terms(
         gait: (N,) how much of the gait is in.
         action: (N, 15) of the policy.
         last_action: (N, 15) of the tick before.
+        torso: its angular velocity, up to this tick.
+        pushed: (N,) whether a push was so recent that steps are needed.
     """
     turn = rotation(x.quaternion)
     forward = heading(turn)
@@ -87,7 +93,9 @@ def terms(
         "height": np.exp(-((x.position[:, 2] - height) ** 2) / 0.001),
         "upright": np.exp(-np.sum(off**2, axis=1) / 0.03),
         "contact": _in_step(on, phase, gait),
-        "stepping": gait * (np.abs(command[:, :3]).max(axis=1) < _STANDS),
+        "stepping": gait * (np.abs(command[:, :3]).max(axis=1) < _STANDS) * ~pushed,
+        "torso_rate": np.minimum(_off_turning(torso.rate, command), _MOST_ROTATION),
+        "torso_change": np.minimum(np.sum(torso.change**2, axis=1), _MOST_ROTATION),
         "slip": np.sum(np.minimum(slipping, 4.0), axis=1),
         "stance_width": np.maximum(_LEAST_WIDTH - width, 0.0),
         "foot_heading": np.sum(ahead[..., 1] ** 2, axis=1),
@@ -112,6 +120,13 @@ def earned(
     """`terms` and the ``fall``, finite: a robot whose simulation diverged earns nothing else."""
     finite = {name: np.where(broken, 0.0, np.nan_to_num(v)) for name, v in terms.items()}
     return finite | {"fall": fell.astype(np.float64)}
+
+
+def _off_turning(rate: Array, command: Array) -> Array:
+    """(N,) rad^2/s^2, square of the torso's angular velocity off the commanded turning."""
+    off = rate.copy()
+    off[:, 2] -= command[:, 2]
+    return np.asarray(np.sum(off**2, axis=1))
 
 
 def _in_step(on: NDArray[np.bool_], phase: Array, gait: Array) -> Array:

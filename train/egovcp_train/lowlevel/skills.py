@@ -13,6 +13,7 @@ from egovcp.spec import (
     ACTION_BOX,
     ACTION_DIM,
     ACTION_ETA,
+    ACTION_RATE_LIMIT,
     CONTROLLER_HZ,
     CONTROLLER_TICKS_PER_PLAN,
     reflect,
@@ -21,6 +22,7 @@ from egovcp.spec import (
 Array = NDArray[np.float64]
 HOLD: Final = 60  # ticks for which a held target stays
 SETTLED: Final = 30  # ticks after which a held target should be reached
+_HELD_TICKS: Final = (5, 15)  # planner ticks between steps of `seldom_walk`, inclusive
 _RAMP: Final = 25  # ticks from standing to the commanded velocity
 _HEIGHT: Final = ACTION_DIM - 1
 
@@ -37,7 +39,9 @@ class Skill:
     settled_only: bool = False
     """Judge hands and height only where their target has been held for 0.6 s."""
     push: float = 0.0
-    """m/s of an impulse in any horizontal direction, after 1 s."""
+    """m/s of an impulse, after 1 s."""
+    push_any: bool = True
+    """Whether the impulse has any horizontal direction; otherwise it is forwards or backwards."""
 
     @property
     def ticks(self) -> int:
@@ -56,6 +60,21 @@ def random_walk(ticks: int, robots: int, rng: np.random.Generator) -> Array:
     steps = ACTION_ETA * rng.uniform(-1, 1, (ticks // CONTROLLER_TICKS_PER_PLAN, robots, 7))
     walk = reflect(np.cumsum(steps, axis=0))
     return _commands(np.repeat(walk, CONTROLLER_TICKS_PER_PLAN, axis=0))
+
+
+def seldom_walk(ticks: int, robots: int, rng: np.random.Generator) -> Array:
+    """As `egovcp-collect --eta=1 --step_ticks=[5,15]`: far steps, at the rate limit, and rests."""
+    wanted, sent = np.zeros((2, robots, ACTION_DIM))
+    wait: NDArray[np.intp] = np.zeros(robots, dtype=np.intp)
+    walk = []
+    for _ in range(ticks // CONTROLLER_TICKS_PER_PLAN):
+        steps = wait <= 0
+        wait = np.where(steps, rng.integers(*_HELD_TICKS, robots, endpoint=True), wait) - 1
+        step = rng.uniform(-1, 1, wanted.shape)
+        wanted = reflect(wanted + np.where(steps[:, None], step, 0.0))
+        sent = sent + np.clip(wanted - sent, -ACTION_RATE_LIMIT, ACTION_RATE_LIMIT)
+        walk.append(sent)
+    return _commands(np.repeat(np.array(walk), CONTROLLER_TICKS_PER_PLAN, axis=0))
 
 
 def held_targets(ticks: int, robots: int, rng: np.random.Generator) -> Array:
@@ -77,14 +96,22 @@ def _at_height(heights: Array, velocity: Array | None = None) -> Array:
 
 
 def walking(
-    speed: tuple[float, float], height: tuple[float, float]
+    speed: tuple[float, float], height: tuple[float, float], axis: int = 0
 ) -> Callable[[int, int, np.random.Generator], Array]:
-    """Straight on at one speed and one height per robot, hands neutral."""
+    """One velocity and one height per robot, hands neutral.
+
+    Args:
+        speed: range, m/s or rad/s; negative: backwards.
+        height: range, m.
+        axis: of the velocity: 0 ahead, 1 to either side, 2 turning either way.
+    """
 
     def script(ticks: int, robots: int, rng: np.random.Generator) -> Array:
         ramp = np.minimum(1.0, np.arange(ticks) / _RAMP)[:, None]
         velocity = np.zeros((ticks, robots, 3))
-        velocity[..., 0] = ramp * rng.uniform(*speed, robots)
+        velocity[..., axis] = ramp * rng.uniform(*speed, robots)
+        if axis > 0:
+            velocity[..., axis] *= rng.choice([-1.0, 1.0], robots)
         start = ACTION_BOX.neutral[_HEIGHT]
         goal = rng.uniform(*height, robots)
         return _at_height(start + ramp * (goal - start), velocity)
@@ -97,17 +124,40 @@ def neutral(ticks: int, robots: int, rng: np.random.Generator) -> Array:
     return _commands(np.zeros((ticks, robots, ACTION_DIM)))
 
 
+_UPRIGHT: Final = (0.70, 0.74)  # m
+
 SKILLS: Final = (
-    Skill("stand", "20 s of the data's random walk of hands and height", 20.0, random_walk),
+    Skill("still", "20 s at the neutral pose", 20.0, neutral),
+    Skill("stand", "20 s of the paper's random walk of hands and height", 20.0, random_walk),
+    Skill("held", "20 s of random targets held for 5 to 15 planner ticks", 20.0, seldom_walk),
     Skill("reach", "targets held for 1.2 s, judged after 0.6 s", 12.0, held_targets, True),
     Skill("squat", "heights of 0.50 to 0.74 m, judged after 0.6 s", 12.0, squats, True),
+    Skill("walk", "10 s at 0.1 to 0.8 m/s, 0.70 to 0.74 m", 10.0, walking((0.1, 0.8), _UPRIGHT)),
+    Skill("backward", "10 s at -0.3 m/s, 0.70 to 0.74 m", 10.0, walking((-0.3, -0.3), _UPRIGHT)),
     Skill(
-        "walk", "10 s at 0.1 to 0.6 m/s, 0.70 to 0.74 m", 10.0, walking((0.1, 0.6), (0.70, 0.74))
+        "sideways",
+        "10 s at 0.2 m/s either way, 0.70 to 0.74 m",
+        10.0,
+        walking((0.2, 0.2), _UPRIGHT, 1),
+    ),
+    Skill(
+        "turning",
+        "10 s at 0.6 rad/s either way, 0.70 to 0.74 m",
+        10.0,
+        walking((0.6, 0.6), _UPRIGHT, 2),
     ),
     Skill(
         "crouch", "10 s at 0.2 to 0.4 m/s, 0.58 to 0.62 m", 10.0, walking((0.2, 0.4), (0.58, 0.62))
     ),
     Skill("low", "10 s at 0.2 to 0.4 m/s, 0.55 m", 10.0, walking((0.2, 0.4), (0.55, 0.55))),
     Skill("push", "an impulse of 0.5 m/s while standing", 6.0, neutral, push=0.5),
+    Skill(
+        "hard_push",
+        "an impulse of 0.8 m/s forwards or backwards while standing",
+        6.0,
+        neutral,
+        push=0.8,
+        push_any=False,
+    ),
     Skill("rest", "60 s at the neutral pose", 60.0, neutral),
 )

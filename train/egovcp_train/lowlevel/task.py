@@ -33,14 +33,19 @@ class CommandConfig:
     """s between changes of velocity and of how hands and height move."""
     standing: float = bounded(0.4, least=0, most=1)
     """Share of commands with zero velocity."""
-    forward: tuple[Range, Range] = bounded(((0.1, 0.3), (0.1, 0.6)), least=-3, most=3)
+    forward: tuple[Range, Range] = bounded(((0.1, 0.3), (0.1, 0.8)), least=-3, most=3)
     """m/s, easy and hard."""
-    backward: float = bounded(0.1, least=0, most=1)
-    """Share of the walking commands that go backwards, at up to half the speed."""
-    sideways: float = bounded(0.15, least=0, most=3)
-    """m/s at the hardest, either way, in a third of the walking commands."""
-    turning: float = bounded(0.4, least=0, most=5)
-    """rad/s at the hardest, either way, in a third of the walking commands."""
+    backward: float = bounded(0.15, least=0, most=1)
+    """Share of the walking commands that go backwards."""
+    backward_speed: tuple[Range, Range] = bounded(((0.1, 0.15), (0.1, 0.35)), least=0, most=3)
+    """m/s of those, easy and hard."""
+    in_place: float = bounded(0.25, least=0, most=1)
+    """Share of the walking commands that go neither forwards nor backwards, only sideways or
+    turning."""
+    sideways: float = bounded(0.25, least=0, most=3)
+    """m/s at the hardest, either way, in a third of the other walking commands."""
+    turning: float = bounded(0.7, least=0, most=5)
+    """rad/s at the hardest, either way, in a third of the other walking commands."""
     standing_height: tuple[Range, Range] = bounded(((0.65, 0.75), (0.50, 0.76)), least=0.3, most=1)
     """m, easy and hard."""
     walking_height: tuple[Range, Range] = bounded(((0.70, 0.75), (0.55, 0.75)), least=0.3, most=1)
@@ -48,7 +53,10 @@ class CommandConfig:
     acceleration: float = bounded(0.8, least=0.01, most=100)
     """m/s^2 and rad/s^2 at which the commanded velocity changes."""
     still_hands: float = bounded(0.2, least=0, most=1)
-    """Share of commands whose hands rest; the others follow the data's random walk."""
+    """Share of commands whose hands rest; the others follow a random walk."""
+    held_hands: float = bounded(0.4, least=0, most=1)
+    """Share of those random walks that step seldom and far, as `egovcp-collect --eta=1
+    --step_ticks=[5,15]` does; the others step at every planner tick, as the paper's."""
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -61,7 +69,7 @@ class DisturbanceConfig:
 
     push_interval: Range = bounded((3.0, 8.0), least=0.02, most=3600)
     """s between pushes."""
-    push: Range = bounded((0.1, 0.7), least=0, most=5)
+    push: Range = bounded((0.1, 0.8), least=0, most=5)
     """m/s of horizontal velocity at most, easy and hard."""
     friction: Range = bounded((0.5, 1.1), least=0.01, most=5)
     """Sliding friction of the feet; the simulation diverges without any."""
@@ -73,7 +81,7 @@ class DisturbanceConfig:
     """Factor on the stiffness of every servo."""
     damping_scale: Range = bounded((0.8, 1.2), least=0.1, most=5)
     """Factor on the damping of every servo."""
-    delay: Range = bounded((0.0, 0.02), least=0, most=0.02)
+    delay: Range = bounded((0.0, 0.02), least=0, most=0.04)
     """s from a measurement to the new targets' effect, in physics steps."""
     models: int = bounded(64, least=1, most=4096)
     """Robots of different physical parameters."""
@@ -93,7 +101,9 @@ class RewardConfig:
     height: float = 1.0
     upright: float = 1.0
     contact: float = 1.0
-    stepping: float = -0.5
+    stepping: float = -1.0
+    torso_rate: float = -0.6
+    torso_change: float = -0.2
     slip: float = -0.5
     stance_width: float = -5.0
     foot_heading: float = -1.0

@@ -17,6 +17,7 @@ from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import run_command, save_config
 from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
+from egovcp.robot.controllers import load_walk_policy
 from egovcp.robot.walk_onnx import export_onnx
 from egovcp.robot.walking import WalkConfig
 from egovcp.sim.capacity import require_robots
@@ -60,6 +61,11 @@ class LowLevelTrainConfig:
     """Commands, disturbances and rewards."""
     walk: WalkConfig = field(default_factory=WalkConfig)
     """What surrounds the policy: stance law, gait, arms."""
+    init: str = ""
+    """Controller whose network the policy starts from: walk (which the package ships) or
+    PATH.safetensors; empty: a new network."""
+    critic_warmup: int = bounded(0, least=0, most=100_000)
+    """Iterations at the start that train the critic alone; for --init."""
     sensors: SensorConfig = field(default_factory=SensorConfig)
     """Noise of proprioception."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
@@ -103,6 +109,8 @@ def train(config: LowLevelTrainConfig) -> None:
     """Run PPO to its end, or to the first SIGINT or SIGTERM, and write the controller.
 
     Raises:
+        UsageError: --init is no network of this size.
+        ArtefactError: the file of --init cannot be used.
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
     require_robots("--robots", config.robots)
@@ -110,9 +118,12 @@ def train(config: LowLevelTrainConfig) -> None:
     threads = config.threads or available_cores()
     torch.set_num_threads(threads)
     torch.manual_seed(config.seed)
+    init = load_walk_policy(config.init) if config.init and not config.resume else None
     learner = _build(config, threads)
     if config.resume:
         _restore(output, learner)
+    elif init is not None:
+        learner.start_from(init)
     output.mkdir(parents=True, exist_ok=True)
     save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
     try:
@@ -137,7 +148,8 @@ def _build(config: LowLevelTrainConfig, threads: int) -> Any:
         threads=threads,
         seed=config.seed,
     )
-    return PpoLearner(env, config.network, config.ppo, config.curriculum)
+    env.spread_ends()
+    return PpoLearner(env, config.network, config.ppo, config.curriculum, config.critic_warmup)
 
 
 def _restore(output: Path, learner: Any) -> None:

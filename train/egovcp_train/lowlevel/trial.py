@@ -19,11 +19,11 @@ from egovcp.robot.reach import nearest_reachable
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.robot import MAX_SPEED
 from egovcp.sim.sensors import noise_std
-from egovcp.spec import CONTROLLER_HZ
-from egovcp_train.lowlevel import events
+from egovcp.spec import CONTROLLER_HZ, CONTROLLER_TICKS_PER_PLAN
+from egovcp_train.lowlevel import camera, events
 from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
 from egovcp_train.lowlevel.heat import relative_rms
-from egovcp_train.lowlevel.physics import Physics, Snapshot
+from egovcp_train.lowlevel.physics import Physics, PhysicsOptions, Snapshot
 from egovcp_train.lowlevel.sensing import measure
 from egovcp_train.lowlevel.skills import HOLD, SETTLED, Skill
 from egovcp_train.lowlevel.task import DisturbanceConfig
@@ -46,8 +46,11 @@ class Outcome:
     hand_lag: Array  # s, by which the hands follow best
     height_error: Array  # m, mean
     velocity_error: Array  # m/s, mean over strides
+    turning_error: Array  # rad/s, mean over strides
     head_top: Array  # m, highest in walking
     stepping: Array  # share of the ticks in which the robot steps
+    camera: Array  # (N, 3) px up, across, by roll; mean rotation per planner step
+    camera_8: Array  # (N, 3) px, per 8 planner steps
     torque_rms: Array  # (N, 29) RMS torque of each joint, relative to the motor's peak
 
 
@@ -58,6 +61,7 @@ class _Record:
         self.hands: list[Array] = []
         self.targets: list[Array] = []
         self.height: list[Array] = []
+        self.torso: list[Array] = []  # of planner ticks
         self.velocity: list[Array] = []
         self.head: list[Array] = []
         self.stepping: list[NDArray[np.bool_]] = []
@@ -73,7 +77,10 @@ class _Record:
         self.hands.append(palms)
         self.targets.append(nearest_reachable(command[:, 3:9].reshape(-1, 2, 3), pelvis, torso))
         self.height.append(x.position[:, 2].copy())
-        self.velocity.append(in_heading(x.velocity, forward))
+        if len(self.height) % CONTROLLER_TICKS_PER_PLAN == 1:
+            self.torso.append(np.nan_to_num(camera.torso(x)))
+        planar = in_heading(x.velocity, forward)
+        self.velocity.append(np.concatenate([planar, x.angular_velocity[:, 2:]], axis=1))
         self.head.append(x.head_top.copy())
         self.stepping.append(stepping)
         self.torque.append(x.torque.copy())
@@ -89,6 +96,7 @@ def play(
     feet: FootModel = "stock",
     threads: int = 1,
     stopped: Callable[[], bool] = lambda: False,
+    options: PhysicsOptions | None = None,
 ) -> Outcome:
     """Run ``skill`` once with each of ``robots`` robots of different physical parameters.
 
@@ -101,16 +109,16 @@ def play(
     qpos = events.neutral(robots)
     std, record = noise_std(sensors), _Record()
     alive = np.ones((skill.ticks, robots), dtype=bool)
-    with closing(Physics(robots, feet, disturbances, threads, seed)) as physics:
+    with closing(Physics(robots, feet, disturbances, threads, seed, options)) as physics:
         physics.place(np.arange(robots), qpos, qpos[:, 7:])
-        delay = events.delays(robots, disturbances, rng)
+        delay = events.delays(robots, disturbances, rng, physics.options.timestep)
         x = physics.snapshot()
         controller.reset(measure(x, commands[0], std, rng))
         for tick, command in enumerate(commands):
             if stopped():
                 raise KeyboardInterrupt
             if skill.push and tick == _PUSH_TICK:
-                physics.qvel[:, :2] += events.kick(skill.push, events.directions(robots, rng))
+                physics.qvel[:, :2] += events.kick(skill.push, _directions(skill, robots, rng))
             state = measure(x, command, std, rng)
             physics.step(controller.step(state), delay)
             x = physics.snapshot()
@@ -118,6 +126,13 @@ def play(
             alive[tick:] &= ~_fallen(x)
             record.add(x, command, controller.stepping)
     return _judge(skill, commands, record, alive)
+
+
+def _directions(skill: Skill, robots: int, rng: np.random.Generator) -> Array:
+    """(N,) rad from the direction that the robots face."""
+    if skill.push_any:
+        return events.directions(robots, rng)
+    return np.asarray(rng.choice([0.0, np.pi], robots))
 
 
 def _require_valid(physics: Physics, alive: NDArray[np.bool_], where: str) -> None:
@@ -147,12 +162,14 @@ def _heading_from_world(forward: Array) -> Array:
 def _judge(skill: Skill, commands: Array, record: _Record, alive: NDArray[np.bool_]) -> Outcome:
     hands, targets = np.array(record.hands), np.array(record.targets)  # (T, N, 2, 3)
     height, velocity = np.array(record.height), np.array(record.velocity)
-    moves = commands[..., :2].any()
+    moves = commands[..., :3].any()
     counted = alive.copy()
     if skill.settled_only:
         counted &= (np.arange(len(commands)) % HOLD >= SETTLED)[:, None]
     elif moves:
         counted[:_WARM_UP] = False
+    torso = np.array(record.torso)
+    planned = (counted if moves else alive)[::CONTROLLER_TICKS_PER_PLAN]
     apart = np.linalg.norm(hands - targets, axis=-1).mean(axis=-1)
     off = np.abs(height - commands[..., -1])
     return Outcome(
@@ -162,11 +179,16 @@ def _judge(skill: Skill, commands: Array, record: _Record, alive: NDArray[np.boo
         if np.ptp(commands[..., 3:9], axis=0).any() and not skill.settled_only
         else _nothing(alive),
         height_error=_mean(off, counted),
-        velocity_error=_velocity_error(velocity, commands[..., :2], counted)
+        velocity_error=_velocity_error(velocity[..., :2], commands[..., :2], counted)
+        if moves
+        else _nothing(alive),
+        turning_error=_velocity_error(velocity[..., 2:], commands[..., 2:3], counted)
         if moves
         else _nothing(alive),
         head_top=_highest(np.array(record.head), counted) if moves else _nothing(alive),
         stepping=_mean(np.array(record.stepping), alive),
+        camera=_rotation(torso, planned, 1),
+        camera_8=_rotation(torso, planned, 8),
         torque_rms=relative_rms(np.array(record.torque), alive),
     )
 
@@ -180,6 +202,15 @@ def _mean(series: Array, counted: NDArray[np.bool_]) -> Array:
     number = counted.sum(axis=0)
     total = np.where(counted, np.nan_to_num(series), 0.0).sum(axis=0)
     return np.asarray(np.where(number > 0, total / np.maximum(number, 1), np.nan))
+
+
+def _rotation(torso: Array, counted: NDArray[np.bool_], apart: int) -> Array:
+    """Attitudes (P, N, 3, 3) at planner ticks -> (N, 3) px, mean rotation over ``apart`` ticks."""
+    if len(torso) <= apart:
+        return np.full((counted.shape[1], 3), np.nan)
+    turned = np.abs(camera.pixels(camera.rotation_vector(torso[:-apart], torso[apart:])))
+    both = counted[:-apart] & counted[apart:]
+    return np.stack([_mean(turned[..., axis], both) for axis in range(3)], axis=-1)
 
 
 def _highest(series: Array, counted: NDArray[np.bool_]) -> Array:
