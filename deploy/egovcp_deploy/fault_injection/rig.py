@@ -39,7 +39,7 @@ from egovcp_deploy.pilot.desk import Reply, Report
 from egovcp_deploy.pilot.states import Limits, Request, State
 from egovcp_deploy.robots.bridge import BridgeConfig
 from egovcp_deploy.robots.fake import FakeBridge, Faults, Ports
-from egovcp_deploy.robots.fake.command import Deadline
+from egovcp_deploy.robots.fake.command import Pace
 from egovcp_deploy.robots.wire import Garbled, decode_command
 from egovcp_deploy.robots.zmq_eye import ZmqEyeConfig
 
@@ -138,7 +138,7 @@ class FaultRig:
 
     # --- the robot's thread --------------------------------------------------------------
     def _simulate(self) -> None:
-        pace = Deadline(MonotonicClock())
+        pace = Pace(MonotonicClock())
         while not self._closing.is_set():
             for _ in range(pace.due()):
                 while self._tasks:

@@ -55,8 +55,8 @@ class CommandConfig:
     still_hands: float = bounded(0.2, least=0, most=1)
     """Share of commands whose hands rest; the others follow a random walk."""
     held_hands: float = bounded(0.4, least=0, most=1)
-    """Share of those random walks that step seldom and far, as `egovcp-collect --eta=1
-    --step_ticks=[5,15]` does; the others step at every planner tick, as the paper's."""
+    """Share of those random walks that hold each target for 5 to 15 planner steps; the others
+    change at every planner step, as in the paper."""
 
     def __post_init__(self) -> None:
         check_bounds(self)

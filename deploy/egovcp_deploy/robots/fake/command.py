@@ -125,7 +125,7 @@ def _live(config: FakeConfig, bridge: FakeBridge, stage: Stage) -> None:
         f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
         f"depth {ports.camera_port}; Ctrl-C ends it"
     )
-    words, pace, written = Console(), Deadline(MonotonicClock()), 0
+    words, pace, written = Console(), Pace(MonotonicClock()), 0
     while not stage.finished:
         for _ in range(pace.due()):
             stage.step()
@@ -139,7 +139,7 @@ def _live(config: FakeConfig, bridge: FakeBridge, stage: Stage) -> None:
             write_report(config.json, outcomes, durable=False)  # quickly: the robot waits
 
 
-class Deadline:
+class Pace:
     """How many steps of 5 ms are due on a clock."""
 
     def __init__(self, clock: Clock) -> None:
