@@ -102,33 +102,24 @@ class TensorFile:
         return parse_json(self.metadata[key])
 
     def require(
-        self,
-        shapes: Mapping[str, tuple[int, ...]],
-        dtypes: Collection[str] = ("F32",),
-        optional: Collection[str] = (),
+        self, shapes: Mapping[str, tuple[int, ...]], dtypes: Collection[str] = ("F32",)
     ) -> None:
         """Raise `UnsafeFileError` unless these tensors are in the file, and no others.
 
         Args:
             shapes: of the tensors, by name.
             dtypes: any of which a tensor may have.
-            optional: names of tensors that may be absent.
         """
-        self.require_names(shapes, dtypes, optional)
+        self.require_names(shapes, dtypes)
         for name, info in self.tensors.items():
             if info.shape != shapes[name]:
                 raise UnsafeFileError(
                     f"tensor {name} has shape {list(info.shape)}, expected {list(shapes[name])}"
                 )
 
-    def require_names(
-        self,
-        names: Collection[str],
-        dtypes: Collection[str] = ("F32",),
-        optional: Collection[str] = (),
-    ) -> None:
+    def require_names(self, names: Collection[str], dtypes: Collection[str] = ("F32",)) -> None:
         """The same for tensors of any shape."""
-        missing = [name for name in names if name not in self.tensors and name not in optional]
+        missing = [name for name in names if name not in self.tensors]
         unknown = [name for name in self.tensors if name not in names]
         if missing:
             raise UnsafeFileError(f"{_tensors(missing)} missing: {missing[0]}")

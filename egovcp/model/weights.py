@@ -26,7 +26,6 @@ MAX_WEIGHT_BYTES: Final = 512 << 20
 DTYPES: Final = ("F32", "F16", "BF16")
 """Of a tensor in the file; all are loaded as float32."""
 
-_OPTIONAL: Final = ("discount",)  # absent from files of earlier versions
 _POSITIVE: Final = ("state_std", "return_std")
 _BYTES: Final = 4  # of a float32
 
@@ -68,7 +67,7 @@ def load_model(
             the model answers an ordinary observation with something that is not finite.
     """
     file = TensorFile.parse(content)
-    file.require(shapes, DTYPES, _OPTIONAL)
+    file.require(shapes, DTYPES)
     try:
         weights = {name: tensor.float() for name, tensor in load(content).items()}
     except SafetensorError as error:
@@ -88,9 +87,9 @@ def _check_numbers(weights: Mapping[str, Tensor]) -> None:
     for name in _POSITIVE:
         if not (weights[name] > 0).all():
             raise UnsafeFileError(f"tensor {name} holds numbers that are not positive")
-    discount = weights.get("discount")
-    if discount is not None and not 0 <= float(discount) <= 1:
-        raise UnsafeFileError(f"tensor discount is {float(discount):g}, expected 0 to 1")
+    discount = float(weights["discount"])
+    if not 0 <= discount <= 1:
+        raise UnsafeFileError(f"tensor discount is {discount:g}, expected 0 to 1")
 
 
 @torch.inference_mode()

@@ -16,8 +16,6 @@ on the robot and replay; `imagine` advances it without an observation.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor, nn
 
@@ -48,11 +46,6 @@ class PosteriorHead(nn.Module):
     def forward(self, h: Tensor, embedding: Tensor) -> Tensor:
         logits: Tensor = self.rest(self.project_h(h) + embedding)
         return logits
-
-
-def _fill_discount(model: WorldModel, state: dict[str, Any], prefix: str, *unused: object) -> None:
-    """Weights that were saved before the discount was kept with them leave it as it is."""
-    state.setdefault(f"{prefix}discount", model.discount)
 
 
 class WorldModel(nn.Module):
@@ -89,7 +82,6 @@ class WorldModel(nn.Module):
         self.register_buffer("return_std", torch.ones(()))
         self.register_buffer("min_return", torch.zeros(()))
         self.register_buffer("discount", torch.tensor(spec.GAMMA))
-        self.register_load_state_dict_pre_hook(_fill_discount)  # type: ignore[no-untyped-call]
 
     def _value_head(self, outputs: int) -> SplitMlp:
         c = self.config

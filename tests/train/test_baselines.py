@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
 
 from egovcp.artefact import load_artefact
 from egovcp.errors import EgovcpError
 from egovcp.manifest import sealed
-from egovcp.model import Batch, WorldModel
+from egovcp.model import Batch
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.loop import Learner
 from egovcp_train.train import main
@@ -106,21 +106,6 @@ def test_the_artefact_says_what_it_is_and_plans(arguments: Arguments, tmp_path: 
     assert float(model.discount) == pytest.approx(0.9)
     assert artefact.planner.objective == "td"
     assert artefact.make_policy().prepare() is not None
-
-
-def test_weights_that_are_older_than_their_discount_leave_it_as_it_is(
-    plain: Path, tmp_path: Path
-) -> None:
-    state = _weights(plain)
-    del state["discount"]
-    save_file(state, tmp_path / "old.safetensors")
-    model = load_artefact(str(plain / "checkpoints/last/pretrained_model")).world_model
-    model.discount.fill_(0.5)
-    model.load_state_dict(load_file(tmp_path / "old.safetensors"))
-    assert float(model.discount) == 0.5
-    older = WorldModel(model.config)
-    older.load_state_dict(load_file(tmp_path / "old.safetensors"))
-    assert float(older.discount) == pytest.approx(0.97)
 
 
 def test_an_artefact_whose_planner_asks_for_rewards_it_does_not_know_is_refused(

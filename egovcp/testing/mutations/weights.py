@@ -76,7 +76,7 @@ def _swap_tensors(folder: Path, rng: Random) -> str:
 
 def _rename_a_tensor(folder: Path, rng: Random) -> str:
     def rename(tensors: dict[str, torch.Tensor]) -> None:
-        old = pick(rng, [k for k in tensors if k != "discount"])
+        old = pick(rng, list(tensors))
         tensors[pick(rng, [old.upper(), f"model.{old}", "", "\x1b[31m", "../" + old])] = (
             tensors.pop(old)
         )
@@ -87,7 +87,7 @@ def _rename_a_tensor(folder: Path, rng: Random) -> str:
 def _drop_or_add_a_tensor(folder: Path, rng: Random) -> str:
     def change(tensors: dict[str, torch.Tensor]) -> None:
         if rng.random() < 0.5:
-            del tensors[pick(rng, [k for k in tensors if k != "discount"])]
+            del tensors[pick(rng, list(tensors))]
         else:
             tensors["extra"] = torch.zeros(int(rng.integers(100)))
 
