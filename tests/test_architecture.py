@@ -1,8 +1,9 @@
-"""The walls of the house: who may import whom."""
+"""Import rules between packages."""
 
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -90,3 +91,11 @@ def test_what_drives_a_robot_reads_no_clock_that_can_be_set() -> None:
 def test_a_reading_of_the_wall_clock_would_be_found(tmp_path: Path) -> None:
     (tmp_path / "late.py").write_text("import time\nstart = time.time()\n")
     assert wall_clock_readings(tmp_path / "late.py") == ["late.py: time.time"]
+
+
+@pytest.mark.parametrize("package", ["model", "plan", "log", "robot"])
+def test_generic_packages_know_nothing_of_balls(package: str) -> None:
+    word = re.compile(r"\b(balls?|flights?|throws?|thrown)\b", re.IGNORECASE)
+    files = [p for p in (ROOT / "egovcp" / package).rglob("*") if p.suffix in {".py", ".c", ".h"}]
+    assert files
+    assert not [str(path) for path in files if word.search(path.read_text(encoding="utf-8"))]
