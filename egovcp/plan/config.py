@@ -37,7 +37,7 @@ class PlannerConfig:
     """Smallest sampling standard deviation, in units of eta."""
     eta: float = bounded(spec.ACTION_ETA, least=1e-4, most=2)
     """Largest action change per step, in units of the action box."""
-    hands_cost: float = bounded(0.02, least=0, most=1e6)
+    hands_cost: float = bounded(0.05, least=0, most=1e6)
     """Cost of hands away from the neutral pose: times the mean squared hand action, in units of
     return."""
     step_cost: float = bounded(0.2, least=0, most=1e6)

@@ -179,7 +179,7 @@ TRAINING_PRESETS: dict[str, dict[str, Any]] = {
     "paper": {
         "sampling": {"mirror": False},
         "optimizer": {"ema": 0.0},
-        "returns": {"keep_truncated": True},
+        "returns": {"keep_truncated": True, "steps": 50},
         "planner": asdict(PAPER_PLANNER),
     },
 }
