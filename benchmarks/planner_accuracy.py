@@ -75,7 +75,7 @@ class Trial:
             parts.append(self._reference.at(carry)(plans[rows], None))
         return torch.cat(parts)
 
-    def expand_candidates(self) -> Tensor:
+    def spread(self) -> Tensor:
         """Deviation (S,) of J among plans of the data's own process."""
         rng = torch.Generator().manual_seed(0)
         steps = 2 * torch.rand(1, 256, self._config.horizon, spec.ACTION_DIM, generator=rng) - 1
@@ -99,7 +99,7 @@ def main() -> None:
     config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))
     trial = Trial(model, config, *states(model, args.dataset, args.episodes, args.every))
     reference = trial.plans("eager", 1)
-    best, spread = trial.plan_value(reference[:, None])[:, 0], trial.expand_candidates()
+    best, spread = trial.plan_value(reference[:, None])[:, 0], trial.spread()
     figures: dict[str, object] = {"states": len(reference), "samples": args.samples}
     others = {name: trial.plans(name, 1) for name in BACKENDS}
     for name, plans in {**others, "other_draws": trial.plans("eager", 2)}.items():

@@ -70,7 +70,7 @@ class Learners:
             keep_freed_memory()
         torch.set_num_threads(threads)
         torch.manual_seed(0)
-        index = EpisodeIndex.of([open_dataset(root)], "train").expand_candidates(EPISODES)
+        index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
         store = EpisodeStore.read(index, returns)
         self._model = WorldModel(WorldModelConfig())
         set_normalisation(self._model, store)

@@ -105,7 +105,7 @@ def main() -> None:
         root = args.root or Path(folder) / "dataset"
         if args.root is None:
             write(root, [make_episode(i, 150) for i in range(EPISODES)])
-        index = EpisodeIndex.of([open_dataset(root)], "train").expand_candidates(EPISODES)
+        index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
         store = EpisodeStore.read(index, ReturnConfig(steps=args.return_steps))
         for size in args.batches:
             seconds = interleaved(cases(store, size, size in args.cpu_batches), args.rounds)

@@ -1,4 +1,4 @@
-"""Judges of plans that compute with a packed planning network."""
+"""Evaluators of plans that compute with packed networks."""
 
 from __future__ import annotations
 

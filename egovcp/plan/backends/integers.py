@@ -74,7 +74,7 @@ class IntegerNetwork:
         plans, steps, _ = actions.shape
         values = torch.empty(plans)
         actions, noise = actions.contiguous(), None if noise is None else noise.contiguous()
-        self._threads.evaluator(
+        self._threads.evaluate(
             network=ctypes.addressof(self._packed.network),
             root=ctypes.addressof(shared.description),
             rows=plans,

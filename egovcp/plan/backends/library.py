@@ -153,7 +153,7 @@ class Threads:
             for _ in range(self._kernel.lacking(self._address, self._others)):
                 self._pool.submit(self._kernel.help, self._address)
 
-    def evaluator(self, **job: int | None) -> None:
+    def evaluate(self, **job: int | None) -> None:
         """Returns when all have ended.
 
         Args:
@@ -163,7 +163,7 @@ class Threads:
             for name, value in job.items():
                 setattr(self._job, name, value)
             self.call()
-            self._kernel.evaluator(self._address)
+            self._kernel.evaluate(self._address)
 
 
 def processor_is_fast() -> bool:
@@ -204,7 +204,7 @@ def library() -> ctypes.CDLL:
             f"the int8 planner cannot be compiled or loaded ({error}); {OTHERWISE}"
         ) from error
     p, i = ctypes.c_void_p, ctypes.c_int32
-    for function in (kernel.evaluator, kernel.help):
+    for function in (kernel.evaluate, kernel.help):
         function.argtypes = [p]
         function.restype = None
     f = ctypes.c_float

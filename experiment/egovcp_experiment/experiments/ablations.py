@@ -31,7 +31,7 @@ CHOICES: Final[dict[str, Flags]] = {
     "state_summed": {"policy.loss.state": spec.STATE_DIM},
     "state_1": {"policy.loss.state": 1, "policy.loss.multistep_state": 1},
     "no_moving": {"policy.loss.motion_weight": 0},
-    "no_foresight": {"policy.loss.multistep_depth": 0, "policy.loss.multistep_state": 0},
+    "no_multistep": {"policy.loss.multistep_depth": 0, "policy.loss.multistep_state": 0},
     "no_near": {"policy.loss.proximity_weight": 0},
     "raw_returns": {"returns.scale": "none"},
     "value_mse": {"policy.value_loss": "mse"},

@@ -200,7 +200,7 @@ static void blocks(Job *job) {
 }
 
 /* All plans of a job are judged when this returns. */
-void evaluator(Job *job) {
+void evaluate(Job *job) {
     open_job(&job->crew);
     blocks(job);
     close_job(&job->crew);
