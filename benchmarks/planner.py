@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import deepcopy
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -25,7 +26,7 @@ from egovcp.model import Carry, WorldModel, WorldModelConfig
 from egovcp.plan import PlanEvaluator, PlannerConfig, Policy, make_plan, optimiser_of
 from egovcp.plan.action_parameterization import reflect
 from egovcp.plan.backends import make_evaluator
-from egovcp.plan.config import BackendName
+from egovcp.plan.config import PAPER_PLANNER, BackendName
 
 SIDE = 1024  # of the matrices of the plain product
 
@@ -122,7 +123,8 @@ def main() -> None:
     torch.manual_seed(0)
     model = WorldModel(WorldModelConfig()).eval().requires_grad_(False)
     torch.nn.init.normal_(model.value_head.rest[-1].weight, std=0.1)  # type: ignore[arg-type]
-    config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))
+    elites = min(64, args.samples // 4)
+    config = replace(PAPER_PLANNER, samples=args.samples, elites=elites, termination_rule="shift")
     h, z = torch.randn(1, model.config.hidden).tanh(), torch.randn(1, model.config.latent)
     carry = Carry(h, z)
     executed = torch.zeros(1, spec.ACTION_DIM)
