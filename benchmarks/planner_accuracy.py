@@ -18,7 +18,7 @@ from report import publish
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.data.arrays import open_dataset
 from egovcp.model import Carry, WorldModel
 from egovcp.plan import PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
@@ -88,14 +88,14 @@ def main() -> None:
     p = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    p.add_argument("--policy", required=True, help="folder of the artefact")
+    p.add_argument("--policy", required=True, help="folder of the artifact")
     p.add_argument("--dataset", required=True, help="folder of the dataset")
     p.add_argument("--episodes", type=int, default=20, help="the last ones of the dataset")
     p.add_argument("--every", type=int, default=4, help="a state of every so many rows")
     p.add_argument("--samples", type=int, default=1024, help="M")
     p.add_argument("--json", type=Path, help="also write the figures to this file")
     args = p.parse_args()
-    model = load_artefact(args.policy).world_model.requires_grad_(False)
+    model = load_artifact(args.policy).world_model.requires_grad_(False)
     config = PlannerConfig(samples=args.samples, elites=min(64, args.samples // 4))
     trial = Trial(model, config, *states(model, args.dataset, args.episodes, args.every))
     reference = trial.plans("eager", 1)

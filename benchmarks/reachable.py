@@ -28,7 +28,7 @@ from report import publish
 from true_state import Array, Columns, true_states
 
 from egovcp import spec
-from egovcp.artefact import Artefact, load_artefact
+from egovcp.artifact import Artifact, load_artifact
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.data.index import EpisodeIndex, require_mixable
@@ -111,7 +111,7 @@ class Case(NamedTuple):
 
     label: str
     returns: ReturnConfig
-    artefact: Artefact | None = None
+    artifact: Artifact | None = None
 
 
 class Outcome(NamedTuple):
@@ -159,11 +159,11 @@ def _cases(config: ReachableConfig, readers: Sequence[DatasetReader]) -> list[Ca
     paths = [config.policy.path] if config.policy.path else []
     found = []
     for number, path in enumerate([*paths, *config.policies], start=1):
-        artefact = load_artefact(path, config.policy.revision if number == 1 else "")
+        artifact = load_artifact(path, config.policy.revision if number == 1 else "")
         for reader in readers:
-            require_same_controller(artefact, reader)
-        returns = replace(returns_of(artefact), keep_truncated=False)
-        found.append(Case(f"policy{number}", returns, artefact))
+            require_same_controller(artifact, reader)
+        returns = replace(returns_of(artifact), keep_truncated=False)
+        found.append(Case(f"policy{number}", returns, artifact))
     if not found:
         found = [Case(f"k{k}", ReturnConfig(config.gamma, k)) for k in config.horizons]
     return [found[0]._replace(label="")] if len(found) == 1 else found
@@ -238,8 +238,8 @@ class _Task:
         target = target[valid]
         said = {"probe": guess.value}
         scores: dict[str, float | int | None] = {}
-        if case.artefact is not None:
-            said["value"] = values(case.artefact, self._heldout, case.returns)
+        if case.artifact is not None:
+            said["value"] = values(case.artifact, self._heldout, case.returns)
             q = torch.from_numpy(said["value"])
             scores = calibration(q, torch.from_numpy(target))
         episode = np.repeat(np.arange(len(self._judging.length)), self._judging.length)[valid]
@@ -285,10 +285,10 @@ def _inputs(task: str, columns: Columns) -> dict[str, Array]:
 
 
 @torch.no_grad()
-def values(artefact: Artefact, heldout: EpisodeIndex, returns: ReturnConfig) -> Array:
+def values(artifact: Artifact, heldout: EpisodeIndex, returns: ReturnConfig) -> Array:
     """Q of the recorded actions on the rows whose return is complete, episodes filtered from
     their start as on the robot."""
-    model = artefact.world_model.eval()
+    model = artifact.world_model.eval()
     store, found = EpisodeStore.read(heldout, returns), []
     for which in np.split(np.arange(len(store.length)), range(AT_ONCE, len(store.length), AT_ONCE)):
         arrays = gather(store, store.start[which], which, int(store.length[which].max()))

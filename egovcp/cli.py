@@ -5,7 +5,7 @@ A command is a dataclass of its options and a function that takes it::
     def main(argv: Sequence[str] | None = None) -> int:
         return run_command(CollectConfig, collect, argv, prog="egovcp-collect")
 
-Exit codes: 0 done, 2 usage, 3 data, 4 artefact, 5 environment, 6 safety stop; 130
+Exit codes: 0 done, 2 usage, 3 data, 4 artifact, 5 environment, 6 safety stop; 130
 after an interrupt. A traceback is printed only with ``--debug``.
 """
 

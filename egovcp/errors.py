@@ -57,8 +57,8 @@ class SimulationDiverged(DataError):
     """The physics of an episode left the range of real robots; the episode is not valid data."""
 
 
-class ArtefactError(EgovcpError):
-    """A policy artefact is missing, tampered with, or of another spec."""
+class ArtifactError(EgovcpError):
+    """A policy artifact is missing, tampered with, or of another spec."""
 
     exit_code = 4
 

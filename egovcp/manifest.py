@@ -1,6 +1,6 @@
-"""The manifest of a policy artefact: which files it has, and where the policy comes from.
+"""The manifest of a policy artifact: which files it has, and where the policy comes from.
 
-The SHA-256 of every file is in the manifest, and so is the manifest's own: nothing in an artefact
+The SHA-256 of every file is in the manifest, and so is the manifest's own: nothing in an artifact
 changes unnoticed. Whoever can write the files can also write the digests, so that every value is
 checked all the same.
 """
@@ -18,7 +18,7 @@ from typing import Any, Final
 from egovcp import spec
 from egovcp.atomic import write_text
 from egovcp.decode import DecodeError, require_type, shown
-from egovcp.errors import ArtefactError
+from egovcp.errors import ArtifactError
 from egovcp.safe_files import UnsafeFileError, read_json
 
 SCHEMA_VERSION: Final = 2
@@ -50,7 +50,7 @@ _DATASET_TYPES: Final[Mapping[str, Any]] = {
 
 
 def feature_spec() -> dict[str, Any]:
-    """What an artefact reads and writes: names, shapes and the action box."""
+    """What an artifact reads and writes: names, shapes and the action box."""
     return {
         "spec_version": spec.SPEC_VERSION,
         "planner_hz": spec.PLANNER_HZ,
@@ -77,12 +77,12 @@ def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
     """Seal a manifest and write it.
 
     Raises:
-        ArtefactError: it holds NaN or an infinite number.
+        ArtifactError: it holds NaN or an infinite number.
     """
     try:
         content = sealed(manifest)
     except ValueError as error:
-        raise ArtefactError(
+        raise ArtifactError(
             f"{folder / MANIFEST}: a number is NaN or infinite ({error}); expected finite numbers"
         ) from error
     write_json_file(folder / MANIFEST, content)
@@ -92,26 +92,26 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """Read a manifest and check everything but the digests of the files.
 
     Raises:
-        ArtefactError: it is missing, damaged, or made for another feature spec.
+        ArtifactError: it is missing, damaged, or made for another feature spec.
     """
     path = folder / MANIFEST
     manifest = read_object(path)
     found = manifest.get("schema_version")
     if found != SCHEMA_VERSION or isinstance(found, bool):
-        raise ArtefactError(
+        raise ArtifactError(
             f"{path}: schema version {shown(found)}, this egovcp reads {SCHEMA_VERSION}; install "
             "the version that made it, or train again"
         )
     _check_features(path, manifest.get("features"))
     if manifest.get(SEAL) != sealed(manifest)[SEAL]:
-        raise ArtefactError(
+        raise ArtifactError(
             f"{path}: its SHA-256 is not the one that it names; it was changed or damaged: fetch "
             "it again"
         )
     try:
         _check_types(manifest)
     except DecodeError as error:
-        raise ArtefactError(f"{path}: {error}; the file is damaged") from error
+        raise ArtifactError(f"{path}: {error}; the file is damaged") from error
     return manifest
 
 
@@ -121,7 +121,7 @@ def _check_features(path: Path, features: Any) -> None:
         return
     found = features if isinstance(features, dict) else {}
     differing = [k for k in expected if found.get(k) != expected[k]]
-    raise ArtefactError(
+    raise ArtifactError(
         f"{path}: made for another feature spec (differs in "
         f"{', '.join(differing) or 'extra keys'}); train again on data of this version"
     )
@@ -151,33 +151,33 @@ def finite_or_null(value: Any) -> Any:
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """The object in a JSON file of an artefact.
+    """The object in a JSON file of an artifact.
 
     Raises:
-        ArtefactError: the file is missing, not a regular file, too large, not plain JSON, or holds
+        ArtifactError: the file is missing, not a regular file, too large, not plain JSON, or holds
             something else.
     """
     try:
         content = read_json(path)
     except OSError as error:
-        raise ArtefactError(f"{path}: {error.strerror}; not a policy artefact") from error
+        raise ArtifactError(f"{path}: {error.strerror}; not a policy artifact") from error
     except UnsafeFileError as error:
-        raise ArtefactError(f"{path}: {error}; the file is damaged") from error
+        raise ArtifactError(f"{path}: {error}; the file is damaged") from error
     if not isinstance(content, dict):
-        raise ArtefactError(f"{path}: expected a JSON object, found {shown(content)}")
+        raise ArtifactError(f"{path}: expected a JSON object, found {shown(content)}")
     return content
 
 
 def write_json_file(path: Path, content: Mapping[str, Any]) -> None:
-    """Write a JSON file of an artefact.
+    """Write a JSON file of an artifact.
 
     Raises:
-        ArtefactError: it holds NaN or an infinite number.
+        ArtifactError: it holds NaN or an infinite number.
     """
     try:
         text = json.dumps(content, indent=2, allow_nan=False)
     except ValueError as error:
-        raise ArtefactError(
+        raise ArtifactError(
             f"{path}: a number is NaN or infinite ({error}); expected finite numbers"
         ) from error
     write_text(path, text + "\n")

@@ -1,10 +1,10 @@
-"""Options that name a policy artefact and change its planner, for every command that plays."""
+"""Options that name a policy artifact and change its planner, for every command that plays."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 
-from egovcp.artefact import Artefact, load_artefact
+from egovcp.artifact import Artifact, load_artifact
 from egovcp.bounds import OutOfBounds, bounded
 from egovcp.errors import UsageError
 from egovcp.plan import PlannerConfig, require_answers
@@ -21,23 +21,23 @@ from egovcp.plan.cost import require_affordable
 
 @dataclass(frozen=True)
 class PolicyOptions:
-    """Which policy artefact."""
+    """Which policy artifact."""
 
     path: str = ""
-    """Folder of the artefact, or its Hub id `user/name`."""
+    """Folder of the artifact, or its Hub id `user/name`."""
     revision: str = ""
     """Branch, tag or commit SHA on the Hub; empty: the latest."""
 
     def require(self, otherwise: str = "") -> None:
-        """Raise `UsageError`, which offers to do ``otherwise``, unless an artefact is named."""
+        """Raise `UsageError`, which offers to do ``otherwise``, unless an artifact is named."""
         if not self.path:
             offer = f", or {otherwise}" if otherwise else ""
-            raise UsageError(f"--policy.path is missing; name the artefact{offer}")
+            raise UsageError(f"--policy.path is missing; name the artifact{offer}")
 
 
 @dataclass(frozen=True)
 class PlannerOptions:
-    """Changes to the artefact's own planner; what is not given stays as it is there."""
+    """Changes to the artifact's own planner; what is not given stays as it is there."""
 
     samples: int | None = bounded(None, least=1, most=2**20)
     """M, candidate plans per iteration."""
@@ -82,17 +82,17 @@ class PlannerOptions:
             raise error.under("--planner.") from error
 
 
-def load_policy(policy: PolicyOptions, planner: PlannerOptions) -> Artefact:
-    """The artefact, whose planner is changed as the options say.
+def load_policy(policy: PolicyOptions, planner: PlannerOptions) -> Artifact:
+    """The artifact, whose planner is changed as the options say.
 
     Raises:
-        ArtefactError: missing, tampered with, or made for another feature spec.
+        ArtifactError: missing, tampered with, or made for another feature spec.
         EnvironmentFailure: the Hub cannot be reached.
         UsageError: the planner's numbers do not go together, a plan would take too long or too
             much memory, or it asks what the model never learned.
     """
-    artefact = load_artefact(policy.path, policy.revision)
-    changed = planner.apply(artefact.planner)
-    require_answers(artefact.world_model.config, changed)
-    require_affordable(artefact.world_model.config, changed)
-    return replace(artefact, planner=changed)
+    artifact = load_artifact(policy.path, policy.revision)
+    changed = planner.apply(artifact.planner)
+    require_answers(artifact.world_model.config, changed)
+    require_affordable(artifact.world_model.config, changed)
+    return replace(artifact, planner=changed)

@@ -29,7 +29,7 @@ from egovcp import spec
 from egovcp.atomic import write_bytes
 from egovcp.bounds import bounded, check_bounds
 from egovcp.decode import decode, shown
-from egovcp.errors import ArtefactError
+from egovcp.errors import ArtifactError
 from egovcp.model.depth import nearness
 from egovcp.plan import PolicyStep
 from egovcp.tensor_file import TensorFile, read_tensor_file
@@ -131,26 +131,26 @@ class ReactiveNetwork:
         """Read and check a file.
 
         Raises:
-            ArtefactError: missing, damaged, or of another schema.
+            ArtifactError: missing, damaged, or of another schema.
         """
         if not os.path.lexists(path):
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{path}: no such policy; expected a .safetensors file that egovcp-train-ppo wrote"
             )
         try:
             return cls._from(read_tensor_file(path, _LIMIT_BYTES))
         except OSError as error:
-            raise ArtefactError(f"{path}: {error.strerror}; it cannot be read") from error
+            raise ArtifactError(f"{path}: {error.strerror}; it cannot be read") from error
         except (SafetensorError, ValueError) as error:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{path}: not a policy of schema {SCHEMA} ({error}); train one with "
                 "egovcp-train-ppo"
             ) from error
 
     def require_controller(self, controller_id: str) -> None:
-        """Raise `ArtefactError` unless the robot has the controller it was trained with."""
+        """Raise `ArtifactError` unless the robot has the controller it was trained with."""
         if controller_id != self.controller_id:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"this policy was trained with the low-level controller {self.controller_id}, the "
                 f"robot has {controller_id}; choose its --env.controller, or train again"
             )

@@ -12,9 +12,9 @@ import egovcp_deploy.evaluate
 import egovcp_train.export
 import egovcp_train.heldout.command
 import egovcp_train.push
-from egovcp.artefact import CONFIG, save_artefact
+from egovcp.artifact import CONFIG, save_artifact
 from egovcp.data import DatasetWriter, Provenance
-from egovcp.errors import ArtefactError
+from egovcp.errors import ArtifactError
 from egovcp.plan import PlannerConfig
 from egovcp.testing import random_episode, toy_model
 from egovcp.testing.mutations.editing import edit_json, edit_tensors
@@ -43,7 +43,7 @@ def _huge_plan(folder: Path) -> str:
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("policy") / "policy"
-    save_artefact(path, toy_model(), PlannerConfig(), {"controller_id": "stance-1"})
+    save_artifact(path, toy_model(), PlannerConfig(), {"controller_id": "stance-1"})
     return path
 
 
@@ -81,7 +81,7 @@ def test_a_damaged_policy_is_refused_by_lerobot(
     modeling = pytest.importorskip("lerobot_policy_egovcp.modeling_egovcp")
     folder = Path(shutil.copytree(original, tmp_path / "policy"))
     file = damage(folder)
-    with pytest.raises(ArtefactError, match=file):
+    with pytest.raises(ArtifactError, match=file):
         modeling.EgovcpPolicy.from_pretrained(folder)
 
 

@@ -57,18 +57,18 @@ class OperatorOptions:
 
 @dataclass(frozen=True)
 class DeployConfig:
-    """Drive a robot with a policy artefact at 25 Hz and record each rollout.
+    """Drive a robot with a policy artifact at 25 Hz and record each rollout.
 
-    --controller=oracle shows how a task is solved, with no artefact at all.
+    --controller=oracle shows how a task is solved, with no artifact at all.
     """
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
-    """The policy artefact; not needed without the controller `planner`."""
+    """The policy artifact; not needed without the controller `planner`."""
     controller: str = PLANNER
-    """Who drives: planner, or in simulation a reference that needs no artefact: hold (neutral
+    """Who drives: planner, or in simulation a reference that needs no artifact: hold (neutral
     pose), random (the paper's walk) or oracle (scripted, sees the truth)."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
-    """Changes to the artefact's planner."""
+    """Changes to the artifact's planner."""
     robot: RobotOptions = field(default_factory=RobotOptions)
     """The robot."""
     operator: OperatorOptions = field(default_factory=OperatorOptions)

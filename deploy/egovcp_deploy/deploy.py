@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.cli import run_command
 from egovcp.errors import EgovcpError, UsageError
 from egovcp.packages import SIMULATOR_MODULES, require_packages
@@ -50,7 +50,7 @@ def deploy(config: DeployConfig) -> None:
 
     Raises:
         UsageError: an option makes no sense, or the folder holds results.
-        ArtefactError: the artefact is missing, damaged, or not made for this robot.
+        ArtifactError: the artifact is missing, damaged, or not made for this robot.
         EnvironmentFailure: simulator, robot, camera or disk fail.
         SafetyStop: the motors were damped for safety.
     """
@@ -59,17 +59,17 @@ def deploy(config: DeployConfig) -> None:
         dry_run.conclude(_findings(config))
         return
     planned = config.controller == PLANNER
-    artefact = load_policy(config.policy, config.planner) if planned else None
+    artifact = load_policy(config.policy, config.planner) if planned else None
     if config.robot.type == SIM and not config.realtime:
-        play_rollouts(config, artefact)
+        play_rollouts(config, artifact)
         return
-    assert artefact is not None, "checked: all else is driven by the planner"
+    assert artifact is not None, "checked: all else is driven by the planner"
     if config.robot.type == REPLAY:
-        replay(config, artefact)
+        replay(config, artifact)
     elif config.robot.type == SIM:
-        drive_simulated(config, artefact)
+        drive_simulated(config, artifact)
     else:
-        drive(config, artefact)
+        drive(config, artifact)
 
 
 def _check(config: DeployConfig) -> None:
@@ -103,30 +103,30 @@ def _check(config: DeployConfig) -> None:
 def _findings(config: DeployConfig) -> Iterator[dry_run.Finding]:
     """All that a run needs, each looked at even if another fails."""
     yield dry_run.examine("disk", lambda: dry_run.disk(Path(config.output_dir)))
-    artefact: Artefact | None = None
+    artifact: Artifact | None = None
     if config.controller == PLANNER:
         try:
-            artefact = load_policy(config.policy, config.planner)
+            artifact = load_policy(config.policy, config.planner)
         except EgovcpError as error:
             yield dry_run.Finding("policy", "", error)
         else:
-            made_for = f"{artefact.path}, for the controller {artefact.controller_id}"
-            policy = artefact.make_policy(1, config.seed)
+            made_for = f"{artifact.path}, for the controller {artifact.controller_id}"
+            policy = artifact.make_policy(1, config.seed)
             yield dry_run.Finding("policy", made_for)
             yield dry_run.examine("planner", lambda: dry_run.plan_time(policy))
     if config.robot.type == SIM:
-        yield dry_run.examine("robot", lambda: _simulated(config, artefact))
+        yield dry_run.examine("robot", lambda: _simulated(config, artifact))
     elif config.robot.type == REPLAY:
-        yield dry_run.examine("recordings", lambda: _recorded(config, artefact))
+        yield dry_run.examine("recordings", lambda: _recorded(config, artifact))
     else:
-        yield from examine_hardware(config, artefact)
+        yield from examine_hardware(config, artifact)
 
 
-def _simulated(config: DeployConfig, artefact: Artefact | None) -> str:
+def _simulated(config: DeployConfig, artifact: Artifact | None) -> str:
     robot = make_robot(config)
     try:
-        if artefact is not None:
-            artefact.require_controller(robot.controller_id)
+        if artifact is not None:
+            artifact.require_controller(robot.controller_id)
         robot.start(0)
         robot.observe()
         return f"simulated, with the controller {robot.controller_id}"
@@ -134,10 +134,10 @@ def _simulated(config: DeployConfig, artefact: Artefact | None) -> str:
         robot.close()
 
 
-def _recorded(config: DeployConfig, artefact: Artefact | None) -> str:
+def _recorded(config: DeployConfig, artifact: Artifact | None) -> str:
     robot = open_recordings(Path(config.robot.recordings))
-    if artefact is not None:
-        artefact.require_controller(robot.controller_id)
+    if artifact is not None:
+        artifact.require_controller(robot.controller_id)
     return f"{robot.count}, of a robot with the controller {robot.controller_id}"
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.errors import EnvironmentFailure
 from egovcp.hardware import available_cores
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
@@ -58,11 +58,11 @@ class Group:
 
 
 class Player:
-    """Plays groups in this process; environments and the artefact are kept between groups."""
+    """Plays groups in this process; environments and the artifact are kept between groups."""
 
-    def __init__(self, setup: Setup, artefact: Artefact | None = None) -> None:
+    def __init__(self, setup: Setup, artifact: Artifact | None = None) -> None:
         self._setup = setup
-        self._artefact = artefact
+        self._artifact = artifact
         self._envs: dict[int, VectorEnv] = {}
         self._planned: dict[tuple[str, int], Planned] = {}
 
@@ -90,9 +90,9 @@ class Player:
         setup = self._setup
         if controller == PPO:
             return ReactivePolicy(ReactiveNetwork.load(Path(setup.ppo)), robots)
-        if self._artefact is None:
-            self._artefact = load_policy(setup.policy, setup.planner)
-        return self._artefact.make_policy(robots, setup.seed)
+        if self._artifact is None:
+            self._artifact = load_policy(setup.policy, setup.planner)
+        return self._artifact.make_policy(robots, setup.seed)
 
 
 def play(
@@ -162,7 +162,7 @@ class Stage:
     Args:
         setup: what all groups share.
         num_workers: processes; 1 plays in this process, 0 takes one per processor core.
-        artefact: what `load_policy` makes of the setup; spares this process loading it again.
+        artifact: what `load_policy` makes of the setup; spares this process loading it again.
         stopped: once it returns true, the episodes that are being played are given up.
     """
 
@@ -170,11 +170,11 @@ class Stage:
         self,
         setup: Setup,
         num_workers: int = 0,
-        artefact: Artefact | None = None,
+        artifact: Artifact | None = None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         self._workers = num_workers or available_cores()
-        self._player = Player(setup, artefact)
+        self._player = Player(setup, artifact)
         self._setup = setup
         self._stopped = stopped
         self._executor: ProcessPoolExecutor | None = None

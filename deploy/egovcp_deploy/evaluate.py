@@ -12,7 +12,7 @@ from typing import Any, Final
 import draccus
 from tqdm import tqdm
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.atomic import write_json
 from egovcp.bounds import MOST_PER_CORE, bounded, check_bounds
 from egovcp.cli import run_command
@@ -81,9 +81,9 @@ class EvalConfig:
     """Play held-out scenarios with the planner and with references; print and save figures."""
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
-    """The policy artefact; not needed without the controller `planner`."""
+    """The policy artifact; not needed without the controller `planner`."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
-    """Changes to the artefact's planner."""
+    """Changes to the artifact's planner."""
     task: str = "ball"
     """ball, wall, arch, all (these three), or sequence: several in one episode, by default
     [arch, ball] (--env.sequence.parts)."""
@@ -151,7 +151,7 @@ def evaluate(config: EvalConfig) -> None:
     Raises:
         UsageError: an option makes no sense, or the folder holds results.
         DataError: ``--constant.path`` cannot be used.
-        ArtefactError: the artefact, or the policy of --ppo.path, is missing, damaged, or of another
+        ArtifactError: the artifact, or the policy of --ppo.path, is missing, damaged, or of another
             low-level controller.
         EnvironmentFailure: the backend of the planner cannot be used here, or a worker was killed.
         KeyboardInterrupt: after SIGINT or SIGTERM.
@@ -159,16 +159,16 @@ def evaluate(config: EvalConfig) -> None:
     config.check()
     config = replace(config, env=decided(config.env))
     constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
-    artefact = _load_policy(config)
+    artifact = _load_policy(config)
     ppo = _load_ppo(config)
-    backend = _prepare_planner(artefact, config.seed)
+    backend = _prepare_planner(artifact, config.seed)
     folder = make_output_dir(config.output_dir)
     setup = Setup(config.env, config.policy, config.planner, config.seed, config.ppo.path)
     scores: Scores = {task: {name: [] for name in config.players} for task in config.tasks}
     try:
         with (
             stop_on_signal() as received,
-            closing(Stage(setup, config.num_workers, artefact, lambda: bool(received))) as stage,
+            closing(Stage(setup, config.num_workers, artifact, lambda: bool(received))) as stage,
         ):
             if "constant" in config.players:
                 constants = _find_constants(config, stage, constants)
@@ -179,7 +179,7 @@ def evaluate(config: EvalConfig) -> None:
             _require_going_on(received)
     finally:
         if played := _with_episodes(scores):
-            record = _record(config, artefact, ppo, constants, played)
+            record = _record(config, artifact, ppo, constants, played)
             _report(folder, config, {"backend": backend, **record}, played)
 
 
@@ -231,19 +231,19 @@ def _is_complete(config: EvalConfig, scores: Scores) -> bool:
     return count == len(config.tasks) * len(config.players) * config.episodes
 
 
-def _load_policy(config: EvalConfig) -> Artefact | None:
+def _load_policy(config: EvalConfig) -> Artifact | None:
     if "planner" not in config.players:
         return None
-    artefact = load_policy(config.policy, config.planner)
-    artefact.require_controller(make_controller(config.env.controller).id)
-    return artefact
+    artifact = load_policy(config.policy, config.planner)
+    artifact.require_controller(make_controller(config.env.controller).id)
+    return artifact
 
 
-def _prepare_planner(artefact: Artefact | None, seed: int) -> str:
+def _prepare_planner(artifact: Artifact | None, seed: int) -> str:
     """What computes the plans; compiled here, once, before workers need it. Empty: no planner."""
-    if artefact is None:
+    if artifact is None:
         return ""
-    policy = artefact.make_policy(1, seed)
+    policy = artifact.make_policy(1, seed)
     policy.prepare()
     return backend_of(policy)
 
@@ -327,7 +327,7 @@ def _so_far(scores: Scores) -> str:
 
 def _record(
     config: EvalConfig,
-    artefact: Artefact | None,
+    artifact: Artifact | None,
     ppo: ReactiveNetwork | None,
     constants: dict[str, BestConstant],
     scores: Scores,
@@ -336,7 +336,7 @@ def _record(
     return {
         "complete": _is_complete(config, scores),
         "config": draccus.encode(_with_absolute_paths(config)),
-        "artefact": artefact.manifest if artefact else None,
+        "artifact": artifact.manifest if artifact else None,
         "ppo": dict(ppo.provenance) if ppo else None,
         "low_level_controller": make_controller(config.env.controller).id,
         "versions": versions(),

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.log.background import BackgroundFanout, BackgroundSink
 from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.live import LiveRerun
@@ -94,11 +94,11 @@ def run_info(
     camera: CameraView,
     config: Mapping[str, Any],
     controller_id: str,
-    artefact: Artefact | None,
+    artifact: Artifact | None,
     backend: str,
 ) -> RunInfo:
     """The first record of a log. ``config`` holds JSON values, ``backend`` see `backend_of`."""
-    files = artefact.manifest["files"] if artefact else {}
+    files = artifact.manifest["files"] if artifact else {}
     return RunInfo(
         task=task,
         seed=seed,

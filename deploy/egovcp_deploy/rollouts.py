@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tqdm import tqdm
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.atomic import write_json
 from egovcp.log.info import RunInfo
 from egovcp.log.tick import Tick
@@ -30,41 +30,41 @@ if TYPE_CHECKING:
     from egovcp_deploy.robots.sim import SimRobot
 
 
-def play_rollouts(config: DeployConfig, artefact: Artefact | None) -> None:
+def play_rollouts(config: DeployConfig, artifact: Artifact | None) -> None:
     """Play and record; whatever ends it, the rollouts that came to their end are summed up.
 
     Raises:
-        ArtefactError: the artefact is not made for this robot.
+        ArtifactError: the artifact is not made for this robot.
         EnvironmentFailure: the simulator is not installed.
     """
     robot = make_robot(config)
     try:
         config = replace(config, env=robot.env.config)  # as decided for its controller
-        _play(config, artefact, robot, _make_policy(config, artefact, robot))
+        _play(config, artifact, robot, _make_policy(config, artifact, robot))
     finally:
         robot.close()
 
 
-def replay(config: DeployConfig, artefact: Artefact) -> None:
+def replay(config: DeployConfig, artifact: Artifact) -> None:
     """Let the policy watch what was recorded; at most ``episodes`` of the recordings.
 
     Raises:
-        ArtefactError: the artefact is not made for the robot that was recorded.
+        ArtifactError: the artifact is not made for the robot that was recorded.
         UsageError, DataError: there is nothing to play back, or it is damaged.
     """
     robot = open_recordings(Path(config.robot.recordings))
-    artefact.require_controller(robot.controller_id)
+    artifact.require_controller(robot.controller_id)
     config = replace(config, episodes=min(config.episodes, robot.count))
-    _play(config, artefact, robot, artefact.make_policy(1, config.seed))
+    _play(config, artifact, robot, artifact.make_policy(1, config.seed))
 
 
-def _make_policy(config: DeployConfig, artefact: Artefact | None, robot: SimRobot) -> RolloutPolicy:
-    if artefact is None:
+def _make_policy(config: DeployConfig, artifact: Artifact | None, robot: SimRobot) -> RolloutPolicy:
+    if artifact is None:
         from egovcp_deploy.controllers import Scripted, reference
 
         return Scripted(reference(config.controller), robot)
-    artefact.require_controller(robot.controller_id)
-    return artefact.make_policy(1, config.seed)
+    artifact.require_controller(robot.controller_id)
+    return artifact.make_policy(1, config.seed)
 
 
 def make_robot(config: DeployConfig) -> SimRobot:
@@ -75,11 +75,11 @@ def make_robot(config: DeployConfig) -> SimRobot:
 
 
 def _play(
-    config: DeployConfig, artefact: Artefact | None, robot: Robot, policy: RolloutPolicy
+    config: DeployConfig, artifact: Artifact | None, robot: Robot, policy: RolloutPolicy
 ) -> None:
     """Record one rollout after the other and, whatever ends them, sum up the complete ones."""
     thinker = Thinker(policy, config.imagine)
-    if artefact is not None:
+    if artifact is not None:
         thinker.warm_up()
     folder = make_output_dir(config.output_dir)
     clock = LockstepClock()
@@ -91,19 +91,19 @@ def _play(
         with tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar:
             for episode in range(config.episodes):
                 robot.start(episode)
-                info = _info(config, artefact, robot, episode, backend)
+                info = _info(config, artifact, robot, episode, backend)
                 with recording(folder, episode, info, config.log, waits=True) as sink:
                     summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))
                 bar.update(1)
     finally:
         if summaries:
-            report = _report(config, artefact, robot, backend, summaries)
+            report = _report(config, artifact, robot, backend, summaries)
             write_json(folder / "deploy.json", report)
             _print(summaries, folder)
 
 
 def _info(
-    config: DeployConfig, artefact: Artefact | None, robot: Robot, episode: int, backend: str
+    config: DeployConfig, artifact: Artifact | None, robot: Robot, episode: int, backend: str
 ) -> RunInfo:
     return run_info(
         config.task,
@@ -112,7 +112,7 @@ def _info(
         robot.camera,
         config.encoded(),
         robot.controller_id,
-        artefact,
+        artifact,
         backend,
     )
 
@@ -125,7 +125,7 @@ def _show(bar: Any, tick: Tick) -> None:
 
 def _report(
     config: DeployConfig,
-    artefact: Artefact | None,
+    artifact: Artifact | None,
     robot: Robot,
     backend: str,
     summaries: Sequence[RolloutSummary],
@@ -137,7 +137,7 @@ def _report(
         "success_rate": float(np.mean([summary.success for summary in summaries])),
         "rollouts": [_row(i, summary) for i, summary in enumerate(summaries)],
         "config": config.encoded(),
-        "artefact": artefact.manifest["files"] if artefact else None,
+        "artifact": artifact.manifest["files"] if artifact else None,
         "low_level_controller": robot.controller_id,
         "backend": backend,
         "versions": versions(),

@@ -1,7 +1,7 @@
 """Public conformance checks: does a part keep its contract with the others?
 
     check_world_model(model)     recurrence, reset, batching and shapes of a world model
-    check_artefact(path)         a policy artefact loads, conforms and plans
+    check_artifact(path)         a policy artifact loads, conforms and plans
     check_env(env, scenarios)    clock, reset, repeatability and limits of an environment
     check_dataset(config)        every episode reads, and its commands line up in time
 
@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING
 from egovcp.errors import ConformanceError
 
 if TYPE_CHECKING:
-    from egovcp.checks.artefact import check_artefact
+    from egovcp.checks.artifact import check_artifact
     from egovcp.checks.dataset import check_dataset
     from egovcp.checks.environment import check_env
     from egovcp.checks.world_model import check_world_model
 
 __all__ = [
     "ConformanceError",
-    "check_artefact",
+    "check_artifact",
     "check_dataset",
     "check_env",
     "check_world_model",
@@ -31,7 +31,7 @@ __all__ = [
 
 #: Each check is imported when it is asked for: whoever checks a dataset need not wait for torch.
 _MODULES = {
-    "check_artefact": "artefact",
+    "check_artifact": "artifact",
     "check_dataset": "dataset",
     "check_env": "environment",
     "check_world_model": "world_model",

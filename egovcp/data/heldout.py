@@ -1,4 +1,4 @@
-"""Which episodes are held out, in a form that is short enough for the artefact they judge."""
+"""Which episodes are held out, in a form that is short enough for the artifact they judge."""
 
 from __future__ import annotations
 

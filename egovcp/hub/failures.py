@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final, Literal
 
 from egovcp.errors import (
-    ArtefactError,
+    ArtifactError,
     DataError,
     EgovcpError,
     EnvironmentFailure,
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 type RepoType = Literal["dataset", "model"]
 """What a repository of the Hub holds; the two have their ids apart from each other."""
 
-_MISSING: Final[dict[RepoType, type[EgovcpError]]] = {"dataset": DataError, "model": ArtefactError}
+_MISSING: Final[dict[RepoType, type[EgovcpError]]] = {"dataset": DataError, "model": ArtifactError}
 
 
 class LostUpdate(EnvironmentFailure):
@@ -39,7 +39,7 @@ def explained(
 
     Raises:
         DataError: there is no such dataset or revision.
-        ArtefactError: there is no such model or revision.
+        ArtifactError: there is no such model or revision.
         UsageError: the id is not one.
         EnvironmentFailure: no network, no access, no space, or no sensible answer.
     """

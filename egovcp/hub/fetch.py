@@ -61,7 +61,7 @@ def snapshot(
 
     Raises:
         DataError: there is no such dataset or revision.
-        ArtefactError: there is no such model or revision.
+        ArtifactError: there is no such model or revision.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
     from huggingface_hub import snapshot_download

@@ -54,7 +54,7 @@ class RunInfo:
     config: Mapping[str, object] = field(default_factory=dict)
     """Resolved configuration of the run; JSON values."""
     hashes: Mapping[str, str] = field(default_factory=dict)
-    """Identities: artefact files, low-level controller, dataset."""
+    """Identities: artifact files, low-level controller, dataset."""
     versions: Mapping[str, str] = field(default_factory=dict)
     """Distribution name -> version."""
     backend: str = ""

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Final, Literal, Self
 
 from egovcp.errors import EnvironmentFailure
-from egovcp.lifeline import command
 from egovcp.log.destination import GRPC_PORT, LOOPBACK, Viewer
+from egovcp.parent_death import command
 
 WEB_PORT: Final = 9090
 _START_TIMEOUT_S: Final = 30.0

@@ -34,7 +34,7 @@ def load_walk_policy(which: str) -> WalkPolicy:
 
     Raises:
         UsageError: neither.
-        ArtefactError: the file cannot be used.
+        ArtifactError: the file cannot be used.
     """
     if which == WALK:
         with resources.as_file(resources.files("egovcp.robot").joinpath(_SHIPPED)) as path:
@@ -51,7 +51,7 @@ def make_controller(which: str) -> LowLevelController:
 
     Raises:
         UsageError: neither.
-        ArtefactError: the file cannot be used.
+        ArtifactError: the file cannot be used.
         EnvironmentFailure: onnxruntime is not installed.
     """
     if which == STANCE:

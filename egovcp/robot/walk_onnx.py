@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from egovcp.bounds import check_bounds
 from egovcp.decode import decode, require_type, shown
-from egovcp.errors import ArtefactError
+from egovcp.errors import ArtifactError
 from egovcp.packages import require_packages
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.robot.stance_table import standing_pose
@@ -127,14 +127,14 @@ class OnnxPolicy:
         """Load and check a file.
 
         Raises:
-            ArtefactError: missing, damaged, or not of this observation and action.
+            ArtifactError: missing, damaged, or not of this observation and action.
             EnvironmentFailure: the package onnxruntime is missing.
         """
         require_packages("egovcp", "a controller in ONNX", "onnx", "onnxruntime")
         import onnxruntime
 
         if not os.path.lexists(path):
-            raise ArtefactError(f"{path}: no such controller; expected an exported .onnx file")
+            raise ArtifactError(f"{path}: no such controller; expected an exported .onnx file")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # a policy step must not wait for other threads
         try:
@@ -147,7 +147,7 @@ class OnnxPolicy:
             self.config: WalkConfig = self._check()
         except Exception as error:  # onnx and onnxruntime raise a class per kind of damage
             reason = " ".join(str(error).split())[:200]
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{path}: not a controller of schema {SCHEMA} ({reason})"
             ) from error
 

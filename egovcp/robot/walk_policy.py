@@ -24,7 +24,7 @@ from safetensors.numpy import load, save
 from egovcp.atomic import write_bytes
 from egovcp.bounds import check_bounds
 from egovcp.decode import decode, shown
-from egovcp.errors import ArtefactError
+from egovcp.errors import ArtifactError
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
 from egovcp.tensor_file import TensorFile, read_tensor_file
 
@@ -87,19 +87,19 @@ class WalkPolicy:
         """Read and check a file.
 
         Raises:
-            ArtefactError: missing, damaged, of another schema or of another observation.
+            ArtifactError: missing, damaged, of another schema or of another observation.
         """
         if not os.path.lexists(path):
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{path}: no such controller; expected a .safetensors file that "
                 "egovcp-train-lowlevel wrote"
             )
         try:
             return cls._from(read_tensor_file(path, _LIMIT_BYTES))
         except OSError as error:
-            raise ArtefactError(f"{path}: {error.strerror}; it cannot be read") from error
+            raise ArtifactError(f"{path}: {error.strerror}; it cannot be read") from error
         except (SafetensorError, ValueError) as error:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{path}: not a controller of schema {SCHEMA} ({error}); train one with "
                 "egovcp-train-lowlevel"
             ) from error

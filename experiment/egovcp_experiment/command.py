@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import draccus
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.cli import report_error, run_command
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import EgovcpError, UsageError, suggest
@@ -113,7 +113,7 @@ def require_given(config: ExperimentConfig) -> None:
     Raises:
         UsageError: a folder is not named.
         DataError: a dataset is missing or damaged.
-        ArtefactError: a policy is missing or damaged.
+        ArtifactError: a policy is missing or damaged.
     """
     for task, root in config.data.roots.items():
         with _naming(f"--data.roots: {task}"):
@@ -123,7 +123,7 @@ def require_given(config: ExperimentConfig) -> None:
     for task, path in config.train.policies.items():
         with _naming(f"--train.policies: {task}"):
             if is_local_path(path):
-                load_artefact(path)
+                load_artifact(path)
 
 
 @contextmanager

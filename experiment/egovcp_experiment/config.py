@@ -56,7 +56,7 @@ class TrainingConfig:
     seeds: tuple[int, ...] = bounded((0,), least=0)
     """Every model is trained once with each of these."""
     policies: dict[str, str] = field(default_factory=dict)
-    """Artefacts that are there already, '{ball: RUN/checkpoints/last/pretrained_model}', in the
+    """Artifacts that are there already, '{ball: RUN/checkpoints/last/pretrained_model}', in the
     place of the default model of that task (all: of the multi-task model) under every seed."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-train."""

@@ -14,10 +14,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.artefact import CONFIG, read_options
+from egovcp.artifact import CONFIG, read_options
 from egovcp_experiment.cell import Cell, Flags, Given, Output, references, text
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.tools import ARTEFACT, COLLECT, PLAY, TRAIN
+from egovcp_experiment.tools import ARTIFACT, COLLECT, PLAY, TRAIN
 
 #: The task of a model that learns all tasks, as egovcp-collect and egovcp-eval call them together.
 ALL: Final = "all"
@@ -80,12 +80,12 @@ class Grid:
         return Output(self.add(Cell(f"collect-{task}-{episodes}", COLLECT, flags, extra)).name)
 
     def model(self, task: str, seed: int, model: Model | None = None) -> Output | Given:
-        """The artefact of a model that was trained on a task, or on `ALL` of them."""
+        """The artifact of a model that was trained on a task, or on `ALL` of them."""
         model = model or Model()
         config = self.config.train
         if task in config.policies and not model.flags:
             return Given(config.policies[task])
-        return Output(self.train(task, seed, model).name, ARTEFACT)
+        return Output(self.train(task, seed, model).name, ARTIFACT)
 
     def train(self, task: str, seed: int, model: Model, name: str = "") -> Cell:
         """The training itself, whose figures are those on held-out episodes."""

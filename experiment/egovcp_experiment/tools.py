@@ -18,8 +18,8 @@ from egovcp.reactive import ReactiveNetwork
 from egovcp.safe_files import sha256
 from egovcp_experiment.cell import Flags, Tool
 
-#: Where egovcp-train leaves its artefact, below the folder of the run.
-ARTEFACT: Final = "checkpoints/last/pretrained_model"
+#: Where egovcp-train leaves its artifact, below the folder of the run.
+ARTIFACT: Final = "checkpoints/last/pretrained_model"
 #: The policy in a checkpoint of egovcp-train-ppo.
 PPO_POLICY: Final = "pretrained_model/ppo.safetensors"
 #: The file in which a study of this package leaves its figures.
@@ -47,12 +47,12 @@ def dataset_digest(folder: Path) -> str:
 
 
 def _trained(folder: Path) -> dict[str, Any]:
-    manifest = read_manifest(folder / ARTEFACT)
+    manifest = read_manifest(folder / ARTIFACT)
     return {"step": manifest["step"], "tasks": manifest["heldout_tasks"]}
 
 
-def artefact_digest(folder: Path) -> str:
-    """The SHA-256 that seals an artefact's manifest, and with it all of its files."""
+def artifact_digest(folder: Path) -> str:
+    """The SHA-256 that seals an artifact's manifest, and with it all of its files."""
     return str(read_manifest(folder)[SEAL])
 
 
@@ -106,7 +106,7 @@ TRAIN: Final = Tool(
     module="egovcp_train.train",
     output="output_dir",
     figures=_trained,
-    digest=lambda folder: artefact_digest(folder / ARTEFACT),
+    digest=lambda folder: artifact_digest(folder / ARTIFACT),
     continued=_resumed,
     prog="egovcp-train",
     learns=True,
@@ -142,13 +142,13 @@ def study(name: str, alone: bool = False) -> Tool:
 
 
 def given_digest(path: str) -> str:
-    """What is known of something that no cell made: an artefact, a dataset, a file, or an id.
+    """What is known of something that no cell made: an artifact, a dataset, a file, or an id.
 
     Something on the Hub is known by its name alone.
     """
     folder = Path(os.path.expanduser(path))
     if (folder / MANIFEST).is_file():
-        return artefact_digest(folder)
+        return artifact_digest(folder)
     if (folder / HASHES_PATH).is_file():
         return dataset_digest(folder)
     if folder.is_file():

@@ -134,7 +134,7 @@ def test_probe_finds_a_return_that_it_is_told_and_none_in_shuffled_rows(
 
 @pytest.fixture(scope="module")
 def policy(root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A tiny artefact, hardly trained."""
+    """A tiny artifact, hardly trained."""
     run = tmp_path_factory.mktemp("policy") / "run"
     quick = "--preset=debug --steps=30 --batch_size=2 --sampling.length=6 --returns.steps=8"
     calm = "--eval_freq=0 --tensorboard=false --threads=1 --device=cpu"

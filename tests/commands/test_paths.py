@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.artefact import load_artefact, save_artefact
+from egovcp.artifact import load_artifact, save_artifact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.flags import flags_of
 from egovcp.log.info import RunInfo
@@ -138,8 +138,8 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Path:
         for number in range(3):
             writer.add(random_episode(number, length=30))
     planner = PlannerConfig(samples=16, horizon=3, iterations=2, elites=4, eta=0.02)
-    save_artefact(folder / "policy", toy_model(), planner, {"controller_id": StanceController().id})
-    load_artefact(str(folder / "policy"))  # imports what the forked commands would each import
+    save_artifact(folder / "policy", toy_model(), planner, {"controller_id": StanceController().id})
+    load_artifact(str(folder / "policy"))  # imports what the forked commands would each import
     sink = McapSink(folder / "recording.mcap")
     sink.open(RunInfo("ball", seed=3, episode=7, hashes={CONTROLLER: StanceController().id}))
     for tick in ticks_of(random_episode(0, length=8)):

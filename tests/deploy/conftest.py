@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.artefact import save_artefact
+from egovcp.artifact import save_artifact
 from egovcp.model import PRESETS
 from egovcp.plan import PlannerConfig
 from egovcp.robot.stance import StanceController
@@ -15,28 +15,28 @@ from egovcp.testing import toy_model
 
 
 @pytest.fixture(scope="session")
-def artefact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A policy artefact for the simulated robot, with random weights and a tiny planner."""
+def artifact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A policy artifact for the simulated robot, with random weights and a tiny planner."""
     path = tmp_path_factory.mktemp("policy") / "policy"
-    save_artefact(path, toy_model(), _PLANNER, {"controller_id": StanceController().id})
+    save_artifact(path, toy_model(), _PLANNER, {"controller_id": StanceController().id})
     return path
 
 
 @pytest.fixture(scope="session")
-def foreign_artefact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def foreign_artifact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same for a robot with another low-level controller."""
     path = tmp_path_factory.mktemp("foreign") / "policy"
-    save_artefact(path, toy_model(), _PLANNER, {"controller_id": "another-controller"})
+    save_artifact(path, toy_model(), _PLANNER, {"controller_id": "another-controller"})
     return path
 
 
 @pytest.fixture(scope="session")
-def earning_artefact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def earning_artifact_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The same with a world model that foresees rewards."""
     path = tmp_path_factory.mktemp("earning") / "policy"
     loss = replace(PRESETS["debug"].loss, reward=1.0)
     model = toy_model(replace(PRESETS["debug"], loss=loss))
-    save_artefact(path, model, _PLANNER, {"controller_id": StanceController().id})
+    save_artifact(path, model, _PLANNER, {"controller_id": StanceController().id})
     return path
 
 

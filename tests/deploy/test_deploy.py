@@ -30,11 +30,11 @@ def run(*flags: str) -> int:
 
 
 def test_rollouts_are_recorded_and_summed_up(
-    tmp_path: Path, artefact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, artifact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
     code = run(
-        f"--policy.path={artefact_dir}", "--episodes=2", "--seed=3", f"--output_dir={out}", *short
+        f"--policy.path={artifact_dir}", "--episodes=2", "--seed=3", f"--output_dir={out}", *short
     )
     assert code == 0, capsys.readouterr().err
     names = {path.name for path in out.iterdir()}
@@ -61,10 +61,10 @@ def test_rollouts_are_recorded_and_summed_up(
 
 
 def test_a_recording_obeys_the_contract_of_the_data(
-    tmp_path: Path, artefact_dir: Path, short: list[str]
+    tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:
     out = tmp_path / "out"
-    run(f"--policy.path={artefact_dir}", "--episodes=1", f"--output_dir={out}", *short)
+    run(f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}", *short)
     ticks = read_recording(out / "rollout-0.mcap").ticks
     sent = np.array([tick.action_sent for tick in ticks])
     steps = np.diff(sent, axis=0, prepend=np.zeros((1, 7)))
@@ -95,14 +95,14 @@ def test_a_recording_obeys_the_contract_of_the_data(
 )
 def test_bad_input_ends_with_one_line_before_any_work(
     tmp_path: Path,
-    artefact_dir: Path,
+    artifact_dir: Path,
     capsys: pytest.CaptureFixture[str],
     flags: list[str],
     code: int,
     message: str,
 ) -> None:
     out = tmp_path / "out"
-    assert run(f"--policy.path={artefact_dir}", f"--output_dir={out}", *flags) == code
+    assert run(f"--policy.path={artifact_dir}", f"--output_dir={out}", *flags) == code
     captured = capsys.readouterr()
     assert message in captured.err
     assert len(captured.err.strip().splitlines()) == 1
@@ -110,28 +110,28 @@ def test_bad_input_ends_with_one_line_before_any_work(
 
 
 def test_results_are_never_overwritten(
-    tmp_path: Path, artefact_dir: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, artifact_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "rollout-0.mcap").write_bytes(b"precious")
-    assert run(f"--policy.path={artefact_dir}", f"--output_dir={tmp_path}") == 2
+    assert run(f"--policy.path={artifact_dir}", f"--output_dir={tmp_path}") == 2
     assert "rollout-0.mcap" in capsys.readouterr().err
     assert (tmp_path / "rollout-0.mcap").read_bytes() == b"precious"
 
 
-def test_an_artefact_of_another_controller_drives_nothing(
-    tmp_path: Path, foreign_artefact_dir: Path, capsys: pytest.CaptureFixture[str]
+def test_an_artifact_of_another_controller_drives_nothing(
+    tmp_path: Path, foreign_artifact_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert run(f"--policy.path={foreign_artefact_dir}", f"--output_dir={out}") == 4
+    assert run(f"--policy.path={foreign_artifact_dir}", f"--output_dir={out}") == 4
     assert "another-controller" in capsys.readouterr().err
     assert not out.exists()
 
 
-def test_each_event_of_an_episode_is_told_once(tmp_path: Path, artefact_dir: Path) -> None:
+def test_each_event_of_an_episode_is_told_once(tmp_path: Path, artifact_dir: Path) -> None:
     out = tmp_path / "out"
     flags = ["--env.ball_episode.ticks=40", "--env.ball_episode.event_ticks=[2,2]", "--imagine=0"]
     flags.append("--env.controller=stance")
-    run(f"--policy.path={artefact_dir}", "--episodes=1", f"--output_dir={out}", *flags)
+    run(f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}", *flags)
     ticks = read_recording(out / "rollout-0.mcap").ticks
     events = [event for tick in ticks for event in tick.events]
     assert "ball thrown" in ticks[2].events
@@ -158,7 +158,7 @@ def test_the_events_of_a_sequence_are_those_of_its_parts(tmp_path: Path) -> None
     ]
 
 
-def test_a_reference_needs_no_artefact_and_leaves_no_plan(
+def test_a_reference_needs_no_artifact_and_leaves_no_plan(
     tmp_path: Path, short: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -169,15 +169,15 @@ def test_a_reference_needs_no_artefact_and_leaves_no_plan(
     assert all(t.plan is None and t.candidates is None and t.value is None for t in ticks)
     assert any(t.action_sent.any() for t in ticks), "the oracle moves its hands to the ball"
     report = json.loads((out / "deploy.json").read_text())
-    assert report["artefact"] is None
+    assert report["artifact"] is None
     assert report["low_level_controller"].startswith("g1-stance")
 
 
 def test_records_say_what_the_controller_has_decided(
-    tmp_path: Path, artefact_dir: Path, short: list[str]
+    tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:
     out = tmp_path / "out"
-    assert run(f"--policy.path={artefact_dir}", "--episodes=1", f"--output_dir={out}", *short) == 0
+    assert run(f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}", *short) == 0
     report = json.loads((out / "deploy.json").read_text())
     env = report["config"]["env"]
     assert env["arch"]["motion"] == "rail"
@@ -186,10 +186,10 @@ def test_records_say_what_the_controller_has_decided(
 
 
 def test_a_changed_planner_is_the_one_that_plans(
-    tmp_path: Path, artefact_dir: Path, short: list[str]
+    tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:
     out = tmp_path / "out"
-    flags = [f"--policy.path={artefact_dir}", "--episodes=1", f"--output_dir={out}"]
+    flags = [f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={out}"]
     assert run(*flags, "--planner.horizon=5", "--planner.elites=2", *short) == 0
     tick = read_recording(out / "rollout-0.mcap").ticks[0]
     assert tick.plan is not None

@@ -63,7 +63,7 @@ def constant_file(tmp_path: Path) -> Path:
 
 def test_all_controllers_play_the_same_scenarios(
     tmp_path: Path,
-    artefact_dir: Path,
+    artifact_dir: Path,
     short: list[str],
     constant_file: Path,
     capsys: pytest.CaptureFixture[str],
@@ -71,7 +71,7 @@ def test_all_controllers_play_the_same_scenarios(
     out = tmp_path / "out"
     code = run(
         out,
-        f"--policy.path={artefact_dir}",
+        f"--policy.path={artifact_dir}",
         "--episodes=3",
         "--num_envs=2",
         f"--constant.path={constant_file}",
@@ -96,10 +96,10 @@ def test_all_controllers_play_the_same_scenarios(
 
 
 def test_results_do_not_depend_on_how_episodes_are_grouped(
-    tmp_path: Path, artefact_dir: Path, short: list[str]
+    tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:
     flags = [
-        f"--policy.path={artefact_dir}",
+        f"--policy.path={artifact_dir}",
         "--controllers=random,planner,oracle",
         "--episodes=4",
         *short,
@@ -118,13 +118,13 @@ def test_results_do_not_depend_on_how_episodes_are_grouped(
 
 
 def test_a_sequence_is_played_by_all_and_its_parts_are_told_apart(
-    tmp_path: Path, artefact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, artifact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     best = {"action": [0.2] * ACTION_DIM, "reward_mean": 0.0, "success_rate": 0.5, "episodes": 9}
     (tmp_path / "constant.json").write_text(json.dumps({"sequence": best}))
     flags = [
         "--task=sequence",
-        f"--policy.path={artefact_dir}",
+        f"--policy.path={artifact_dir}",
         f"--constant.path={tmp_path / 'constant.json'}",
         "--episodes=2",
         "--env.arch_episode.ticks=8",
@@ -184,19 +184,19 @@ def test_bad_input_ends_with_one_line_before_any_work(
 
 
 @pytest.mark.parametrize("objective", ["reward", "td"])
-def test_one_artefact_is_played_by_every_objective(
-    tmp_path: Path, earning_artefact_dir: Path, short: list[str], objective: str
+def test_one_artifact_is_played_by_every_objective(
+    tmp_path: Path, earning_artifact_dir: Path, short: list[str], objective: str
 ) -> None:
     flags = ["--controllers=planner", "--episodes=2", *short, f"--planner.objective={objective}"]
-    assert run(tmp_path / "out", f"--policy.path={earning_artefact_dir}", *flags) == 0
+    assert run(tmp_path / "out", f"--policy.path={earning_artifact_dir}", *flags) == 0
     assert len(played(tmp_path / "out")["ball"]["planner"]) == 2
 
 
 def test_rewards_that_a_model_does_not_foresee_are_not_added_up(
-    tmp_path: Path, artefact_dir: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, artifact_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = ["--controllers=planner", "--env.controller=stance", "--planner.objective=td"]
-    assert run(tmp_path / "out", f"--policy.path={artefact_dir}", *flags) == 2
+    assert run(tmp_path / "out", f"--policy.path={artifact_dir}", *flags) == 2
     assert "train it with --policy.loss.reward=1" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
@@ -235,11 +235,11 @@ def test_results_are_never_overwritten(tmp_path: Path, capsys: pytest.CaptureFix
     assert (tmp_path / "eval.json").read_text() == "precious"
 
 
-def test_an_artefact_of_another_controller_is_not_evaluated(
-    tmp_path: Path, foreign_artefact_dir: Path, capsys: pytest.CaptureFixture[str]
+def test_an_artifact_of_another_controller_is_not_evaluated(
+    tmp_path: Path, foreign_artifact_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    assert run(out, f"--policy.path={foreign_artefact_dir}", "--controllers=planner") == 4
+    assert run(out, f"--policy.path={foreign_artifact_dir}", "--controllers=planner") == 4
     assert "another-controller" in capsys.readouterr().err
     assert not out.exists()
 
@@ -261,7 +261,7 @@ def test_a_diverging_simulation_is_an_error_that_names_the_episode(
 def test_int8_is_refused_before_any_work_where_it_cannot_be_used(
     command: str,
     tmp_path: Path,
-    artefact_dir: Path,
+    artifact_dir: Path,
     short: list[str],
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
@@ -270,7 +270,7 @@ def test_int8_is_refused_before_any_work_where_it_cannot_be_used(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     library.library.cache_clear()
     out = tmp_path / "out"
-    flags = [f"--policy.path={artefact_dir}", f"--output_dir={out}", "--planner.backend=int8"]
+    flags = [f"--policy.path={artifact_dir}", f"--output_dir={out}", "--planner.backend=int8"]
     try:
         assert {"evaluate": main, "deploy": deploy}[command]([*flags, *short]) == 5
     finally:
@@ -282,13 +282,13 @@ def test_int8_is_refused_before_any_work_where_it_cannot_be_used(
 
 
 def test_recorded_paths_are_absolute(
-    tmp_path: Path, artefact_dir: Path, short: list[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, artifact_dir: Path, short: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(artefact_dir.parent)
-    flags = [f"--policy.path={artefact_dir.name}", "--controllers=planner", "--episodes=1"]
+    monkeypatch.chdir(artifact_dir.parent)
+    flags = [f"--policy.path={artifact_dir.name}", "--controllers=planner", "--episodes=1"]
     assert run(tmp_path / "out", *flags, *short) == 0
     config = json.loads((tmp_path / "out" / "eval_run.json").read_text())["config"]
-    assert config["policy"]["path"] == str(artefact_dir)
+    assert config["policy"]["path"] == str(artifact_dir)
 
 
 def _interrupt_at_group(monkeypatch: pytest.MonkeyPatch, number: int, signals: int = 1) -> None:

@@ -7,18 +7,18 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.plan.config import BackendName
 from egovcp_deploy.policy import backend_of
 
 
 @pytest.mark.parametrize("backend", ["eager", "float32", "bfloat16"])
 def test_a_backend_that_was_asked_for_is_the_one_that_is_named(
-    artefact_dir: Path, backend: BackendName
+    artifact_dir: Path, backend: BackendName
 ) -> None:
-    artefact = load_artefact(str(artefact_dir))
-    artefact = replace(artefact, planner=replace(artefact.planner, backend=backend))
-    assert backend_of(artefact.make_policy(1, 0)) == backend
+    artifact = load_artifact(str(artifact_dir))
+    artifact = replace(artifact, planner=replace(artifact.planner, backend=backend))
+    assert backend_of(artifact.make_policy(1, 0)) == backend
 
 
 @pytest.mark.parametrize(
@@ -26,13 +26,13 @@ def test_a_backend_that_was_asked_for_is_the_one_that_is_named(
     [("Int8Evaluator", "int8"), ("FloatEvaluator", "float32"), ("ReferenceEvaluator", "eager")],
 )
 def test_auto_is_named_by_what_it_took(
-    artefact_dir: Path, monkeypatch: pytest.MonkeyPatch, evaluator: str, name: str
+    artifact_dir: Path, monkeypatch: pytest.MonkeyPatch, evaluator: str, name: str
 ) -> None:
-    policy = load_artefact(str(artefact_dir)).make_policy(1, 0)
+    policy = load_artifact(str(artifact_dir)).make_policy(1, 0)
     assert policy.config.backend == "auto"
     monkeypatch.setattr(policy, "prepare", type(evaluator, (), {}))
     assert backend_of(policy) == name
 
 
-def test_auto_takes_something_that_has_a_name(artefact_dir: Path) -> None:
-    assert backend_of(load_artefact(str(artefact_dir)).make_policy(1, 0)) in ("int8", "float32")
+def test_auto_takes_something_that_has_a_name(artifact_dir: Path) -> None:
+    assert backend_of(load_artifact(str(artifact_dir)).make_policy(1, 0)) in ("int8", "float32")

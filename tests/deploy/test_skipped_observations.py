@@ -46,10 +46,10 @@ def one_nan(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("one_nan")
 def test_a_rollout_counts_it_and_goes_on(
-    tmp_path: Path, artefact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, artifact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
-    flags = [f"--policy.path={artefact_dir}", "--episodes=1", "--log.rrd=false", *short]
+    flags = [f"--policy.path={artifact_dir}", "--episodes=1", "--log.rrd=false", *short]
     assert deploy([*flags, f"--output_dir={out}"]) == 0
     (row,) = json.loads((out / "deploy.json").read_text())["rollouts"]
     assert row["skipped_observations"] == 1
@@ -64,10 +64,10 @@ def test_a_rollout_counts_it_and_goes_on(
 
 @pytest.mark.usefixtures("one_nan")
 def test_an_evaluation_counts_it_for_the_robot_that_sensed_it(
-    tmp_path: Path, artefact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, artifact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = [
-        *(f"--policy.path={artefact_dir}", f"--output_dir={tmp_path / 'out'}", *short),
+        *(f"--policy.path={artifact_dir}", f"--output_dir={tmp_path / 'out'}", *short),
         *("--controllers=planner,hold", "--episodes=2", "--num_envs=2", "--num_workers=1"),
     ]
     assert evaluate(flags) == 0

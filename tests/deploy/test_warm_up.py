@@ -37,10 +37,10 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("clock")
 def test_an_evaluation_does_not_time_the_first_plan(
-    tmp_path: Path, artefact_dir: Path, short: list[str]
+    tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:
     flags = [
-        *(f"--policy.path={artefact_dir}", f"--output_dir={tmp_path / 'out'}", *short),
+        *(f"--policy.path={artifact_dir}", f"--output_dir={tmp_path / 'out'}", *short),
         *("--controllers=planner", "--episodes=3", "--num_envs=2", "--num_workers=1"),
     ]
     assert evaluate(flags) == 0
@@ -51,9 +51,9 @@ def test_an_evaluation_does_not_time_the_first_plan(
 
 @pytest.mark.usefixtures("clock")
 def test_a_rollout_does_not_time_the_first_plan(
-    tmp_path: Path, artefact_dir: Path, short: list[str]
+    tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:
-    flags = [f"--policy.path={artefact_dir}", "--episodes=1", f"--output_dir={tmp_path / 'out'}"]
+    flags = [f"--policy.path={artifact_dir}", "--episodes=1", f"--output_dir={tmp_path / 'out'}"]
     assert deploy([*flags, "--log.rrd=false", *short]) == 0
     (row,) = json.loads((tmp_path / "out" / "deploy.json").read_text())["rollouts"]
     assert row["plan_ms_p99"] == pytest.approx(1e3 * PLAN_S)

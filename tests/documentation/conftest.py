@@ -8,7 +8,7 @@ from pathlib import Path
 import draccus
 import pytest
 
-from egovcp.artefact import save_artefact
+from egovcp.artifact import save_artifact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.plan import PlannerConfig
 from egovcp.robot.stance import StanceController
@@ -48,11 +48,11 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> Path:
         with DatasetWriter(folder / name, provenance) as writer:
             for number in range(EPISODES):
                 writer.add(random_episode(number, TICKS, task=task, seed=seed))
-    artefact = folder / "artefact"
-    save_artefact(artefact, toy_model(), _PLANNER, {"controller_id": controller})
+    artifact = folder / "artifact"
+    save_artifact(artifact, toy_model(), _PLANNER, {"controller_id": controller})
     for name in RUNS:
         policy = folder / name / "checkpoints" / "last" / "pretrained_model"
-        shutil.copytree(artefact, policy)
+        shutil.copytree(artifact, policy)
     recording = folder / "rollout-0.mcap"
     assert egovcp_mcap(["from-dataset", str(folder / "data" / "ball"), str(recording)]) == 0
     for copy in ("live/rollout-0.mcap", "runs/ball/rollout-0.mcap", "torn.mcap"):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.artefact import FILES, save_artefact
+from egovcp.artifact import FILES, save_artifact
 from egovcp.atomic import removed_on_error, write_bytes, write_json, write_text
 from egovcp.plan import PlannerConfig
 from egovcp.testing import toy_model
@@ -66,7 +66,7 @@ def test_temporary_file_folder_or_link_is_removed_and_nothing_else(tmp_path: Pat
 
 
 def _write_policy(folder: Path) -> None:
-    save_artefact(folder / "policy", toy_model(), PlannerConfig(), {"controller_id": "a"})
+    save_artifact(folder / "policy", toy_model(), PlannerConfig(), {"controller_id": "a"})
     assert {path.name for path in (folder / "policy").iterdir()} == set(FILES)
 
 

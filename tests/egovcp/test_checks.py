@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.artefact import save_artefact
+from egovcp.artifact import save_artifact
 from egovcp.checks import (
     ConformanceError,
-    check_artefact,
+    check_artifact,
     check_dataset,
     check_env,
     check_world_model,
 )
 from egovcp.data import DatasetConfig, DatasetWriter, Episode, Provenance
-from egovcp.errors import ArtefactError, DataError
+from egovcp.errors import ArtifactError, DataError
 from egovcp.model import Carry, WorldModel
 from egovcp.plan import PlannerConfig
 from egovcp.testing import CountingEnv, CountingModel, ToyObservation, ToyStep, toy_model
@@ -103,26 +103,26 @@ def test_weights_that_are_not_numbers_are_found() -> None:
         check_world_model(model)
 
 
-# --- artefacts -------------------------------------------------------------------------
+# --- artifacts -------------------------------------------------------------------------
 def _save(path: Path, model: WorldModel) -> str:
     planner = PlannerConfig(samples=16, elites=4)
-    save_artefact(path, model, planner, {"controller_id": "stance-1"})
+    save_artifact(path, model, planner, {"controller_id": "stance-1"})
     return str(path)
 
 
-def test_a_good_artefact_passes(tmp_path: Path) -> None:
-    artefact = check_artefact(_save(tmp_path / "policy", toy_model()))
-    assert artefact.controller_id == "stance-1"
+def test_a_good_artifact_passes(tmp_path: Path) -> None:
+    artifact = check_artifact(_save(tmp_path / "policy", toy_model()))
+    assert artifact.controller_id == "stance-1"
 
 
 @pytest.mark.parametrize("name", ["value_head", "gru"])
-def test_an_artefact_that_learned_nonsense_is_refused(tmp_path: Path, name: str) -> None:
+def test_an_artifact_that_learned_nonsense_is_refused(tmp_path: Path, name: str) -> None:
     model = toy_model()
     with torch.no_grad():
         for parameter in getattr(model, name).parameters():
             parameter.fill_(torch.nan)
-    with pytest.raises(ArtefactError, match=r"model\.safetensors: .* holds NaN"):
-        check_artefact(_save(tmp_path / "policy", model))
+    with pytest.raises(ArtifactError, match=r"model\.safetensors: .* holds NaN"):
+        check_artifact(_save(tmp_path / "policy", model))
 
 
 # --- environments ----------------------------------------------------------------------

@@ -13,7 +13,7 @@ import pytest
 
 from egovcp.cli import DatasetConfig, parse_config, run_command, save_config
 from egovcp.errors import (
-    ArtefactError,
+    ArtifactError,
     DataError,
     EgovcpError,
     EnvironmentFailure,
@@ -310,7 +310,7 @@ def _run(*argv: str, error: BaseException | None = None) -> int:
         (EgovcpError("x"), 1),
         (UsageError("x"), 2),
         (DataError("x"), 3),
-        (ArtefactError("x"), 4),
+        (ArtifactError("x"), 4),
         (EnvironmentFailure("x"), 5),
         (SafetyStop("x"), 6),
         (KeyboardInterrupt(), 130),

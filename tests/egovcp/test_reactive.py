@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from egovcp import spec
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.errors import ArtifactError, UsageError
 from egovcp.reactive import SCHEMA, Eyes, ReactiveConfig, ReactiveNetwork, ReactivePolicy
 from egovcp.testing import toy_reactive
 
@@ -64,7 +64,7 @@ def test_a_file_holds_all_of_it(tmp_path: Path) -> None:
     assert (loaded.config, loaded.controller_id) == (network.config, "walk-1")
     assert loaded.provenance == {"steps": 0}
     loaded.require_controller("walk-1")
-    with pytest.raises(ArtefactError, match="walk-1, the robot has walk-2"):
+    with pytest.raises(ArtifactError, match="walk-1, the robot has walk-2"):
         loaded.require_controller("walk-2")
 
 
@@ -89,18 +89,18 @@ def test_a_file_that_is_none_is_refused(
         "provenance": {},
     }
     save_file(tensors, path, {"schema": SCHEMA, "content": json.dumps(content)})
-    with pytest.raises(ArtefactError, match=message):
+    with pytest.raises(ArtifactError, match=message):
         ReactiveNetwork.load(path)
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(ArtefactError, match="no such policy"):
+    with pytest.raises(ArtifactError, match="no such policy"):
         ReactiveNetwork.load(tmp_path / "missing.safetensors")
     (tmp_path / "text.safetensors").write_text("text")
-    with pytest.raises(ArtefactError, match="not a policy of schema"):
+    with pytest.raises(ArtifactError, match="not a policy of schema"):
         ReactiveNetwork.load(tmp_path / "text.safetensors")
     save_file({"x": torch.zeros(1)}, tmp_path / "other.safetensors")
-    with pytest.raises(ArtefactError, match="its schema is null"):
+    with pytest.raises(ArtifactError, match="its schema is null"):
         ReactiveNetwork.load(tmp_path / "other.safetensors")
 
 

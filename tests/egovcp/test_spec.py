@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.errors import (
-    ArtefactError,
+    ArtifactError,
     ConformanceError,
     DataError,
     EgovcpError,
@@ -113,7 +113,7 @@ def test_the_features_are_json_and_have_the_shapes_of_the_constants() -> None:
 
 # --- errors -----------------------------------------------------------------------------
 def test_every_kind_of_error_has_its_exit_code() -> None:
-    kinds = (UsageError, DataError, ArtefactError, EnvironmentFailure, SafetyStop)
+    kinds = (UsageError, DataError, ArtifactError, EnvironmentFailure, SafetyStop)
     assert [kind.exit_code for kind in kinds] == [2, 3, 4, 5, 6]
     assert all(issubclass(kind, EgovcpError) for kind in (*kinds, ConformanceError))
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egovcp.artefact import save_artefact
+from egovcp.artifact import save_artifact
 from egovcp.plan import PlannerConfig
 from egovcp.testing import toy_model
 from egovcp_experiment.cell import Cell, Output
@@ -18,7 +18,7 @@ from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.report.document import Plot, Report, Table
 from egovcp_experiment.scales import SCALES
 from egovcp_experiment.studies.open_loop import HORIZONS
-from egovcp_experiment.tools import ARTEFACT, COLLECT, PLAY
+from egovcp_experiment.tools import ARTIFACT, COLLECT, PLAY
 
 _PARTS = "env.sequence.parts"
 
@@ -123,7 +123,7 @@ def test_a_sequence_is_played_by_the_model_of_all_tasks() -> None:
     }
     assert len(plays) == 2 * len(planners)
     for cell in planners.values():
-        assert cell.flags["policy.path"] == Output("train-all-default-s0", ARTEFACT)
+        assert cell.flags["policy.path"] == Output("train-all-default-s0", ARTIFACT)
     box = planners["play-sequence-in_arch_then_box-s0"].flags
     assert (box[_PARTS], box["env.ball.shape"]) == (["arch", "ball"], "box")
 
@@ -179,7 +179,7 @@ def test_multitask_says_for_how_long_models_were_trained(tmp_path: Path) -> None
     assert words({}).startswith("Every model was trained for 10 minutes: the one on mixed data")
     policy = str(tmp_path / "policy")
     entries = {"controller_id": "stance-1", "step": 4321}
-    save_artefact(Path(policy), toy_model(), PlannerConfig(), entries)
+    save_artifact(Path(policy), toy_model(), PlannerConfig(), entries)
     some = words({"ball": policy, "all": "me/model"})
     assert "of ball alone, 4321 gradient steps; on mixed data, `me/model`. Every other" in some
     every = words(dict.fromkeys(("ball", "wall", "arch", "all"), policy))

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from egovcp.artefact import save_artefact
+from egovcp.artifact import save_artifact
 from egovcp.cli import parse_config
 from egovcp.errors import UsageError
 from egovcp.plan import PlannerConfig
@@ -21,7 +21,7 @@ from egovcp_experiment.config import DataConfig, ExperimentConfig, PlayConfig, T
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.grid import ALL, Grid, Model, Variant
 from egovcp_experiment.scales import SCALES
-from egovcp_experiment.tools import ARTEFACT, COLLECT, PLAY, TRAIN
+from egovcp_experiment.tools import ARTIFACT, COLLECT, PLAY, TRAIN
 
 CONFIGS = {
     "egovcp_collect.collect": ("egovcp_collect.config", "CollectConfig"),
@@ -54,7 +54,7 @@ def test_what_differs_in_nothing_is_played_once_for_all_experiments() -> None:
             play = f"play-{task}-default-s0"
             assert found[name][play].flags == found["ppo"][play].flags
     mixed = found["multitask"]["play-ball-mixed-s0"].flags["policy.path"]
-    assert mixed == Output("train-all-default-s0", ARTEFACT)
+    assert mixed == Output("train-all-default-s0", ARTIFACT)
 
 
 def test_a_variant_that_asks_for_what_is_done_anyway_is_the_default() -> None:
@@ -91,7 +91,7 @@ def test_what_a_model_that_is_there_does_by_itself_is_the_default(
     tmp_path: Path, asked: Flags, known: bool
 ) -> None:
     planner = PlannerConfig(horizon=5)
-    save_artefact(tmp_path / "p", toy_model(), planner, {"controller_id": "stance"})
+    save_artifact(tmp_path / "p", toy_model(), planner, {"controller_id": "stance"})
     grid = Grid(ExperimentConfig(train=TrainingConfig(policies={"ball": str(tmp_path / "p")})))
     variant = Variant("asked", play=asked)
     assert grid.play("ball", 0, variant).name == f"play-ball-{'default' if known else 'asked'}-s0"

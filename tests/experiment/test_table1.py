@@ -15,7 +15,7 @@ from egovcp_experiment.config import ExperimentConfig, TrainingConfig
 from egovcp_experiment.experiments import EXPERIMENTS
 from egovcp_experiment.report.document import Report, Table
 from egovcp_experiment.scales import SCALES
-from egovcp_experiment.tools import ARTEFACT, PLAY, TRAIN
+from egovcp_experiment.tools import ARTIFACT, PLAY, TRAIN
 
 type Trained = Callable[[str, float], Mapping[str, Any]]
 
@@ -45,11 +45,11 @@ def test_rows_say_what_is_planned_by() -> None:
 
 
 def test_rows_of_one_training_share_its_model() -> None:
-    ours = Output("train-ball-reward-s1", ARTEFACT)
+    ours = Output("train-ball-reward-s1", ARTIFACT)
     for name in (*(f"ours_n{n}" for n in range(1, 7)), "rew_mpc", "td_mpc_mc"):
         assert row(name, 1).flags["policy.path"] == ours
-    assert row("arwm", 1).flags["policy.path"] == Output("train-ball-reward_arwm-s1", ARTEFACT)
-    assert row("td_mpc_td", 1).flags["policy.path"] == Output("train-ball-reward_td-s1", ARTEFACT)
+    assert row("arwm", 1).flags["policy.path"] == Output("train-ball-reward_arwm-s1", ARTIFACT)
+    assert row("td_mpc_td", 1).flags["policy.path"] == Output("train-ball-reward_td-s1", ARTIFACT)
     assert sum(cell.tool is TRAIN for cell in CELLS.values()) == 3 * len(SEEDS) * 2
 
 

@@ -1,4 +1,4 @@
-"""A tiny dataset, an artefact of egovcp-train, and LeRobot's view of both."""
+"""A tiny dataset, an artifact of egovcp-train, and LeRobot's view of both."""
 
 from pathlib import Path
 
@@ -35,9 +35,9 @@ def meta(dataset_root: Path) -> LeRobotDatasetMetadata:
 
 
 @pytest.fixture(scope="session")
-def artefact(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def artifact(dataset_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """What egovcp-train writes; tests must not change it."""
-    output = tmp_path_factory.mktemp("artefact") / "run"
+    output = tmp_path_factory.mktemp("artifact") / "run"
     options = {
         "output_dir": output,
         "dataset.root": dataset_root,

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from huggingface_hub import HfApi
 
-from egovcp.artefact import load_artefact
-from egovcp.checks import check_artefact
+from egovcp.artifact import load_artifact
+from egovcp.checks import check_artifact
 from egovcp.processors import PROCESSORS
 from egovcp.robot.stance import StanceController
 from egovcp.testing.hub import FakeHub, environment, in_this_process
@@ -100,15 +100,15 @@ def run(
 def test_it_trains_a_policy_that_egovcp_and_lerobot_load(run: tuple[Path, str]) -> None:
     output, log = run
     assert re.search(r"step:2 .*kl_prior:", log)
-    artefact = check_artefact(str(_checkpoint(output, 2)))
-    assert artefact.controller_id == StanceController().id
-    assert "--policy.type=egovcp" in artefact.manifest["command"]
+    artifact = check_artifact(str(_checkpoint(output, 2)))
+    assert artifact.controller_id == StanceController().id
+    assert "--policy.type=egovcp" in artifact.manifest["command"]
     policy = EgovcpPolicy.from_pretrained(_checkpoint(output, 2))
-    assert policy.config.planner == artefact.planner
+    assert policy.config.planner == artifact.planner
     assert policy.config.planner.samples == 16
 
 
-def test_what_it_publishes_is_the_artefact(
+def test_what_it_publishes_is_the_artifact(
     hub: FakeHub, run: tuple[Path, str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """LeRobot adds its options and the processors, which the manifest does not seal."""
@@ -117,11 +117,11 @@ def test_what_it_publishes_is_the_artefact(
     assert hub.store.refs(f"models/{POLICY}").private
     monkeypatch.setenv("HF_TOKEN", TOKEN)
     with in_this_process(hub.endpoint, tmp_path):
-        check_artefact(POLICY)
+        check_artifact(POLICY)
         policy = EgovcpPolicy.from_pretrained(POLICY)
         published = HfApi(endpoint=hub.endpoint, token=TOKEN).list_repo_files(POLICY)
     assert {"train_config.json", *PROCESSORS} <= set(published)
-    for name, value in load_artefact(str(_checkpoint(output, 2))).world_model.state_dict().items():
+    for name, value in load_artifact(str(_checkpoint(output, 2))).world_model.state_dict().items():
         assert policy.world_model.state_dict()[name].equal(value), name
 
 
@@ -132,7 +132,7 @@ def test_a_run_is_resumed(surroundings: dict[str, str], run: tuple[Path, str]) -
     log = _run(surroundings, "train", f"--config_path={options}", "--resume=true", "--steps=3")
     assert "Resuming data order at epoch 0, sample 8" in log
     before, after = (
-        check_artefact(str(_checkpoint(output, step))).world_model.state_dict() for step in (2, 3)
+        check_artifact(str(_checkpoint(output, step))).world_model.state_dict() for step in (2, 3)
     )
     assert before.keys() == after.keys()
     assert any(not before[name].equal(after[name]) for name in before)

@@ -14,8 +14,8 @@ from lerobot.policies import make_policy, make_pre_post_processors
 from lerobot.scripts.lerobot_eval import rollout
 
 from egovcp import spec
-from egovcp.artefact import load_artefact
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.artifact import load_artifact
+from egovcp.errors import ArtifactError, UsageError
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.gym import EgovcpEnv
 from lerobot_env_egovcp import EgovcpEnvConfig, LeRobotView
@@ -83,13 +83,13 @@ def test_the_picture_is_bright_where_something_is_near(view: LeRobotView) -> Non
     assert (np.diff(grey[depth > 0][order]) <= 0).all()
 
 
-def test_a_rollout_of_lerobot_takes_the_actions_of_the_artefact(
-    artefact: Path, plain: EgovcpEnv
+def test_a_rollout_of_lerobot_takes_the_actions_of_the_artifact(
+    artifact: Path, plain: EgovcpEnv
 ) -> None:
     """The way of lerobot-eval: two robots side by side, each as if it were alone."""
     config = EgovcpEnvConfig(task="ball", simulation=SIMULATION)
-    policy_config = PreTrainedConfig.from_pretrained(artefact)
-    policy_config.pretrained_path, policy_config.device = artefact, "cpu"
+    policy_config = PreTrainedConfig.from_pretrained(artifact)
+    policy_config.pretrained_path, policy_config.device = artifact, "cpu"
     policy = make_policy(policy_config, env_cfg=config)
     envs = make_env(config, n_envs=2)
     try:
@@ -97,13 +97,13 @@ def test_a_rollout_of_lerobot_takes_the_actions_of_the_artefact(
             envs["egovcp"][0],
             policy,
             *make_env_pre_post_processors(config, policy_config),
-            *make_pre_post_processors(policy_config, str(artefact)),
+            *make_pre_post_processors(policy_config, str(artifact)),
             seeds=[5, 6],
         )
     finally:
         close_envs(envs)
     for row, seed in enumerate((5, 6)):
-        alone = load_artefact(str(artefact)).make_policy()
+        alone = load_artifact(str(artifact)).make_policy()
         seen, _ = plain.reset(seed=seed)
         for tick in range(TICKS):
             action = alone.act(seen["depth"][None], seen["state"][None]).action
@@ -118,22 +118,22 @@ def test_a_rollout_of_lerobot_takes_the_actions_of_the_artefact(
 
 
 def test_a_rollout_of_lerobot_with_another_controller_is_refused_before_its_first_step(
-    artefact: Path, monkeypatch: pytest.MonkeyPatch
+    artifact: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     config = EgovcpEnvConfig(task="ball", simulation=replace(SIMULATION, controller="walk"))
-    policy_config = PreTrainedConfig.from_pretrained(artefact)
-    policy_config.pretrained_path, policy_config.device = artefact, "cpu"
+    policy_config = PreTrainedConfig.from_pretrained(artifact)
+    policy_config.pretrained_path, policy_config.device = artifact, "cpu"
     policy = make_policy(policy_config, env_cfg=config)
     envs = make_env(config, n_envs=2)
     steps: list[object] = []
     monkeypatch.setattr(EgovcpEnv, "step", lambda *_: steps.append(1))
     try:
-        with pytest.raises(ArtefactError, match=r"'g1-stance.*'g1-walk.*simulation\.controller"):
+        with pytest.raises(ArtifactError, match=r"'g1-stance.*'g1-walk.*simulation\.controller"):
             rollout(
                 envs["egovcp"][0],
                 policy,
                 *make_env_pre_post_processors(config, policy_config),
-                *make_pre_post_processors(policy_config, str(artefact)),
+                *make_pre_post_processors(policy_config, str(artifact)),
                 seeds=[5, 6],
             )
     finally:

@@ -15,7 +15,7 @@ from lerobot.policies.utils import build_inference_frame
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.errors import ArtefactError, DataError
+from egovcp.errors import ArtifactError, DataError
 from lerobot_policy_egovcp import EgovcpPolicy
 from lerobot_policy_egovcp.observations import read_observation
 
@@ -126,7 +126,7 @@ def test_an_incomplete_observation_is_refused(depth: Tensor, state: Tensor) -> N
 
 # --- the policy ----------------------------------------------------------------------------
 def test_an_observation_of_the_robot_plugin_is_accepted(
-    artefact: Path, depth: Tensor, state: Tensor
+    artifact: Path, depth: Tensor, state: Tensor
 ) -> None:
     """`EgovcpG1.get_observation`: uint16 (48, 64, 1), which LeRobot only transposes."""
     raw = dict(zip(spec.STATE_NAMES, state[0].tolist(), strict=True))
@@ -138,25 +138,25 @@ def test_an_observation_of_the_robot_plugin_is_accepted(
     frame = build_inference_frame(raw, torch.device("cpu"), features)
     assert frame[spec.DEPTH_KEY].dtype == torch.uint16
     batch = {spec.DEPTH_KEY: depth[:1], spec.STATE_KEY: state[:1]}
-    expected = EgovcpPolicy.from_pretrained(artefact).select_action(batch)
-    assert torch.equal(EgovcpPolicy.from_pretrained(artefact).select_action(frame), expected)
+    expected = EgovcpPolicy.from_pretrained(artifact).select_action(batch)
+    assert torch.equal(EgovcpPolicy.from_pretrained(artifact).select_action(frame), expected)
 
 
 def test_a_refused_observation_does_not_change_the_policy(
-    artefact: Path, depth: Tensor, state: Tensor
+    artifact: Path, depth: Tensor, state: Tensor
 ) -> None:
     batch = {spec.DEPTH_KEY: depth, spec.STATE_KEY: state}
-    expected = EgovcpPolicy.from_pretrained(artefact).select_action(batch)
-    policy = EgovcpPolicy.from_pretrained(artefact)
+    expected = EgovcpPolicy.from_pretrained(artifact).select_action(batch)
+    policy = EgovcpPolicy.from_pretrained(artifact)
     with pytest.raises(DataError, match="73"):
         policy.select_action(batch | {spec.STATE_KEY: state[:, :73]})
     assert torch.equal(policy.select_action(batch), expected)
 
 
 def test_a_state_that_is_not_finite_is_skipped_with_one_warning(
-    artefact: Path, depth: Tensor, state: Tensor, caplog: pytest.LogCaptureFixture
+    artifact: Path, depth: Tensor, state: Tensor, caplog: pytest.LogCaptureFixture
 ) -> None:
-    policy = EgovcpPolicy.from_pretrained(artefact)
+    policy = EgovcpPolicy.from_pretrained(artifact)
     bad = state.clone()
     bad[1, 20] = torch.nan
     actions = []
@@ -174,20 +174,20 @@ def test_a_state_that_is_not_finite_is_skipped_with_one_warning(
 
 
 def test_a_controller_other_than_that_of_the_data_is_refused(
-    artefact: Path, depth: Tensor, state: Tensor
+    artifact: Path, depth: Tensor, state: Tensor
 ) -> None:
-    policy = EgovcpPolicy.from_pretrained(artefact)
+    policy = EgovcpPolicy.from_pretrained(artifact)
     batch: Batch = {spec.DEPTH_KEY: depth, spec.STATE_KEY: state}
-    with pytest.raises(ArtefactError, match=r"stance.*'walker-7'.*--env\.simulation\.controller"):
+    with pytest.raises(ArtifactError, match=r"stance.*'walker-7'.*--env\.simulation\.controller"):
         policy.select_action(batch | {"info": {spec.CONTROLLER_ID_KEY: "walker-7"}})
     policy.select_action(batch | {"info": {}})
 
 
 # --- datasets ------------------------------------------------------------------------------
-def test_a_frame_of_a_dataset_is_accepted(artefact: Path, dataset_root: Path) -> None:
+def test_a_frame_of_a_dataset_is_accepted(artifact: Path, dataset_root: Path) -> None:
     frame = LeRobotDataset("me/ball", root=dataset_root)[0]
     batch = {key: frame[key][None] for key in (spec.DEPTH_KEY, spec.STATE_KEY)}
-    expected = EgovcpPolicy.from_pretrained(artefact).select_action(batch)
-    action = EgovcpPolicy.from_pretrained(artefact).select_action(frame)
+    expected = EgovcpPolicy.from_pretrained(artifact).select_action(batch)
+    action = EgovcpPolicy.from_pretrained(artifact).select_action(frame)
     assert action.shape == (1, spec.ACTION_DIM)
     assert torch.equal(action, expected)

@@ -13,11 +13,11 @@ from lerobot.datasets.factory import resolve_delta_timestamps
 from lerobot.policies import make_policy
 from torch import Tensor
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.data.stream import gather
 from egovcp.data.windows import mirror_rows
-from egovcp.errors import ArtefactError, DataError, UsageError
+from egovcp.errors import ArtifactError, DataError, UsageError
 from egovcp.model import Batch
 from egovcp.robot.stance import StanceController
 from egovcp_train.batches import set_normalisation
@@ -148,12 +148,12 @@ def test_the_loss_falls_and_every_part_is_reported(
     assert np.mean(losses[-15:]) < 0.9 * np.mean(losses[:15])
 
 
-def test_what_is_saved_is_an_artefact(
+def test_what_is_saved_is_an_artifact(
     policy: EgovcpPolicy, meta: LeRobotDatasetMetadata, tmp_path: Path
 ) -> None:
     (tmp_path / "notes.md").write_text("mine")
     policy.save_pretrained(tmp_path)
-    loaded = load_artefact(str(tmp_path))
+    loaded = load_artifact(str(tmp_path))
     assert loaded.controller_id == StanceController().id
     assert loaded.manifest["datasets"] == [{"repo_id": "me/ball", "revision": ""}]
     assert loaded.planner == policy.config.planner
@@ -162,18 +162,18 @@ def test_what_is_saved_is_an_artefact(
     assert (tmp_path / "notes.md").read_text() == "mine"
 
 
-def test_saving_what_was_loaded_keeps_where_it_comes_from(artefact: Path, tmp_path: Path) -> None:
-    EgovcpPolicy.from_pretrained(artefact).save_pretrained(tmp_path)
-    old, new = load_artefact(str(artefact)), load_artefact(str(tmp_path))
+def test_saving_what_was_loaded_keeps_where_it_comes_from(artifact: Path, tmp_path: Path) -> None:
+    EgovcpPolicy.from_pretrained(artifact).save_pretrained(tmp_path)
+    old, new = load_artifact(str(artifact)), load_artifact(str(tmp_path))
     for key in ("controller_id", "datasets", "heldout", "train_config", "step"):
         assert new.manifest[key] == old.manifest[key]
     assert new.world_model.config == old.world_model.config
 
 
-def test_an_artefact_of_egovcp_train_learns_on(
-    artefact: Path, meta: LeRobotDatasetMetadata
+def test_an_artifact_of_egovcp_train_learns_on(
+    artifact: Path, meta: LeRobotDatasetMetadata
 ) -> None:
-    policy = EgovcpPolicy.from_pretrained(artefact, dataset_meta=meta)
+    policy = EgovcpPolicy.from_pretrained(artifact, dataset_meta=meta)
     policy.config.sequence_length, policy.config.returns = 6, ReturnConfig(steps=4)
     statistics = {k: v.clone() for k, v in policy.world_model.named_buffers()}
     loss, _ = policy.train().forward(_windows(policy.config, meta, ROWS))
@@ -202,13 +202,13 @@ def test_episodes_shorter_than_the_return_are_refused(
 
 
 def test_a_policy_without_dataset_neither_learns_nor_says_whom_it_drives(
-    artefact: Path, tmp_path: Path, config: EgovcpConfig, meta: LeRobotDatasetMetadata
+    artifact: Path, tmp_path: Path, config: EgovcpConfig, meta: LeRobotDatasetMetadata
 ) -> None:
     make_policy(config, ds_meta=meta)  # fills in the features
     lonely = EgovcpPolicy(config)
     with pytest.raises(UsageError, match="dataset_meta"):
         lonely.forward(_windows(config, meta, [0]))
-    with pytest.raises(ArtefactError, match="controller_id"):
+    with pytest.raises(ArtifactError, match="controller_id"):
         lonely.save_pretrained(tmp_path)
 
 

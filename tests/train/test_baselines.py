@@ -1,4 +1,4 @@
-"""The variants of the paper's table I, from the flags of egovcp-train to the artefact."""
+"""The variants of the paper's table I, from the flags of egovcp-train to the artifact."""
 
 import hashlib
 import json
@@ -11,7 +11,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.errors import EgovcpError
 from egovcp.manifest import sealed
 from egovcp.model import Batch
@@ -97,18 +97,18 @@ def test_resume_with_td_needs_a_checkpoint_with_a_target_network(
     assert "does not fit the options" in capsys.readouterr().err
 
 
-def test_the_artefact_says_what_it_is_and_plans(arguments: Arguments, tmp_path: Path) -> None:
+def test_the_artifact_says_what_it_is_and_plans(arguments: Arguments, tmp_path: Path) -> None:
     options = {**TD, **ARWM, **REWARD, "returns__gamma": 0.9}
     assert main(arguments(tmp_path / "all", **options)) == 0
-    artefact = load_artefact(str(tmp_path / "all/checkpoints/last/pretrained_model"))
-    model = artefact.world_model
+    artifact = load_artifact(str(tmp_path / "all/checkpoints/last/pretrained_model"))
+    model = artifact.world_model
     assert (model.config.dynamics, model.config.loss.q_target) == ("autoregressive", "td")
     assert float(model.discount) == pytest.approx(0.9)
-    assert artefact.planner.objective == "td"
-    assert artefact.make_policy().prepare() is not None
+    assert artifact.planner.objective == "td"
+    assert artifact.make_policy().prepare() is not None
 
 
-def test_an_artefact_whose_planner_asks_for_rewards_it_does_not_know_is_refused(
+def test_an_artifact_whose_planner_asks_for_rewards_it_does_not_know_is_refused(
     plain: Path, tmp_path: Path
 ) -> None:
     """As somebody may have written it by hand: egovcp-train refuses to."""
@@ -122,7 +122,7 @@ def test_an_artefact_whose_planner_asks_for_rewards_it_does_not_know_is_refused(
     manifest["files"]["config.json"] = digest
     (folder / "manifest.json").write_text(json.dumps(sealed(manifest)))
     with pytest.raises(EgovcpError, match=r"objective=reward adds up predicted rewards") as caught:
-        load_artefact(str(folder))
+        load_artifact(str(folder))
     assert caught.value.exit_code == 4
 
 

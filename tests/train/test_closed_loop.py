@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.errors import UsageError
 from egovcp.plan import PlannerConfig
 from egovcp.testing import toy_model
@@ -43,7 +43,7 @@ def test_a_run_records_what_it_played(
     argv = arguments(tmp_path / "run", eval_closed_loop=3, steps=1, tensorboard="true")
     assert main(argv) == 0
     folder = tmp_path / "run" / "checkpoints" / "last" / "pretrained_model"
-    found = load_artefact(str(folder)).manifest["closed_loop"]
+    found = load_artifact(str(folder)).manifest["closed_loop"]
     assert found == {"ball/return": 1.5, "ball/success": 0.5}
     (events,) = (tmp_path / "run" / "tensorboard").iterdir()
     assert b"closed_loop/ball/return" in events.read_bytes()

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from egovcp.errors import ArtefactError
+from egovcp.errors import ArtifactError
 from egovcp_train.checkpoint import (
     DIGEST_FILE,
     STATE_FILE,
@@ -34,7 +34,7 @@ def _state_file(output: Path) -> Path:
 
 
 def _refuses_to_load(output: Path, reason: str) -> None:
-    with pytest.raises(ArtefactError, match=rf"state\.pt: cannot be read \({reason}") as caught:
+    with pytest.raises(ArtifactError, match=rf"state\.pt: cannot be read \({reason}") as caught:
         load_training_state(output)
     assert "\n" not in str(caught.value)
 
@@ -57,7 +57,7 @@ def test_a_damaged_training_state_without_digest_is_refused(tmp_path: Path) -> N
     for at in range(start - 12, start + 12):
         for byte in (0, 0x2E, 0x52, 0x68, 0x75, 0xFF):
             file.write_bytes(content[:at] + bytes([byte]) + content[at + 1 :])
-            with contextlib.suppress(ArtefactError):
+            with contextlib.suppress(ArtifactError):
                 load_training_state(tmp_path)
 
 

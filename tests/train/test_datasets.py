@@ -11,7 +11,7 @@ import pyarrow.parquet as pq
 import pytest
 import torch
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.testing import random_episode
 from egovcp_train.checkpoint import load_training_state
@@ -41,8 +41,8 @@ def test_a_run_on_two_datasets_is_resumed_exactly(mixed: Arguments, tmp_path: Pa
     one, two = load_training_state(straight), load_training_state(resumed)
     assert one["streams"] == two["streams"]
     assert one["streams"][0]["mix"] == {"datasets": [2.0, 1.0], "tasks": {"ball": 2.0}}
-    artefact = load_artefact(str(straight / "checkpoints" / "last" / "pretrained_model"))
-    assert len(artefact.manifest["datasets"]) == 2
+    artifact = load_artifact(str(straight / "checkpoints" / "last" / "pretrained_model"))
+    assert len(artifact.manifest["datasets"]) == 2
     assert all(torch.isfinite(w).all() for w in two["learner"]["model"].values())
 
 
@@ -110,7 +110,7 @@ def test_the_statistics_from_the_disk_are_those_from_memory(
         argv = arguments(tmp_path / mode, steps=1, loading__mode=mode, seed=3)
         assert main(argv) == 0
         folder = tmp_path / mode / "checkpoints" / "last" / "pretrained_model"
-        models.append(load_artefact(str(folder)).world_model.state_dict())
+        models.append(load_artifact(str(folder)).world_model.state_dict())
     for name in ("state_mean", "state_std", "return_mean", "return_std", "min_return"):
         torch.testing.assert_close(models[0][name], models[1][name])
 

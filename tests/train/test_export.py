@@ -15,8 +15,8 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from egovcp import packages, spec
-from egovcp.artefact import load_artefact, save_artefact
-from egovcp.errors import ArtefactError
+from egovcp.artifact import load_artifact, save_artifact
+from egovcp.errors import ArtifactError
 from egovcp.model import PRESETS, Carry, WorldModel
 from egovcp.model.depth import nearness
 from egovcp.plan import PlannerConfig
@@ -43,19 +43,19 @@ def _lively(model: WorldModel) -> WorldModel:
 
 
 @pytest.fixture(scope="module")
-def artefact(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("artefact") / "policy"
+def artifact(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("artifact") / "policy"
     torch.manual_seed(0)
     planner = PlannerConfig(samples=16, elites=4)
-    save_artefact(path, _lively(WorldModel(PRESETS["debug"])), planner, {"controller_id": "s-1"})
+    save_artifact(path, _lively(WorldModel(PRESETS["debug"])), planner, {"controller_id": "s-1"})
     return path
 
 
 @pytest.fixture(scope="module")
-def exported(artefact: Path) -> Path:
+def exported(artifact: Path) -> Path:
     """An export; tests must not change it."""
-    output = artefact.parent / "onnx"
-    assert main([f"--policy.path={artefact}", f"--output_dir={output}"]) == 0
+    output = artifact.parent / "onnx"
+    assert main([f"--policy.path={artifact}", f"--output_dir={output}"]) == 0
     return output
 
 
@@ -74,7 +74,7 @@ def run(exported: Path) -> Run:
 
 def test_the_golden_vectors_hold_in_another_runtime(exported: Path, run: Run) -> None:
     golden = load_file(exported / GOLDEN)
-    model = load_artefact(str(exported.parent / "policy")).world_model
+    model = load_artifact(str(exported.parent / "policy")).world_model
     for name, kind in NETWORKS.items():
         network = kind(model)
         found = run(name, **{key: golden[f"inputs/{key}"] for key in network.inputs})
@@ -85,8 +85,8 @@ def test_the_golden_vectors_hold_in_another_runtime(exported: Path, run: Run) ->
 
 
 @pytest.mark.parametrize("batch", [1, 3, 64])
-def test_any_batch_of_other_inputs_agrees(artefact: Path, run: Run, batch: int) -> None:
-    model = load_artefact(str(artefact)).world_model
+def test_any_batch_of_other_inputs_agrees(artifact: Path, run: Run, batch: int) -> None:
+    model = load_artifact(str(artifact)).world_model
     inputs = golden_inputs(model, batch, seed=11)
     carry = Carry(inputs["h"], inputs["z"])
     with torch.no_grad():
@@ -104,17 +104,17 @@ def test_any_batch_of_other_inputs_agrees(artefact: Path, run: Run, batch: int) 
         np.testing.assert_allclose(found, expected, atol=1e-4, rtol=1e-4)
 
 
-def test_a_first_tick_heals_a_broken_memory(artefact: Path, run: Run) -> None:
-    inputs = golden_inputs(load_artefact(str(artefact)).world_model, 1)
+def test_a_first_tick_heals_a_broken_memory(artifact: Path, run: Run) -> None:
+    inputs = golden_inputs(load_artifact(str(artifact)).world_model, 1)
     healthy = run("observe", **inputs)
     broken = inputs | {"h": torch.full_like(inputs["h"], torch.nan)}
     for a, b in zip(run("observe", **broken), healthy, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_an_episode_filtered_and_imagined_stays_together(artefact: Path, run: Run) -> None:
+def test_an_episode_filtered_and_imagined_stays_together(artifact: Path, run: Run) -> None:
     """Errors do not grow with the recurrence."""
-    model = load_artefact(str(artefact)).world_model
+    model = load_artifact(str(artifact)).world_model
     carry = model.initial(2)
     memory = {name: np.asarray(part) for name, part in carry._asdict().items()}
     with torch.no_grad():
@@ -142,12 +142,12 @@ def test_pooling_closes_holes_as_training_does() -> None:
     torch.testing.assert_close(pooled_nearness(depth.float(), 5.0), expected, atol=1e-6, rtol=0)
 
 
-def test_the_description_fits_the_files(exported: Path, artefact: Path) -> None:
+def test_the_description_fits_the_files(exported: Path, artifact: Path) -> None:
     assert {path.name for path in exported.iterdir()} == FILES
     report = json.loads((exported / REPORT).read_text())
     assert report["controller_id"] == "s-1"
     assert report["min_return"] == -9.0
-    assert report["features"] == load_artefact(str(artefact)).manifest["features"]
+    assert report["features"] == load_artifact(str(artifact)).manifest["features"]
     for name, entry in report["networks"].items():
         path = exported / entry["file"]
         assert entry["sha256"] == hashlib.sha256(path.read_bytes()).hexdigest()
@@ -165,7 +165,7 @@ def test_the_preset_paper_is_exported_too(tmp_path: Path) -> None:
     torch.manual_seed(0)
     config = PRESETS["paper"]
     small = type(config)(**{**vars(config), "hidden": 16, "latent": 4, "units": 16})
-    save_artefact(
+    save_artifact(
         tmp_path / "policy", _lively(WorldModel(small)), PlannerConfig(), {"controller_id": "s-1"}
     )
     argv = [f"--policy.path={tmp_path / 'policy'}", f"--output_dir={tmp_path / 'onnx'}"]
@@ -180,18 +180,18 @@ def test_a_network_that_says_something_else_is_refused(exported: Path, tmp_path:
     golden = load_file(tmp_path / GOLDEN)
     golden["outputs/value/value"][3] += 1e-2
     save_file(golden, tmp_path / GOLDEN)
-    with pytest.raises(ArtefactError, match=r"value\.onnx differs from the original by"):
+    with pytest.raises(ArtifactError, match=r"value\.onnx differs from the original by"):
         verify(tmp_path)
 
 
 def test_a_failed_export_leaves_nothing(
-    artefact: Path,
+    artifact: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(module, "TOLERANCE", 0.0)
-    assert main([f"--policy.path={artefact}", f"--output_dir={tmp_path / 'onnx'}"]) == 4
+    assert main([f"--policy.path={artifact}", f"--output_dir={tmp_path / 'onnx'}"]) == 4
     assert "the export is wrong" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
 
@@ -220,13 +220,13 @@ def test_misuse_is_explained(
 
 
 def test_without_the_packages_it_says_what_to_install(
-    artefact: Path,
+    artifact: Path,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(packages, "is_installed", lambda name: name != "onnx")
-    assert main([f"--policy.path={artefact}", f"--output_dir={tmp_path / 'onnx'}"]) == 5
+    assert main([f"--policy.path={artifact}", f"--output_dir={tmp_path / 'onnx'}"]) == 5
     assert "egovcp-export needs onnx, which is not installed" in capsys.readouterr().err
     assert not list(tmp_path.glob("*onnx*"))
 
@@ -238,7 +238,7 @@ def test_a_reward_is_exported(tmp_path: Path) -> None:
     config = dataclasses.replace(config, loss=loss)
     torch.manual_seed(0)
     model = _lively(WorldModel(config))
-    save_artefact(tmp_path / "policy", model, PlannerConfig(), {"controller_id": "s-1"})
+    save_artifact(tmp_path / "policy", model, PlannerConfig(), {"controller_id": "s-1"})
     argv = [f"--policy.path={tmp_path / 'policy'}", f"--output_dir={tmp_path / 'onnx'}"]
     assert main(argv) == 0
     errors = verify(tmp_path / "onnx")
@@ -251,7 +251,7 @@ def test_a_planner_that_draws_latents_is_refused(
 ) -> None:
     model = WorldModel(PRESETS["debug"])
     provenance = {"controller_id": "s-1"}
-    save_artefact(tmp_path / "policy", model, PlannerConfig(latent="sample"), provenance)
+    save_artifact(tmp_path / "policy", model, PlannerConfig(latent="sample"), provenance)
     argv = [f"--policy.path={tmp_path / 'policy'}", f"--output_dir={tmp_path / 'onnx'}"]
     assert main(argv) == 4
     assert "--planner.latent=mean" in capsys.readouterr().err

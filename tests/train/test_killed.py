@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.model import Batch
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.loop import Learner
@@ -114,6 +114,6 @@ def _whole(output: Path) -> int:
     assert last.is_symlink()
     assert last.is_dir(), "last dangles"
     step = int(load_training_state(output)["learner"]["step"])
-    assert load_artefact(str(last / "pretrained_model")).manifest["step"] == step
+    assert load_artifact(str(last / "pretrained_model")).manifest["step"] == step
     assert last.resolve().name == f"{step:06d}"
     return step

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from egovcp.artefact import load_artefact, save_artefact
-from egovcp.checks import check_artefact
+from egovcp.artifact import load_artifact, save_artifact
+from egovcp.checks import check_artifact
 from egovcp.hub import RetryPolicy
 from egovcp.plan import PlannerConfig
 from egovcp.processors import PROCESSORS
@@ -38,10 +38,10 @@ def logged_in(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An artefact without a run; tests must not change it."""
-    path = tmp_path_factory.mktemp("artefact") / "pretrained_model"
+    """An artifact without a run; tests must not change it."""
+    path = tmp_path_factory.mktemp("artifact") / "pretrained_model"
     planner = PlannerConfig(samples=16, elites=4, iterations=1)
-    save_artefact(path, toy_model(), planner, {"controller_id": "stance-1", "step": 7})
+    save_artifact(path, toy_model(), planner, {"controller_id": "stance-1", "step": 7})
     return path
 
 
@@ -62,9 +62,9 @@ def test_a_run_is_published_in_one_commit_and_plans_from_there(
     published = {path for path in head.files if path != ".gitattributes"}
     data = {"config.json", "model.safetensors", "manifest.json", *PROCESSORS}
     assert published == {*data, "README.md", "assets/training.png"}
-    artefact = check_artefact("me/policy", head.sha)
-    assert artefact.manifest == load_artefact(str(_last(run))).manifest
-    config = json.loads((artefact.path / "config.json").read_text())
+    artifact = check_artifact("me/policy", head.sha)
+    assert artifact.manifest == load_artifact(str(_last(run))).manifest
+    config = json.loads((artifact.path / "config.json").read_text())
     assert not {"push_to_hub", "repo_id", "private"} & config["world_model"].keys()
 
 
@@ -74,7 +74,7 @@ def test_the_card_says_what_the_manifest_knows(
     run = tmp_path / "run"
     assert train(arguments(run, *TO_HUB, sampling__length=16)) == 0
     card = (_last(run) / "README.md").read_text(encoding="utf-8")
-    manifest = load_artefact(str(_last(run))).manifest
+    manifest = load_artifact(str(_last(run))).manifest
     front = yaml.safe_load(card.split("---")[1])
     assert (front["license"], front["pipeline_tag"]) == ("apache-2.0", "robotics")
     assert manifest["tasks"] == ["ball"]
@@ -89,7 +89,7 @@ def test_the_card_says_what_the_manifest_knows(
 def test_a_run_that_is_not_published_has_its_card_too(arguments: Arguments, tmp_path: Path) -> None:
     assert train(arguments(tmp_path / "run", steps=1)) == 0
     card = (_last(tmp_path / "run") / "README.md").read_text(encoding="utf-8")
-    assert f'load_artefact("{_last(tmp_path / "run").resolve()}")' in card
+    assert f'load_artifact("{_last(tmp_path / "run").resolve()}")' in card
 
 
 def test_a_private_run_is_private(hub: FakeHub, arguments: Arguments, tmp_path: Path) -> None:
@@ -159,13 +159,13 @@ def test_a_failed_push_keeps_the_run_and_names_the_command_that_repeats_it(
     shown = capsys.readouterr()
     assert "done at step 6" in shown.out
     assert shown.err.splitlines()[-1].startswith("egovcp-train: error: ")
-    assert check_artefact(str(_last(run))).manifest["step"] == 6
+    assert check_artifact(str(_last(run))).manifest["step"] == 6
     assert hub.requests["commit"] == 0
     hub.heal()
     name, *again = shlex.split(shown.err.strip().rpartition("repeat that with: ")[2])
     assert name == "egovcp-push"
     assert push(again) == 0
-    assert load_artefact("me/policy").manifest["step"] == 6
+    assert load_artifact("me/policy").manifest["step"] == 6
     assert hub.store.refs(REPO).private
 
 
@@ -187,7 +187,7 @@ def test_a_resumed_run_is_published_as_it_was_told_at_first(
     hub.heal()
     assert train([f"--output_dir={run}", "--resume"]) == 0
     assert hub.requests["commit"] == 1
-    assert load_artefact("me/policy").manifest["step"] == 6
+    assert load_artifact("me/policy").manifest["step"] == 6
 
 
 # --- egovcp-push ------------------------------------------------------------------------
@@ -202,10 +202,10 @@ def test_pushing_again_changes_nothing(hub: FakeHub, policy: Path, tmp_path: Pat
     assert push(argv) == 0
     assert json.loads(report.read_text())["new"] is False
     assert hub.store.commit(REPO, "main").sha == head
-    assert load_artefact("me/policy", "v1").path.name == head
+    assert load_artifact("me/policy", "v1").path.name == head
 
 
-def test_only_the_artefact_and_its_card_are_published(hub: FakeHub, policy: Path) -> None:
+def test_only_the_artifact_and_its_card_are_published(hub: FakeHub, policy: Path) -> None:
     (policy / "notes.txt").write_text("mine")
     assert push([f"--policy.path={policy}", "--repo_id=me/policy", *QUICK]) == 0
     assert "notes.txt" not in hub.store.commit(REPO, "main").files
@@ -220,7 +220,7 @@ def test_only_the_artefact_and_its_card_are_published(hub: FakeHub, policy: Path
         ("", "me/policy", 2, "expected the folder"),
         ("absent", "me/policy", 2, "expected the folder"),
         (None, "policy", 2, "expected user/name"),
-        (".", "me/policy", 4, "not a policy artefact"),
+        (".", "me/policy", 4, "not a policy artifact"),
     ],
 )
 def test_misuse_is_explained(

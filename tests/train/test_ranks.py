@@ -17,7 +17,7 @@ import pytest
 import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.train import main
 
@@ -108,7 +108,7 @@ def test_a_signal_stops_all_of_them_and_the_run_can_go_on(
     assert "stopped early at step" in out
     step = load_training_state(output)["learner"]["step"]
     folder = output / "checkpoints" / "last" / "pretrained_model"
-    assert load_artefact(str(folder)).manifest["step"] == step
+    assert load_artifact(str(folder)).manifest["step"] == step
     argv = [f"--output_dir={output}", "--resume", f"--steps={step + 2}"]
     assert _launch(argv)[0] == 0
 

@@ -15,7 +15,7 @@ import draccus
 import pytest
 import torch
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Provenance
 from egovcp.model import Batch
 from egovcp_train import checkpoint
@@ -82,7 +82,7 @@ def test_a_stopped_run_that_is_resumed_equals_an_uninterrupted_one(
     assert "stopped early at step 4" in said
     command = next(line for line in said.splitlines() if line.startswith("continue: "))
     assert _state(output)["learner"]["step"] == 4
-    load_artefact(str(output / "checkpoints" / "last" / "pretrained_model"))
+    load_artifact(str(output / "checkpoints" / "last" / "pretrained_model"))
     assert [signal.getsignal(s) for s in (signal.SIGINT, signal.SIGTERM)] == handlers
 
     assert main(command.removeprefix("continue: egovcp-train ").split()) == 0

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from egovcp import spec
-from egovcp.artefact import load_artefact
-from egovcp.checks import check_artefact
+from egovcp.artifact import load_artifact
+from egovcp.checks import check_artifact
 from egovcp.cli import parse_config
 from egovcp.data import DatasetWriter, Episode, Provenance
 from egovcp.entry_point import prepare_process
@@ -39,7 +39,7 @@ def _last(output: Path) -> Path:
 
 
 # --- a run ------------------------------------------------------------------------------
-def test_a_run_writes_checkpoints_and_an_artefact_that_plans(
+def test_a_run_writes_checkpoints_and_an_artifact_that_plans(
     arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     output = tmp_path / "run"
@@ -50,12 +50,12 @@ def test_a_run_writes_checkpoints_and_an_artefact_that_plans(
         "last",
     ]
     assert _last(output).resolve().name == "000006"
-    artefact = check_artefact(str(_last(output) / "pretrained_model"))
-    assert artefact.controller_id == "stance-test"
-    assert artefact.planner.samples == 16
-    assert artefact.manifest["step"] == 6
-    assert {"latent/active", "latent/kl"} <= artefact.manifest["heldout"].keys()
-    assert artefact.manifest["heldout_tasks"]["ball"]["episodes"] == 1
+    artifact = check_artifact(str(_last(output) / "pretrained_model"))
+    assert artifact.controller_id == "stance-test"
+    assert artifact.planner.samples == 16
+    assert artifact.manifest["step"] == 6
+    assert {"latent/active", "latent/kl"} <= artifact.manifest["heldout"].keys()
+    assert artifact.manifest["heldout_tasks"]["ball"]["episodes"] == 1
     printed = capsys.readouterr().out
     assert "done at step 6" in printed
     assert str(output / "checkpoints" / "000006" / "pretrained_model") in printed
@@ -115,7 +115,7 @@ def test_the_statistics_are_those_of_the_training_episodes(
     arguments: Arguments, tmp_path: Path
 ) -> None:
     assert main(arguments(tmp_path / "run", steps=1)) == 0
-    model = load_artefact(str(_last(tmp_path / "run") / "pretrained_model")).world_model
+    model = load_artifact(str(_last(tmp_path / "run") / "pretrained_model")).world_model
     assert model.state_mean.abs().max() < 0.5
     assert ((model.state_std - 1).abs() < 0.5).all()
     ceiling = sum(spec.GAMMA**i for i in range(5))
@@ -124,14 +124,14 @@ def test_the_statistics_are_those_of_the_training_episodes(
 
 def test_a_preset_is_where_the_policy_options_start(arguments: Arguments, tmp_path: Path) -> None:
     assert main(arguments(tmp_path / "run", "--policy.latent=5", "--policy.loss.value=2.5")) == 0
-    config = load_artefact(str(_last(tmp_path / "run") / "pretrained_model")).world_model.config
+    config = load_artifact(str(_last(tmp_path / "run") / "pretrained_model")).world_model.config
     assert (config.hidden, config.latent, config.loss.value) == (32, 5, 2.5)
 
 
 def test_a_run_under_a_clock_ends_early_and_whole(arguments: Arguments, tmp_path: Path) -> None:
     output = tmp_path / "run"
     assert main(arguments(output, steps=10**6, save_freq=10**6, max_minutes=0.005)) == 0
-    step = load_artefact(str(_last(output) / "pretrained_model")).manifest["step"]
+    step = load_artifact(str(_last(output) / "pretrained_model")).manifest["step"]
     assert 0 < step < 10**6
 
 
@@ -279,7 +279,7 @@ def test_a_fault_in_mid_run_stops_within_3_steps_and_keeps_the_last_good_checkpo
     assert steps[-1] == 7
     assert "last good checkpoint" in capsys.readouterr().err.splitlines()[-1]
     for folder in (output / "checkpoints").iterdir():
-        weights = load_artefact(str(folder / "pretrained_model")).world_model.state_dict()
+        weights = load_artifact(str(folder / "pretrained_model")).world_model.state_dict()
         assert all(x.isfinite().all() for x in weights.values())
     learner = load_training_state(output)["learner"]
     kept = [*learner["model"].values(), *learner["averaged"].values()]
@@ -336,7 +336,7 @@ def test_bfloat16_is_chosen_where_the_device_computes_in_it(
     assert not choose_bf16("no", torch.device("cpu"))
 
 
-def test_the_controller_of_the_data_goes_into_the_artefact(
+def test_the_controller_of_the_data_goes_into_the_artifact(
     arguments: Arguments, tmp_path: Path
 ) -> None:
     rows = 12
@@ -361,7 +361,7 @@ def test_the_controller_of_the_data_goes_into_the_artefact(
     assert main(argv) == 0
     folder = _last(tmp_path / "run") / "pretrained_model"
     assert (folder / MANIFEST).is_file()
-    assert load_artefact(str(folder)).controller_id == "walker-7"
+    assert load_artifact(str(folder)).controller_id == "walker-7"
 
 
 def test_paper_preset_sets_the_options_of_the_paper_outside_the_world_model_too() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp_train.train import main
 
 type Arguments = Callable[..., list[str]]
@@ -54,7 +54,7 @@ def test_pictures_that_fail_in_the_middle_cost_nothing_of_what_was_to_be_saved_t
         patch.setattr("egovcp_train.train.draw", _full)
         assert main(arguments(output, **options)) == 5
     assert (output / "checkpoints" / "last").resolve().name == "000003"
-    kept = load_artefact(str(output / "checkpoints/last/pretrained_model"))
+    kept = load_artifact(str(output / "checkpoints/last/pretrained_model"))
     assert "value/slope" in kept.manifest["heldout"]
     assert main([f"--output_dir={output}", "--resume"]) == 0
     assert _weights(output) == _weights(whole)

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 import torch
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader, DatasetWriter, Provenance
 from egovcp.data.source import lerobot_home
@@ -80,8 +80,8 @@ def _data_files(hub_home: Path) -> int:
     return len(list(hub_home.rglob("snapshots/*/data/**/*.parquet")))
 
 
-def _artefact(output: Path) -> Any:
-    return load_artefact(str(output / "checkpoints" / "last" / "pretrained_model"))
+def _artifact(output: Path) -> Any:
+    return load_artifact(str(output / "checkpoints" / "last" / "pretrained_model"))
 
 
 @pytest.mark.usefixtures("nothing_ahead")
@@ -90,7 +90,7 @@ def test_a_run_starts_before_the_dataset_is_here_and_stays_with_its_commit(
 ) -> None:
     assert main(streamed(tmp_path / "run", steps=1)) == 0
     assert 0 < _data_files(lerobot_home()) < 8
-    manifest = _artefact(tmp_path / "run").manifest
+    manifest = _artifact(tmp_path / "run").manifest
     assert manifest["datasets"] == [{"repo_id": "me/ball", "revision": commit, "episodes": ""}]
     assert manifest["heldout_episodes"]["count"] == 1
 
@@ -98,7 +98,7 @@ def test_a_run_starts_before_the_dataset_is_here_and_stays_with_its_commit(
     (other / "README.md").write_text("a newer version")
     assert _publish(other) != commit
     assert main([f"--output_dir={tmp_path / 'run'}", "--resume", "--steps=2"]) == 0
-    assert _artefact(tmp_path / "run").manifest["datasets"][0]["revision"] == commit
+    assert _artifact(tmp_path / "run").manifest["datasets"][0]["revision"] == commit
 
 
 def test_the_batches_and_the_state_statistics_are_those_of_a_local_copy(
@@ -109,7 +109,7 @@ def test_the_batches_and_the_state_statistics_are_those_of_a_local_copy(
     assert main(arguments(tmp_path / "disk", dataset__root=many_files, steps=3, **window)) == 0
     streams = [load_training_state(tmp_path / name)["streams"][0] for name in ("streamed", "disk")]
     assert streams[0] == streams[1]
-    models = [_artefact(tmp_path / name).world_model.state_dict() for name in ("streamed", "disk")]
+    models = [_artifact(tmp_path / name).world_model.state_dict() for name in ("streamed", "disk")]
     for name in ("state_mean", "state_std"):
         torch.testing.assert_close(models[0][name], models[1][name])
 
@@ -183,9 +183,9 @@ def test_only_the_episodes_asked_for_are_trained_on_and_named(
     arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(arguments(tmp_path / "run", dataset__episodes="[0:3, 5]")) == 0
-    artefact = _artefact(tmp_path / "run")
-    assert artefact.manifest["datasets"][0]["episodes"] == "[0:3, 5]"
-    (numbers,) = artefact.manifest["heldout_episodes"]["numbers"]
+    artifact = _artifact(tmp_path / "run")
+    assert artifact.manifest["datasets"][0]["episodes"] == "[0:3, 5]"
+    (numbers,) = artifact.manifest["heldout_episodes"]["numbers"]
     assert set(numbers) < {0, 1, 2, 5}
     assert main([f"--output_dir={tmp_path / 'run'}", "--resume", "--steps=7"]) == 0
 

@@ -19,14 +19,14 @@ class _Run:
     def __init__(self, run_id: str) -> None:
         self.id = run_id
         self.logged: list[tuple[int, dict[str, Any]]] = []
-        self.artefacts: list[Any] = []
+        self.artifacts: list[Any] = []
         self.finished = False
 
     def log(self, values: dict[str, Any], step: int) -> None:
         self.logged.append((step, values))
 
-    def log_artifact(self, artefact: Any) -> None:
-        self.artefacts.append(artefact)
+    def log_artifact(self, artifact: Any) -> None:
+        self.artifacts.append(artifact)
 
     def finish(self) -> None:
         self.finished = True
@@ -82,14 +82,14 @@ def test_scalars_pictures_and_the_policy_go_there_and_a_resumed_run_goes_on(
     assert "heldout/value_ball" in logged
     steps = [step for step, _ in run.logged]
     assert steps == sorted(steps)  # wandb drops what goes back in time
-    (artefact,) = run.artefacts
-    assert artefact.folders == [str(output / "checkpoints" / "000006" / "pretrained_model")]
+    (artifact,) = run.artifacts
+    assert artifact.folders == [str(output / "checkpoints" / "000006" / "pretrained_model")]
     assert run.finished
 
     argv = [f"--output_dir={output}", "--resume", "--steps=8", "--wandb.disable_artifact"]
     assert main(argv) == 0
     assert wandb.asked[-1]["id"] == "abc123"
-    assert wandb.runs[-1].artefacts == []
+    assert wandb.runs[-1].artifacts == []
 
 
 def test_without_the_package_it_is_refused_before_anything_is_written(

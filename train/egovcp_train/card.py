@@ -10,7 +10,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.artefact import Artefact, load_artefact
+from egovcp.artifact import Artifact, load_artifact
 from egovcp.atomic import write_text
 from egovcp_train.curves import draw_curves
 
@@ -42,28 +42,28 @@ def versions() -> dict[str, str]:
 
 
 def write_card(folder: Path, run: Path, repo_id: str) -> None:
-    """Put card and training curves beside the artefact in ``folder``.
+    """Put card and training curves beside the artifact in ``folder``.
 
     Args:
-        folder: the artefact.
+        folder: the artifact.
         run: output folder of the run, whose records the curves are drawn from.
         repo_id: id on the Hub that the examples name; empty: they name the folder.
     """
     draw_curves(run, folder / CURVES)
-    write_text(folder / CARD, card_text(load_artefact(str(folder)), repo_id))
+    write_text(folder / CARD, card_text(load_artifact(str(folder)), repo_id))
 
 
-def card_text(artefact: Artefact, repo_id: str) -> str:
+def card_text(artifact: Artifact, repo_id: str) -> str:
     """The card of a policy; it shows the curves that lie beside it.
 
     Args:
-        artefact: the policy.
+        artifact: the policy.
         repo_id: id on the Hub, `user/name`, that the examples name; empty: they name the folder.
     """
     from huggingface_hub import ModelCard
 
-    manifest = artefact.manifest
-    name = repo_id or str(artefact.path)
+    manifest = artifact.manifest
+    name = repo_id or str(artifact.path)
     title = repo_id.partition("/")[2] or "egovcp policy"
     card = ModelCard.from_template(
         _front_matter(manifest, title),
@@ -73,15 +73,15 @@ def card_text(artefact: Artefact, repo_id: str) -> str:
         on_hub=bool(repo_id),
         tasks=[(task, _ABOUT.get(task, "")) for task in manifest.get("tasks", [])],
         datasets=[_dataset(d, manifest) for d in manifest.get("datasets", [])],
-        controller_id=artefact.controller_id,
+        controller_id=artifact.controller_id,
         step=manifest.get("step", "an unknown number of"),
         command=_command(manifest),
         versions=", ".join(f"{k} {v}" for k, v in _versions(manifest).items()),
         metrics=[(k, f"{v:.4g}", _meaning(k)) for k, v in sorted(_figures(manifest).items())],
-        curves=CURVES if (artefact.path / CURVES).is_file() else "",
-        parameters=f"{sum(p.numel() for p in artefact.world_model.parameters()):,}",
-        sizes=artefact.world_model.config,
-        planner=artefact.planner,
+        curves=CURVES if (artifact.path / CURVES).is_file() else "",
+        parameters=f"{sum(p.numel() for p in artifact.world_model.parameters()):,}",
+        sizes=artifact.world_model.config,
+        planner=artifact.planner,
         features=manifest["features"],
     )
     return f"{str(card).rstrip()}\n"

@@ -1,6 +1,6 @@
 """Checkpoints in LeRobot's layout, complete or absent, never half-written.
 
-checkpoints/000500/pretrained_model/   the policy artefact (averaged weights)
+checkpoints/000500/pretrained_model/   the policy artifact (averaged weights)
 checkpoints/000500/training_state/     raw weights, optimiser, random streams, data position, and
                                        their SHA-256
 checkpoints/last -> 000500
@@ -20,7 +20,7 @@ import torch
 
 from egovcp.atomic import removed_on_error
 from egovcp.data.files import sync, sync_tree
-from egovcp.errors import ArtefactError
+from egovcp.errors import ArtifactError
 from egovcp.model.weights import MAX_WEIGHT_BYTES
 from egovcp.safe_files import UnsafeFileError, open_regular, read_text, sha256
 
@@ -77,11 +77,11 @@ def load_training_state(output_dir: Path) -> dict[str, Any]:
     """Training state of the last complete checkpoint.
 
     Raises:
-        ArtefactError: there is none, or it cannot be read.
+        ArtifactError: there is none, or it cannot be read.
     """
     path = output_dir / "checkpoints" / "last" / "training_state" / STATE_FILE
     if not os.path.lexists(path):
-        raise ArtefactError(
+        raise ArtifactError(
             f"{output_dir}: no checkpoint to resume from (expected "
             f"{path.relative_to(output_dir)}); start without --resume in a new folder"
         )
@@ -92,7 +92,7 @@ def load_training_state(output_dir: Path) -> dict[str, Any]:
         return state
     except (OSError, UnsafeFileError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise ArtefactError(
+        raise ArtifactError(
             f"{path}: cannot be read ({reason}); point {output_dir}/checkpoints/last at an older "
             "checkpoint, or start again"
         ) from error
@@ -103,13 +103,13 @@ def restoring(output_dir: Path) -> Iterator[None]:
     """Around the code that takes a training state.
 
     Raises:
-        ArtefactError: the state is not that of the options.
+        ArtifactError: the state is not that of the options.
     """
     try:
         yield
     except (AttributeError, LookupError, RuntimeError, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
-        raise ArtefactError(
+        raise ArtifactError(
             f"{output_dir}: its checkpoint does not fit the options given ({reason}); resume "
             "without them, or start a new run"
         ) from error

@@ -98,11 +98,11 @@ class PolicyConfig(WorldModelConfig):
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """Train the ego-vision world model from a LeRobot dataset and write a policy artefact.
+    """Train the ego-vision world model from a LeRobot dataset and write a policy artifact.
 
     The dataset comes from disk (--dataset.root) or from the Hub (--dataset.repo_id); --datasets
     mixes several. Checkpoints follow LeRobot's layout:
-    OUTPUT_DIR/checkpoints/last/pretrained_model is the artefact for egovcp-deploy.
+    OUTPUT_DIR/checkpoints/last/pretrained_model is the artifact for egovcp-deploy.
     """
 
     output_dir: str
@@ -117,7 +117,7 @@ class TrainConfig:
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     """World model, losses, and where to publish."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
-    """Planner settings stored in the artefact."""
+    """Planner settings stored in the artifact."""
     returns: ReturnConfig = field(default_factory=ReturnConfig)
     """Monte Carlo target of Q."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)

@@ -21,10 +21,10 @@ import numpy as np
 import torch
 from safetensors.torch import load_file, save
 
-from egovcp.artefact import WEIGHTS, Artefact, load_artefact
+from egovcp.artifact import WEIGHTS, Artifact, load_artifact
 from egovcp.atomic import removed_on_error, write_bytes
 from egovcp.cli import run_command
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.errors import ArtifactError, UsageError
 from egovcp.manifest import MANIFEST
 from egovcp.packages import require_packages
 from egovcp.policy_options import PolicyOptions
@@ -57,7 +57,7 @@ class ExportConfig:
     """
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
-    """The artefact."""
+    """The artifact."""
     output_dir: str = ""
     """New folder for the networks."""
 
@@ -71,36 +71,36 @@ def export(config: ExportConfig) -> None:
     """Write, prove, and say how far the networks are from the original.
 
     Raises:
-        UsageError: artefact or folder are not named, or the folder holds something.
-        ArtefactError: the artefact is damaged, or a network does not say what the original says.
+        UsageError: artifact or folder are not named, or the folder holds something.
+        ArtifactError: the artifact is damaged, or a network does not say what the original says.
         EnvironmentFailure: onnx or onnxruntime is missing, or the folder cannot be written.
     """
     if not config.policy.path or not config.output_dir:
         raise UsageError(
-            "--policy.path and --output_dir are needed: the artefact, and a new folder"
+            "--policy.path and --output_dir are needed: the artifact, and a new folder"
         )
     _require_packages()
     output = prepare_output(config.output_dir, resume=False, resumable=False)
-    artefact = load_artefact(config.policy.path, config.policy.revision)
+    artifact = load_artifact(config.policy.path, config.policy.revision)
     with removed_on_error(output.with_name(output.name + ".partial")) as work:
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
-        errors = write_export(artefact, work)
+        errors = write_export(artifact, work)
         os.replace(work, output)
     for name, error in errors.items():
         echo(f"{output / name}.onnx: at most {error:.1e} from the original")
     echo(f"golden vectors: {output / GOLDEN}; description: {output / REPORT}")
 
 
-def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:
+def write_export(artifact: Artifact, folder: Path) -> dict[str, float]:
     """Write everything to the existing ``folder``; network -> its largest error.
 
     Raises:
-        ArtefactError: a network does not say what the original says, or the planner would ask for
+        ArtifactError: a network does not say what the original says, or the planner would ask for
             more than they say.
     """
-    model = artefact.world_model
-    _require_exportable(artefact)
+    model = artifact.world_model
+    _require_exportable(artifact)
     for name, network in networks_of(model).items():
         write_graph(network(model), golden_inputs(model, _TRACED_ROWS, 1), folder / f"{name}.onnx")
     inputs = golden_inputs(model, _ROWS)
@@ -109,18 +109,18 @@ def write_export(artefact: Artefact, folder: Path) -> dict[str, float]:
         golden |= {f"outputs/{name}/{key}": tensor for key, tensor in outputs.items()}
     write_bytes(folder / GOLDEN, save({name: t.contiguous() for name, t in golden.items()}))
     errors = verify(folder)
-    report = _report(artefact, folder, golden) | {"largest_error": errors}
+    report = _report(artifact, folder, golden) | {"largest_error": errors}
     text = json.dumps(report, indent=2, allow_nan=False) + "\n"
     (folder / REPORT).write_text(text, encoding="utf-8")
     return errors
 
 
-def _require_exportable(artefact: Artefact) -> None:
-    """Raise `ArtefactError` for a planner that asks what the networks do not answer."""
-    planner = artefact.planner
+def _require_exportable(artifact: Artifact) -> None:
+    """Raise `ArtifactError` for a planner that asks what the networks do not answer."""
+    planner = artifact.planner
     if planner.latent != "mean":
-        raise ArtefactError(
-            f"{artefact.path}: its planner has latent={planner.latent}; the networks written here "
+        raise ArtifactError(
+            f"{artifact.path}: its planner has latent={planner.latent}; the networks written here "
             "give the mean, and another plan: train with --planner.latent=mean"
         )
 
@@ -131,7 +131,7 @@ def verify(folder: Path) -> dict[str, float]:
     Errors are relative where the reference exceeds 1, absolute elsewhere.
 
     Raises:
-        ArtefactError: one exceeds `TOLERANCE`.
+        ArtifactError: one exceeds `TOLERANCE`.
         EnvironmentFailure: onnxruntime is missing.
     """
     _require_packages()
@@ -141,7 +141,7 @@ def verify(folder: Path) -> dict[str, float]:
     for name in {**NETWORKS, **present}:
         errors[name] = _largest_error(folder, name, golden)
         if not errors[name] <= TOLERANCE:  # NaN is more, too
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{folder / name}.onnx differs from the original by {errors[name]:.1e}, more than "
                 f"{TOLERANCE:g}; the export is wrong"
             )
@@ -174,10 +174,10 @@ def _largest_error(folder: Path, name: str, golden: Mapping[str, torch.Tensor]) 
     )
 
 
-def _report(artefact: Artefact, folder: Path, golden: dict[str, torch.Tensor]) -> dict[str, Any]:
+def _report(artifact: Artifact, folder: Path, golden: dict[str, torch.Tensor]) -> dict[str, Any]:
     """What another runtime must know besides the graphs."""
 
-    model = artefact.world_model
+    model = artifact.world_model
     networks = {name: network(model) for name, network in networks_of(model).items()}
 
     def described(key: str) -> dict[str, Any]:
@@ -198,15 +198,15 @@ def _report(artefact: Artefact, folder: Path, golden: dict[str, torch.Tensor]) -
             for name, network in networks.items()
         },
         "golden": {"file": GOLDEN, "sha256": _sha256(folder / GOLDEN), "tolerance": TOLERANCE},
-        "min_return": float(artefact.world_model.min_return),
-        "discount": float(artefact.world_model.discount),
-        "planner": draccus.encode(artefact.planner),
-        "controller_id": artefact.controller_id,
-        "features": artefact.manifest["features"],
-        "artefact": {
-            "manifest_sha256": _sha256(artefact.path / MANIFEST),
-            "weights_sha256": artefact.manifest["files"][WEIGHTS],
-            "datasets": artefact.manifest.get("datasets", []),
+        "min_return": float(artifact.world_model.min_return),
+        "discount": float(artifact.world_model.discount),
+        "planner": draccus.encode(artifact.planner),
+        "controller_id": artifact.controller_id,
+        "features": artifact.manifest["features"],
+        "artifact": {
+            "manifest_sha256": _sha256(artifact.path / MANIFEST),
+            "weights_sha256": artifact.manifest["files"][WEIGHTS],
+            "datasets": artifact.manifest.get("datasets", []),
         },
     }
 

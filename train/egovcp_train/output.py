@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.errors import ArtifactError, UsageError
 from egovcp.flags import read_config
 from egovcp.outputs import require_writable
 from egovcp.removed_options import RemovedOptionError, refuse_removed_options
@@ -27,7 +27,7 @@ def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
 
     Raises:
         UsageError: a config file is given as well.
-        ArtefactError: the run's own file cannot be read, or holds other options.
+        ArtifactError: the run's own file cannot be read, or holds other options.
     """
     given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
     saved = Path(given.get("output_dir", "")) / CONFIG_FILE
@@ -45,7 +45,7 @@ def saved_options(config_class: type, output: Path) -> dict[str, Any]:
     """The options that a run has stored in its folder; empty if it has stored none.
 
     Raises:
-        ArtefactError: they cannot be read, or are not those of ``config_class``.
+        ArtifactError: they cannot be read, or are not those of ``config_class``.
     """
     saved = output / CONFIG_FILE
     if not os.path.lexists(saved):
@@ -55,13 +55,13 @@ def saved_options(config_class: type, output: Path) -> dict[str, Any]:
         refuse_removed_options(options, str(saved))
         build(config_class, options, "--")
     except OSError as error:
-        raise ArtefactError(f"{saved}: cannot be read: {error.strerror}; {_LOST}") from error
+        raise ArtifactError(f"{saved}: cannot be read: {error.strerror}; {_LOST}") from error
     except RemovedOptionError as error:
-        raise ArtefactError(
+        raise ArtifactError(
             f"{error}; a run of an older version cannot go on: start a new one"
         ) from error
     except (UsageError, ValueError) as error:
-        raise ArtefactError(f"{saved}: {error}; {_LOST}") from error
+        raise ArtifactError(f"{saved}: {error}; {_LOST}") from error
     return options
 
 
@@ -74,7 +74,7 @@ def prepare_output(output_dir: str, resume: bool, resumable: bool = True) -> Pat
         resumable: whether the command has the option ``--resume``.
 
     Raises:
-        ArtefactError: there is nothing to resume.
+        ArtifactError: there is nothing to resume.
         UsageError: the folder exists and is not empty.
         EnvironmentFailure: it cannot be written to.
     """

@@ -1,4 +1,4 @@
-"""A policy to the Hub: the repository before training, the artefact and its card after."""
+"""A policy to the Hub: the repository before training, the artifact and its card after."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import shlex
 from pathlib import Path
 from typing import Final
 
-from egovcp.artefact import FILES, Artefact, load_artefact
+from egovcp.artifact import FILES, Artifact, load_artifact
 from egovcp.errors import EgovcpError, EnvironmentFailure
 from egovcp.hub import Content, Publication, Published, RetryPolicy, publish, reserve
 from egovcp.terminal import echo
@@ -29,17 +29,17 @@ def reserve_policy(policy: PolicyConfig) -> None:
 
 
 def publication(
-    artefact: Artefact, repo_id: str, private: bool = False, message: str = ""
+    artifact: Artifact, repo_id: str, private: bool = False, message: str = ""
 ) -> Publication:
-    """The artefact with a card of its own, as one commit; nothing else that lies beside it."""
-    folder = artefact.path
+    """The artifact with a card of its own, as one commit; nothing else that lies beside it."""
+    folder = artifact.path
     names = [name for name in (*FILES, CURVES) if (folder / name).is_file()]
     contents = {name: Content(folder / name) for name in names}
-    contents[CARD] = Content(card_text(artefact, repo_id).encode())
+    contents[CARD] = Content(card_text(artifact, repo_id).encode())
     return Publication(
         repo_id=repo_id,
         contents=contents,
-        message=message or f"policy after {artefact.manifest.get('step', '?')} steps",
+        message=message or f"policy after {artifact.manifest.get('step', '?')} steps",
         owned=(ASSETS,),
         private=private,
         repo_type="model",
@@ -53,7 +53,7 @@ def publish_trained(folder: Path, policy: PolicyConfig) -> None:
         EnvironmentFailure: it could not be published; the message says how to try again.
     """
     try:
-        target = publication(load_artefact(str(folder)), policy.repo_id, policy.private)
+        target = publication(load_artifact(str(folder)), policy.repo_id, policy.private)
         report(target, publish(target, RETRY_POLICY))
     except (EgovcpError, OSError) as error:
         private = ["--private"] if policy.private else []

@@ -1,4 +1,4 @@
-"""``egovcp-push``: a policy artefact to the Hub."""
+"""``egovcp-push``: a policy artifact to the Hub."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.hub import PublishConfig, is_repo_id, publish
@@ -18,22 +18,22 @@ PROG = "egovcp-push"
 
 @dataclass(frozen=True)
 class FolderConfig:
-    """Which policy artefact."""
+    """Which policy artifact."""
 
     path: str = ""
-    """Folder of the artefact, OUTPUT_DIR/checkpoints/last/pretrained_model of a run."""
+    """Folder of the artifact, OUTPUT_DIR/checkpoints/last/pretrained_model of a run."""
 
 
 @dataclass(frozen=True)
 class PushConfig(PublishConfig):
-    """Publish a policy artefact and its card on the Hub in one commit.
+    """Publish a policy artifact and its card on the Hub in one commit.
 
-    The artefact is checked first. A push that failed can be repeated: it completes what is
+    The artifact is checked first. A push that failed can be repeated: it completes what is
     missing, and commits nothing if nothing differs.
     """
 
     policy: FolderConfig = field(default_factory=FolderConfig)
-    """The artefact."""
+    """The artifact."""
     message: str = ""
     """Title of the commit; empty: how long it was trained."""
 
@@ -48,18 +48,18 @@ def push(config: PushConfig) -> None:
 
     Raises:
         UsageError: the folder or the id is missing or wrong.
-        ArtefactError: the artefact is damaged.
+        ArtifactError: the artifact is damaged.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
     if not Path(config.policy.path).is_dir() or not config.policy.path:
         raise UsageError(
-            f"--policy.path={config.policy.path!r}: expected the folder of an artefact, such as "
+            f"--policy.path={config.policy.path!r}: expected the folder of an artifact, such as "
             "runs/ball/checkpoints/last/pretrained_model"
         )
     if not is_repo_id(config.repo_id):
         raise UsageError(f"--repo_id={config.repo_id!r}: expected user/name, where to publish")
-    artefact = load_artefact(config.policy.path)
-    plain = publication(artefact, config.repo_id, config.private, config.message)
+    artifact = load_artifact(config.policy.path)
+    plain = publication(artifact, config.repo_id, config.private, config.message)
     target = replace(plain, branch=config.branch, tag=config.tag)
     published = publish(target, config.network)
     report(target, published)

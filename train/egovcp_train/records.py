@@ -21,7 +21,7 @@ class Records(Protocol):
         """Record a picture (height, width, 3) at ``step``."""
         ...
 
-    def artefact(self, step: int, folder: Path) -> None:
+    def artifact(self, step: int, folder: Path) -> None:
         """Take the finished policy."""
         ...
 
@@ -52,7 +52,7 @@ class Recorder:
         if self._writer is not None:
             self._writer.add_image(name, pixels, step, dataformats="HWC")
 
-    def artefact(self, step: int, folder: Path) -> None:
+    def artifact(self, step: int, folder: Path) -> None:
         """TensorBoard keeps no files."""
 
     def close(self) -> None:
@@ -80,10 +80,10 @@ class Everywhere:
         for records in self._records:
             records.picture(step, name, pixels)
 
-    def artefact(self, step: int, folder: Path) -> None:
+    def artifact(self, step: int, folder: Path) -> None:
         """Hand on the finished policy."""
         for records in self._records:
-            records.artefact(step, folder)
+            records.artifact(step, folder)
 
     def close(self) -> None:
         """Everything is written."""

@@ -1,4 +1,4 @@
-"""``egovcp-train``: dataset in, policy artefact out."""
+"""``egovcp-train``: dataset in, policy artifact out."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import draccus
 import torch
 from tqdm import tqdm
 
-from egovcp.artefact import save_artefact
+from egovcp.artifact import save_artifact
 from egovcp.cli import run_command, save_config
 from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.errors import UsageError
@@ -95,7 +95,7 @@ def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
 
 
 def train(config: TrainConfig) -> None:
-    """Run training to its end, or to the first SIGINT or SIGTERM, and write the artefact.
+    """Run training to its end, or to the first SIGINT or SIGTERM, and write the artifact.
 
     Raises:
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
@@ -177,14 +177,14 @@ class Run:
 
     def _conclude(self, final: Path, finished: bool) -> None:
         """Say where everything is, and publish what is finished."""
-        artefact = final / "pretrained_model"
+        artifact = final / "pretrained_model"
         echo(self._last_words(final, stopped=not finished))
-        write_card(artefact, self.output, self.config.policy.repo_id)
+        write_card(artifact, self.output, self.config.policy.repo_id)
         if finished:
-            self.recorder.artefact(self.learner.step, artefact)
+            self.recorder.artifact(self.learner.step, artifact)
         self.recorder.close()
         if finished and self.config.policy.push_to_hub:
-            publish_trained(artefact, self.config.policy)
+            publish_trained(artifact, self.config.policy)
 
     def _learn(self, stopped: list[int]) -> bool:
         """Step until the budget is spent, or ``stopped`` fills here or in another process; returns
@@ -262,7 +262,7 @@ class Run:
                 self.recorder.picture(step, f"heldout/{name}", picture)
 
     def save(self, model: WorldModel) -> None:
-        """Write a checkpoint: the model as artefact, and the training state of all processes.
+        """Write a checkpoint: the model as artifact, and the training state of all processes.
 
         Raises:
             DataError: the model is not finite.
@@ -278,7 +278,7 @@ class Run:
         learned = {"learner": self.learner.state_dict(), "streams": streams}
         state = {**learned, "datasets": digests, **spent}
         with new_checkpoint(self.output, self.learner.step, state) as folder:
-            save_artefact(folder, model, self.config.planner, provenance)
+            save_artifact(folder, model, self.config.planner, provenance)
 
     def _summary(self, terms: dict[str, Any], bar: Any, frames: int) -> dict[str, str]:
         summary = {"loss": f"{float(terms['loss/total']):.3f}"}
@@ -292,22 +292,22 @@ class Run:
         found = self.metrics | {f"closed_loop/{k}": v for k, v in self.played.items()}
         lines = [f"  {name:<20} {value:.4f}" for name, value in sorted(found.items())]
         state = "stopped early" if stopped else "done"
-        artefact = final / "pretrained_model"
+        artifact = final / "pretrained_model"
         return "\n".join(
             [
                 f"{PROG}: {state} at step {self.learner.step}; on held-out episodes:",
                 *lines,
                 table(self.tasks),
-                f"artefact: {artefact}",
+                f"artifact: {artifact}",
                 f"continue: {PROG} --output_dir={self.output} --resume"
                 if stopped
-                else f"next: egovcp-eval --policy.path={artefact} --task=... --output_dir=...",
+                else f"next: egovcp-eval --policy.path={artifact} --task=... --output_dir=...",
             ]
         )
 
 
 def _require_loadable(config: TrainConfig) -> None:
-    """Raise `UsageError` for networks so large that their artefact would be refused."""
+    """Raise `UsageError` for networks so large that their artifact would be refused."""
     try:
         tensor_shapes(config.policy.world_model())
     except ValueError as error:
@@ -351,7 +351,7 @@ def _restore(output: Path, learner: Learner, material: TrainingData) -> float:
     """Continue from the last checkpoint; returns the seconds that the run has taken so far.
 
     Raises:
-        ArtefactError: its networks are not those of the options.
+        ArtifactError: its networks are not those of the options.
         DataError: the dataset is another one.
         UsageError: the windows or the processes are others.
     """

@@ -1,4 +1,4 @@
-"""Scalars, pictures and the artefact of a run to Weights & Biases, if asked."""
+"""Scalars, pictures and the artifact of a run to Weights & Biases, if asked."""
 
 from __future__ import annotations
 
@@ -89,13 +89,13 @@ class WandbRecorder:
         """Record a picture (height, width, 3) at ``step``."""
         self._run.log({name: self._wandb.Image(pixels)}, step=step)
 
-    def artefact(self, step: int, folder: Path) -> None:
+    def artifact(self, step: int, folder: Path) -> None:
         """Upload the finished policy, unless that is switched off."""
         if self._config.disable_artifact:
             return
-        artefact = self._wandb.Artifact(f"egovcp-{self._run.id}-{step:06d}", type="model")
-        artefact.add_dir(str(folder))
-        self._run.log_artifact(artefact)
+        artifact = self._wandb.Artifact(f"egovcp-{self._run.id}-{step:06d}", type="model")
+        artifact.add_dir(str(folder))
+        self._run.log_artifact(artifact)
 
     def close(self) -> None:
         """Send what is left."""

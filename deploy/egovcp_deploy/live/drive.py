@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from tqdm import tqdm
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.atomic import write_json
 from egovcp.errors import EgovcpError, SafetyStop, UsageError
 from egovcp.hardware import available_cores
@@ -52,38 +52,38 @@ def check_live(config: DeployConfig) -> None:
         raise UsageError(f"--operator.duration={config.operator.duration}: expected s from 0")
 
 
-def drive(config: DeployConfig, artefact: Artefact) -> None:
+def drive(config: DeployConfig, artifact: Artifact) -> None:
     """One run of a robot, recorded as rollout 0.
 
     Raises:
-        ArtefactError: the artefact is not made for the low-level controller.
+        ArtifactError: the artifact is not made for the low-level controller.
         EnvironmentFailure: robot, camera or disk fail.
         SafetyStop: the motors were damped for safety.
     """
     hardware = HardwareOptions(config.robot.bridge, config.robot.camera)
-    folder = _prepare(config, artefact)
+    folder = _prepare(config, artifact)
     stays = config.operator.type != "auto" or not config.operator.duration
-    _run(config, artefact, folder, LiveSetup(hardware, *_how(config), stays))
+    _run(config, artifact, folder, LiveSetup(hardware, *_how(config), stays))
 
 
-def drive_simulated(config: DeployConfig, artefact: Artefact) -> None:
+def drive_simulated(config: DeployConfig, artifact: Artifact) -> None:
     """The same with the simulator on the wall clock, for one episode.
 
     Raises:
-        ArtefactError, EnvironmentFailure, SafetyStop: as `drive`.
+        ArtifactError, EnvironmentFailure, SafetyStop: as `drive`.
     """
     operator_options = config.operator
     if operator_options.type == "auto" and not operator_options.duration:
         operator_options = replace(operator_options, duration=SIMULATED_S)
     robot = replace(config.robot, controller=config.env.controller)
     config = replace(config, robot=robot, operator=operator_options)
-    folder = _prepare(config, artefact)
+    folder = _prepare(config, artifact)
     with simulated(config, folder / "task.json") as hardware:
-        _run(config, artefact, folder, LiveSetup(hardware, *_how(config), False, simulated=True))
+        _run(config, artifact, folder, LiveSetup(hardware, *_how(config), False, simulated=True))
 
 
-def _prepare(config: DeployConfig, artefact: Artefact) -> Path:
-    artefact.require_controller(make_controller(config.robot.controller).id)
+def _prepare(config: DeployConfig, artifact: Artifact) -> Path:
+    artifact.require_controller(make_controller(config.robot.controller).id)
     return make_output_dir(config.output_dir)
 
 
@@ -91,10 +91,10 @@ def _how(config: DeployConfig) -> tuple[str, Limits]:
     return config.robot.controller, config.robot.limits
 
 
-def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetup) -> None:
+def _run(config: DeployConfig, artifact: Artifact, folder: Path, setup: LiveSetup) -> None:
     controller_id = make_controller(setup.controller).id
     _leave_a_core()
-    policy = artefact.make_policy(1, config.seed)
+    policy = artifact.make_policy(1, config.seed)
     thinker = Thinker(policy, config.imagine)
     thinker.warm_up()
     info = run_info(
@@ -104,7 +104,7 @@ def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetu
         CameraView(),
         config.encoded(),
         controller_id,
-        artefact,
+        artifact,
         backend_of(policy),
     )
     try:
@@ -112,7 +112,7 @@ def _run(config: DeployConfig, artefact: Artefact, folder: Path, setup: LiveSetu
     except EgovcpError:
         _clear(folder)
         raise
-    write_json(folder / "deploy.json", _report(config, artefact, info, summary))
+    write_json(folder / "deploy.json", _report(config, artifact, info, summary))
     _print(summary, info.backend, folder)
     _judge(summary, folder)
 
@@ -169,7 +169,7 @@ def _show(bar: Any, tick: Tick) -> None:
 
 
 def _report(
-    config: DeployConfig, artefact: Artefact, info: RunInfo, summary: LiveSummary
+    config: DeployConfig, artifact: Artifact, info: RunInfo, summary: LiveSummary
 ) -> dict[str, Any]:
     """Content of ``deploy.json``."""
     return {
@@ -188,7 +188,7 @@ def _report(
         "failure": "" if summary.failure is None else failure_words(summary.failure),
         "events": summary.events,
         "config": config.encoded(),
-        "artefact": artefact.manifest["files"],
+        "artifact": artifact.manifest["files"],
         "low_level_controller": info.hashes["low_level_controller"],
         "backend": info.backend,
         "versions": dict(info.versions),

@@ -14,7 +14,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.errors import EnvironmentFailure
 from egovcp.robot.controllers import make_controller
 from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER, LINK_NAMES, link_transforms
@@ -63,13 +63,13 @@ class Heard:
     """Of every image when it arrived, where the camera tells."""
 
 
-def examine_hardware(config: DeployConfig, artefact: Artefact | None) -> Iterator[Finding]:
+def examine_hardware(config: DeployConfig, artifact: Artifact | None) -> Iterator[Finding]:
     """Controller, robot and camera."""
 
     def controller() -> str:
         found = make_controller(config.robot.controller).id
-        if artefact is not None:
-            artefact.require_controller(found)
+        if artifact is not None:
+            artifact.require_controller(found)
         return found
 
     yield examine("controller", controller)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from egovcp.errors import EnvironmentFailure
-from egovcp.lifeline import die_with_parent
+from egovcp.parent_death import die_with_parent
 from egovcp.workers import inherited_by_workers
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions

@@ -44,7 +44,7 @@ class Robot(Protocol):
 
     @property
     def controller_id(self) -> str:
-        """Identity of the low-level controller; an artefact drives only its data's."""
+        """Identity of the low-level controller; an artifact drives only its data's."""
         ...
 
     @property

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from safetensors.torch import load, save
 
-from egovcp.artefact import CONFIG, WEIGHTS
+from egovcp.artifact import CONFIG, WEIGHTS
 from egovcp.manifest import MANIFEST, sealed
 from egovcp.processors import PROCESSORS
 

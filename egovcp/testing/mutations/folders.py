@@ -12,7 +12,7 @@ from typing import Any, Final
 import torch
 from safetensors.torch import load, save
 
-from egovcp.artefact import CONFIG, FILES, WEIGHTS
+from egovcp.artifact import CONFIG, FILES, WEIGHTS
 from egovcp.manifest import MANIFEST, SEAL
 from egovcp.processors import PROCESSORS
 from egovcp.testing.mutations.editing import (

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.artefact import CONFIG, WEIGHTS
+from egovcp.artifact import CONFIG, WEIGHTS
 from egovcp.processors import PROCESSORS
 from egovcp.testing.mutations.editing import (
     JSON_FILES,

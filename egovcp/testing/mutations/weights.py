@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 import torch
 
-from egovcp.artefact import FILES, WEIGHTS
+from egovcp.artifact import FILES, WEIGHTS
 from egovcp.testing.mutations.editing import (
     ANY_FILE,
     Json,

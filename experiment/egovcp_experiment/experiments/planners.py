@@ -16,7 +16,7 @@ from egovcp_experiment.store import Record
 from egovcp_experiment.studies.plan_time import SEARCHES
 from egovcp_experiment.tools import study
 
-#: Rule -> flags of egovcp-eval; the search is the artefact's own.
+#: Rule -> flags of egovcp-eval; the search is the artifact's own.
 RULES: Final[dict[str, Flags]] = {
     "default": {},
     "rule_paper": {"planner.termination_rule": "paper"},
@@ -76,7 +76,7 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
         f"{config.play.budget_ms:g} ms on the machine below, by a timing of all of them in turns. "
         "Elites are as many as the planner has, and at most half of the candidates. "
         "`cem_1` and `cem_6` are `cem` with that many rounds instead of 3. "
-        "Rules: the artefact's own search."
+        "Rules: the artifact's own search."
     ]
     figures: dict[str, Any] = {}
     for task in config.tasks:

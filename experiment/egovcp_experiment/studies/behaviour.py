@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.intervals import bootstrap, wilson
@@ -101,16 +101,16 @@ def measure(config: BehaviourConfig) -> None:
     """Play scenes with and without an event, and write what was done in them."""
     if config.task not in TASKS:
         raise UsageError(f"--task={config.task}: expected one of {', '.join(TASKS)}")
-    artefact = config.artefact()
-    eventful = _tracks(artefact, config.env, config)
-    empty = _tracks(artefact, config.empty(), config)
+    artifact = config.artifact()
+    eventful = _tracks(artifact, config.env, config)
+    empty = _tracks(artifact, config.empty(), config)
     found = {"ball": _ball, "wall": _wall, "arch": _arch}[config.task](config, eventful, empty)
     finish(config, {"task": config.task, "episodes": config.episodes, **found})
 
 
-def _tracks(artefact: Artefact, env: EnvConfig, config: BehaviourConfig) -> list[Track]:
+def _tracks(artifact: Artifact, env: EnvConfig, config: BehaviourConfig) -> list[Track]:
     tracks = _Tracks()
-    watch(artefact, env, config, tracks)
+    watch(artifact, env, config, tracks)
     return tracks.tracks
 
 

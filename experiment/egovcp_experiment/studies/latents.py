@@ -73,11 +73,11 @@ def measure(config: LatentsConfig) -> None:
     """Play, and write the maps."""
     if config.points < 4 or not config.tasks:
         raise UsageError("--points must be at least 4, and --tasks name a task")
-    artefact = config.artefact()
+    artifact = config.artifact()
     rows = []
     for number, task in enumerate(config.tasks):
         seen = _Seen(number)
-        watch(artefact, config.env, replace(config, task=task), seen)
+        watch(artifact, config.env, replace(config, task=task), seen)
         rows += seen.rows
     states = _spread(rows, config.points)
     figures: dict[str, Any] = {

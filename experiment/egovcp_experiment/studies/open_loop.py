@@ -88,11 +88,11 @@ def measure(config: OpenLoopConfig) -> None:
     """Play, imagine, and write pictures and errors."""
     if config.task not in SEEN_S:
         raise UsageError(f"--task={config.task}: expected one of {', '.join(SEEN_S)}")
-    artefact = config.artefact()
+    artifact = config.artifact()
     films = _Films(config)
-    watch(artefact, config.env, config, films)
+    watch(artifact, config.env, config, films)
     whole = [f for _, f in sorted(films.films.items()) if len(f.depth) > HORIZONS[-1]]
-    foreseen = [_foreseen(artefact.world_model, film) for film in whole]
+    foreseen = [_foreseen(artifact.world_model, film) for film in whole]
     seen = [np.stack([film.depth[k] for k in HORIZONS]) / 1e3 for film in whole]
     errors = {}
     for i, k in enumerate(HORIZONS):

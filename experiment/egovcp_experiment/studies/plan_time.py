@@ -15,7 +15,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.plan import PlannerConfig, Policy
@@ -45,7 +45,7 @@ class PlanTimeConfig(StudyConfig):
     """Find the candidates that each search affords in equal time."""
 
     planner: PlannerOptions = field(default_factory=PlannerOptions)
-    """Changes to the artefact's planner, whose number of elites all searches keep."""
+    """Changes to the artifact's planner, whose number of elites all searches keep."""
     budget_ms: float = 40.0
     """Time for a plan of one robot, ms."""
     rounds: int = 9
@@ -56,24 +56,24 @@ def measure(config: PlanTimeConfig) -> None:
     """Time the searches and write what each affords."""
     if config.budget_ms <= 0 or config.rounds < 1:
         raise UsageError("--budget_ms must be above 0, and --rounds at least 1")
-    artefact = config.load(config.planner)
+    artifact = config.load(config.planner)
     policies = {
-        (name, samples): _policy(artefact, name, samples)
+        (name, samples): _policy(artifact, name, samples)
         for name in SEARCHES
         for samples in (_FEW, _MANY)
     }
     times = _in_turns(policies, config.rounds)
     searches = {
         name: _afforded(
-            artefact.planner, name, times[name, _FEW], times[name, _MANY], config.budget_ms
+            artifact.planner, name, times[name, _FEW], times[name, _MANY], config.budget_ms
         )
         for name in SEARCHES
     }
     finish(config, {"budget_ms": config.budget_ms, "searches": searches})
 
 
-def _policy(artefact: Artefact, search: str, samples: int) -> Policy:
-    policy = artefact.make_policy(planner=_planner(artefact.planner, search, samples))
+def _policy(artifact: Artifact, search: str, samples: int) -> Policy:
+    policy = artifact.make_policy(planner=_planner(artifact.planner, search, samples))
     policy.prepare()
     return policy
 

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
@@ -81,9 +81,9 @@ class _Point:
 class _Points(Watcher):
     """Keeps one moment of every episode."""
 
-    def __init__(self, task: str, artefact: Artefact, seed: int) -> None:
-        self._after, self._model = _AFTER[task], artefact.world_model
-        self._eta = artefact.planner.eta
+    def __init__(self, task: str, artifact: Artifact, seed: int) -> None:
+        self._after, self._model = _AFTER[task], artifact.world_model
+        self._eta = artifact.planner.eta
         self._generator = torch.Generator().manual_seed(seed)
         self.points: list[_Point] = []
 
@@ -140,11 +140,11 @@ def measure(config: ResidualsConfig) -> None:
             f"--eta={config.eta} --step_ticks={[least, most]}: expected a step within the box, at "
             "most 2, and 1 <= shortest <= longest; the data's card says how its walk stepped"
         )
-    artefact = config.artefact()
-    points = _Points(config.task, artefact, config.seed)
-    longest = replace(artefact, planner=replace(artefact.planner, horizon=STEPS))
+    artifact = config.artifact()
+    points = _Points(config.task, artifact, config.seed)
+    longest = replace(artifact, planner=replace(artifact.planner, horizon=STEPS))
     watch(longest, config.env, config, points)
-    returns = _returns(artefact)
+    returns = _returns(artifact)
     found: dict[str, list[Residuals]] = {}
     for number, point in enumerate(tqdm(points.points, unit="plan", desc="branch")):
         for kind, plan in point.plans.items():
@@ -158,17 +158,17 @@ def measure(config: ResidualsConfig) -> None:
             "task": config.task,
             "branches": config.branches,
             "return_steps": returns[1],
-            "return_std": float(artefact.world_model.return_std),
+            "return_std": float(artifact.world_model.return_std),
             "plans": {kind: analysis(rows) for kind, rows in found.items()},
         },
     )
 
 
-def _returns(artefact: Artefact) -> tuple[float, int]:
+def _returns(artifact: Artifact) -> tuple[float, int]:
     """Discount and ticks of the return that Q was trained on."""
-    if not artefact.manifest.get("train_config", {}).get("returns"):
-        raise UsageError(f"{artefact.path} does not say which return it was trained on")
-    returns = returns_of(artefact)
+    if not artifact.manifest.get("train_config", {}).get("returns"):
+        raise UsageError(f"{artifact.path} does not say which return it was trained on")
+    returns = returns_of(artifact)
     return returns.gamma, returns.steps
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.atomic import write_json
 from egovcp.errors import UsageError
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
@@ -25,12 +25,12 @@ class StudyConfig:
     policy: PolicyOptions = field(default_factory=PolicyOptions)
     """The policy to look at."""
 
-    def load(self, planner: PlannerOptions = _AS_IT_IS) -> Artefact:
+    def load(self, planner: PlannerOptions = _AS_IT_IS) -> Artifact:
         """The policy, its planner changed.
 
         Raises:
             UsageError: none is named, or the changes make no sense.
-            ArtefactError: it is missing or damaged.
+            ArtifactError: it is missing or damaged.
         """
         self.policy.require()
         return load_policy(self.policy, planner)

@@ -104,10 +104,10 @@ def measure(config: ValueMapsConfig) -> None:
     """Play, and write the maps."""
     if config.task != "ball":
         raise UsageError(f"--task={config.task}: expected ball, the task with something to meet")
-    artefact = config.artefact()
+    artifact = config.artifact()
     maps = _Maps()
-    watch(artefact, config.env, config, maps)
-    scale = float(artefact.world_model.return_std)
+    watch(artifact, config.env, config, maps)
+    scale = float(artifact.world_model.return_std)
     finish(config, {"summary": _summary(maps, scale), **_shown(maps), "return_std": scale})
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from egovcp.artefact import Artefact
+from egovcp.artifact import Artifact
 from egovcp.errors import UsageError
 from egovcp.plan import Policy, PolicyStep
 from egovcp.policy_options import PlannerOptions
@@ -36,22 +36,22 @@ class WatchConfig(StudyConfig):
     seed: int = 0
     """Which scenarios."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
-    """Changes to the artefact's planner."""
+    """Changes to the artifact's planner."""
     env: EnvConfig = field(default_factory=eventful)
     """Scenes, sensors, delays and randomisation."""
 
-    def artefact(self) -> Artefact:
+    def artifact(self) -> Artifact:
         """The policy, if the options make sense.
 
         Raises:
             UsageError: they do not.
-            ArtefactError: the artefact is missing, damaged, or of another controller.
+            ArtifactError: the artifact is missing, damaged, or of another controller.
         """
         if self.episodes < 1:
             raise UsageError(f"--episodes={self.episodes}: expected at least 1")
-        artefact = self.load(self.planner)
-        artefact.require_controller(make_controller(self.env.controller).id)
-        return artefact
+        artifact = self.load(self.planner)
+        artifact.require_controller(make_controller(self.env.controller).id)
+        return artifact
 
     def empty(self) -> EnvConfig:
         """The scenes without any event."""
@@ -87,7 +87,7 @@ class Watcher:
 
 
 def watch(
-    artefact: Artefact,
+    artifact: Artifact,
     env_config: EnvConfig,
     config: WatchConfig,
     watcher: Watcher,
@@ -99,18 +99,18 @@ def watch(
         for part in batched(every, _ROBOTS):
             if over():
                 return
-            _play(artefact, VectorEnv(env_config, len(part)), part, config.seed, watcher)
+            _play(artifact, VectorEnv(env_config, len(part)), part, config.seed, watcher)
             bar.update(len(part))
 
 
 def _play(
-    artefact: Artefact,
+    artifact: Artifact,
     env: VectorEnv,
     scenarios: Sequence[Scenario],
     seed: int,
     watcher: Watcher,
 ) -> None:
-    policy = artefact.make_policy(len(scenarios), seed)
+    policy = artifact.make_policy(len(scenarios), seed)
     observation = env.reset(scenarios)
     watcher.begin(scenarios)
     while not env.done.all():

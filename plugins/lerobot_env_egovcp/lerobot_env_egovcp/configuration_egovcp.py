@@ -84,7 +84,7 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
         """What LeRobot applies to observations and to actions of these environments.
 
         Raises:
-            UsageError, ArtefactError: as `make_controller`, for ``simulation.controller``.
+            UsageError, ArtifactError: as `make_controller`, for ``simulation.controller``.
         """
         step = ControllerIdProcessorStep(make_controller(self.simulation.controller).id)
         return PolicyProcessorPipeline(steps=[step]), PolicyProcessorPipeline(steps=[])

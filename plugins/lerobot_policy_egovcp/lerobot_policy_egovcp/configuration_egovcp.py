@@ -29,7 +29,7 @@ def _no_normalisation() -> dict[str, NormalizationMode]:
 @PreTrainedConfig.register_subclass("egovcp")
 @dataclass
 class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
-    """World model, planner and training of an egovcp policy; the first two are the artefact's.
+    """World model, planner and training of an egovcp policy; the first two are the artifact's.
 
     ``lerobot-train`` saves the last weights, not averaged ones as ``egovcp-train`` does: its
     training loop has no place for a second model.

@@ -18,9 +18,9 @@ from lerobot.policies import PreTrainedPolicy
 from torch import Tensor, nn
 
 from egovcp import spec
-from egovcp.artefact import CONFIG, Artefact, load_artefact, write_artefact
+from egovcp.artifact import CONFIG, Artifact, load_artifact, write_artifact
 from egovcp.data import DatasetReader
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.errors import ArtifactError, UsageError
 from egovcp.manifest import SEAL
 from egovcp.model import WorldModel, world_model_loss
 from egovcp.model.statistics import set_statistics
@@ -39,7 +39,7 @@ _OWN_KEYS = ("schema_version", "egovcp_version", "features", "files", SEAL)  # o
 class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
     """Filters every observation into the world model's memory, then plans.
 
-    What it saves is an artefact as ``egovcp-train`` writes it (see `egovcp.artefact`).
+    What it saves is an artifact as ``egovcp-train`` writes it (see `egovcp.artifact`).
     """
 
     config_class = EgovcpConfig
@@ -90,40 +90,40 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         dataset_stats: Stats | None = None,
         dataset_meta: LeRobotDatasetMetadata | None = None,
     ) -> Self:
-        """Load and validate an artefact of ``egovcp-train`` or ``lerobot-train``, for evaluation.
+        """Load and validate an artifact of ``egovcp-train`` or ``lerobot-train``, for evaluation.
 
         Args:
-            config: replaces the artefact's own, for another planner or other loss weights.
-            dataset_stats: not used: the artefact has its own.
+            config: replaces the artifact's own, for another planner or other loss weights.
+            dataset_stats: not used: the artifact has its own.
             dataset_meta: a dataset to train on further.
 
         Raises:
-            ArtefactError: missing, tampered with, of another spec, not of this ``config``, or
+            ArtifactError: missing, tampered with, of another spec, not of this ``config``, or
                 of another low-level controller than the dataset.
             EnvironmentFailure: the Hub cannot be reached.
         """
-        artefact = load_artefact(str(pretrained_name_or_path), revision or "")
+        artifact = load_artifact(str(pretrained_name_or_path), revision or "")
         if config is None:
-            config = _read_config(artefact.path)
+            config = _read_config(artifact.path)
         policy = cls(config, dataset_meta=dataset_meta)
         if policy._reader is not None:
-            artefact.require_controller(policy._reader.controller_id)
-        policy._take(artefact)
+            artifact.require_controller(policy._reader.controller_id)
+        policy._take(artifact)
         policy.to(config.device)
         policy.eval()
         return policy
 
-    def _take(self, artefact: Artefact) -> None:
-        """The weights and, for want of a dataset of its own, the provenance of an artefact."""
+    def _take(self, artifact: Artifact) -> None:
+        """The weights and, for want of a dataset of its own, the provenance of an artifact."""
         try:
-            self.world_model.load_state_dict(artefact.world_model.state_dict())
+            self.world_model.load_state_dict(artifact.world_model.state_dict())
         except RuntimeError as error:
             reason = " ".join(str(error).split())[:300]
-            raise ArtefactError(
-                f"{artefact.path}: its weights are not those of --policy.world_model ({reason}); "
-                "leave the sizes as the artefact has them"
+            raise ArtifactError(
+                f"{artifact.path}: its weights are not those of --policy.world_model ({reason}); "
+                "leave the sizes as the artifact has them"
             ) from error
-        older = {k: v for k, v in artefact.manifest.items() if k not in _OWN_KEYS}
+        older = {k: v for k, v in artifact.manifest.items() if k not in _OWN_KEYS}
         self._provenance = self._provenance or older
 
     # --- acting --------------------------------------------------------------------------
@@ -155,7 +155,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         Raises:
             DataError: a part of the observation is missing, or of another type, shape or unit.
             UsageError: E changed without a `reset`.
-            ArtefactError: the policy was trained for another low-level controller.
+            ArtifactError: the policy was trained for another low-level controller.
         """
         self._require_controller(batch.get("info"))
         depth, state = read_observation(batch)
@@ -175,7 +175,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         found = info.get(spec.CONTROLLER_ID_KEY) if isinstance(info, Mapping) else None
         expected = self._provenance.get("controller_id")
         if None not in (found, expected) and found != expected:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"the policy was trained on data of low-level controller {expected!r}, but the "
                 f"environment runs {found!r}; choose the data's with --env.simulation.controller, "
                 "or train on data of this one"
@@ -224,17 +224,17 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
     def _save_pretrained(
         self, save_directory: Path, state_dict: dict[str, Tensor] | None = None
     ) -> None:
-        """Write the artefact; LeRobot adds its processors, and so the manifest is without them.
+        """Write the artifact; LeRobot adds its processors, and so the manifest is without them.
 
         Raises:
-            ArtefactError: it is not known which low-level controller the policy drives.
+            ArtifactError: it is not known which low-level controller the policy drives.
         """
         weights = {
             name.removeprefix(_PREFIX): value
             for name, value in (state_dict or self.state_dict()).items()
         }
         config = draccus.encode(self.config, PreTrainedConfig)
-        write_artefact(Path(save_directory), config, weights, self._provenance, {})
+        write_artifact(Path(save_directory), config, weights, self._provenance, {})
 
 
 def _read_config(folder: Path) -> EgovcpConfig:
@@ -243,7 +243,7 @@ def _read_config(folder: Path) -> EgovcpConfig:
         return config
     except (UsageError, DraccusException, TypeError, ValueError) as error:
         reason = " ".join(str(error).split())[:300]
-        raise ArtefactError(f"{folder / CONFIG}: {reason}; the file is damaged") from error
+        raise ArtifactError(f"{folder / CONFIG}: {reason}; the file is damaged") from error
 
 
 def _reader(meta: LeRobotDatasetMetadata | None) -> DatasetReader | None:

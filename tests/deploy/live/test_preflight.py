@@ -109,7 +109,7 @@ type Look = Callable[..., tuple[int, dict[str, str]]]
 @pytest.fixture
 def look(
     robot: LiveRobot,
-    artefact_dir: Path,
+    artifact_dir: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
@@ -133,7 +133,7 @@ def look(
             code = main(
                 [
                     *("--dry_run=true", "--robot.type=unitree_g1", "--robot.controller=stance"),
-                    f"--policy.path={artefact_dir}",
+                    f"--policy.path={artifact_dir}",
                     f"--output_dir={tmp_path / 'run'}",
                     f"--robot.bridge.state_port={fake.ports.state_port}",
                     f"--robot.bridge.command_port={fake.ports.command_port}",

@@ -90,7 +90,7 @@ class Stand:
 
 
 @pytest.fixture
-def drive(robot: LiveRobot, artefact_dir: Path, tmp_path: Path) -> Iterator[Callable[..., Stand]]:
+def drive(robot: LiveRobot, artifact_dir: Path, tmp_path: Path) -> Iterator[Callable[..., Stand]]:
     robot.start(Scenario("ball", 0, 0))
     fake = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
     running, programs = Running(fake), list[subprocess.Popen[str]]()
@@ -99,7 +99,7 @@ def drive(robot: LiveRobot, artefact_dir: Path, tmp_path: Path) -> Iterator[Call
         folder, ports = tmp_path / "run", fake.ports
         command = [
             *(sys.executable, "-c", before + _PROGRAM, "--robot.type=unitree_g1"),
-            *(f"--policy.path={artefact_dir}", f"--output_dir={folder}", "--log.rrd=false"),
+            *(f"--policy.path={artifact_dir}", f"--output_dir={folder}", "--log.rrd=false"),
             "--robot.controller=stance",
             f"--robot.bridge.state_port={ports.state_port}",
             f"--robot.bridge.command_port={ports.command_port}",
@@ -236,11 +236,11 @@ def test_a_robot_that_goes_silent_is_damped_and_the_run_is_a_safety_stop(
     assert "no new proprioception" in words
 
 
-def test_no_robot_there_is_said_at_once(artefact_dir: Path, tmp_path: Path) -> None:
+def test_no_robot_there_is_said_at_once(artifact_dir: Path, tmp_path: Path) -> None:
     result = subprocess.run(
         [
             *(sys.executable, "-m", "egovcp_deploy.deploy", "--robot.type=unitree_g1"),
-            *(f"--policy.path={artefact_dir}", f"--output_dir={tmp_path / 'run'}"),
+            *(f"--policy.path={artifact_dir}", f"--output_dir={tmp_path / 'run'}"),
             *("--robot.controller=stance", "--robot.bridge.state_port=1"),
         ],
         capture_output=True,

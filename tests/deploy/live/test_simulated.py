@@ -24,14 +24,14 @@ type Start = Callable[..., subprocess.Popen[str]]
 
 
 @pytest.fixture
-def start(artefact_dir: Path, tmp_path: Path, short: list[str]) -> Iterator[Start]:
+def start(artifact_dir: Path, tmp_path: Path, short: list[str]) -> Iterator[Start]:
     """Starts a run of a tiny planner that writes into ``tmp_path / "run"``."""
     programs = list[subprocess.Popen[str]]()
 
     def start(*flags: str) -> subprocess.Popen[str]:
         command = [
             *(sys.executable, "-m", "egovcp_deploy.deploy", "--realtime=true"),
-            *(f"--policy.path={artefact_dir}", f"--output_dir={tmp_path / 'run'}"),
+            *(f"--policy.path={artifact_dir}", f"--output_dir={tmp_path / 'run'}"),
             *("--log.rrd=false", *short, *QUICK, *flags),
         ]
         environment = os.environ | {"OMP_NUM_THREADS": "1"}

@@ -11,7 +11,7 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from egovcp.artefact import load_artefact
+from egovcp.artifact import load_artifact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.errors import DataError, UsageError
 from egovcp.log.info import RunInfo
@@ -63,8 +63,8 @@ class Watched:
         self._policy.advance(sent)
 
 
-def watched(artefact_dir: Path, askew: float = 0.0) -> Watched:
-    return Watched(load_artefact(str(artefact_dir)).make_policy(1, seed=5), askew)
+def watched(artifact_dir: Path, askew: float = 0.0) -> Watched:
+    return Watched(load_artifact(str(artifact_dir)).make_policy(1, seed=5), askew)
 
 
 def run(policy: Watched, robot: Robot, sink: Sink) -> None:
@@ -81,13 +81,13 @@ def play(policy: Watched, robot: ReplayRobot, episode: int = 0) -> list[Tick]:
 
 @pytest.fixture(scope="module")
 def recorded(
-    artefact_dir: Path, tmp_path_factory: pytest.TempPathFactory
+    artifact_dir: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, list[Watched]]:
     """Two simulated rollouts on disk, and what the policy thought."""
     folder, thoughts = tmp_path_factory.mktemp("runs"), []
     robot = SimRobot(CONFIG, "ball", seed=1)
     for episode in range(2):
-        policy, sink = watched(artefact_dir), McapSink(folder / f"rollout-{episode}.mcap")
+        policy, sink = watched(artifact_dir), McapSink(folder / f"rollout-{episode}.mcap")
         robot.start(episode)
         sink.open(
             RunInfo(
@@ -107,10 +107,10 @@ def recorded(
 @pytest.mark.parametrize("askew", [0.0, 0.5])
 @pytest.mark.parametrize("episode", [0, 1])
 def test_the_recurrence_takes_the_same_steps(
-    recorded: tuple[Path, list[Watched]], artefact_dir: Path, episode: int, askew: float
+    recorded: tuple[Path, list[Watched]], artifact_dir: Path, episode: int, askew: float
 ) -> None:
     folder, thoughts = recorded
-    again = watched(artefact_dir, askew)  # whatever it plans now, what was sent was sent
+    again = watched(artifact_dir, askew)  # whatever it plans now, what was sent was sent
     ticks = play(again, open_recordings(folder), episode)
     then = thoughts[episode]
     assert len(ticks) == len(then.carries) == TICKS
@@ -120,11 +120,11 @@ def test_the_recurrence_takes_the_same_steps(
 
 
 def test_everything_that_was_recorded_comes_back(
-    recorded: tuple[Path, list[Watched]], artefact_dir: Path
+    recorded: tuple[Path, list[Watched]], artifact_dir: Path
 ) -> None:
     folder, _ = recorded
     robot = open_recordings(folder / "rollout-1.mcap")
-    ticks = play(watched(artefact_dir), robot)
+    ticks = play(watched(artifact_dir), robot)
     live = SimRobot(CONFIG, "ball", seed=1)
     live.start(1)
     assert robot.controller_id == live.controller_id
@@ -150,12 +150,12 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_an_episode_of_a_dataset_plays_back(dataset: Path, artefact_dir: Path) -> None:
+def test_an_episode_of_a_dataset_plays_back(dataset: Path, artifact_dir: Path) -> None:
     robot = open_recordings(dataset)
     assert robot.count == 2
     assert robot.controller_id == "stance-1"
     for number, episode in enumerate((random_episode(0, 6), random_episode(1, 4, time_limit=9))):
-        ticks = play(watched(artefact_dir), robot, number)
+        ticks = play(watched(artifact_dir), robot, number)
         for t, tick in enumerate(ticks):
             np.testing.assert_array_equal(tick.depth, episode.depth[t])
             np.testing.assert_array_equal(tick.state, episode.state[t])
@@ -185,12 +185,12 @@ def test_a_run_on_the_wall_clock_begins_where_the_planner_took_over(
 
 
 def test_a_recording_that_was_torn_off_ends_where_it_ends(
-    recorded: tuple[Path, list[Watched]], artefact_dir: Path, tmp_path: Path
+    recorded: tuple[Path, list[Watched]], artifact_dir: Path, tmp_path: Path
 ) -> None:
     whole = (recorded[0] / "rollout-0.mcap").read_bytes()
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(whole[: len(whole) * 2 // 3])
-    ticks = play(watched(artefact_dir), open_recordings(torn))
+    ticks = play(watched(artifact_dir), open_recordings(torn))
     assert 0 < len(ticks) < TICKS
     assert ticks[-1].truncated
     assert ENDS in ticks[-1].events

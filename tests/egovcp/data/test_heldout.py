@@ -1,4 +1,4 @@
-"""What the artefact says of the episodes that it was not trained on."""
+"""What the artifact says of the episodes that it was not trained on."""
 
 import json
 

@@ -7,7 +7,7 @@ import numpy as np
 import onnx
 import pytest
 
-from egovcp.errors import ArtefactError
+from egovcp.errors import ArtifactError
 from egovcp.robot.controllers import make_controller
 from egovcp.robot.g1 import STIFFNESS
 from egovcp.robot.walk_onnx import OBSERVATION_NAMES, OnnxPolicy, export_onnx
@@ -86,13 +86,13 @@ def _changed(path: Path, key: str, value: str) -> None:
 )
 def test_another_layout_is_refused(path: Path, key: str, value: str, reason: str):
     _changed(path, key, value)
-    with pytest.raises(ArtefactError, match=reason):
+    with pytest.raises(ArtifactError, match=reason):
         OnnxPolicy(path)
 
 
 def test_a_torn_or_missing_file_is_refused(path: Path):
     path.write_bytes(path.read_bytes()[:500])
-    with pytest.raises(ArtefactError, match="not a controller"):
+    with pytest.raises(ArtifactError, match="not a controller"):
         OnnxPolicy(path)
-    with pytest.raises(ArtefactError, match="no such controller"):
+    with pytest.raises(ArtifactError, match="no such controller"):
         OnnxPolicy(path.with_name("none.onnx"))

@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.numpy import save_file
 
-from egovcp.errors import ArtefactError
+from egovcp.errors import ArtifactError
 from egovcp.robot.gait import GaitConfig
 from egovcp.robot.walk_policy import SCHEMA, WalkPolicy
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
@@ -70,7 +70,7 @@ def test_the_digest_follows_every_number(policy: WalkPolicy):
 
 
 def test_a_missing_file_is_named(tmp_path: Path):
-    with pytest.raises(ArtefactError, match=r"none\.safetensors.*egovcp-train-lowlevel"):
+    with pytest.raises(ArtifactError, match=r"none\.safetensors.*egovcp-train-lowlevel"):
         WalkPolicy.load(tmp_path / "none.safetensors")
 
 
@@ -103,7 +103,7 @@ GOOD = {"schema": SCHEMA, "content": json.dumps({"config": {}, "provenance": {}}
 def test_anything_else_is_refused(policy, tmp_path, change, metadata, reason):
     path = tmp_path / "walk.safetensors"
     save_file(_tensors(policy) | change, path, metadata=metadata or None)
-    with pytest.raises(ArtefactError, match=reason):
+    with pytest.raises(ArtifactError, match=reason):
         WalkPolicy.load(path)
 
 
@@ -111,5 +111,5 @@ def test_a_torn_file_is_refused(policy: WalkPolicy, tmp_path: Path):
     path = tmp_path / "walk.safetensors"
     policy.save(path)
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ArtefactError, match="not a controller"):
+    with pytest.raises(ArtifactError, match="not a controller"):
         WalkPolicy.load(path)

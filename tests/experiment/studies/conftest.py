@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.artefact import save_artefact
+from egovcp.artifact import save_artifact
 from egovcp.plan import PlannerConfig
 from egovcp.robot.stance import StanceController
 from egovcp.testing import toy_model
@@ -14,14 +14,14 @@ from egovcp.testing import toy_model
 
 @pytest.fixture(scope="session")
 def policy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A policy artefact with random weights and a tiny planner."""
+    """A policy artifact with random weights and a tiny planner."""
     path = tmp_path_factory.mktemp("policy") / "policy"
     planner = PlannerConfig(samples=16, horizon=2, iterations=1, elites=4)
     provenance = {
         "controller_id": StanceController().id,
         "train_config": {"returns": {"gamma": 0.97, "steps": 8}},
     }
-    save_artefact(path, toy_model(), planner, provenance)
+    save_artifact(path, toy_model(), planner, provenance)
     return path
 
 

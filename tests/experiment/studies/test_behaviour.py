@@ -65,7 +65,7 @@ def test_its_planner_can_be_changed(
     assert "elites (2) exceed samples (1)" in capsys.readouterr().err
 
 
-def test_an_artefact_of_another_controller_is_refused(
+def test_an_artifact_of_another_controller_is_refused(
     flags: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([*flags, "--env.controller=walk"]) == 4

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from egovcp.artefact import load_artefact, save_artefact
+from egovcp.artifact import load_artifact, save_artifact
 from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader
 from egovcp.plan import PlannerConfig
@@ -24,7 +24,7 @@ type Arguments = Callable[..., list[str]]
 
 @pytest.fixture(scope="module")
 def policy(arguments: Arguments, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The artefact of a run of two steps."""
+    """The artifact of a run of two steps."""
     output = tmp_path_factory.mktemp("policy") / "run"
     assert train(arguments(output, steps=2)) == 0
     return output / "checkpoints" / "last" / "pretrained_model"
@@ -88,7 +88,7 @@ def test_the_figures_of_a_run_are_measured_again(
     assert main(argv) == 0
     assert {p.name for p in tmp_path.iterdir()} == {"heldout.json"}
     content = json.loads((tmp_path / "heldout.json").read_text("utf-8"))
-    trained = load_artefact(str(policy)).manifest
+    trained = load_artifact(str(policy)).manifest
     assert content["tasks"] == trained["heldout_tasks"]
     assert content["all_tasks"] == trained["heldout"]
 
@@ -132,7 +132,7 @@ def test_refusals(
 def test_data_of_another_controller_is_refused(
     dataset_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    save_artefact(tmp_path / "p", toy_model(), PlannerConfig(), {"controller_id": "walk-of-others"})
+    save_artifact(tmp_path / "p", toy_model(), PlannerConfig(), {"controller_id": "walk-of-others"})
     assert main(_argv(tmp_path / "p", dataset_root, tmp_path / "out")) == 4
     said = capsys.readouterr().err
     assert "walk-of-others" in said

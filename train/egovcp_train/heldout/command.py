@@ -12,12 +12,12 @@ from typing import Any, Final
 
 import torch
 
-from egovcp.artefact import Artefact, load_artefact
+from egovcp.artifact import Artifact, load_artifact
 from egovcp.atomic import write_text
 from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.errors import ArtifactError, UsageError
 from egovcp.outputs import require_writable
 from egovcp.policy_options import PolicyOptions
 from egovcp.stop_signals import stop_on_signal
@@ -76,7 +76,7 @@ def evaluate(config: HeldoutConfig) -> None:
 
     Raises:
         UsageError: an option makes no sense.
-        ArtefactError: the policy is damaged, or of another low-level controller.
+        ArtifactError: the policy is damaged, or of another low-level controller.
         DataError: the dataset is damaged.
         EnvironmentFailure: the folder cannot be written.
         KeyboardInterrupt: after SIGINT or SIGTERM.
@@ -85,14 +85,14 @@ def evaluate(config: HeldoutConfig) -> None:
     torch.set_num_threads(config.threads or torch.get_num_threads())
     device = choose_device(config.device)
     reader = DatasetReader.open(config.dataset)
-    artefact = load_artefact(config.policy.path, config.policy.revision)
-    require_same_controller(artefact, reader)
-    returns = returns_of(artefact)
+    artifact = load_artifact(config.policy.path, config.policy.revision)
+    require_same_controller(artifact, reader)
+    returns = returns_of(artifact)
     limit = config.episodes or None
     store = EpisodeStore.load([reader], config.split, returns, per_task=limit)
     if returns.scale == "per_task":
-        store = on_task_scales(store, _return_scales(artefact))
-    model = artefact.world_model.to(device)
+        store = on_task_scales(store, _return_scales(artifact))
+    model = artifact.world_model.to(device)
     with stop_on_signal() as received:
         stopped = partial(bool, received)
         report = measure(model, recorded(store, device), config.stride, stopped)
@@ -103,7 +103,7 @@ def evaluate(config: HeldoutConfig) -> None:
         if found["episodes"] < requested[task]:
             found |= {"incomplete": True, "episodes_requested": requested[task]}
     echo(table(report.tasks))
-    _write(output, report, _run(config, artefact, reader) | {"complete": complete})
+    _write(output, report, _run(config, artifact, reader) | {"complete": complete})
     if not complete:
         counts = [f"{task} {played.get(task, 0)} of {n}" for task, n in requested.items()]
         echo(f"INCOMPLETE: {', '.join(counts)} episodes measured")
@@ -123,36 +123,36 @@ def _check(config: HeldoutConfig) -> Path:
     return output
 
 
-def require_same_controller(artefact: Artefact, reader: DatasetReader) -> None:
-    """Raise `ArtefactError` where the data's actions were given to another controller."""
-    if artefact.controller_id != reader.controller_id:
-        raise ArtefactError(
-            f"{artefact.path} was trained on data of low-level controller "
-            f"{artefact.controller_id!r}, {reader.root} was collected with "
+def require_same_controller(artifact: Artifact, reader: DatasetReader) -> None:
+    """Raise `ArtifactError` where the data's actions were given to another controller."""
+    if artifact.controller_id != reader.controller_id:
+        raise ArtifactError(
+            f"{artifact.path} was trained on data of low-level controller "
+            f"{artifact.controller_id!r}, {reader.root} was collected with "
             f"{reader.controller_id!r}: the same actions lead elsewhere; choose a dataset of the "
             "policy's controller"
         )
 
 
-def _return_scales(artefact: Artefact) -> dict[str, ReturnScale]:
+def _return_scales(artifact: Artifact) -> dict[str, ReturnScale]:
     """The scales of the training.
 
     Raises:
-        ArtefactError: they cannot be read.
+        ArtifactError: they cannot be read.
     """
     try:
-        return {k: ReturnScale(*v) for k, v in artefact.manifest["return_scales"].items()}
+        return {k: ReturnScale(*v) for k, v in artifact.manifest["return_scales"].items()}
     except (AttributeError, KeyError, TypeError) as error:
-        raise ArtefactError(
-            f"{artefact.path}: its manifest does not say on which scale each task's returns were "
+        raise ArtifactError(
+            f"{artifact.path}: its manifest does not say on which scale each task's returns were "
             "(return_scales); train again with this version"
         ) from error
 
 
-def _run(config: HeldoutConfig, artefact: Artefact, reader: DatasetReader) -> dict[str, Any]:
+def _run(config: HeldoutConfig, artifact: Artifact, reader: DatasetReader) -> dict[str, Any]:
     return {
-        "policy": str(artefact.path.absolute()),
-        "step": artefact.manifest.get("step"),
+        "policy": str(artifact.path.absolute()),
+        "step": artifact.manifest.get("step"),
         "dataset": {
             "repo_id": reader.source.repo_id,
             "revision": reader.source.commit,

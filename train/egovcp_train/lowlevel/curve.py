@@ -17,7 +17,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from egovcp.errors import ArtefactError, EgovcpError
+from egovcp.errors import ArtifactError, EgovcpError
 from egovcp.terminal import echo
 
 COLUMNS: Final = {
@@ -36,7 +36,7 @@ def read(runs: Sequence[Path]) -> list[dict[str, float]]:
         runs: output folders of a run and of its continuations, in order.
 
     Raises:
-        ArtefactError: a folder holds no records of a training of the low-level controller.
+        ArtifactError: a folder holds no records of a training of the low-level controller.
     """
     series: dict[str, list[Any]] = {name: [] for name in COLUMNS}
     for run in runs:
@@ -64,7 +64,7 @@ def _records(run: Path) -> dict[str, list[Any]]:
         records.Reload()
     missing = sorted(set(COLUMNS.values()) - set(records.Tags()["scalars"]))
     if missing:
-        raise ArtefactError(
+        raise ArtifactError(
             f"{folder}: no records of {', '.join(missing)}; expected those of an output folder "
             "of egovcp-train-lowlevel that has finished an iteration, with --tensorboard=true"
         )

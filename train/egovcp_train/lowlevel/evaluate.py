@@ -92,7 +92,7 @@ def evaluate(config: LowLevelEvalConfig) -> None:
 
     Raises:
         UsageError: an option makes no sense.
-        ArtefactError: the controller's file cannot be used.
+        ArtifactError: the controller's file cannot be used.
         DataError: the simulation diverged.
         EnvironmentFailure: a package is missing, or the folder cannot be written.
         KeyboardInterrupt: after SIGINT or SIGTERM.

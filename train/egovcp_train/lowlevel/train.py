@@ -110,7 +110,7 @@ def train(config: LowLevelTrainConfig) -> None:
 
     Raises:
         UsageError: --init is no network of this size.
-        ArtefactError: the file of --init cannot be used.
+        ArtifactError: the file of --init cannot be used.
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
     require_robots("--robots", config.robots)

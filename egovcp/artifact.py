@@ -1,11 +1,11 @@
-"""The policy artefact: a LeRobot ``pretrained_model`` folder that explains itself.
+"""The policy artifact: a LeRobot ``pretrained_model`` folder that explains itself.
 
     config.json        "type": "egovcp", network and planner configuration, features
     model.safetensors  weights and normalisation statistics
     policy_*.json      the steps LeRobot takes before and after the policy
     manifest.json      schema version, SHA-256 of all files and its own, data, controller, code
 
-safetensors and JSON only: loading an artefact never executes code. Other files beside these, such
+safetensors and JSON only: loading an artifact never executes code. Other files beside these, such
 as a model card and its pictures, are no part of it: neither read nor, from the Hub, fetched.
 """
 
@@ -26,7 +26,7 @@ from torch import Tensor
 
 from egovcp.atomic import removed_on_error, write_bytes
 from egovcp.decode import DecodeError, decode, require_type, shown
-from egovcp.errors import ArtefactError, UsageError
+from egovcp.errors import ArtifactError, UsageError
 from egovcp.hub import HubUnreachable, RetryPolicy, is_local_path, is_repo_id, snapshot
 from egovcp.manifest import (
     MANIFEST,
@@ -57,7 +57,7 @@ _TRACKER_OPTIONS: Final = frozenset(
     }
 )
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
-#: All files of an artefact: nothing else is read, nor fetched from the Hub.
+#: All files of an artifact: nothing else is read, nor fetched from the Hub.
 FILES: Final = (CONFIG, WEIGHTS, MANIFEST, *PROCESSORS)
 #: Where a training run keeps its latest policy.
 _IN_RUN: Final = "checkpoints/last/pretrained_model"
@@ -65,7 +65,7 @@ _RETRY_POLICY = RetryPolicy()
 
 
 @dataclass(frozen=True)
-class Artefact:
+class Artifact:
     """A loaded, validated policy."""
 
     path: Path
@@ -81,13 +81,13 @@ class Artefact:
     def make_policy(
         self, num_envs: int = 1, seed: int = 0, planner: PlannerConfig | None = None
     ) -> Policy:
-        """A policy for ``num_envs`` robots; ``planner`` overrides the artefact's own."""
+        """A policy for ``num_envs`` robots; ``planner`` overrides the artifact's own."""
         return Policy(self.world_model, planner or self.planner, num_envs, seed)
 
     def require_controller(self, controller_id: str) -> None:
-        """Raise `ArtefactError` unless the robot runs the controller of the data."""
+        """Raise `ArtifactError` unless the robot runs the controller of the data."""
         if controller_id != self.controller_id:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{self.path} was trained on data of low-level controller {self.controller_id!r}, "
                 f"but the robot runs {controller_id!r}; choose the data's "
                 "(--env.controller in simulation, --robot.controller on a robot), or collect data "
@@ -95,19 +95,19 @@ class Artefact:
             )
 
 
-def save_artefact(
+def save_artifact(
     path: Path, model: WorldModel, planner: PlannerConfig, provenance: dict[str, Any]
 ) -> None:
-    """Write the artefact to a temporary folder, then rename it into place.
+    """Write the artifact to a temporary folder, then rename it into place.
 
     Args:
-        path: folder to create; an older artefact there is replaced once the new one is
+        path: folder to create; an older artifact there is replaced once the new one is
             complete, and stays if anything fails.
         provenance: JSON-able; must hold ``controller_id`` and says which data and
             command made the policy.
 
     Raises:
-        ArtefactError: the provenance names no controller, or a number in it is not finite.
+        ArtifactError: the provenance names no controller, or a number in it is not finite.
     """
     _require_controller_id(path, provenance)
     config = {
@@ -120,18 +120,18 @@ def save_artefact(
     with removed_on_error(path.with_name(path.name + ".partial")) as work:
         shutil.rmtree(work, ignore_errors=True)
         work.mkdir(parents=True)
-        write_artefact(work, config, model.state_dict(), provenance, PROCESSORS)
+        write_artifact(work, config, model.state_dict(), provenance, PROCESSORS)
         _replace(path, work)
 
 
-def write_artefact(
+def write_artifact(
     folder: Path,
     config: Mapping[str, Any],
     weights: Mapping[str, Tensor],
     provenance: Mapping[str, Any],
     processors: Mapping[str, Any],
 ) -> None:
-    """Write the files of an artefact into a folder that exists; see `save_artefact`.
+    """Write the files of an artifact into a folder that exists; see `save_artifact`.
 
     Args:
         config: LeRobot's configuration of the policy, with ``world_model`` and ``planner``.
@@ -139,7 +139,7 @@ def write_artefact(
         processors: JSON file name -> content; may be empty if somebody else writes them.
 
     Raises:
-        ArtefactError: the provenance names no controller, or a number in it is not finite.
+        ArtifactError: the provenance names no controller, or a number in it is not finite.
     """
     _require_controller_id(folder, provenance)
     write_json_file(folder / CONFIG, config)
@@ -159,7 +159,7 @@ def write_artefact(
 
 def _require_controller_id(path: Path, provenance: Mapping[str, Any]) -> None:
     if not isinstance(provenance.get("controller_id"), str):
-        raise ArtefactError(f"{path}: the provenance of a policy must hold its controller_id")
+        raise ArtifactError(f"{path}: the provenance of a policy must hold its controller_id")
 
 
 def _replace(path: Path, new: Path) -> None:
@@ -177,7 +177,7 @@ def _replace(path: Path, new: Path) -> None:
     shutil.rmtree(old, ignore_errors=True)
 
 
-def load_artefact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POLICY) -> Artefact:
+def load_artifact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POLICY) -> Artifact:
     """Load and validate a policy from a folder or, failing that, a Hub model id.
 
     If the Hub cannot be reached, an earlier download of that revision serves.
@@ -185,11 +185,11 @@ def load_artefact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POL
     Args:
         path: the folder, or `user/name`.
         revision: branch, tag or commit SHA on the Hub; empty: the latest. The name of
-            `Artefact.path` is the commit's SHA then.
+            `Artifact.path` is the commit's SHA then.
         retry: how often and how long the Hub is asked.
 
     Raises:
-        ArtefactError: missing, tampered with, made for another feature spec, or with weights or
+        ArtifactError: missing, tampered with, made for another feature spec, or with weights or
             options that cannot be used.
         UsageError: a revision is asked of a folder.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
@@ -202,19 +202,19 @@ def load_artefact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POL
     _check_processors(folder)
     config, planner = read_options(folder)
     model = _load_weights(folder, config, digests.get(WEIGHTS))
-    return Artefact(folder, model, planner, manifest)
+    return Artifact(folder, model, planner, manifest)
 
 
 def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
     """What the policy in a folder is and how it plans, without its weights.
 
     Raises:
-        ArtefactError: they are missing, not readable, or ask too much of the machine.
+        ArtifactError: they are missing, not readable, or ask too much of the machine.
     """
     config = read_object(folder / CONFIG)
     world_model = config.get("world_model")
     if isinstance(world_model, dict) and not _TRACKER_OPTIONS.isdisjoint(world_model):
-        raise ArtefactError(
+        raise ArtifactError(
             f"{folder / CONFIG}: trained by an older version with a ball tracker, which this "
             "version no longer has; train again"
         )
@@ -225,14 +225,14 @@ def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
         planner = decode(PlannerConfig, config.get("planner"), "planner")
         require_answers(model, planner)
     except (DecodeError, UsageError) as error:
-        raise ArtefactError(
+        raise ArtifactError(
             f"{folder / CONFIG}: {error}; a policy of another version of egovcp has to be trained "
             "again with this one"
         ) from error
     try:
         require_affordable(model, planner)
     except UsageError as error:
-        raise ArtefactError(f"{folder / CONFIG}: {error}") from error
+        raise ArtifactError(f"{folder / CONFIG}: {error}") from error
     return model, planner
 
 
@@ -241,15 +241,15 @@ def _load_weights(folder: Path, config: WorldModelConfig, digest: object) -> Wor
     try:
         shapes = tensor_shapes(config)
     except ValueError as error:
-        raise ArtefactError(f"{folder / CONFIG}: {error}") from error
+        raise ArtifactError(f"{folder / CONFIG}: {error}") from error
     try:
         content = read_bytes(path, size_limit(shapes))
         _require_digest(path, hashlib.sha256(content).hexdigest(), digest)
         return load_model(config, shapes, content)
     except OSError as error:
-        raise ArtefactError(f"{path}: {error.strerror}; the artefact is incomplete") from error
+        raise ArtifactError(f"{path}: {error.strerror}; the artifact is incomplete") from error
     except UnsafeFileError as error:
-        raise ArtefactError(
+        raise ArtifactError(
             f"{path}: {error}; expected the weights of the networks in {CONFIG}: fetch or train "
             "the policy again"
         ) from error
@@ -264,11 +264,11 @@ def _locate(path: str, revision: str, retry: RetryPolicy) -> Path:
             "or the other"
         )
     if is_folder:
-        _require_artefact_folder(folder)
+        _require_artifact_folder(folder)
         return folder
     if not is_repo_id(path) or (is_local_path(path) and not revision):
         found = "not a folder" if os.path.lexists(folder) else "no such folder"
-        raise ArtefactError(
+        raise ArtifactError(
             f"{found}: {path!r}; expected a policy folder with {CONFIG}, {WEIGHTS} and "
             f"{MANIFEST} (a run's {_IN_RUN}) or a Hub id 'user/name'"
         )
@@ -278,20 +278,20 @@ def _locate(path: str, revision: str, retry: RetryPolicy) -> Path:
         raise HubUnreachable(f"there is no folder {path!r}, and {error}") from error
 
 
-def _require_artefact_folder(folder: Path) -> None:
-    """Raise `ArtefactError`, which names the policy, for the folder of a training run."""
+def _require_artifact_folder(folder: Path) -> None:
+    """Raise `ArtifactError`, which names the policy, for the folder of a training run."""
     if os.path.lexists(folder / MANIFEST):
         return
     for inner in (_IN_RUN, "last/pretrained_model", "pretrained_model"):
         if os.path.lexists(folder / inner / MANIFEST):
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{folder} is the folder of a training run, not of a policy; its policy is "
                 f"{folder / inner}"
             )
 
 
 def _check_processors(folder: Path) -> None:
-    """Raise `ArtefactError` unless LeRobot's processors name only registered steps.
+    """Raise `ArtifactError` unless LeRobot's processors name only registered steps.
 
     LeRobot imports whatever module a step of another kind names.
     """
@@ -306,14 +306,14 @@ def _check_processors(folder: Path) -> None:
                 if "class" in step:
                     raise DecodeError(f"steps[{index}] names a class to import")
         except DecodeError as error:
-            raise ArtefactError(
+            raise ArtifactError(
                 f"{folder / name}: {error}; expected steps that LeRobot has registered"
             ) from error
 
 
 def _require_digest(path: Path, found: str, expected: object) -> None:
     if found != expected:
-        raise ArtefactError(
+        raise ArtifactError(
             f"{path}: SHA-256 is {found[:12]}..., the manifest says {shown(str(expected)[:12])}; "
             "the file was changed or damaged: fetch it again"
         )
@@ -324,6 +324,6 @@ def _json_digest(path: Path) -> str:
     try:
         return sha256(path, JSON_LIMIT_BYTES)
     except OSError as error:
-        raise ArtefactError(f"{path}: {error.strerror}; the artefact is incomplete") from error
+        raise ArtifactError(f"{path}: {error.strerror}; the artifact is incomplete") from error
     except UnsafeFileError as error:
-        raise ArtefactError(f"{path}: {error}; the file is damaged") from error
+        raise ArtifactError(f"{path}: {error}; the file is damaged") from error

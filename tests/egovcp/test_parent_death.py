@@ -1,4 +1,4 @@
-"""A child that ends with its parent, also when the parent has no time to say so."""
+"""A child process ends with its parent, even when the parent is killed."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import psutil
 
 _PARENT = """
 import subprocess, sys, time
-from egovcp.lifeline import command
+from egovcp.parent_death import command
 child = subprocess.Popen(command("/bin/sleep", "1000"), stdin=subprocess.DEVNULL)
 print(child.pid, flush=True)
 time.sleep(1000)
 """
 
 
-def test_a_killed_parent_takes_its_child_along() -> None:
+def test_a_child_ends_when_its_parent_is_killed() -> None:
     with subprocess.Popen(
         [sys.executable, "-c", _PARENT], stdout=subprocess.PIPE, text=True
     ) as parent:

@@ -1,7 +1,6 @@
-"""Processes that must not outlive the one that needs them, however that one ends.
+"""Child processes that the kernel kills when their parent ends, even by SIGKILL.
 
-`kill -9` leaves a program no time to end its children, so the kernel is asked to. Run as a
-script, with the number of its parent and a command, this file becomes that command.
+Run as a script with the parent's process id and a command, this file executes that command.
 """
 
 from __future__ import annotations
@@ -16,20 +15,20 @@ _PR_SET_PDEATHSIG: Final = 1
 
 
 def die_with_parent(parent: int) -> None:
-    """Have this process killed when ``parent``, which started it, ends.
+    """Have the kernel kill this process when ``parent`` ends; does nothing outside Linux.
 
-    Linux only; elsewhere nothing happens. What counts is the end of the *thread* that started
-    this process, so start it from one that lasts, such as the main thread.
+    The signal comes when the *thread* that started this process ends, so start it from the main
+    thread.
     """
     if not sys.platform.startswith("linux"):
         return
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it ended before the kernel was told
+    if os.getppid() != parent:  # it ended before prctl
         os.kill(os.getpid(), signal.SIGKILL)
 
 
 def command(program: str, *arguments: str) -> list[str]:
-    """How to start ``program`` so that it ends with this process."""
+    """Command line that runs ``program`` until this process ends."""
     return [sys.executable, "-I", "-S", __file__, str(os.getpid()), program, *arguments]
 
 

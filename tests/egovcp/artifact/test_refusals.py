@@ -1,4 +1,4 @@
-"""Anything but an artefact as it was written is refused by name, and nothing in it is executed."""
+"""Anything but an artifact as it was written is refused by name, and nothing in it is executed."""
 
 import pickle
 from collections.abc import Callable
@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from egovcp.artefact import CONFIG, WEIGHTS, load_artefact, read_options
-from egovcp.errors import ArtefactError
+from egovcp.artifact import CONFIG, WEIGHTS, load_artifact, read_options
+from egovcp.errors import ArtifactError
 from egovcp.manifest import MANIFEST
 from egovcp.model import PRESETS
 from egovcp.processors import PROCESSORS
@@ -19,8 +19,8 @@ from .conftest import FILES, PLANNER, Json, edit, sign
 @pytest.mark.parametrize("name", sorted(FILES))
 def test_a_missing_file_is_named(folder: Path, name: str) -> None:
     (folder / name).unlink()
-    with pytest.raises(ArtefactError, match=name):
-        load_artefact(str(folder))
+    with pytest.raises(ArtifactError, match=name):
+        load_artifact(str(folder))
 
 
 @pytest.mark.parametrize("name", sorted(FILES - {MANIFEST}))
@@ -29,8 +29,8 @@ def test_a_changed_byte_is_noticed(folder: Path, name: str, where: int) -> None:
     content = bytearray((folder / name).read_bytes())
     content[where] ^= 1
     (folder / name).write_bytes(content)
-    with pytest.raises(ArtefactError, match=f"{name}.*SHA-256"):
-        load_artefact(str(folder))
+    with pytest.raises(ArtifactError, match=f"{name}.*SHA-256"):
+        load_artifact(str(folder))
 
 
 @pytest.mark.parametrize("word", ["stance-1", "sha256", "schema_version", "files"])
@@ -38,23 +38,23 @@ def test_no_word_of_the_manifest_changes_unnoticed(folder: Path, word: str) -> N
     text = (folder / MANIFEST).read_text()
     assert word in text
     (folder / MANIFEST).write_text(text.replace(word, word.upper(), 1))
-    with pytest.raises(ArtefactError, match=MANIFEST):
-        load_artefact(str(folder))
+    with pytest.raises(ArtifactError, match=MANIFEST):
+        load_artifact(str(folder))
 
 
-def test_an_older_artefact_without_files_for_lerobot_still_loads(folder: Path) -> None:
+def test_an_older_artifact_without_files_for_lerobot_still_loads(folder: Path) -> None:
     for name in PROCESSORS:
         (folder / name).unlink()
     edit(folder / MANIFEST, lambda m: [m["files"].pop(name) for name in PROCESSORS])
-    assert load_artefact(str(folder)).planner == PLANNER
+    assert load_artifact(str(folder)).planner == PLANNER
 
 
 @pytest.mark.parametrize("name", sorted(FILES))
 def test_a_truncated_file_is_noticed(folder: Path, name: str) -> None:
     content = (folder / name).read_bytes()
     (folder / name).write_bytes(content[: len(content) // 2])
-    with pytest.raises(ArtefactError, match=name):
-        load_artefact(str(folder))
+    with pytest.raises(ArtifactError, match=name):
+        load_artifact(str(folder))
 
 
 @pytest.mark.parametrize(
@@ -79,15 +79,15 @@ def test_a_manifest_of_something_else_is_refused(
     folder: Path, change: Callable[[Json], object], message: str
 ) -> None:
     edit(folder / MANIFEST, change)
-    with pytest.raises(ArtefactError, match=message):
-        load_artefact(str(folder))
+    with pytest.raises(ArtifactError, match=message):
+        load_artifact(str(folder))
 
 
 @pytest.mark.parametrize("content", ["[]", "3", "null", "not json", '{"a": ', "\xff\xfe"])
 def test_a_manifest_that_is_none_is_refused(folder: Path, content: str) -> None:
     (folder / MANIFEST).write_text(content, encoding="latin-1")
-    with pytest.raises(ArtefactError, match=MANIFEST):
-        load_artefact(str(folder))
+    with pytest.raises(ArtifactError, match=MANIFEST):
+        load_artifact(str(folder))
 
 
 @pytest.mark.parametrize(
@@ -111,8 +111,8 @@ def test_a_configuration_that_cannot_be_is_refused(
     """Even where somebody has signed it again."""
     edit(folder / CONFIG, change)
     sign(folder)
-    with pytest.raises(ArtefactError, match="copy"):
-        load_artefact(str(folder))
+    with pytest.raises(ArtifactError, match="copy"):
+        load_artifact(str(folder))
 
 
 def test_options_are_read_without_weights(folder: Path) -> None:
@@ -133,7 +133,7 @@ def test_options_of_another_version_are_refused(
     folder: Path, change: Callable[[Json], object]
 ) -> None:
     edit(folder / CONFIG, change)
-    with pytest.raises(ArtefactError, match=CONFIG):
+    with pytest.raises(ArtifactError, match=CONFIG):
         read_options(folder)
 
 
@@ -143,8 +143,8 @@ def test_options_of_another_version_are_refused(
 def test_a_policy_with_a_ball_tracker_is_refused(folder: Path, option: str, value: object) -> None:
     edit(folder / CONFIG, lambda config: config["world_model"].update({option: value}))
     sign(folder)
-    with pytest.raises(ArtefactError, match=r"older version with a ball tracker.*; train again$"):
-        load_artefact(str(folder))
+    with pytest.raises(ArtifactError, match=r"older version with a ball tracker.*; train again$"):
+        load_artifact(str(folder))
 
 
 class _Bomb:
@@ -155,12 +155,12 @@ class _Bomb:
 def test_a_pickle_is_never_executed(folder: Path) -> None:
     (folder / WEIGHTS).write_bytes(pickle.dumps(_Bomb()))
     sign(folder)
-    with pytest.raises(ArtefactError, match="weights"):
-        load_artefact(str(folder))
+    with pytest.raises(ArtifactError, match="weights"):
+        load_artifact(str(folder))
     torch.save(_Bomb(), folder / WEIGHTS)
     sign(folder)
-    with pytest.raises(ArtefactError, match="weights"):
-        load_artefact(str(folder))
+    with pytest.raises(ArtifactError, match="weights"):
+        load_artifact(str(folder))
 
 
 def test_loading_never_unpickles(original: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +169,7 @@ def test_loading_never_unpickles(original: Path, monkeypatch: pytest.MonkeyPatch
 
     for target in ("pickle.load", "pickle.loads", "pickle.Unpickler", "torch.load"):
         monkeypatch.setattr(target, refuse)
-    load_artefact(str(original))
+    load_artifact(str(original))
 
 
 def test_it_holds_only_json_and_safetensors(original: Path) -> None:
@@ -177,7 +177,7 @@ def test_it_holds_only_json_and_safetensors(original: Path) -> None:
 
 
 def test_another_controller_is_refused(original: Path) -> None:
-    loaded = load_artefact(str(original))
+    loaded = load_artifact(str(original))
     loaded.require_controller("stance-1")
-    with pytest.raises(ArtefactError, match=r"policy.*'stance-1'.*'walker-2'"):
+    with pytest.raises(ArtifactError, match=r"policy.*'stance-1'.*'walker-2'"):
         loaded.require_controller("walker-2")

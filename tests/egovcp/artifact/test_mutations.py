@@ -7,8 +7,8 @@ import pytest
 import torch
 from safetensors.torch import load
 
-from egovcp.artefact import WEIGHTS, load_artefact
-from egovcp.errors import ArtefactError
+from egovcp.artifact import WEIGHTS, load_artifact
+from egovcp.errors import ArtifactError
 from egovcp.testing.limited import run_limited
 from egovcp.testing.mutations import ANY_FILE, MARKER, mutate_policy
 
@@ -20,8 +20,8 @@ _DIFFERENT = 99  # exit code: a policy loaded something else than what its files
 
 def _load_and_compare(folder: Path) -> int:
     try:
-        loaded = load_artefact(str(folder))
-    except ArtefactError as error:
+        loaded = load_artifact(str(folder))
+    except ArtifactError as error:
         print(error)
         return error.exit_code
     held = load((folder / WEIGHTS).read_bytes())
@@ -34,7 +34,7 @@ def _load_and_compare(folder: Path) -> int:
 def test_mutated_policies_are_refused_within_limits(
     original: Path, tmp_path: Path, part: int
 ) -> None:
-    load_artefact(str(original))  # each child inherits what is initialised on first use
+    load_artifact(str(original))  # each child inherits what is initialised on first use
     count = POLICIES // 10
     for seed in range(part * count, (part + 1) * count):
         folder = Path(shutil.copytree(original, tmp_path / str(seed)))

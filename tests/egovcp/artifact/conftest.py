@@ -1,4 +1,4 @@
-"""An artefact, and ways to tamper with a copy of it."""
+"""An artifact, and ways to tamper with a copy of it."""
 
 import hashlib
 import json
@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from egovcp.artefact import CONFIG, WEIGHTS, save_artefact
+from egovcp.artifact import CONFIG, WEIGHTS, save_artifact
 from egovcp.hub import RetryPolicy
 from egovcp.manifest import MANIFEST, sealed
 from egovcp.plan import PlannerConfig
@@ -27,12 +27,12 @@ type Json = dict[str, Any]
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An artefact that tests must not change."""
-    path = tmp_path_factory.mktemp("artefact") / "policy"
+    """An artifact that tests must not change."""
+    path = tmp_path_factory.mktemp("artifact") / "policy"
     model = toy_model()
     model.state_mean.uniform_(-1, 1)
     model.min_return.fill_(-7.0)
-    save_artefact(path, model, PLANNER, PROVENANCE)
+    save_artifact(path, model, PLANNER, PROVENANCE)
     return path
 
 
