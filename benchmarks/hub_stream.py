@@ -22,7 +22,11 @@ from egovcp.data import (
     StreamConfig,
 )
 from egovcp.hub import Content, Publication, RetryPolicy, publish
-from egovcp.testing.hub import in_this_process
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # for tests.support
+
+from tests.support.hub import in_this_process  # noqa: E402
 
 _REPO = "me/bench"
 _EPISODES_PER_FILE = 25
@@ -31,8 +35,8 @@ _EPISODES_PER_FILE = 25
 @contextlib.contextmanager
 def serving(folder: Path) -> Iterator[str]:
     """A fake Hub in a process of its own; its address."""
-    command = [sys.executable, "-m", "egovcp.testing.hub", "--root", folder]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as hub:
+    command = [sys.executable, "-m", "tests.support.hub", "--root", folder]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as hub:
         assert hub.stdout is not None
         try:
             yield hub.stdout.readline().split("HF_ENDPOINT=")[1].split()[0]

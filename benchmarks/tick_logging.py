@@ -20,6 +20,7 @@ import contextlib
 import os
 import queue
 import signal
+import socket
 import tempfile
 import threading
 import time
@@ -41,7 +42,6 @@ from egovcp.log.tick import BasePose, Candidates, Tick
 from egovcp.plan import PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.spec import PLANNER_DT, PLANNER_HZ, STATE_DIM
 from egovcp.testing import toy_model
-from egovcp.testing.ports import free_port
 
 _INFO = RunInfo("ball")
 _PAUSE_S = 0.2  # between two cases: what the one before has left behind is written meanwhile
@@ -204,6 +204,11 @@ def _fanout(mcap: Sink, rerun: Sink) -> BackgroundFanout:
     )
 
 
+def _free_port() -> int:
+    with socket.create_server((LOOPBACK, 0)) as server:
+        return int(server.getsockname()[1])
+
+
 @contextlib.contextmanager
 def _opened(sink: Sink) -> Iterator[Sink]:
     sink.open(_INFO)
@@ -222,9 +227,9 @@ def _stalled(mcap: Sink, rerun: Sink) -> Iterator[Sink]:
 
 @contextlib.contextmanager
 def _dead(mcap: Sink) -> Iterator[Sink]:
-    viewer = Viewer(f"rerun+http://{LOOPBACK}:{free_port()}/proxy")
+    viewer = Viewer(f"rerun+http://{LOOPBACK}:{_free_port()}/proxy")
     with (
-        LiveRerun("web", viewer, free_port()) as live,
+        LiveRerun("web", viewer, _free_port()) as live,
         _opened(_fanout(mcap, RerunSink(live.viewer))) as sink,
     ):
         assert live.pid is not None

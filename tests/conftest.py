@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.testing.hub import FakeHub, in_this_process
+from tests.support.hub import FakeHub, in_this_process
 
 # a shell that starts the tests in the background has them, and what they start, ignore it
 signal.signal(signal.SIGINT, signal.default_int_handler)

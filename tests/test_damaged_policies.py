@@ -17,7 +17,7 @@ from egovcp.data import DatasetWriter, Provenance
 from egovcp.errors import ArtifactError
 from egovcp.plan import PlannerConfig
 from egovcp.testing import random_episode, toy_model
-from egovcp.testing.mutations.editing import edit_json, edit_tensors
+from tests.support.policy_mutations.editing import edit_json, edit_tensors
 
 type RunCommand = Callable[[str, str], int]
 

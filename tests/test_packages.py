@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.packages import DISTRIBUTIONS, distribution_of
-from egovcp.testing.limited import LimitedResult, run_limited
+from tests.support.limited import LimitedResult, run_limited
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Distribution -> folder of its pyproject.toml.

@@ -18,7 +18,7 @@ from egovcp.plan import PlannerConfig
 from egovcp.robot.stance import StanceController
 from egovcp.rollouts import CONTROLLER, ticks_of
 from egovcp.testing import random_episode, toy_model
-from egovcp.testing.limited import LimitedResult, run_limited
+from tests.support.limited import LimitedResult, run_limited
 
 from .listing import ListedCommand, all_commands
 

@@ -19,13 +19,13 @@ from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
-from egovcp.testing import toy_reactive
 from egovcp_deploy import episodes
 from egovcp_deploy.controllers import reference
 from egovcp_deploy.deploy import main as deploy
 from egovcp_deploy.episodes import Group, Setup, Stage
 from egovcp_deploy.evaluate import EvalConfig, main
 from egovcp_deploy.scores import EpisodeScore
+from tests.support.models import toy_reactive
 
 KEYS = {
     "episodes",

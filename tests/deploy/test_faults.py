@@ -15,13 +15,13 @@ from egovcp.plan import PolicyStep
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
-from egovcp.testing.sinks import MemorySink
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.states import Request, State
 from egovcp_deploy.robots import Outcome, Sensed
 from egovcp_deploy.robots.sim import SimRobot
 from egovcp_deploy.runner import Runner
 from egovcp_deploy.safety import HOLD_RATE
+from tests.support.sinks import MemorySink
 
 MS = 1_000_000
 TICK_MS = 40

@@ -12,11 +12,11 @@ from egovcp.log.info import CameraView
 from egovcp.plan import PolicyStep
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM, STATE_SLICES
-from egovcp.testing.sinks import MemorySink
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.pilot import REJECTED
 from egovcp_deploy.robots import Outcome, Sensed
 from egovcp_deploy.runner import LOGGED_CANDIDATES, Runner
+from tests.support.sinks import MemorySink
 
 
 class PlainPolicy:

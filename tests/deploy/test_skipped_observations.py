@@ -16,13 +16,13 @@ from egovcp.rate import LockstepClock
 from egovcp.sim.env import Observation, StepResult, VectorEnv
 from egovcp.spec import ACTION_DIM, STATE_DIM
 from egovcp.testing import toy_model
-from egovcp.testing.sinks import MemorySink
 from egovcp_deploy.deploy import main as deploy
 from egovcp_deploy.evaluate import main as evaluate
 from egovcp_deploy.live.link import encode_report
 from egovcp_deploy.live.operators import Auto
 from egovcp_deploy.live.planner import PlannerLoop
 from egovcp_deploy.pilot.desk import SKIPPED, Report, Thinker
+from tests.support.sinks import MemorySink
 
 BAD_TICK, TICK_NS = 5, 40_000_000
 PLANNER = PlannerConfig(samples=16, horizon=3, iterations=1, elites=4)

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 
 from egovcp.spec import ACTION_BOX
-from egovcp.testing import PointWorld
 from egovcp_deploy.value_maps import value_maps
+from tests.support.worlds import PointWorld
 
 
 def test_each_hand_has_its_own_map_with_the_goal_as_its_best_point() -> None:

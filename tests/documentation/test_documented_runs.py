@@ -12,8 +12,8 @@ from huggingface_hub import HfApi
 
 from egovcp.log.destination import Viewer
 from egovcp.log.live import LiveRerun
-from egovcp.testing.hub import FakeHub, in_this_process
-from egovcp.testing.ports import free_port
+from tests.support.hub import FakeHub, in_this_process
+from tests.support.ports import free_port
 
 from .markdown import DocumentedCommand, Text
 from .programs import main_of

@@ -22,7 +22,9 @@ from egovcp.data import DatasetConfig, DatasetWriter, Episode, Provenance
 from egovcp.errors import ArtifactError, DataError
 from egovcp.model import Carry, WorldModel
 from egovcp.plan import PlannerConfig
-from egovcp.testing import CountingEnv, CountingModel, ToyObservation, ToyStep, toy_model
+from egovcp.testing import toy_model
+from tests.support.environments import CountingEnv, ToyObservation, ToyStep
+from tests.support.models import CountingModel
 
 DEBUG = toy_model().config
 

@@ -12,7 +12,8 @@ from egovcp.cuda_graphs import MOST_RECORDINGS, Recorded
 from egovcp.model import PRESETS, Carry
 from egovcp.plan import PlannerConfig, ReferenceEvaluator
 from egovcp.plan.backends.evaluators import FloatEvaluator
-from egovcp.testing import AgainRecorder, toy_model
+from egovcp.testing import toy_model
+from tests.support.cuda_graphs import RecomputingRecorder
 
 
 class _Pair(NamedTuple):
@@ -32,7 +33,7 @@ def _arguments(size: int, seed: int, third: bool = True) -> tuple[Tensor, Any]:
 
 
 def test_a_recording_serves_all_of_its_shape_and_no_other() -> None:
-    recorder = AgainRecorder()
+    recorder = RecomputingRecorder()
     recorded = Recorded(_function, recorder)
     for seed in range(3):
         for size, third in ((4, True), (5, True), (4, False)):
@@ -44,7 +45,7 @@ def test_a_recording_serves_all_of_its_shape_and_no_other() -> None:
 
 
 def test_what_was_answered_and_what_was_given_stay_as_they_are() -> None:
-    recorded = Recorded(_function, AgainRecorder())
+    recorded = Recorded(_function, RecomputingRecorder())
     given = _arguments(4, 0)
     before = [given[0].clone(), given[1][0].clone()]
     first = recorded(*given)
@@ -56,7 +57,7 @@ def test_what_was_answered_and_what_was_given_stay_as_they_are() -> None:
 
 
 def test_recordings_serve_under_either_mode_of_torch() -> None:
-    recorded = Recorded(_function, AgainRecorder())
+    recorded = Recorded(_function, RecomputingRecorder())
     for mode in (torch.inference_mode, torch.no_grad, torch.inference_mode):
         with mode():
             given = _arguments(4, 2)
@@ -82,7 +83,7 @@ def test_what_cannot_be_recorded_is_computed_and_not_tried_again() -> None:
 
 
 def test_shapes_beyond_the_most_are_computed_without_a_recording() -> None:
-    recorder = AgainRecorder()
+    recorder = RecomputingRecorder()
     recorded = Recorded(_function, recorder)
     for size in range(1, MOST_RECORDINGS + 4):
         given = _arguments(size, size)
@@ -94,7 +95,7 @@ def test_what_is_no_tensor_has_a_recording_of_its_own() -> None:
     def scaled(x: Tensor, by: int) -> tuple[str, Tensor]:
         return f"by {by}", by * x
 
-    recorder = AgainRecorder()
+    recorder = RecomputingRecorder()
     recorded = Recorded(scaled, recorder)
     for by in (2, 3, 2, 3):
         x = torch.rand(4)
@@ -105,7 +106,7 @@ def test_what_is_no_tensor_has_a_recording_of_its_own() -> None:
 
 
 def test_results_that_are_not_copied_are_those_of_the_last_call() -> None:
-    recorded = Recorded(_function, AgainRecorder(), copies=False)
+    recorded = Recorded(_function, RecomputingRecorder(), copies=False)
     first = recorded(*_arguments(4, 0))
     second = recorded(*_arguments(4, 1))
     assert first.sum is second.sum

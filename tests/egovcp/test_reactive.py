@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from egovcp import spec
 from egovcp.errors import ArtifactError, UsageError
 from egovcp.reactive import SCHEMA, Eyes, ReactiveConfig, ReactiveNetwork, ReactivePolicy
-from egovcp.testing import toy_reactive
+from tests.support.models import toy_reactive
 
 ROWS, COLS = spec.DEPTH_ROWS, spec.DEPTH_COLS
 

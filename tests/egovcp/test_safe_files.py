@@ -12,7 +12,7 @@ import pytest
 
 from egovcp import safe_files
 from egovcp.safe_files import UnsafeFileError
-from egovcp.testing.limited import run_limited
+from tests.support.limited import run_limited
 
 
 def test_a_regular_file_is_read(tmp_path: Path) -> None:

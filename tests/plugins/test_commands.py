@@ -16,8 +16,8 @@ from egovcp.artifact import load_artifact
 from egovcp.checks import check_artifact
 from egovcp.processors import PROCESSORS
 from egovcp.robot.stance import StanceController
-from egovcp.testing.hub import FakeHub, environment, in_this_process
 from lerobot_policy_egovcp import EgovcpPolicy
+from tests.support.hub import FakeHub, environment, in_this_process
 
 PLUGINS = sorted((Path(__file__).resolve().parents[2] / "plugins").iterdir())
 POLICY = "me/policy"

@@ -10,9 +10,10 @@ import torch
 from egovcp.cuda_graphs import Recorded
 from egovcp.errors import DataError
 from egovcp.model import PRESETS, Batch
-from egovcp.testing import AgainRecorder, random_batch, toy_model
+from egovcp.testing import random_batch, toy_model
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.loop import Budget, Learner
+from tests.support.cuda_graphs import RecomputingRecorder
 
 CONFIG = OptimizerConfig(warmup_steps=0)
 
@@ -102,7 +103,7 @@ def test_recorded_steps_learn_the_same_bit_for_bit(
     loss = dataclasses.replace(PRESETS["debug"].loss, q_target=q_target, decode_every=2)
     config = dataclasses.replace(PRESETS["debug"], dynamics=dynamics, loss=loss)
     plain, recorded = (Learner(toy_model(config), CONFIG, seed=0) for _ in range(2))
-    recorder = AgainRecorder()
+    recorder = RecomputingRecorder()
     recorded._gradients = Recorded(recorded._find, recorder, most=64, copies=False)
     for seed in range(12):
         expected = plain.update(random_batch(2, 6, seed), 0.0)

@@ -16,10 +16,10 @@ from egovcp.hub import RetryPolicy
 from egovcp.plan import PlannerConfig
 from egovcp.processors import PROCESSORS
 from egovcp.testing import toy_model
-from egovcp.testing.hub import FakeHub, in_this_process
 from egovcp_train import publish as publishing
 from egovcp_train.push import main as push
 from egovcp_train.train import main as train
+from tests.support.hub import FakeHub, in_this_process
 
 type Arguments = Callable[..., list[str]]
 

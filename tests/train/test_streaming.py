@@ -14,10 +14,10 @@ from egovcp.data import DatasetReader, DatasetWriter, Provenance
 from egovcp.data.source import lerobot_home
 from egovcp.hub import Content, Publication, RetryPolicy, publish
 from egovcp.model import Batch
-from egovcp.testing.hub import FakeHub
 from egovcp_train.checkpoint import load_training_state
 from egovcp_train.loop import Learner
 from egovcp_train.train import main
+from tests.support.hub import FakeHub
 
 type Arguments = Callable[..., list[str]]
 

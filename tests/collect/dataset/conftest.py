@@ -10,7 +10,7 @@ import pytest
 
 from egovcp import spec
 from egovcp.data import DatasetWriter, Episode, Provenance
-from egovcp.testing import CountingEnv
+from tests.support.environments import CountingEnv
 
 type MakeEpisode = Callable[..., Episode]
 

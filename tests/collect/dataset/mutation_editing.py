@@ -9,7 +9,7 @@ from typing import Final
 from egovcp.atomic import write_json
 from egovcp.data.hashes import covered
 from egovcp.safe_files import sha256
-from egovcp.testing.mutations.editing import Random
+from tests.support.policy_mutations.editing import Random
 
 from .damage import (
     COLLECTION,

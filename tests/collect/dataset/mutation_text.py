@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp import spec
-from egovcp.testing.mutations.editing import Random, pick, wrong_encodings
+from tests.support.policy_mutations.editing import Random, pick, wrong_encodings
 
 from . import damage as d
 from .damage import (

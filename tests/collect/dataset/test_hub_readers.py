@@ -13,8 +13,8 @@ import pytest
 
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.testing import random_episode
-from egovcp.testing.hub import FakeHub, environment, in_this_process
 from egovcp_collect.dataset.cli import main
+from tests.support.hub import FakeHub, environment, in_this_process
 
 _SCRIPT = """
 import json, sys

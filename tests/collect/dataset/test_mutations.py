@@ -18,8 +18,8 @@ import pytest
 from PIL import Image, TiffImagePlugin
 
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, schema
-from egovcp.testing.limited import run_limited
 from egovcp_collect.dataset.cli import main
+from tests.support.limited import run_limited
 
 from .conftest import COLLECTED, walk
 from .damage import HASHES

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from egovcp.data import DatasetConfig, DatasetReader
-from egovcp.testing.hub import FakeHub
 from egovcp_collect.dataset.cli import main
+from tests.support.hub import FakeHub
 
 from .conftest import write
 

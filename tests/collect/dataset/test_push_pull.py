@@ -10,9 +10,9 @@ import pytest
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Provenance, schema
 from egovcp.data.committer import work_folder
 from egovcp.testing import random_episode
-from egovcp.testing.hub import FakeHub
-from egovcp.testing.hub.faults import Trouble
 from egovcp_collect.dataset.cli import main
+from tests.support.hub import FakeHub
+from tests.support.hub.faults import Trouble
 
 REPO = "datasets/me/six"
 QUICK = ("--network.attempts=2", "--network.wait_s=0.01", "--network.timeout_s=20")

@@ -12,11 +12,11 @@ from egovcp.log.tick import Tick
 from egovcp.plan import PolicyStep
 from egovcp.rate import LockstepClock
 from egovcp.spec import ACTION_DIM, STATE_DIM
-from egovcp.testing.sinks import MemorySink
 from egovcp_deploy.live.link import Order, decode_order, encode_report
 from egovcp_deploy.live.planner import LiveSummary, PlannerLoop
 from egovcp_deploy.pilot.desk import Report, Thinker
 from egovcp_deploy.pilot.states import Request, State
+from tests.support.sinks import MemorySink
 
 TICK_NS = 40_000_000
 

@@ -159,7 +159,7 @@ def test_metadata_damaged_in_both_copies_is_refused(
 
 
 def test_a_size_that_damage_made_huge_allocates_nothing(record: Record, tmp_path: Path) -> None:
-    from egovcp.testing.limited import run_limited
+    from tests.support.limited import run_limited
 
     whole = record()
     chunk = chunk_ranges(whole)[3]

@@ -11,13 +11,13 @@ import zmq
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.robot.g1 import DAMPING, STIFFNESS
-from egovcp.testing.ports import free_port
 from egovcp_deploy.robots.body import MotorCommand
 from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
 from egovcp_deploy.robots.fake import FakeBridge
 from egovcp_deploy.robots.fake.bridge import MODE
 from egovcp_deploy.robots.fake.running import Running, config_of, eventually
 from egovcp_deploy.robots.zmq_eye import ZmqEye, ZmqEyeConfig
+from tests.support.ports import free_port
 
 ZERO = np.zeros(29)
 DAMP = MotorCommand(ZERO, ZERO, DAMPING, MODE)

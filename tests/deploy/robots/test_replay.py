@@ -23,12 +23,12 @@ from egovcp.plan import Policy, PolicyStep
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.testing import random_episode
-from egovcp.testing.sinks import MemorySink
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.robots import Robot
 from egovcp_deploy.robots.replay import ENDS, ReplayRobot, open_recordings, recorded_run
 from egovcp_deploy.robots.sim import SimRobot
 from egovcp_deploy.runner import Runner
+from tests.support.sinks import MemorySink
 
 TICKS = 12
 CONFIG = EnvConfig(controller="stance", ball_episode=EpisodeConfig(TICKS, (2, 3), 0.0))

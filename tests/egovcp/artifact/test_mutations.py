@@ -9,8 +9,8 @@ from safetensors.torch import load
 
 from egovcp.artifact import WEIGHTS, load_artifact
 from egovcp.errors import ArtifactError
-from egovcp.testing.limited import run_limited
-from egovcp.testing.mutations import ANY_FILE, MARKER, mutate_policy
+from tests.support.limited import run_limited
+from tests.support.policy_mutations import ANY_FILE, MARKER, mutate_policy
 
 from .conftest import PLANNER
 

@@ -9,8 +9,8 @@ from egovcp.artifact import WEIGHTS, load_artifact
 from egovcp.errors import ArtifactError, EnvironmentFailure, UsageError
 from egovcp.hub import Content, Publication, publish
 from egovcp.manifest import MANIFEST, sealed
-from egovcp.testing.hub import FakeHub
-from egovcp.testing.hub.faults import Trouble
+from tests.support.hub import FakeHub
+from tests.support.hub.faults import Trouble
 
 from .conftest import FILES, QUICK
 

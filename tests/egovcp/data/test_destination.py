@@ -24,7 +24,7 @@ from egovcp.data.committer import committing, work_folder
 from egovcp.data.encoded import encode
 from egovcp.data.spool import SealedEpisode
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.testing.limited import run_limited
+from tests.support.limited import run_limited
 
 _RUN = Provenance("stance-1", seed=0, command="collect")
 

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 
 from egovcp.data.parquet import open_parquet
 from egovcp.errors import DataError
-from egovcp.testing.limited import run_limited
+from tests.support.limited import run_limited
 
 _TAIL = 8  # length of the footer, 4 bytes, and the magic number
 

@@ -10,9 +10,9 @@ import pytest
 from egovcp.data import DatasetConfig, DatasetReader, source
 from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.hub import Content, Publication, RetryPolicy, publish
-from egovcp.testing.hub import FakeHub
-from egovcp.testing.hub.faults import Trouble
-from egovcp.testing.ports import reserved_port
+from tests.support.hub import FakeHub
+from tests.support.hub.faults import Trouble
+from tests.support.ports import reserved_port
 
 QUICK = RetryPolicy(attempts=2, wait_s=0.01, timeout_s=20)
 SIX = DatasetConfig(repo_id="me/six")

@@ -20,7 +20,7 @@ from egovcp.hub import carrier as carriers
 from egovcp.hub import shelf as shelves
 from egovcp.hub.carrier import Carrier, Errand, serve
 from egovcp.hub.retry import RetryingClient, http_library, uses_default_client
-from egovcp.testing.hub import FakeHub, client_factory
+from tests.support.hub import FakeHub, client_factory
 
 DATA = "data/chunk-000/file-000.parquet"
 

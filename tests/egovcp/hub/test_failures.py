@@ -8,7 +8,7 @@ from huggingface_hub import constants
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.hub import Publication, RetryPolicy, explained, publish, token
-from egovcp.testing.hub import FakeHub
+from tests.support.hub import FakeHub
 
 
 @pytest.mark.parametrize("bad", ["hf_abc\x01def", "hf_abc def", "hf_abć"])

@@ -6,8 +6,8 @@ import pytest
 
 from egovcp.errors import DataError, EgovcpError, EnvironmentFailure
 from egovcp.hub import Content, Publication, RetryPolicy, fetch, publish, resolve
-from egovcp.testing.hub import FakeHub
-from egovcp.testing.hub.faults import Trouble
+from tests.support.hub import FakeHub
+from tests.support.hub.faults import Trouble
 
 HEALTHY = RetryPolicy(attempts=3, wait_s=0.01)
 ROUTES = ("info", "tree", "metadata", "resolve")

@@ -7,8 +7,8 @@ import pytest
 
 from egovcp.errors import DataError, EgovcpError, EnvironmentFailure, UsageError
 from egovcp.hub import Content, LostUpdate, Publication, RetryPolicy, publish
-from egovcp.testing.hub import FakeHub
-from egovcp.testing.hub.faults import Trouble
+from tests.support.hub import FakeHub
+from tests.support.hub.faults import Trouble
 
 REPO = "datasets/me/small"
 HEALTHY = RetryPolicy(attempts=3, wait_s=0.01)

@@ -7,7 +7,7 @@ import pytest
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.hub import Content, Publication, RetryPolicy, publish, reserve
-from egovcp.testing.hub import FakeHub, in_this_process
+from tests.support.hub import FakeHub, in_this_process
 
 POLICY = Publication("me/policy", {"config.json": Content(b"{}")}, "a policy", repo_type="model")
 

@@ -11,7 +11,7 @@ import pytest
 
 from egovcp.hub import HubUnreachable, RetryPolicy, retrying
 from egovcp.hub.retry import RetryingClient, http_library
-from egovcp.testing.hub import FakeHub, client_factory
+from tests.support.hub import FakeHub, client_factory
 
 
 def ask(hub: FakeHub, seconds: float | None) -> int:

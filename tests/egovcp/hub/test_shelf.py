@@ -7,7 +7,7 @@ import pytest
 
 from egovcp.errors import DataError, EnvironmentFailure
 from egovcp.hub import Content, Publication, RetryPolicy, Shelf, publish
-from egovcp.testing.hub import FakeHub
+from tests.support.hub import FakeHub
 
 DATA = "data/chunk-000/file-000.parquet"
 

@@ -20,7 +20,7 @@ from egovcp.log.background import BackgroundFanout, BackgroundSink
 from egovcp.log.info import RunInfo
 from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
-from egovcp.testing.sinks import DiarySink
+from tests.support.sinks import FaultySink
 
 INFO = RunInfo("ball")
 type Start = Callable[..., BackgroundSink]
@@ -60,7 +60,7 @@ def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
 def test_every_call_arrives_in_order(
     tmp_path: Path, start: Start, make_tick: Any, told: list[str]
 ) -> None:
-    sink = start(DiarySink(tmp_path / "diary"))
+    sink = start(FaultySink(tmp_path / "diary"))
     for index in range(40):
         sink.write(make_tick(index, bare=True))
     sink.close()
@@ -87,7 +87,7 @@ def test_what_does_not_fit_is_dropped_counted_and_told_in_the_log(
     tmp_path: Path, start: Start, make_tick: Any, told: list[str]
 ) -> None:
     diary = tmp_path / "diary"
-    sink = start(DiarySink(diary), queue_ticks=3)
+    sink = start(FaultySink(diary), queue_ticks=3)
     os.kill(sink.pid, signal.SIGSTOP)
     index = -1
     while sink.dropped < 5:
@@ -113,7 +113,7 @@ def test_what_does_not_fit_is_dropped_counted_and_told_in_the_log(
 def test_a_disk_that_hangs_loses_nothing_if_the_queue_is_long_enough(
     tmp_path: Path, start: Start, make_tick: Any, told: list[str]
 ) -> None:
-    sink = start(DiarySink(tmp_path / "diary"), close_timeout_s=60.0)
+    sink = start(FaultySink(tmp_path / "diary"), close_timeout_s=60.0)
     os.kill(sink.pid, signal.SIGSTOP)
     for index in range(250):  # 10 s at 25 Hz
         sink.write(make_tick(index))
@@ -126,7 +126,7 @@ def test_a_disk_that_hangs_loses_nothing_if_the_queue_is_long_enough(
 def test_close_does_not_wait_for_a_disk_that_hangs(
     tmp_path: Path, start: Start, make_tick: Any, told: list[str]
 ) -> None:
-    sink = start(DiarySink(tmp_path / "diary", stall_at=1, stall_s=200.0), close_timeout_s=0.3)
+    sink = start(FaultySink(tmp_path / "diary", stall_at=1, stall_s=200.0), close_timeout_s=0.3)
     for index in range(4):
         sink.write(make_tick(index, bare=True))
     until(lambda: "stall" in lines(tmp_path / "diary"))
@@ -140,7 +140,7 @@ def test_close_does_not_wait_for_a_disk_that_hangs(
 def test_a_full_disk_is_told_once_and_the_run_goes_on(
     tmp_path: Path, start: Start, make_tick: Any, told: list[str]
 ) -> None:
-    sink = start(DiarySink(tmp_path / "diary", raise_at=2))
+    sink = start(FaultySink(tmp_path / "diary", raise_at=2))
     for index in range(3):
         sink.write(make_tick(index, bare=True))
     until(lambda: "close" in lines(tmp_path / "diary"))
@@ -156,7 +156,7 @@ def test_a_full_disk_is_told_once_and_the_run_goes_on(
 def test_the_death_of_its_process_is_told_once(
     tmp_path: Path, start: Start, make_tick: Any, told: list[str]
 ) -> None:
-    sink = start(DiarySink(tmp_path / "diary"))
+    sink = start(FaultySink(tmp_path / "diary"))
     os.kill(sink.pid, signal.SIGKILL)
     index = 0
     while sink.failure is None:
@@ -182,7 +182,7 @@ def test_lossless_waits_instead_of_dropping(
     tmp_path: Path, start: Start, make_tick: Any, told: list[str]
 ) -> None:
     sink = start(
-        DiarySink(tmp_path / "diary", stall_at=1, stall_s=0.5), queue_ticks=2, lossless=True
+        FaultySink(tmp_path / "diary", stall_at=1, stall_s=0.5), queue_ticks=2, lossless=True
     )
     for index in range(60):
         sink.write(make_tick(index))
@@ -195,9 +195,9 @@ def test_one_that_hangs_does_not_hold_up_its_neighbours(
     tmp_path: Path, make_tick: Any, told: list[str]
 ) -> None:
     sinks = [
-        BackgroundSink(DiarySink(tmp_path / "a", stall_at=0, stall_s=200.0), "a",
+        BackgroundSink(FaultySink(tmp_path / "a", stall_at=0, stall_s=200.0), "a",
                        close_timeout_s=0.2, tell=told.append),
-        BackgroundSink(DiarySink(tmp_path / "b"), "b", tell=told.append),
+        BackgroundSink(FaultySink(tmp_path / "b"), "b", tell=told.append),
     ]  # fmt: skip
     with closing(BackgroundFanout(sinks)) as both:
         both.open(INFO)
@@ -210,7 +210,7 @@ def test_one_that_hangs_does_not_hold_up_its_neighbours(
 def test_if_one_cannot_be_opened_none_is_left_running(tmp_path: Path, told: list[str]) -> None:
     (tmp_path / "a.mcap").write_bytes(b"precious")
     sinks = [
-        BackgroundSink(DiarySink(tmp_path / "b"), "b", tell=told.append),
+        BackgroundSink(FaultySink(tmp_path / "b"), "b", tell=told.append),
         BackgroundSink(McapSink(tmp_path / "a.mcap"), "a", tell=told.append),
     ]
     with pytest.raises(EnvironmentFailure):

@@ -21,7 +21,7 @@ from egovcp.log.destination import Viewer
 from egovcp.log.info import RunInfo
 from egovcp.log.live import LiveRerun
 from egovcp.log.rerun import RerunSink
-from egovcp.testing.ports import free_port
+from tests.support.ports import free_port
 
 INFO = RunInfo("ball")
 

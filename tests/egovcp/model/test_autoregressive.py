@@ -10,7 +10,8 @@ from egovcp.errors import UsageError
 from egovcp.model import PRESETS, Batch, Carry, LossConfig, WorldModel, world_model_loss
 from egovcp.model.losses import filter_sequence, pixel_weights
 from egovcp.model.multistep import autoregressive_losses
-from egovcp.testing import memory_batch, random_batch, toy_model
+from egovcp.testing import random_batch, toy_model
+from tests.support.batches import memory_batch
 
 DEBUG = PRESETS["debug"]
 STEPS = 3

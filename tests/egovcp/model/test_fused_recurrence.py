@@ -8,7 +8,8 @@ from egovcp import spec
 from egovcp.checks import check_world_model
 from egovcp.model import PRESETS, Batch, Carry, WorldModel
 from egovcp.model.losses import filter_sequence
-from egovcp.testing import CountingModel, random_batch, toy_model
+from egovcp.testing import random_batch, toy_model
+from tests.support.models import CountingModel
 
 
 def _step_by_step(model: WorldModel, batch: Batch) -> Carry:

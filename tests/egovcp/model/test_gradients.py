@@ -23,7 +23,8 @@ from egovcp.model import (
 )
 from egovcp.model.config import LossConfig
 from egovcp.model.parallel import run_parallel
-from egovcp.testing import CountingModel, random_batch, toy_model
+from egovcp.testing import random_batch, toy_model
+from tests.support.models import CountingModel
 
 NOWHERE = FakeTensorMode()  # one for all: constants are kept for each device
 BF16 = partial(torch.autocast, "cpu", torch.bfloat16)

@@ -5,7 +5,7 @@ import torch
 
 from egovcp.model import PRESETS, Batch, Carry, WorldModel, world_model_loss
 from egovcp.model.losses import filter_sequence
-from egovcp.testing import memory_batch
+from tests.support.batches import memory_batch
 
 SEQUENCES, LENGTH, BATCH, STEPS, RATE = 256, 4, 16, 100, 1e-2
 

@@ -15,7 +15,8 @@ from egovcp.model.losses import (
     moving_pixels,
 )
 from egovcp.model.value_losses import value_and_termination_losses
-from egovcp.testing import CountingModel, random_batch, toy_model
+from egovcp.testing import random_batch, toy_model
+from tests.support.models import CountingModel
 
 
 def _loss(model: WorldModel, batch: Batch, seed: int = 0) -> dict[str, float]:

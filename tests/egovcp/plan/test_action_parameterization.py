@@ -10,7 +10,7 @@ from egovcp import spec
 from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.plan.action_parameterization import random_walk, reflect, target_steps
 from egovcp.plan.config import OptimiserName
-from egovcp.testing import PointWorld
+from tests.support.worlds import PointWorld
 
 ETA = spec.ACTION_ETA
 

@@ -18,7 +18,8 @@ from egovcp.plan.action_parameterization import random_walk
 from egovcp.plan.backends import library, make_evaluator
 from egovcp.plan.backends.evaluators import FloatEvaluator, Int8Evaluator
 from egovcp.plan.config import BackendName
-from egovcp.testing import CountingModel, toy_model
+from egovcp.testing import toy_model
+from tests.support.models import CountingModel
 
 needs_compiler = pytest.mark.skipif(library.compiler() is None, reason="no C compiler")
 EXACT, BYTES = 1e-5, 0.1  # largest error, in deviations of J

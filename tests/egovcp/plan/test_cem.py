@@ -14,7 +14,8 @@ from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, opti
 from egovcp.plan.action_parameterization import random_walk, shift
 from egovcp.plan.config import ActionParameterization, TerminationRule
 from egovcp.plan.objective import Dynamics, evaluate
-from egovcp.testing import Point, PointWorld, plain_planner, toy_model
+from egovcp.testing import toy_model
+from tests.support.worlds import Point, PointWorld, plain_planner
 
 ETA = spec.ACTION_ETA
 SMALL = plain_planner(samples=256, elites=32, iterations=4)

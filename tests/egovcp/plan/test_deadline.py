@@ -9,7 +9,8 @@ from egovcp import spec
 from egovcp.plan import Plan, Policy, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.plan.objective import PlanValue
 from egovcp.plan.search import Deadline
-from egovcp.testing import CountingModel, Point, PointWorld, plain_planner
+from tests.support.models import CountingModel
+from tests.support.worlds import Point, PointWorld, plain_planner
 
 CONFIG = plain_planner(samples=64, elites=8, iterations=6)
 

@@ -14,7 +14,7 @@ from egovcp.plan.backends import library, make_evaluator
 from egovcp.plan.backends.evaluators import FloatEvaluator, Int8Evaluator
 from egovcp.plan.config import BackendName
 from egovcp.testing import toy_model
-from egovcp.testing.limited import run_limited
+from tests.support.limited import run_limited
 
 needs_compiler = pytest.mark.skipif(library.compiler() is None, reason="no C compiler")
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")

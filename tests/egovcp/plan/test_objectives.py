@@ -15,7 +15,8 @@ from egovcp.plan import PlannerConfig, Policy, ReferenceEvaluator, make_plan, op
 from egovcp.plan.backends import make_evaluator
 from egovcp.plan.choices import require_answers
 from egovcp.plan.objective import evaluate
-from egovcp.testing import Point, PointWorld, ScriptedWorld, plain_planner, toy_model
+from egovcp.testing import toy_model
+from tests.support.worlds import Point, PointWorld, ScriptedWorld, plain_planner
 
 OBJECTIVES = ("value", "reward", "td")
 RULES = ("paper", "shift", "survival")

@@ -17,7 +17,7 @@ from egovcp.plan.mppi import weights
 from egovcp.plan.objective import evaluate
 from egovcp.plan.optimisers import OPTIMISERS
 from egovcp.plan.search import SearchState
-from egovcp.testing import Point, PointWorld, plain_planner
+from tests.support.worlds import Point, PointWorld, plain_planner
 
 ETA = spec.ACTION_ETA
 every = pytest.mark.parametrize("name", list(OPTIMISERS))

@@ -14,7 +14,9 @@ from egovcp import spec
 from egovcp.model import Carry, WorldModel
 from egovcp.plan import Optimiser, Plan, PlanEvaluator, PlannerConfig, Policy, PolicyStep, make_plan
 from egovcp.plan.action_parameterization import shift
-from egovcp.testing import CountingModel, plain_planner, toy_model
+from egovcp.testing import toy_model
+from tests.support.models import CountingModel
+from tests.support.worlds import plain_planner
 
 CONFIG = plain_planner(samples=64, elites=8, iterations=2)
 A = spec.ACTION_DIM

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.plan import Policy, PolicyStep
-from egovcp.testing import plain_planner, toy_model
+from egovcp.testing import toy_model
+from tests.support.worlds import plain_planner
 
 CONFIG = plain_planner(samples=32, elites=4, iterations=1, backend="float32")
 ROBOTS, TICKS, BAD_TICK, BAD_ROBOT = 3, 5, 2, 1

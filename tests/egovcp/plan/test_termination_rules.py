@@ -6,7 +6,7 @@ import torch
 from egovcp.plan import PlannerConfig
 from egovcp.plan.config import TerminationRule
 from egovcp.plan.objective import evaluate
-from egovcp.testing import ScriptedWorld
+from tests.support.worlds import ScriptedWorld
 
 VALUES = [8.0, 4.0, -2.0, 6.0]
 FLOOR = -10.0

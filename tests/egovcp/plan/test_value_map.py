@@ -10,7 +10,8 @@ import torch
 
 from egovcp.plan.value_map import HAND_AXES, HandGrid, hand_grid, value_map
 from egovcp.spec import ACTION_BOX
-from egovcp.testing import PointWorld, toy_model
+from egovcp.testing import toy_model
+from tests.support.worlds import PointWorld
 
 type Hand = Literal["left", "right"]
 HANDS: tuple[Hand, ...] = ("left", "right")

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from egovcp.testing.hub.messages import Answer, Request, say
-from egovcp.testing.hub.store import Refusal, Store
+from tests.support.hub.messages import Answer, Request, say
+from tests.support.hub.store import Refusal, Store
 
 _DATE = "2026-01-01T00:00:00.000Z"
 

@@ -13,10 +13,10 @@ from types import TracebackType
 from typing import Self
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from egovcp.testing.hub.faults import EVER, Fault, Faults, Trouble
-from egovcp.testing.hub.messages import Answer, Request, arriving, say
-from egovcp.testing.hub.routes import ROUTES, Route
-from egovcp.testing.hub.store import Refusal, Store
+from tests.support.hub.faults import EVER, Fault, Faults, Trouble
+from tests.support.hub.messages import Answer, Request, arriving, say
+from tests.support.hub.routes import ROUTES, Route
+from tests.support.hub.store import Refusal, Store
 
 _STALL_S = 3600.0
 _READING = {"GET", "HEAD"}

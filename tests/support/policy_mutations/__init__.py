@@ -12,10 +12,10 @@ from typing import Final
 
 import numpy as np
 
-from egovcp.testing.mutations.editing import ANY_FILE, MARKER, Mutate
-from egovcp.testing.mutations.folders import FOLDER_MUTATIONS
-from egovcp.testing.mutations.texts import TEXT_MUTATIONS
-from egovcp.testing.mutations.weights import WEIGHT_MUTATIONS
+from tests.support.policy_mutations.editing import ANY_FILE, MARKER, Mutate
+from tests.support.policy_mutations.folders import FOLDER_MUTATIONS
+from tests.support.policy_mutations.texts import TEXT_MUTATIONS
+from tests.support.policy_mutations.weights import WEIGHT_MUTATIONS
 
 __all__ = ["ANY_FILE", "MARKER", "Mutation", "mutate_policy"]
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from egovcp.artifact import CONFIG, WEIGHTS
 from egovcp.processors import PROCESSORS
-from egovcp.testing.mutations.editing import (
+from tests.support.policy_mutations.editing import (
     JSON_FILES,
     MARKER,
     Json,

@@ -6,9 +6,9 @@ import re
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from egovcp.testing.hub import files, repositories, uploads
-from egovcp.testing.hub.messages import Answer, Request
-from egovcp.testing.hub.store import Store
+from tests.support.hub import files, repositories, uploads
+from tests.support.hub.messages import Answer, Request
+from tests.support.hub.store import Store
 
 _REPO = r"(?P<repo>[^/]+/[^/]+)"
 _API = rf"/api/(?P<kind>models|datasets|spaces)/{_REPO}"

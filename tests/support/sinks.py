@@ -1,4 +1,4 @@
-"""Sinks for tests: one that keeps the ticks, one that fails as disks and viewers do."""
+"""Sinks for tests: one that keeps ticks in memory, one that stalls or raises on request."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from egovcp.log.tick import Tick
 
 
 @dataclass
-class DiarySink:
-    """Writes a line per call into a text file, and misbehaves on request."""
+class FaultySink:
+    """Appends a line per call to a text file; stalls or raises at given ticks."""
 
     path: Path
     stall_at: int = -1
@@ -51,11 +51,11 @@ class MemorySink:
         """In the order of writing."""
 
     def open(self, info: RunInfo) -> None:
-        """Nothing to begin."""
+        """Does nothing."""
 
     def write(self, tick: Tick) -> None:
-        """One more."""
+        """Append the tick."""
         self.ticks.append(tick)
 
     def close(self) -> None:
-        """They stay."""
+        """Does nothing."""

@@ -15,7 +15,7 @@ from safetensors.torch import load, save
 from egovcp.artifact import CONFIG, FILES, WEIGHTS
 from egovcp.manifest import MANIFEST, SEAL
 from egovcp.processors import PROCESSORS
-from egovcp.testing.mutations.editing import (
+from tests.support.policy_mutations.editing import (
     MARKER,
     Json,
     Mutate,

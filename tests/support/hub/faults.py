@@ -24,7 +24,7 @@ class Fault:
     """Trouble for the next requests of a route."""
 
     route: str
-    """Name of the route (see `egovcp.testing.hub.api.ROUTES`); ``*``: any."""
+    """Name of the route (see `tests.support.hub.routes.ROUTES`); ``*``: any."""
     trouble: Trouble
     times: int = EVER
     """How many requests it befalls."""

@@ -1,35 +1,17 @@
-"""World models that answer at once: an untrained one, and one that counts."""
+"""Small models: an untrained reactive policy, and a world model that counts."""
 
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from egovcp import spec
-from egovcp.model import PRESETS, Carry, WorldModel, WorldModelConfig
+from egovcp.model import PRESETS, Carry, WorldModel
 from egovcp.reactive import ReactiveConfig, ReactiveNetwork, tensor_shapes
 
 
-def toy_model(preset: str | WorldModelConfig = "debug", seed: int = 0) -> WorldModel:
-    """An untrained world model, of a preset or a configuration, whose heads answer differently to
-    different questions.
-
-    A new `WorldModel` predicts constants for value and termination, which hides mistakes.
-    """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        model = WorldModel(PRESETS[preset] if isinstance(preset, str) else preset)
-        for head in (model.value_head, model.termination_head, model.reward_head):
-            if head is not None:
-                last = head.rest[-1]
-                assert isinstance(last, nn.Linear)
-                nn.init.normal_(last.weight, std=0.3)
-    return model.eval()
-
-
 def toy_reactive(controller_id: str, seed: int = 0) -> ReactiveNetwork:
-    """A policy without a world model, untrained and small, that answers differently to different
-    observations."""
+    """A small untrained reactive policy whose action depends on its observations."""
     config = ReactiveConfig(frames=2, channels=(2, 4, 4), hidden=(16,))
     rng = torch.Generator().manual_seed(seed)
     tensors = {
@@ -41,7 +23,7 @@ def toy_reactive(controller_id: str, seed: int = 0) -> ReactiveNetwork:
 
 
 class CountingModel(WorldModel):
-    """Counts instead of thinking: h[:, 0] is the number of observations since the reset,
+    """Counts its calls: h[:, 0] is the number of observations since the reset,
     z[:, :7] the action that led to the state, h[:, 1] the imagined ticks.
 
     Q is highest for an action that repeats the last one, shifted by ``drift``.

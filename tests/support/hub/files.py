@@ -9,8 +9,8 @@ from pathlib import PurePosixPath
 from typing import Any
 from urllib.parse import urlencode
 
-from egovcp.testing.hub.messages import Answer, Request, say
-from egovcp.testing.hub.store import Commit, File, Refusal, Store
+from tests.support.hub.messages import Answer, Request, say
+from tests.support.hub.store import Commit, File, Refusal, Store
 
 _PAGE = 1000  # entries
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)")

@@ -4,11 +4,11 @@ A local server behind ``HF_ENDPOINT``, with enough of the Hub's interface to cre
 repository, upload, commit, tag, list, download and stream a dataset. It keeps contents on
 disk, counts requests and fails on demand (`FakeHub.fail`). On the command line::
 
-    python -m egovcp.testing.hub --root DIR --port 8080
+    python -m tests.support.hub --root DIR --port 8080
 """
 
-from egovcp.testing.hub.environment import client_factory, environment, in_this_process
-from egovcp.testing.hub.faults import Fault
-from egovcp.testing.hub.server import FakeHub
+from tests.support.hub.environment import client_factory, environment, in_this_process
+from tests.support.hub.faults import Fault
+from tests.support.hub.server import FakeHub
 
 __all__ = ["FakeHub", "Fault", "client_factory", "environment", "in_this_process"]

@@ -1,4 +1,4 @@
-"""In the place of CUDA graphs, on any device."""
+"""A stand-in for CUDA graphs on any device."""
 
 from __future__ import annotations
 
@@ -10,12 +10,13 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 
-class AgainRecorder:
-    """A replay computes again, and writes to what the recording has written to."""
+class RecomputingRecorder:
+    """Records nothing: a replay calls the function again and copies its results into the first
+    ones."""
 
     def __init__(self) -> None:
         self.made = 0
-        """Recordings."""
+        """Number of recordings."""
 
     def __call__(
         self, function: Callable[[], Any], device: torch.device

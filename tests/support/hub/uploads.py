@@ -7,8 +7,8 @@ import json
 from pathlib import PurePosixPath
 from typing import Any
 
-from egovcp.testing.hub.messages import Answer, Request, say
-from egovcp.testing.hub.store import Commit, File, Refusal, Store, pointer_oid
+from tests.support.hub.messages import Answer, Request, say
+from tests.support.hub.store import Commit, File, Refusal, Store, pointer_oid
 
 _LARGE = 10 * 2**20  # bytes
 _LARGE_SUFFIXES = {".parquet", ".png", ".jpg", ".mp4", ".safetensors", ".bin", ".onnx", ".rrd"}

@@ -16,9 +16,10 @@ from huggingface_hub.errors import (
     RevisionNotFoundError,
 )
 
-from egovcp.testing.hub import FakeHub, files, in_this_process
+from tests.support.hub import FakeHub, files, in_this_process
 
 REPO = "me/things"
+ROOT = Path(__file__).resolve().parents[2]
 LARGE = bytes(range(256)) * 100
 
 
@@ -156,8 +157,8 @@ def test_faults_befall_the_requests_they_were_ordered_for(api: HfApi, hub: FakeH
 
 
 def test_the_command_says_where_it_is(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "egovcp.testing.hub", "--root", str(tmp_path)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+    command = [sys.executable, "-m", "tests.support.hub", "--root", str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         assert process.stdout is not None
         line = process.stdout.readline()
         endpoint = line.removeprefix("export HF_ENDPOINT=").split()[0]

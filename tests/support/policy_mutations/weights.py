@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from egovcp.artifact import FILES, WEIGHTS
-from egovcp.testing.mutations.editing import (
+from tests.support.policy_mutations.editing import (
     ANY_FILE,
     Json,
     Mutate,

@@ -5,7 +5,7 @@ import signal
 import socket
 import time
 
-from egovcp.testing.limited import run_limited
+from tests.support.limited import run_limited
 
 
 def test_returns_the_exit_code_and_the_output() -> None:

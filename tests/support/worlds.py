@@ -1,4 +1,4 @@
-"""Worlds whose best plan, values and terminations are known."""
+"""World models with known optimal plans, values and terminations."""
 
 from __future__ import annotations
 

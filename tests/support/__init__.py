@@ -1,0 +1,1 @@
+"""Fakes, generators and limits for the tests and benchmarks of this repository."""
