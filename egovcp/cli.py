@@ -84,8 +84,9 @@ def parse_config[C](
     flags = flags_of(config_class)
     try:
         args = split_flags(argv, flags)
-        if any(arg in HELP for arg in args):
-            print_help(config_class, prog, epilog)
+        topics = [arg.partition("=")[2] for arg in args if arg.partition("=")[0] in HELP]
+        if topics:
+            print_help(config_class, prog, epilog, topics[-1])
         beneath = defaults(args) if defaults else {}
         config = build(config_class, merged(beneath, flag_values(args, flags)), "--")
     except WrongValue as error:
@@ -109,7 +110,6 @@ def run_command[C](
     args = list(sys.argv[1:] if argv is None else argv)
     switch = ("--debug", "--debug=true")
     debug = any(a in switch for a in args)
-    epilog = (epilog + "\n" if epilog else "") + "--debug prints the traceback of an error."
     raise_on_sigint()
     try:
         plain = [a for a in args if a not in switch]

@@ -5,6 +5,7 @@ A distribution declares its commands in a module that imports nothing else::
     collect = EntryPoint("egovcp-collect", "egovcp_collect.collect")
 
 and names them in its ``pyproject.toml``: ``egovcp-collect = "egovcp_collect.commands:collect"``.
+``--version`` is answered here, before the command is imported.
 
 Exit codes beyond those of `egovcp.errors`: 130 after Ctrl-C, 141 if the reader of the output has
 gone (``| head -1``), 1 with a traceback for a bug.
@@ -66,6 +67,8 @@ class EntryPoint:
     def _run(self, argv: Sequence[str] | None) -> int:
         from importlib import import_module
 
+        if "--version" in (sys.argv[1:] if argv is None else argv):
+            return self._print_version()
         try:
             main: Callable[[Sequence[str] | None], int] = import_module(self.module).main
             code = main(argv)
@@ -76,6 +79,15 @@ class EntryPoint:
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         return code
+
+    def _print_version(self) -> int:
+        from importlib import metadata
+
+        from egovcp.terminal import echo
+
+        distribution = self.module.partition(".")[0].replace("_", "-")
+        echo(f"{self.prog} {metadata.version(distribution)}")
+        return 0
 
     def _missing(self, error: ModuleNotFoundError) -> int:
         from egovcp.packages import missing_package
@@ -155,3 +167,6 @@ def _print_last(text: str) -> None:
     with suppress(OSError):  # stderr may be closed as well
         echo(text, error=True, end="")
     discard_output()
+
+
+info = EntryPoint("egovcp-info", "egovcp.info")

@@ -24,6 +24,15 @@ from egovcp.values import (
 
 CONFIG_FILE: Final = f"--{CONFIG_ARG}"
 HELP: Final = ("-h", "--help")
+#: LeRobot's name of an option -> its name here, where both mean the same.
+LEROBOT_NAMES: Final[Mapping[str, str]] = {
+    "env.task": "task",
+    "eval.n_episodes": "episodes",
+    "eval.batch_size": "num_envs",
+    "policy.device": "device",
+    "eval_steps": "eval_freq",
+    "env_eval_freq": "eval_freq",
+}
 _FILE_LIMIT_BYTES: Final = 64 << 10  # YAML is parsed at about 50 kB/s
 
 
@@ -58,9 +67,12 @@ def split_flags(argv: Sequence[str], flags: Mapping[str, Any]) -> list[str]:
 
 
 def _checked(arg: str, flags: Mapping[str, Any]) -> str:
-    flag, equals, _ = arg.partition("=")
-    if arg in HELP:
+    flag, equals, value = arg.partition("=")
+    if flag in HELP:
         return arg
+    own = f"--{LEROBOT_NAMES.get(flag.removeprefix('--'))}"
+    if flag not in flags and own in flags:
+        flag, arg = own, f"{own}{equals}{value}"
     if not flag.startswith("-"):
         raise UsageError(f"unexpected argument {arg!r}; options are written --name=value")
     if flag not in flags:

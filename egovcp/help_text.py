@@ -1,81 +1,157 @@
-"""``--help`` of a command: every option with its type, its bounds and its default."""
+"""``--help`` of a command: its options in groups, with types, bounds and defaults.
+
+``--help`` shows the options outside groups and those of small groups, each with its first sentence,
+and lists the other groups. ``--help=GROUP`` shows one group in full, ``--help=all`` every option.
+"""
 
 from __future__ import annotations
 
-import argparse
 import ast
 import dataclasses
 import inspect
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any, Final
+from typing import Any, Final, NoReturn
 
 from egovcp.bounds import as_flag_value, bounds_of
+from egovcp.errors import UsageError, did_you_mean
 from egovcp.flags import CONFIG_FILE
 from egovcp.terminal import echo
 from egovcp.values import default_of, is_dataclass_type, option_types, type_name
 
+ALL: Final = "all"
+_WIDTH: Final = 110
+_COLUMN: Final = 40  # where descriptions start
+_SMALL_GROUP: Final = 4
 _SYNTAX: Final = (
-    "A list is written [a, b] or (a, b), a group of options {name: value}; quote both for the "
-    "shell. A switch alone is true."
+    "Lists: [a, b] or (a, b). Groups: {name: value}. Quote both for the shell. --debug prints the "
+    "traceback of an error, --version the version."
 )
 
 
-def print_help(config_class: type, prog: str, epilog: str) -> None:
+@dataclass(frozen=True)
+class _Option:
+    flag: str
+    kind: str
+    text: str
+    default: Any
+    bounds: str = ""
+
+    def row(self, full: bool) -> tuple[str, str]:
+        """Flag with type, and description; only the first sentence unless ``full``."""
+        words = [self.text if full else self.text.partition(". ")[0].removesuffix(".") + "."]
+        if self.bounds and full:
+            words.append(f"[{self.bounds}]")
+        if self.default is dataclasses.MISSING:
+            words.append("(required)")
+        elif self.default not in ("", None, ()):
+            words.append(f"(default: {as_flag_value(self.default)})")
+        return f"{self.flag} {self.kind}", " ".join(words)
+
+
+@dataclass(frozen=True)
+class _Group:
+    name: str
+    """Such as ``policy.loss``; empty: the options outside groups."""
+    summary: str
+    options: tuple[_Option, ...]
+
+    @property
+    def is_short(self) -> bool:
+        """Whether ``--help`` shows the options."""
+        return not self.name or ("." not in self.name and len(self.options) <= _SMALL_GROUP)
+
+
+def print_help(config_class: type, prog: str, epilog: str, topic: str = "") -> NoReturn:
     """Print the help and end the process.
 
+    Args:
+        topic: a group such as ``policy.loss``, `ALL`, or empty for the overview.
+
     Raises:
-        SystemExit: always.
+        SystemExit: always, except for an unknown topic.
+        UsageError: there is no such group.
     """
-    parser = argparse.ArgumentParser(
-        prog,
-        f"{prog} [--NAME=VALUE ...]",
-        description=_first_paragraph(config_class),
-        epilog=f"{_SYNTAX} {epilog}",
-        formatter_class=lambda prog: argparse.HelpFormatter(prog, max_help_position=44, width=110),
-    )
-    config_file = "Read options from this YAML, JSON or TOML file; flags override them."
-    parser.add_argument(CONFIG_FILE, metavar="text", help=config_file)
-    _add_options(parser, parser, config_class, None, "--")
-    echo(parser.format_help(), end="")
+    groups = list(_groups(config_class, None, ""))
+    if not topic:
+        lines = [f"{prog}: {_first_paragraph(config_class)}", *_overview(groups), ""]
+        lines += textwrap.wrap(f"{_SYNTAX} {epilog}".strip(), _WIDTH)
+    else:
+        names = {group.name.partition(".")[0] for group in groups} | {g.name for g in groups}
+        if topic != ALL and topic not in names - {""}:
+            raise UsageError(f"--help={topic}: no such group{did_you_mean(topic, names - {''})}")
+        shown = [g for g in groups if topic == ALL or f"{g.name}.".startswith(f"{topic}.")]
+        lines = [line for group in shown for line in _section(group, full=True)][1:]
+    echo("\n".join(lines))
     raise SystemExit(0)
 
 
-def _add_options(
-    parser: argparse.ArgumentParser, group: Any, config_class: Any, config: Any, prefix: str
-) -> None:
-    """Add the options of a dataclass to its group, and those of the dataclasses within it.
+def _overview(groups: Sequence[_Group]) -> Iterator[str]:
+    for group in groups:
+        if group.is_short:
+            yield from _section(group, full=False)
+    rows = []
+    for group in groups:
+        inner = [g for g in groups if f"{g.name}.".startswith(f"{group.name}.")]
+        hidden = sum(len(g.options) for g in inner if not g.is_short)
+        if group.name and "." not in group.name and hidden:
+            count = f"{hidden} option{'s' if hidden > 1 else ''}"
+            rows.append((f"{group.name} ({count})", group.summary.partition(". ")[0]))
+    if rows:
+        yield from ("", "More options, shown by --help=GROUP or --help=all:")
+        yield from _table(rows)
+
+
+def _section(group: _Group, full: bool) -> Iterator[str]:
+    yield ""
+    yield f"{group.name}: {group.summary}" if group.name else "Options:"
+    rows = [option.row(full) for option in group.options]
+    if full and group.name:
+        several = f"Several of the options --{group.name}.NAME at once."
+        rows.insert(0, (f"--{group.name} {{NAME: VALUE, ...}}", several))
+    yield from _table(rows)
+
+
+def _table(rows: Iterable[tuple[str, str]]) -> Iterator[str]:
+    for left, text in rows:
+        lines = textwrap.wrap(text, _WIDTH - _COLUMN, break_on_hyphens=False) or [""]
+        if len(left) + 4 > _COLUMN:
+            lines.insert(0, "")
+        yield f"  {left:{_COLUMN - 2}}{lines[0]}".rstrip()
+        yield from (" " * _COLUMN + line for line in lines[1:])
+
+
+def _groups(config_class: Any, config: Any, name: str) -> Iterator[_Group]:
+    """The options of a dataclass, then those of the dataclasses in it.
 
     Args:
         config: an instance that has the defaults; None: those of the class.
     """
     kinds, documents = option_types(config_class), dict(_documents(config_class))
-    nested: list[tuple[str, Any, Any]] = []
+    prefix = f"{name}." if name else ""
+    options, nested = list[_Option](), list[tuple[Any, Any, str]]()
+    if not name:
+        file = "Read options from this YAML, JSON or TOML file; flags override them."
+        options.append(_Option(CONFIG_FILE, "text", file, ""))
     for field in dataclasses.fields(config_class):
-        flag, kind = f"{prefix}{field.name}", kinds[field.name]
-        default = default_of(field) if config is None else getattr(config, field.name)
+        kind, default = kinds[field.name], default_of(field)
+        default = default if config is None else getattr(config, field.name)
         if is_dataclass_type(kind):
-            nested.append((flag, kind, default))
-            continue
-        words = [documents.get(field.name, "")]
-        if bounds := str(bounds_of(field) or ""):
-            words.append(f"[{bounds}]")
-        if default is dataclasses.MISSING:
-            words.append("(required)")
-        elif default != "":
-            words.append(f"(default: {as_flag_value(default)})")
-        group.add_argument(flag, metavar=type_name(kind), help=_escaped(" ".join(words)))
-    for flag, kind, default in nested:
-        inner = parser.add_argument_group(flag.removeprefix("--"), _first_paragraph(kind))
-        several = f"Several of the options {flag}.NAME at once."
-        inner.add_argument(flag, metavar=type_name(kind), help=several)
-        default = default if isinstance(default, kind) else None
-        _add_options(parser, inner, kind, default, f"{flag}.")
+            inner = default if isinstance(default, kind) else None
+            nested.append((kind, inner, f"{prefix}{field.name}"))
+        else:
+            text, bounds = documents.get(field.name, ""), str(bounds_of(field) or "")
+            flag = f"--{prefix}{field.name}"
+            options.append(_Option(flag, type_name(kind), text, default, bounds))
+    yield _Group(name, _first_paragraph(config_class), tuple(options))
+    for arguments in nested:
+        yield from _groups(*arguments)
 
 
 def _documents(config_class: type) -> Iterator[tuple[str, str]]:
-    """(option, the string literal below it) of a dataclass and those it inherits from."""
+    """(option, the string literal below it) of a dataclass and its bases."""
     for base in reversed(config_class.__mro__):
         if not dataclasses.is_dataclass(base):
             continue
@@ -93,8 +169,3 @@ def _documents(config_class: type) -> Iterator[tuple[str, str]]:
 def _first_paragraph(config_class: type) -> str:
     text = inspect.cleandoc(config_class.__doc__ or "").split("\n\n")[0]
     return " ".join(text.split())
-
-
-def _escaped(text: str) -> str:
-    """`argparse` formats help texts with the ``%`` operator."""
-    return text.replace("%", "%%")

@@ -18,7 +18,7 @@ from .listing import all_commands
 ROOT = Path(__file__).resolve().parents[2]
 FLAG = re.compile(r"(?<![\w.-])--[a-z]\w*(?:\.\w+)*")
 #: Of every command; and what stands for any name.
-COMMON = {"--debug", "--help", "--config_path", "--name", "--group.option", "--a"}
+COMMON = {"--debug", "--help", "--version", "--config_path", "--name", "--group.option", "--a"}
 #: Flags of other programs that our code starts or names.
 FOREIGN = {"--bind", "--port", "--serve", "--web", "--expect", "--user"}
 APPLICATIONS = {
@@ -64,21 +64,27 @@ def _named(text: str, own: set[str]) -> Iterator[str]:
                     yield flag
 
 
-def _help(main: object, arguments: tuple[str, ...]) -> str:
+def _help(main: object, arguments: tuple[str, ...], topic: str = "--help=all") -> str:
     printed = io.StringIO()
     with redirect_stdout(printed), pytest.raises(SystemExit):
-        main([*arguments, "--help"])  # type: ignore[operator]
+        main([*arguments, topic])  # type: ignore[operator]
     return printed.getvalue()
 
 
-def test_help_names_only_flags_of_its_command() -> None:
+@pytest.mark.parametrize("topic", ["--help", "--help=all"])
+def test_help_names_only_flags_of_its_command(topic: str) -> None:
     wrong = []
     for command in all_commands():
-        text = re.sub(r"-\n\s+", "-", _help(command.main, command.arguments))
+        text = re.sub(r"-\n\s+", "-", _help(command.main, command.arguments, topic))
         text = " ".join(text.split())
         for flag in _named(text, set(flags_of(command.config_class))):
             wrong.append(f"{command.prog} --help names {flag}")
     assert not wrong, "\n".join(wrong)
+
+
+def test_help_of_every_command_has_at_most_80_lines() -> None:
+    texts = {c.prog: _help(c.main, c.arguments, "--help") for c in all_commands()}
+    assert {prog: text.count("\n") for prog, text in texts.items() if text.count("\n") > 80} == {}
 
 
 @pytest.mark.parametrize("application", APPLICATIONS)

@@ -77,7 +77,7 @@ def known_flags() -> frozenset[str]:
     for point in metadata.entry_points(group="console_scripts"):
         if point.name.startswith("egovcp-"):
             for subcommand in _subcommands(point.name):
-                found |= set(re.findall(r"--[\w.-]+", _help(point.name, *subcommand)))
+                found |= set(re.findall(r"--[\w.-]+", _help(point.name, *subcommand, "--help=all")))
     found |= {flag.replace("--", "--policy.", 1) for flag in flags_of(EgovcpConfig)}
     found |= {flag.replace("--", "--env.", 1) for flag in flags_of(EgovcpEnvConfig)}
     for script in (ROOT / "benchmarks").glob("*.py"):
@@ -93,16 +93,16 @@ def known_flags() -> frozenset[str]:
 def _subcommands(program: str) -> list[list[str]]:
     if program == "egovcp-experiment":
         return [["ablations"]]  # all have the same options
-    text = _help(program)
+    text = _help(program, "--help")
     names = re.findall(r"^  ([a-z-]+)  ?", text, re.M) if "SUBCOMMAND" in text else []
     return [[name] for name in names] or [[]]
 
 
 @cache
-def _help(program: str, *subcommand: str) -> str:
+def _help(program: str, *arguments: str) -> str:
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-        main_of(program)([*subcommand, "--help"])
+        main_of(program)(list(arguments))
     return printed.getvalue()
 
 

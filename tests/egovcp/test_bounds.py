@@ -114,7 +114,7 @@ def test_a_command_whose_whole_config_checks_itself_names_the_flag_too() -> None
 
 def test_help_tells_the_bounds(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        _parse("--help")
+        _parse("--help=all")
     words = " ".join(capsys.readouterr().out.split())
     assert "Area, m^2. [more than 0] (default: 20.0)" in words
     assert "Reefs; null: as the wind says. [at least 0 and at most 3]" in words

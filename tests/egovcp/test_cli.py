@@ -369,8 +369,60 @@ def test_help_ends_well_and_shows_defaults_and_units(capsys: pytest.CaptureFixtu
 
 def test_help_lists_every_option_once(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        _run("--help")
+        _run("--help=all")
     listed = re.findall(r"^  (--[\w.]+)", capsys.readouterr().out, flags=re.MULTILINE)
     assert {"--lamp", "--lamp.stand", "--lamp.stand.height_range", "--count"} <= set(listed)
     assert len(set(listed)) == len(listed)
     assert "--stand" not in listed
+
+
+@pytest.mark.parametrize("topic", ["lamp", "lamp.stand"])
+def test_help_of_a_group_shows_its_options_only(
+    topic: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        _run(f"--help={topic}")
+    text = capsys.readouterr().out
+    assert "--lamp.stand.height_range" in text
+    assert ("--lamp.watts" in text) == (topic == "lamp")
+    assert "--count" not in text
+
+
+def test_help_of_an_unknown_group_names_the_one_that_was_meant(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert _run("--help=lmap") == 2
+    assert "did you mean 'lamp'" in capsys.readouterr().err
+
+
+def test_help_lists_the_groups_that_it_leaves_out(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        _run("--help")
+    text = capsys.readouterr().out
+    assert "--lamp.stand.height_range" not in text
+    assert re.search(r"^  lamp \(1 options?\) ", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize("sizes", ["(4,5,6)", "[4,5,6]", "( 4, 5, 6 )", "[4, 5, 6,]"])
+def test_a_sequence_may_be_written_as_a_tuple_or_as_a_list(sizes: str) -> None:
+    assert _parse(f"--sizes={sizes}").sizes == (4, 5, 6)
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Options under names of this project."""
+
+    task: str = "ball"
+    episodes: int = 1
+    eval_freq: int = 1
+
+
+def test_lerobots_names_stand_for_the_same_options() -> None:
+    argv = ["--env.task=wall", "--eval.n_episodes", "7", "--env_eval_freq=3"]
+    assert parse_config(Evaluation, argv, PROG) == Evaluation("wall", 7, 3)
+    assert parse_config(Evaluation, ["--eval_steps=5"], PROG) == Evaluation(eval_freq=5)
+
+
+def test_a_lerobot_name_without_counterpart_is_unknown() -> None:
+    with pytest.raises(UsageError, match=r"unknown option --env\.task"):
+        _parse("--env.task=wall")

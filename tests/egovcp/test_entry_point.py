@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,13 @@ def run(tmp_path: Path) -> Run:
         )
 
     return run  # type: ignore[return-value]
+
+
+def test_version_is_printed_without_importing_the_command() -> None:
+    start = "from egovcp.entry_point import EntryPoint; EntryPoint('egovcp-x', 'egovcp.absent')()"
+    command = [sys.executable, "-c", start, "--version"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout == f"egovcp-x {version('egovcp')}\n"
 
 
 # --- Ctrl-C -----------------------------------------------------------------------------
