@@ -16,7 +16,7 @@ from torch import Tensor, nn
 from egovcp import spec
 from egovcp.model import Batch, LossConfig, WorldModel
 from egovcp.model.networks import SplitLinear, SplitMlp
-from egovcp.model.two_hot import REACH
+from egovcp.model.value import REACH
 from egovcp_train.config import OptimizerConfig
 
 

@@ -1,7 +1,7 @@
 """The world model: networks, recurrence and losses. Imports neither data nor a simulator."""
 
-from egovcp.model.carry import Carry
 from egovcp.model.config import PRESETS, LossConfig, WorldModelConfig
+from egovcp.model.latent_state import Carry
 from egovcp.model.losses import Batch
 from egovcp.model.objective import (
     StepNoise,

@@ -8,19 +8,18 @@ because it is not conditioned on an action and the terminal observation is not s
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
-from egovcp.model.carry import Carry
 from egovcp.model.config import LossConfig
-from egovcp.model.data_parallel import over_all_rows, row_noise
 from egovcp.model.depth import highest_3x3, lowest_3x3, nearness
 from egovcp.model.fused_recurrence import filter_window
-from egovcp.model.gaussian import Gaussian, kl_divergence
-from egovcp.model.image_loss import image_error
+from egovcp.model.latent_state import Carry, Gaussian, kl_divergence
+from egovcp.model.parallel import over_all_rows, row_noise
 from egovcp.model.world_model import WorldModel
 
 #: Pictures that are looked at together where no gradient is asked for: what the layers make of more
@@ -108,10 +107,41 @@ def _pieces(*rows: Tensor) -> Iterator[tuple[Tensor, ...]]:
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Mean of x where mask; 0 where the mask is empty.
 
-    Of a batch that processes share (`egovcp.model.data_parallel`): this one's part of the mean.
+    Of a batch that processes share (`egovcp.model.parallel`): this one's part of the mean.
     """
     weight = mask.to(x.dtype)
     return (x * weight).sum() / over_all_rows(weight.sum()).clamp_min(1.0)
+
+
+def image_error(image: Tensor, near: Tensor, weight: Tensor) -> Tensor:
+    """Mean over the pixels of half the weighted squared error, (...,), float32.
+
+    The gradient is written by hand: one pass over the pixels where autograd takes five.
+
+    Args:
+        image: (..., H, W) nearness as decoded.
+        near: (..., H, W) as observed; no gradient.
+        weight: (..., H, W) of the pixels; no gradient.
+    """
+    error: Tensor = _ImageError.apply(image, near, weight)  # type: ignore[no-untyped-call]
+    return error
+
+
+class _ImageError(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, image: Tensor, near: Tensor, weight: Tensor) -> Tensor:
+        difference = image - near
+        weighted = difference * weight
+        ctx.save_for_backward(weighted)
+        ctx.dtype = image.dtype
+        return 0.5 * difference.mul_(weighted).mean((-2, -1))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        (weighted,) = ctx.saved_tensors
+        pixels = weighted.shape[-2] * weighted.shape[-1]
+        return (weighted * (gradient / pixels)[..., None, None]).to(ctx.dtype), None, None
 
 
 def depth_loss(

@@ -23,11 +23,10 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from egovcp.model.carry import Carry
 from egovcp.model.config import LossConfig
 from egovcp.model.fused_recurrence import imagine_window
-from egovcp.model.image_loss import image_error
-from egovcp.model.losses import Batch, Rollout, masked_mean, unbroken
+from egovcp.model.latent_state import Carry
+from egovcp.model.losses import Batch, Rollout, image_error, masked_mean, unbroken
 from egovcp.model.world_model import WorldModel
 
 

@@ -17,9 +17,7 @@ import torch
 from torch import Tensor
 
 from egovcp.model import losses
-from egovcp.model.carry import Carry
-from egovcp.model.data_parallel import WHOLE, present_share
-from egovcp.model.gaussian import Gaussian
+from egovcp.model.latent_state import Carry, Gaussian
 from egovcp.model.losses import Batch, Rollout
 from egovcp.model.multistep import (
     autoregressive_losses,
@@ -28,7 +26,7 @@ from egovcp.model.multistep import (
     multistep_losses,
 )
 from egovcp.model.networks import SplitMlp
-from egovcp.model.parallel import run_parallel
+from egovcp.model.parallel import SINGLE_PROCESS, current_rank, run_parallel
 from egovcp.model.value_losses import value_and_termination_losses
 from egovcp.model.world_model import WorldModel
 
@@ -116,7 +114,7 @@ def world_model_gradients(
         told, foreseen = _parts(model, cut, batch, draws, head)
         first, second = partial(with_gradient, told), partial(with_gradient, foreseen)
         # Processes that share a batch meet at every mean, and so in one order.
-        if batch.state.device.type == "cpu" and present_share() is WHOLE:
+        if batch.state.device.type == "cpu" and current_rank() is SINGLE_PROCESS:
             (terms, gradients), (more, others) = run_parallel(first, second)
         else:
             (terms, gradients), (more, others) = first(), second()

@@ -15,8 +15,8 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from egovcp.model.carry import Carry
 from egovcp.model.config import LossConfig
+from egovcp.model.latent_state import Carry
 from egovcp.model.losses import Batch, Rollout, masked_mean, unbroken
 from egovcp.model.networks import SplitMlp
 from egovcp.model.world_model import WorldModel

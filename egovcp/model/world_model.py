@@ -16,16 +16,19 @@ on the robot and replay; `imagine` advances it without an observation.
 
 from __future__ import annotations
 
+from typing import Final
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import value
-from egovcp.model.carry import Carry
 from egovcp.model.config import WorldModelConfig
 from egovcp.model.depth import nearness, network_image, to_metres
-from egovcp.model.gaussian import Gaussian
+from egovcp.model.latent_state import Carry, Gaussian
 from egovcp.model.networks import (
     DepthDecoder,
     DepthEncoder,
@@ -33,6 +36,9 @@ from egovcp.model.networks import (
     SplitLinear,
     SplitMlp,
 )
+
+MIN_STATE_STD: Final = 0.02  # constants, such as the velocity command of a standing robot
+MIN_RETURN_QUANTILE: Final = 0.001
 
 
 class PosteriorHead(nn.Module):
@@ -93,6 +99,34 @@ class WorldModel(nn.Module):
         self.value_head.start_at_zero()
         if self.reward_head is not None:
             self.reward_head.start_at_zero()
+
+    def set_statistics(
+        self,
+        state_mean: NDArray[np.floating],
+        state_std: NDArray[np.floating],
+        returns: NDArray[np.floating],
+        scaled: bool = True,
+        gamma: float = spec.GAMMA,
+    ) -> None:
+        """Set the normalisation constants from a dataset.
+
+        Args:
+            state_mean: (74,) mean of the proprioceptive state.
+            state_std: (74,) its standard deviation; values below `MIN_STATE_STD` are raised to it.
+            returns: (n,) the complete Monte Carlo returns, n >= 1.
+            scaled: fit Q to standardised returns; else to the returns themselves.
+            gamma: discount per step of the returns.
+        """
+        values = {
+            "state_mean": state_mean,
+            "state_std": np.maximum(state_std, MIN_STATE_STD),
+            "return_mean": returns.mean(dtype=np.float64) if scaled else 0.0,
+            "return_std": max(float(returns.std(dtype=np.float64)), 1e-6) if scaled else 1.0,
+            "min_return": np.quantile(returns, MIN_RETURN_QUANTILE),
+            "discount": gamma,
+        }
+        for name, number in values.items():
+            getattr(self, name).copy_(torch.as_tensor(number, dtype=torch.float32))
 
     # --- observation -----------------------------------------------------------------
     def embed_near(self, near: Tensor, standardised: Tensor) -> Tensor:

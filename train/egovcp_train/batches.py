@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from egovcp.data import EpisodeStore, ReturnConfig
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
-from egovcp.model.statistics import set_statistics
 
 DEFAULT_RETURNS = ReturnConfig()
 
@@ -61,4 +60,4 @@ def fix_normalisation(
             "are not longer than --returns.steps; lower it, or collect longer episodes"
         )
     scaled = config.scale != "none"
-    set_statistics(model, state_mean, state_std, returns, scaled, config.gamma)
+    model.set_statistics(state_mean, state_std, returns, scaled, config.gamma)

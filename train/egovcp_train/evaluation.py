@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from egovcp.model import Batch, WorldModel
-from egovcp.model.gaussian import kl_divergence
+from egovcp.model.latent_state import kl_divergence
 from egovcp.model.losses import Rollout, filter_sequence
 from egovcp_train.heldout.calibration import calibration
 

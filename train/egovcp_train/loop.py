@@ -15,7 +15,7 @@ from torch import Tensor
 from egovcp.cuda_graphs import Recorded
 from egovcp.errors import DataError
 from egovcp.model import Batch, StepNoise, WorldModel, sample_step_noise, world_model_gradients
-from egovcp.model.data_parallel import sharing
+from egovcp.model.parallel import data_parallel
 from egovcp.model.value_losses import TargetNetwork
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.device import precision
@@ -73,7 +73,7 @@ class Learner:
         self.model.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(progress)
-        with sharing(self.ranks.share):
+        with data_parallel(self.ranks.share):
             draws = sample_step_noise(self.model, batch, self.generator)
             names, values, gradients = self._gradients(batch, draws)
         for parameter, gradient in zip(self._parameters, gradients, strict=True):

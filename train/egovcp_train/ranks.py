@@ -17,7 +17,7 @@ import torch.distributed as dist
 from torch import Tensor
 
 from egovcp.errors import EnvironmentFailure
-from egovcp.model.data_parallel import WHOLE, Share
+from egovcp.model.parallel import SINGLE_PROCESS, DataParallelRank
 from egovcp.packages import require_packages
 
 type Terms = dict[str, Tensor]
@@ -34,7 +34,7 @@ class Ranks:
     """Number of processes."""
     local: int = 1
     """Processes on this computer, which share its memory."""
-    share: Share = WHOLE
+    share: DataParallelRank = SINGLE_PROCESS
     """This process' part of a batch."""
 
     @property
@@ -91,7 +91,7 @@ class LaunchedRanks(Ranks):
             raise EnvironmentFailure(f"cannot connect the processes ({reason})") from error
         self.rank, self.count = state.process_index, state.num_processes
         self.local = int(os.environ.get("LOCAL_WORLD_SIZE", self.count))
-        self.share = Share(self.rank, self.count, _summed)
+        self.share = DataParallelRank(self.rank, self.count, _summed)
 
     def decided[T](self, value: T) -> T:
         box = [value]

@@ -23,7 +23,6 @@ from egovcp.data import DatasetReader
 from egovcp.errors import ArtifactError, UsageError
 from egovcp.manifest import SEAL
 from egovcp.model import WorldModel, world_model_loss
-from egovcp.model.statistics import set_statistics
 from egovcp.plan import Policy
 from lerobot_policy_egovcp.configuration_egovcp import EgovcpConfig
 from lerobot_policy_egovcp.observations import read_observation
@@ -71,8 +70,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         if self._reader is not None and dataset_stats is not None:
             state = dataset_stats[spec.STATE_KEY]
             returns = self._dataset_targets().usable.numpy()
-            set_statistics(
-                self.world_model,
+            self.world_model.set_statistics(
                 np.asarray(state["mean"]),
                 np.asarray(state["std"]),
                 returns,

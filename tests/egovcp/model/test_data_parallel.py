@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 from egovcp.model import Batch, WorldModel, world_model_loss
-from egovcp.model.data_parallel import Share, over_all_rows, row_noise, sharing
+from egovcp.model.parallel import DataParallelRank, data_parallel, over_all_rows, row_noise
 from egovcp.testing import random_batch, toy_model
 
 ROWS = 2  # of each of two processes
 
 
-def _together[T](work: Callable[[Share], T]) -> list[T]:
+def _together[T](work: Callable[[DataParallelRank], T]) -> list[T]:
     """Run both processes' work, each in a thread, with a sum over the two."""
     barrier = threading.Barrier(2, timeout=60)
     given: dict[int, Tensor] = {}
@@ -28,7 +28,7 @@ def _together[T](work: Callable[[Share], T]) -> list[T]:
             barrier.wait()  # nobody overwrites what the other has yet to read
             return total
 
-        return work(Share(rank, 2, add_up))
+        return work(DataParallelRank(rank, 2, add_up))
 
     with ThreadPoolExecutor(2) as pool:
         return list(pool.map(run, range(2)))
@@ -62,8 +62,8 @@ def _learned(model: WorldModel, batch: Batch) -> tuple[dict[str, Tensor], dict[s
 def test_losses_and_gradients_add_up_to_those_of_the_whole_batch(preset: str) -> None:
     batch = _uneven()
 
-    def work(share: Share) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        with sharing(share):
+    def work(share: DataParallelRank) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
+        with data_parallel(share):
             return _learned(models[share.rank], _part(batch, share.rank))
 
     models = [toy_model(preset), toy_model(preset)]
@@ -84,9 +84,9 @@ def test_means_of_each_process_alone_would_not_add_up() -> None:
 
 
 def test_the_noise_is_that_of_the_whole_batch() -> None:
-    def draw(share: Share) -> tuple[Tensor, Tensor]:
+    def draw(share: DataParallelRank) -> tuple[Tensor, Tensor]:
         generator = torch.Generator().manual_seed(1)
-        with sharing(share):
+        with data_parallel(share):
             noise = row_noise((ROWS, 5), generator, torch.device("cpu"))
         return noise, torch.rand(3, generator=generator)
 
@@ -99,6 +99,6 @@ def test_the_noise_is_that_of_the_whole_batch() -> None:
 
 
 def test_the_share_ends_with_its_context() -> None:
-    with sharing(Share(0, 2, lambda x: 2 * x)):
+    with data_parallel(DataParallelRank(0, 2, lambda x: 2 * x)):
         assert over_all_rows(torch.tensor(3.0)) == 6.0
     assert over_all_rows(torch.tensor(3.0)) == 3.0

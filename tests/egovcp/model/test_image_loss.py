@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from egovcp.model.image_loss import image_error
+from egovcp.model.losses import image_error
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16])

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from egovcp.model import PRESETS, Batch, Carry, LossConfig, WorldModel, world_model_loss
-from egovcp.model.gaussian import Gaussian
+from egovcp.model.latent_state import Gaussian
 from egovcp.model.losses import (
     Rollout,
     filter_sequence,

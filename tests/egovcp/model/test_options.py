@@ -16,7 +16,7 @@ from egovcp.model import (
     WorldModelConfig,
     world_model_loss,
 )
-from egovcp.model.gaussian import Gaussian
+from egovcp.model.latent_state import Gaussian
 from egovcp.model.losses import (
     Rollout,
     filter_sequence,

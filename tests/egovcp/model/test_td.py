@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from egovcp.model import PRESETS, Batch, Carry, LossConfig, WorldModel, WorldModelConfig
-from egovcp.model.gaussian import Gaussian
+from egovcp.model.latent_state import Gaussian
 from egovcp.model.losses import Rollout
 from egovcp.model.value_losses import (
     TargetNetwork,

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
-from egovcp.model.gaussian import kl_divergence
+from egovcp.model.latent_state import kl_divergence
 from egovcp.model.losses import Rollout, filter_sequence
 from egovcp_train.evaluation import ACTIVE_NATS, Summary
 from egovcp_train.heldout.calibration import calibration

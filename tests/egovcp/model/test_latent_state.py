@@ -1,6 +1,6 @@
 import torch
 
-from egovcp.model.gaussian import Gaussian, kl_divergence
+from egovcp.model.latent_state import Gaussian, kl_divergence
 
 
 def _random(seed: int) -> Gaussian:
