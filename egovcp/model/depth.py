@@ -1,4 +1,4 @@
-"""From raw depth in millimetres to what the network sees."""
+"""Conversion of raw depth images to the nearness images that the networks use."""
 
 from __future__ import annotations
 
@@ -13,12 +13,11 @@ def nearness(depth_mm: Tensor, max_m: float) -> Tensor:
     """(B, H, W) raw depth, mm, 0 = invalid -> (B, H, W) nearness in [0, 1].
 
     Nearness is 1 - z / max: 0 where nothing is in range, growing towards the camera, so
-    that a near object stands out from an empty background and vanishing detail is far away. A
-    morphological closing (3 x 3 maximum, then minimum) fills isolated invalid pixels
-    without touching the outline of a near object: left in, one per cent of random holes
-    outweighs a small distant object a hundredfold in the reconstruction.
+    that near objects stand out from an empty background. A morphological closing (3 x 3 maximum,
+    then minimum) fills isolated invalid pixels and keeps the outline of near objects. Without it,
+    one per cent of random holes would outweigh a small distant object in the reconstruction.
     """
-    # In whole millimetres, where what is nearest is the minimum: half the memory to go through.
+    # In int16 millimetres, where the nearest is the minimum: half the memory traffic of float32.
     far = math.ceil(1e3 * max_m)
     dtype = torch.int16 if far <= torch.iinfo(torch.int16).max else torch.int32
     depth = depth_mm.clamp(0, far).to(dtype)
@@ -51,9 +50,9 @@ def highest_3x3(x: Tensor) -> Tensor:
 def network_image(near: Tensor) -> Tensor:
     """(B, H, W) nearness -> (B, 2, H, W): nearness and validity.
 
-    In memory the two of a pixel lie side by side, as a convolution reads them.
+    The two channels of a pixel are adjacent in memory (channels last).
     """
-    if torch.onnx.is_in_onnx_export():  # it knows no complex numbers
+    if torch.onnx.is_in_onnx_export():  # which does not support complex tensors
         return torch.stack([near, near.sign()], 1)
     return torch.view_as_real(torch.complex(near, near.sign())).permute(0, 3, 1, 2)
 

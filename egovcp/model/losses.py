@@ -1,8 +1,8 @@
 """The terms of the training objective (paper equations 6 to 9) over sequences [B, T, ...].
 
-Alignment of a row t: the model filters o_t after a_{t-1}; Q_t judges a_t against the
-Monte Carlo return from t; D judges the state that a_t has produced, (h_{t+1}, z^_{t+1}),
-because it is not conditioned on an action and the terminal observation is not stored.
+Alignment of a row t: the model filters o_t after a_{t-1}; Q_t is fitted to the
+Monte Carlo return from t; D classifies the state that a_t has produced, (h_{t+1}, z^_{t+1}),
+because D has no action as input and the terminal observation is not stored.
 """
 
 from __future__ import annotations
@@ -22,13 +22,12 @@ from egovcp.model.latent_state import Carry, Gaussian, kl_divergence
 from egovcp.model.parallel import over_all_rows, row_noise
 from egovcp.model.world_model import WorldModel
 
-#: Pictures that are looked at together where no gradient is asked for: what the layers make of more
-#: no longer fits into a cache, nor into the memory that the allocator keeps.
-_AT_ONCE: Final = 512
+#: Images encoded at once without gradient: activations of more no longer fit into the cache.
+_CHUNK: Final = 512
 
 
 class Batch(NamedTuple):
-    """Sequences; what each tensor holds is fixed by `egovcp.data.stream`."""
+    """Windows of episodes (B, T, ...)."""
 
     depth: Tensor  # (B, T, 48, 64) mm, int32 or uint16-valued
     state: Tensor  # (B, T, 74)
@@ -63,8 +62,8 @@ def filter_sequence(
 ) -> Rollout:
     """Run the posterior over whole sequences, as `WorldModel.observe` does step by step.
 
-    Training samples z, with ``noise`` (`latent_noise`) if it is drawn already; without ``sample``
-    z is the posterior mean, as it is on the robot.
+    Training samples z with ``noise`` (`latent_noise`), sampled here if None. Without ``sample`` z is
+    the posterior mean, as in deployment.
     """
     size, length = batch.valid.shape
     near = nearness(batch.depth.flatten(0, 1), model.config.depth_max_m)
@@ -88,7 +87,7 @@ def filter_sequence(
 def latent_noise(
     model: WorldModel, batch: Batch, generator: torch.Generator | None = None
 ) -> Tensor:
-    """What z is sampled with, (T, B, Z), drawn a tick at a time."""
+    """Noise of z, (T, B, Z), sampled step by step."""
     size, length = batch.valid.shape
     shape, device = (size, model.config.latent), batch.state.device
     return torch.stack([row_noise(shape, generator, device) for _ in range(length)])
@@ -101,13 +100,13 @@ def _embed(model: WorldModel, near: Tensor, state: Tensor) -> Tensor:
 
 
 def _pieces(*rows: Tensor) -> Iterator[tuple[Tensor, ...]]:
-    return zip(*(torch.split(x, _AT_ONCE) for x in rows), strict=True)
+    return zip(*(torch.split(x, _CHUNK) for x in rows), strict=True)
 
 
 def masked_mean(x: Tensor, mask: Tensor) -> Tensor:
     """Mean of x where mask; 0 where the mask is empty.
 
-    Of a batch that processes share (`egovcp.model.parallel`): this one's part of the mean.
+    Under `egovcp.model.parallel.data_parallel`: this process' part of the mean.
     """
     weight = mask.to(x.dtype)
     return (x * weight).sum() / over_all_rows(weight.sum()).clamp_min(1.0)
@@ -157,10 +156,10 @@ def depth_loss(
     Args:
         model: the world model.
         rollout: the filtered batch.
-        valid: (B, T) bool, rows that count.
+        valid: (B, T) bool, rows to average over.
         weight: (B, T, H, W) of the pixels.
         every: n.
-        first: the first of them, see `first_image`.
+        first: index of the first image, see `first_image`.
     """
     rows = (slice(None), slice(first, None, min(every, valid.shape[1])))
     near = rollout.near[rows]
@@ -169,13 +168,13 @@ def depth_loss(
 
 
 def first_image(every: int, batch: Batch, generator: torch.Generator | None = None) -> int:
-    """The first of every n-th image that is decoded, drawn at random."""
+    """Random index of the first image that is decoded, below n."""
     every = min(every, batch.valid.shape[1])
     return int(torch.randint(every, (), generator=generator, device=batch.valid.device))
 
 
 def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
-    """How much each pixel of (B, T, H, W) nearness counts: 1, and more where something moves."""
+    """Weight of each pixel of nearness (B, T, H, W): 1, more where it moves or is near."""
     config = model.config.loss
     weight = torch.ones_like(near)
     if config.motion_weight > 0:
@@ -188,8 +187,8 @@ def pixel_weights(near: Tensor, batch: Batch, model: WorldModel) -> Tensor:
 
 
 def moving_pixels(near: Tensor, threshold: float) -> Tensor:
-    """(B, T, H, W) nearness -> 1 where a pixel differs from all 3 x 3 around it in the previous
-    frame, else 0: the robot's own sway moves edges by a pixel and slides along the floor."""
+    """(B, T, H, W) nearness -> 1 where a pixel differs from its whole 3 x 3 neighbourhood in the
+    previous frame, else 0. The neighbourhood excludes edges that move by a pixel with the robot."""
     return F.pad(_changed(near, threshold), (0, 0, 0, 0, 1, 0)).to(near.dtype)
 
 

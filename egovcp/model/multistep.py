@@ -1,18 +1,17 @@
-"""Losses of states imagined several ticks ahead, against what was then recorded.
+"""Losses of states imagined several steps ahead, against the recorded observations.
 
-Equation 8 compares prior and posterior one tick ahead only, where errors are small that grow
-over several ticks. So states are also imagined over many ticks, from some rows of a window and
-with the recorded actions, and their decoded images and proprioception are compared with the
-recorded ones.
+Equation 8 compares prior and posterior one step ahead, where errors that grow over several steps are
+still small. These losses imagine several steps from some rows of a window, with the recorded actions,
+and compare the decoded images and proprioception with the recorded ones.
 
-The same, at every tick and in the place of equation 8, is autoregressive training: from filtered
-states the model goes on with nothing but its own predictions,
+Autoregressive training does so at every step and replaces equation 8: from filtered states the model
+continues with its own predictions,
 
     h_{k+1} = f(h_k, z^_k, a_k)
     z^_{k+1} = mean of p(z | h_{k+1})
     o^_{k+1} = mean of p(o | h_{k+1}, z^_{k+1})
 
-and the gradient of every o^ goes back through all predictions before it.
+and the gradient of every o^ flows through all earlier predictions.
 """
 
 from __future__ import annotations
@@ -34,12 +33,12 @@ class Imagined(NamedTuple):
     """States imagined from several rows, S in all."""
 
     carry: Carry  # (B, S, ...)
-    rows: Tensor  # (S,) the row that each stands for
-    known: Tensor  # (B, S) bool: there is such a row, of the same episode
+    rows: Tensor  # (S,) rows of the window that they predict
+    known: Tensor  # (B, S) bool: that row exists and is of the same episode
 
 
-class Weights(NamedTuple):
-    """Weights of the two errors."""
+class _TermWeights(NamedTuple):
+    """Weights of the two terms."""
 
     depth: float
     state: float
@@ -52,17 +51,17 @@ def multistep_losses(
     weight: Tensor,
     first: int,
 ) -> dict[str, Tensor]:
-    """Picture and proprioception of states imagined ``multistep_horizons`` ticks ahead.
+    """Depth image and proprioception of states imagined ``multistep_horizons`` steps ahead.
 
     Args:
         model: the world model.
         rollout: the filtered batch.
-        batch: what was recorded.
+        batch: the recorded windows.
         weight: (B, T, H, W) of the pixels.
-        first: row from which is imagined, see `first_row`.
+        first: first row to imagine from, see `first_row`.
     """
     config = model.config.loss
-    weights = Weights(config.multistep_depth, config.multistep_state)
+    weights = _TermWeights(config.multistep_depth, config.multistep_state)
     if not any(weights):
         return {}
     seen = imagine_ahead(model, rollout.carry, batch, config.multistep_horizons, first)
@@ -76,15 +75,15 @@ def autoregressive_losses(
     weight: Tensor,
     first: int,
 ) -> dict[str, Tensor]:
-    """The same at each of ``autoregressive_steps`` ticks, weighted as the reconstruction is."""
+    """The same at each of ``autoregressive_steps`` steps, with the weights of the reconstruction."""
     config = model.config.loss
-    weights = Weights(config.depth, config.state)
-    seen = imagine_ahead(model, rollout.carry, batch, autoregressive_ticks(config), first)
+    weights = _TermWeights(config.depth, config.state)
+    seen = imagine_ahead(model, rollout.carry, batch, autoregressive_horizons(config), first)
     return _compare("autoregressive", model, seen, rollout, batch, weight, weights)
 
 
-def autoregressive_ticks(config: LossConfig) -> range:
-    """How far ahead `autoregressive_losses` looks."""
+def autoregressive_horizons(config: LossConfig) -> range:
+    """Horizons of `autoregressive_losses`, steps."""
     return range(1, config.autoregressive_steps + 1)
 
 
@@ -95,8 +94,18 @@ def imagine_ahead(
     ahead: Sequence[int],
     first: int,
 ) -> Imagined | None:
-    """Imagine ``ahead`` ticks from every n-th filtered state (B, T, ...) on, beginning at row
-    ``first``, with the recorded actions; None if the window is too short for any."""
+    """Imagine with the recorded actions from every n-th filtered state (B, T, ...).
+
+    Args:
+        model: the world model.
+        carry: the filtered states.
+        batch: the recorded windows.
+        ahead: horizons, steps.
+        first: first row to imagine from.
+
+    Returns:
+        The states at these horizons; None if the window is shorter than all of them.
+    """
     length = batch.valid.shape[1]
     ahead = [k for k in ahead if k < length]
     if not ahead:
@@ -114,20 +123,20 @@ def imagine_ahead(
 def first_row(
     config: LossConfig, ahead: Sequence[int], batch: Batch, generator: torch.Generator | None
 ) -> int:
-    """The first of every n-th row from which `imagine_ahead` goes, drawn at random."""
+    """Random first row for `imagine_ahead`, below n."""
     every = _every(config, ahead, batch.valid.shape[1])
     return int(torch.randint(every, (), generator=generator, device=batch.state.device))
 
 
 def _every(config: LossConfig, ahead: Sequence[int], length: int) -> int:
-    """n: at least one row is to be imagined from, if the window is long enough for any."""
+    """n, small enough that a window longer than the shortest horizon has a first row."""
     return max(1, min(config.multistep_stride, length - min(ahead, default=length)))
 
 
 def _imagined(
     model: WorldModel, carry: Carry, batch: Batch, starts: Sequence[Tensor]
 ) -> list[Carry]:
-    """States (S B, ...) after each tick, imagined from as many rows S as it names."""
+    """States (S B, ...) after each step; ``starts`` has the S start rows of each step."""
     size = len(batch.valid)
     h, z = (x[:, starts[0]].transpose(0, 1).flatten(0, 1) for x in (carry.h, carry.z))
     rows = torch.cat([start + k for k, start in enumerate(starts)])
@@ -136,8 +145,8 @@ def _imagined(
 
 
 def _rows(carry: Carry, imagined: Carry, start: Tensor) -> Carry:
-    """The states (B, S, ...) that are imagined (S B, ...) from some rows of a carry (B, T, ...)."""
-    shape = (len(start), len(carry.h))  # of no rows, where a window is too short
+    """Reshape states (S B, ...) imagined from rows of a carry (B, T, ...) to (B, S, ...)."""
+    shape = (len(start), len(carry.h))  # S = 0 where a window is too short
     h, z = (x.view(*shape, x.shape[-1]).transpose(0, 1) for x in (imagined.h, imagined.z))
     return Carry(h, z)
 
@@ -145,22 +154,22 @@ def _rows(carry: Carry, imagined: Carry, start: Tensor) -> Carry:
 def _compare(
     name: str,
     model: WorldModel,
-    seen: Imagined | None,
+    imagined: Imagined | None,
     rollout: Rollout,
     batch: Batch,
     weight: Tensor,
-    weights: Weights,
+    weights: _TermWeights,
 ) -> dict[str, Tensor]:
-    """Errors of imagined states against the rows that they stand for, as terms ``NAME_...``."""
-    if seen is None:
+    """Terms ``NAME_depth`` and ``NAME_state`` of imagined states."""
+    if imagined is None:
         return {}
-    carry, rows, known = seen
+    carry, rows, known = imagined
     near = rollout.near[:, rows]
     image = model.decode_depth(carry.features.flatten(0, 1)).view_as(near)
-    picture = image_error(image, near, weight[:, rows])
-    foreseen = model.decode_state(carry.h, carry.z).float()
-    state = 0.5 * (foreseen - rollout.state[:, rows]).square().mean(-1)
+    depth = image_error(image, near, weight[:, rows])
+    predicted = model.decode_state(carry.h, carry.z).float()
+    state = 0.5 * (predicted - rollout.state[:, rows]).square().mean(-1)
     return {
-        f"{name}_depth": weights.depth * masked_mean(picture, known),
+        f"{name}_depth": weights.depth * masked_mean(depth, known),
         f"{name}_state": weights.state * masked_mean(state, known),
     }

@@ -1,4 +1,4 @@
-"""The building blocks: MLPs, the depth CNN and its mirror image, and the GRU cell."""
+"""Building blocks: MLPs, the depth encoder and decoder, and the GRU cell."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from egovcp import spec
 class SplitLinear(nn.Module):
     """A Linear on the concatenation of several inputs, computed part by part.
 
-    Parts may differ in their leading dimensions as long as these broadcast: a state
-    shared by many candidate actions is multiplied once, and an observation's part can be
-    computed for all steps before a recurrence starts.
+    Leading dimensions of the parts broadcast: a state shared by many candidate actions is multiplied
+    once, and the part of an observation can be computed for all steps before a recurrence.
     """
 
     def __init__(self, inputs: Sequence[int], outputs: int, bias: bool = False) -> None:
@@ -27,7 +26,7 @@ class SplitLinear(nn.Module):
         self.reset_parameters()
 
     def reset_parameters(self) -> None:
-        """Start like one Linear on all inputs."""
+        """Initialise like one Linear on the concatenation."""
         bound = self.inputs**-0.5
         for part in self.parts:
             nn.init.uniform_(part.weight, -bound, bound)  # type: ignore[arg-type]
@@ -73,8 +72,8 @@ class SplitMlp(nn.Module):
 class GruCell(nn.Module):
     """A GRU cell with one normalised projection of input and h (equation 1).
 
-    The update gate starts biased towards keeping ``h``, so that gradients reach far
-    back from the first step of training.
+    A negative ``update_bias`` makes the update gate keep ``h`` initially, so that gradients reach far
+    back from the first training step.
     """
 
     def __init__(self, inputs: int, hidden: int, update_bias: float) -> None:
@@ -94,8 +93,8 @@ class GruCell(nn.Module):
 class DepthEncoder(nn.Module):
     """Image of nearness and validity (B, 2, 48, 64) -> features (B, C * 3 * 4).
 
-    The stem reads overlapping 8 x 8 patches on a grid of 4 pixels: a third of the cost of
-    two stride-2 layers on a CPU, and an object 3 pixels wide still fills a patch.
+    The stem has overlapping 8 x 8 patches at stride 4: on a CPU a third of the cost of two
+    stride-2 layers.
     """
 
     def __init__(self, channels: tuple[int, int, int]) -> None:
@@ -120,7 +119,7 @@ class DepthEncoder(nn.Module):
 class DepthDecoder(nn.Module):
     """State features (B, inputs) -> nearness image (B, 48, 64).
 
-    A map of 6 x 8 cells, each of which paints its own 8 x 8 pixels.
+    A map of 6 x 8 cells; each is decoded to 8 x 8 pixels.
     """
 
     PATCH = 8
@@ -139,7 +138,7 @@ class DepthDecoder(nn.Module):
     def forward(self, features: Tensor) -> Tensor:
         maps = self.project(features).view(-1, *self.shape)
         patches: Tensor = self.layers(maps.contiguous(memory_format=torch.channels_last))
-        # What `F.pixel_shuffle` does, which takes three times as long on a CPU.
+        # The same as `F.pixel_shuffle`, three times as fast on a CPU.
         rows, cols = self.shape[1:]
         cells = patches.permute(0, 2, 3, 1).reshape(-1, rows, cols, self.PATCH, self.PATCH)
         return cells.transpose(2, 3).reshape(-1, spec.DEPTH_ROWS, spec.DEPTH_COLS)

@@ -1,9 +1,9 @@
 """The training objective: equation 6, the sum of its terms, and its gradient.
 
-What filtered states are asked for and what is foreseen from them share nothing but these states,
-and take about as long. So the gradient is found in three pieces: of either with respect to the
-states and the weights it uses, the two side by side where the processor has threads for both; and
-of the filter, back from the sum of the two.
+The terms of filtered states and those of states imagined several steps ahead share nothing but the
+filtered states, and cost about the same. So the gradient is computed in three parts: of either group
+of terms with respect to the states and the weights, in parallel on a CPU with several threads; then
+of the filter, from the sum of the two.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from egovcp.model import losses
-from egovcp.model.latent_state import Carry, Gaussian
+from egovcp.model.latent_state import Gaussian
 from egovcp.model.losses import Batch, Rollout
 from egovcp.model.multistep import (
+    autoregressive_horizons,
     autoregressive_losses,
-    autoregressive_ticks,
     first_row,
     multistep_losses,
 )
@@ -31,22 +31,22 @@ from egovcp.model.value_losses import value_and_termination_losses
 from egovcp.model.world_model import WorldModel
 
 type Terms = dict[str, Tensor]
-type Part = Callable[[], Terms]
+type TermGroup = Callable[[], Terms]
 
 
 class StepNoise(NamedTuple):
-    """What a step leaves to chance."""
+    """Random numbers of one training step."""
 
-    noise: Tensor  # (T, B, Z) with which z is sampled
-    image: int  # the first that is decoded
-    multistep: int  # the first row from which is imagined
-    autoregressive: int  # the same of autoregressive training; 0 without it
+    noise: Tensor  # (T, B, Z), noise of z
+    image: int  # index of the first image that is decoded
+    multistep: int  # first row from which `multistep_losses` imagines
+    autoregressive: int  # the same for `autoregressive_losses`; 0 if unused
 
 
 def sample_step_noise(
     model: WorldModel, batch: Batch, generator: torch.Generator | None = None
 ) -> StepNoise:
-    """For a batch of this shape; ``generator``: None is torch's own."""
+    """Sample for a batch of this shape; generator None: torch's default generator."""
     config = model.config.loss
     noise = losses.latent_noise(model, batch, generator)
     multistep = first_row(config, config.multistep_horizons, batch, generator)
@@ -54,28 +54,31 @@ def sample_step_noise(
     if model.config.dynamics == "joint":
         return StepNoise(noise, image, multistep, 0)
     return StepNoise(
-        noise, image, multistep, first_row(config, autoregressive_ticks(config), batch, generator)
+        noise,
+        image,
+        multistep,
+        first_row(config, autoregressive_horizons(config), batch, generator),
     )
 
 
 def world_model_loss(
     model: WorldModel,
     batch: Batch,
-    chance: StepNoise | torch.Generator | None = None,
+    noise: StepNoise | torch.Generator | None = None,
     head: SplitMlp | None = None,
 ) -> tuple[Tensor, Terms]:
     """Total loss of equation 6 and its terms (scalars, detached).
 
     Args:
         model: the world model.
-        batch: windows.
-        chance: what is drawn, or what draws it; None: torch's own generator.
-        head: of Q, for its TD target (`egovcp.model.value_losses`); None: the model's own.
+        batch: windows of episodes.
+        noise: random numbers, or the generator that samples them; None: torch's default generator.
+        head: value head of the TD target (`egovcp.model.value_losses`); None: the model's.
     """
-    draws = chance if isinstance(chance, StepNoise) else sample_step_noise(model, batch, chance)
+    draws = noise if isinstance(noise, StepNoise) else sample_step_noise(model, batch, noise)
     rollout = losses.filter_sequence(model, batch, noise=draws.noise)
-    told, foreseen = _parts(model, rollout, batch, draws, head)
-    terms = told() | foreseen()
+    filtered, imagined = _term_groups(model, rollout, batch, draws, head)
+    terms = filtered() | imagined()
     return _sum(terms), _named(terms)
 
 
@@ -86,24 +89,25 @@ def world_model_gradients(
     head: SplitMlp | None = None,
     precision: Callable[[], AbstractContextManager[object]] = nullcontext,
 ) -> tuple[Tensor, Terms]:
-    """`world_model_loss`, detached, and its gradient in the ``grad`` of the model's parameters, in
-    the place of what was there. On a GPU nothing in it waits for what is computed there.
+    """`world_model_loss`, detached; the gradient replaces the ``grad`` of the model's parameters.
+
+    Never synchronises with a GPU.
 
     Args:
         model: the world model.
-        batch: windows.
-        draws: what is left to chance.
-        head: as there.
-        precision: a context in which the losses, not their gradients, are computed.
+        batch: windows of episodes.
+        draws: random numbers of the step.
+        head: value head of the TD target; None: the model's.
+        precision: context (autocast) of the losses, not of their gradients.
     """
     parameters = [p for p in model.parameters() if p.requires_grad]
-    with precision():  # all of it: who leaves the last one takes casts of weights from the others
+    with precision():  # one outer context: leaving the last one clears autocast's weight cache
         rollout = losses.filter_sequence(model, batch, noise=draws.noise)
-        cut, outer, states = _cut(rollout)
+        leaves, outer, states = _detach(rollout)
 
-        def with_gradient(part: Part) -> tuple[Terms, list[Tensor | None]]:
+        def with_gradient(group: TermGroup) -> tuple[Terms, list[Tensor | None]]:
             with precision():
-                terms = part()
+                terms = group()
                 total = _sum(terms)
             inputs = [*states, *parameters]
             if not terms:
@@ -111,9 +115,9 @@ def world_model_gradients(
             with torch.autocast(batch.state.device.type, enabled=False):
                 return terms, list(torch.autograd.grad(total, inputs, allow_unused=True))
 
-        told, foreseen = _parts(model, cut, batch, draws, head)
-        first, second = partial(with_gradient, told), partial(with_gradient, foreseen)
-        # Processes that share a batch meet at every mean, and so in one order.
+        filtered, imagined = _term_groups(model, leaves, batch, draws, head)
+        first, second = partial(with_gradient, filtered), partial(with_gradient, imagined)
+        # Data-parallel processes synchronise at every mean, so the order must be fixed.
         if batch.state.device.type == "cpu" and current_rank() is SINGLE_PROCESS:
             (terms, gradients), (more, others) = run_parallel(first, second)
         else:
@@ -127,18 +131,18 @@ def world_model_gradients(
     return _sum(terms).detach(), _named(terms)
 
 
-def _parts(
+def _term_groups(
     model: WorldModel,
     rollout: Rollout,
     batch: Batch,
     draws: StepNoise,
     head: SplitMlp | None,
-) -> tuple[Part, Part]:
-    """What filtered states are asked for, and what is foreseen from them."""
+) -> tuple[TermGroup, TermGroup]:
+    """The terms of filtered states, and those of states imagined several steps ahead."""
     config = model.config.loss
     weight = losses.pixel_weights(rollout.near, batch, model)
 
-    def told() -> Terms:
+    def filtered() -> Terms:
         every = config.decode_every
         depth = losses.depth_loss(model, rollout, batch.valid, weight, every, draws.image)
         terms = {
@@ -151,30 +155,30 @@ def _parts(
             terms |= autoregressive_losses(model, rollout, batch, weight, draws.autoregressive)
         return terms | value_and_termination_losses(model, rollout, batch, config, head)
 
-    def foreseen() -> Terms:
+    def imagined() -> Terms:
         return multistep_losses(model, rollout, batch, weight, draws.multistep)
 
-    return told, foreseen
+    return filtered, imagined
 
 
-def _cut(rollout: Rollout) -> tuple[Rollout, list[Tensor], list[Tensor]]:
-    """A rollout whose gradient ends there; what its gradient goes on from, and where it ends."""
+def _detach(rollout: Rollout) -> tuple[Rollout, list[Tensor], list[Tensor]]:
+    """A copy of the rollout made of leaf tensors; the original tensors; the leaves."""
     outer: list[Tensor] = []
     inner: list[Tensor] = []
 
-    def ending(x: Tensor) -> Tensor:
+    def leaf(x: Tensor) -> Tensor:
         if not x.requires_grad:
             return x
         outer.append(x)
         inner.append(x.detach().requires_grad_())
         return inner[-1]
 
-    cut = rollout._replace(
-        carry=Carry.map(rollout.carry, ending),
-        posterior=Gaussian(*map(ending, rollout.posterior)),
+    detached = rollout._replace(
+        carry=rollout.carry.map(leaf),
+        posterior=Gaussian(*map(leaf, rollout.posterior)),
         prior=Gaussian(*map(ending, rollout.prior)),
     )
-    return cut, outer, inner
+    return detached, outer, inner
 
 
 def _sum(terms: Terms) -> Tensor:

@@ -25,7 +25,7 @@ from egovcp.model.world_model import WorldModel
 class TargetNetwork(nn.Module):
     """A copy of the head of Q that follows it by an exponential moving average.
 
-    Encoder and recurrence are not copied: both heads read the same states.
+    Encoder and recurrence are not copied: both heads have the same inputs.
     """
 
     def __init__(self, model: WorldModel) -> None:
@@ -46,14 +46,14 @@ def td_target(
 ) -> tuple[Tensor, Tensor]:
     """Targets (B, T) in units of return, and the rows that have one.
 
-    A row has none if it is the last one of its window, or of an episode that the time limit
-    ended: nobody knows what came next. The row of a failure needs no next one.
+    The last row of a window, or of an episode ended by the time limit, has no target, because the
+    next state is unknown. The row of a failure needs no next state.
 
     Args:
-        model: asked for Q.
+        model: the world model.
         carry: the filtered states (B, T, ...).
-        batch: what was recorded.
-        head: of Q'; None: the model's own.
+        batch: the recorded windows.
+        head: value head of Q'; None: the model's.
     """
     if head is None:
         head = model.value_head
@@ -66,14 +66,13 @@ def td_target(
 def value_target(
     model: WorldModel, carry: Carry, batch: Batch, head: SplitMlp | None = None
 ) -> tuple[Tensor, Tensor]:
-    """What Q is fitted to at each row (B, T), in deviations of the return from its mean, and the
-    rows (B, T) at which that is known.
+    """Standardised target of Q at each row (B, T), and the rows (B, T) at which it is known.
 
     Args:
-        model: says which target (`LossConfig.q_target`).
+        model: the world model; its `LossConfig.q_target` selects the target.
         carry: the filtered states (B, T, ...).
-        batch: what was recorded.
-        head: of Q, for the TD target; None: the model's own.
+        batch: the recorded windows.
+        head: value head of the TD target; None: the model's.
     """
     if model.config.loss.q_target == "mc":
         target, usable = batch.mc_return, batch.valid & batch.mc_valid
@@ -91,10 +90,9 @@ def value_and_termination_losses(
 ) -> dict[str, Tensor]:
     """Equations 9 and 7b, on the posterior and on states imagined from it.
 
-    The planner asks Q about imagined states, so Q learns on them as well: k steps after
-    row t the model has imagined (h_{t+k}, z^_{t+k}) from the recorded actions, and its
-    value is regressed on the target of row t + k. The reward, if it is predicted at all,
-    is asked of the same states.
+    The planner evaluates Q on imagined states, so Q is also trained on them: the value of
+    (h_{t+k}, z^_{t+k}), imagined from row t with the recorded actions, is fitted to the target of
+    row t + k. A reward head is trained on the same states.
     """
     target, usable = value_target(model, rollout.carry, batch, head)
     error = model.value_error(rollout.carry, batch.action, target)
@@ -117,7 +115,7 @@ def value_and_termination_losses(
                 logit, batch.terminal_next.float(), reduction="none"
             )
             losses["termination"] = config.termination * masked_mean(bce, batch.valid)
-        carry = carry.map(lambda x: x[:, :-1])  # (B, T - k): the rows that exist
+        carry = carry.map(lambda x: x[:, :-1])  # (B, T - k)
         if config.imagined_steps and k < length:
             same_episode = unbroken(batch, k)
             error = model.value_error(carry, batch.action[:, k:], target[:, k:])
@@ -132,7 +130,7 @@ def value_and_termination_losses(
 
 
 def _reward_error(model: WorldModel, carry: Carry, batch: Batch, mask: Tensor) -> Tensor:
-    """Mean squared error of the reward at the last rows of a window, as many as ``mask`` has."""
+    """Mean squared error of the reward at the last rows of a window; ``mask`` has their number."""
     rows = slice(batch.valid.shape[1] - mask.shape[1], None)
     target = batch.reward[:, rows] / model.return_std
     return masked_mean((model.scaled_reward(carry, batch.action[:, rows]) - target).square(), mask)

@@ -1,7 +1,7 @@
-"""Loads the weights of a world model from a safetensors file that somebody else wrote.
+"""Loads the weights of a world model from an untrusted safetensors file.
 
-The configuration says which tensors there must be. They are compared with the header of the file
-before any network is allocated, and their numbers before the model is returned.
+Names and shapes in the header of the file are compared with the configuration before any network is
+allocated; values are checked before the model is returned.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from egovcp.safe_files import UnsafeFileError
 from egovcp.tensor_file import HEADER_LIMIT_BYTES, TensorFile
 
 MAX_WEIGHT_BYTES: Final = 512 << 20
-"""Most that the weights of a model may take, float32."""
+"""Upper limit of the size of a model's weights, float32."""
 DTYPES: Final = ("F32", "F16", "BF16")
-"""Of a tensor in the file; all are loaded as float32."""
+"""Dtypes accepted in the file; all are loaded as float32."""
 
 _POSITIVE: Final = ("state_std", "return_std")
 _BYTES: Final = 4  # of a float32
@@ -55,16 +55,16 @@ def size_limit(shapes: Mapping[str, tuple[int, ...]]) -> int:
 def load_model(
     config: WorldModelConfig, shapes: Mapping[str, tuple[int, ...]], content: bytes
 ) -> WorldModel:
-    """A model in evaluation mode with the weights of a file.
+    """Build a model in evaluation mode with the weights of a file.
 
     Args:
-        config: of the model.
+        config: configuration of the model.
         shapes: its `tensor_shapes`.
-        content: the file.
+        content: bytes of the file.
 
     Raises:
-        UnsafeFileError: its tensors are not those of the configuration, a number is not finite, or
-            the model answers an ordinary observation with something that is not finite.
+        UnsafeFileError: the tensors do not match the configuration, a value is not finite, or an
+            output of the model for an empty image is not finite.
     """
     file = TensorFile.parse(content)
     file.require(shapes, DTYPES)
@@ -76,7 +76,7 @@ def load_model(
     model = WorldModel(config)
     model.load_state_dict(weights)
     model.eval()
-    _check_answer(model)
+    _check_outputs(model)
     return model
 
 
@@ -93,21 +93,21 @@ def _check_numbers(weights: Mapping[str, Tensor]) -> None:
 
 
 @torch.inference_mode()
-def _check_answer(model: WorldModel) -> None:
-    """Finite weights may still overflow: filter an empty image and judge the neutral action."""
+def _check_outputs(model: WorldModel) -> None:
+    """Finite weights may still overflow: filter an empty image and evaluate the neutral action."""
     action = torch.zeros(1, spec.ACTION_DIM)
     depth = torch.zeros(1, spec.DEPTH_ROWS, spec.DEPTH_COLS, dtype=torch.int32)
     first = torch.ones(1, dtype=torch.bool)
     carry = model.observe(model.initial(1), action, depth, model.state_mean[None], first)
     carry = model.imagine(carry, action)
-    answers = {
+    outputs = {
         "state": carry.h,
         "latent": carry.z,
         "value": model.value(carry, action),
         "termination": model.termination(carry),
     }
-    for name, answer in answers.items():
-        if not answer.isfinite().all():
+    for name, output in outputs.items():
+        if not output.isfinite().all():
             raise UnsafeFileError(
-                f"its weights overflow: the {name} after an empty image is not finite"
+                f"the weights overflow: the {name} after an empty image is not finite"
             )

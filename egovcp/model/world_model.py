@@ -7,8 +7,8 @@
     d_t = D(h_t, z_t)                         (4)   probability of termination
     Q_t = Q(h_t, z_t, a_t)                    (5)   surrogate value
 
-Every method accepts a carry whose leading dimensions broadcast against the action's: one
-state judged under a thousand candidates is computed once.
+Leading dimensions of a carry broadcast against those of the action: a state evaluated under a
+thousand candidate actions is computed once.
 
 The recurrence is an explicit `Carry`: the same `observe` step serves training, filtering
 on the robot and replay; `imagine` advances it without an observation.
@@ -42,7 +42,7 @@ MIN_RETURN_QUANTILE: Final = 0.001
 
 
 class PosteriorHead(nn.Module):
-    """One hidden layer on [h, o]; the part of o arrives ready-made (`embed_observation`)."""
+    """One hidden layer on [h, o]; o is already projected (`WorldModel.embed_observation`)."""
 
     def __init__(self, hidden: int, units: int, latent: int) -> None:
         super().__init__()
@@ -67,7 +67,7 @@ class WorldModel(nn.Module):
     def __init__(self, config: WorldModelConfig) -> None:
         super().__init__()
         self.config = c = config
-        state = (c.hidden, c.latent)  # what every head reads
+        state = (c.hidden, c.latent)  # input of every head
         self.encode_depth = DepthEncoder(c.channels)
         self.encode_state = SplitMlp((spec.STATE_DIM,), c.units, c.units)
         self.embed_observation = SplitLinear((self.encode_depth.outputs, c.units), c.units)
@@ -94,7 +94,7 @@ class WorldModel(nn.Module):
         return SplitMlp((c.hidden, c.latent, spec.ACTION_DIM), c.units, outputs, hidden_layers=2)
 
     def _start_at_zero(self) -> None:
-        """Value and termination start as constants, so that early plans are not random."""
+        """Value and termination heads predict constants before training."""
         self.termination_head.start_at_zero()
         self.value_head.start_at_zero()
         if self.reward_head is not None:
@@ -190,7 +190,7 @@ class WorldModel(nn.Module):
     def advance(self, carry: Carry, action: Tensor, is_first: Tensor) -> Tensor:
         """h_t of equation 1, restarting from zeros where ``is_first`` (B,).
 
-        The old memory is replaced, not multiplied by zero: a reset heals NaN, too.
+        The old state is replaced, not multiplied by zero, so that a reset also removes NaN.
         """
         first = is_first[:, None]
         h, z, action = (x.masked_fill(first, 0.0) for x in (carry.h, carry.z, action))
@@ -254,7 +254,7 @@ class WorldModel(nn.Module):
         return r.squeeze(-1).float()
 
     def termination_logit(self, carry: Carry) -> Tensor:
-        """Log-odds that the episode has failed at this state, (...,); equation 4."""
+        """Logit of the probability that the episode has failed at this state, (...,); equation 4."""
         d: Tensor = self.termination_head(carry.h, carry.z)
         return d.squeeze(-1).float()
 
@@ -262,12 +262,12 @@ class WorldModel(nn.Module):
         """Probability that the episode has failed at this state, (...,)."""
         return torch.sigmoid(self.termination_logit(carry))
 
-    def picture(self, carry: Carry) -> Tensor:
+    def decode_near(self, carry: Carry) -> Tensor:
         """Decoded nearness (B, 48, 64) of a state (B, ...); not clamped."""
         image: Tensor = self.decode_depth(carry.features)
         return image.float()
 
     def decode(self, carry: Carry) -> tuple[Tensor, Tensor]:
         """Carry (B, ...) -> depth (B, 48, 64) in metres, 0 = nothing in range; state (B, 74)."""
-        depth = to_metres(self.picture(carry), self.config.depth_max_m)
+        depth = to_metres(self.decode_near(carry), self.config.depth_max_m)
         return depth, self.decode_state(carry.h, carry.z).float() * self.state_std + self.state_mean

@@ -46,10 +46,10 @@ def test_the_first_picture_is_filtered_and_the_others_are_imagined() -> None:
         (found,) = _strips(batch)
         s = found.start
         carry = Carry(rollout.carry.h[:, s], rollout.carry.z[:, s])
-        filtered = model.picture(carry)[0].clamp(0, 1)
+        filtered = model.decode_near(carry)[0].clamp(0, 1)
         carry = model.imagine(carry, batch.action[:, s])
         carry = model.imagine(carry, batch.action[:, s + 1])
-        ahead = model.picture(carry)[0].clamp(0, 1)
+        ahead = model.decode_near(carry)[0].clamp(0, 1)
     torch.testing.assert_close(torch.from_numpy(found.foreseen[0]), filtered)
     torch.testing.assert_close(torch.from_numpy(found.foreseen[1]), ahead)
 

@@ -81,7 +81,7 @@ class OpenLoop:
         self._rows[k] += len(b)
         for some in torch.split(torch.arange(len(b), device=b.device), _IMAGES_AT_ONCE):
             bs, ts = b[some], then[some]
-            image = model.picture(_some(found, some)).clamp(0.0, 1.0)
+            image = model.decode_near(_some(found, some)).clamp(0.0, 1.0)
             truth = rollout.near[bs, ts]
             wrong = (image - truth).abs()
             still = (rollout.near[bs, ts - k] - truth).abs()

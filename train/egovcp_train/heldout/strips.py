@@ -72,6 +72,6 @@ def _strip(
     for k in range(max(HORIZONS)):
         states.append(model.imagine(states[-1], episodes.batch.action[b, s + k][None]))
     shown = Carry.join([states[k] for k in STRIP], torch.cat)
-    foreseen = model.picture(shown).clamp(0.0, 1.0)
+    foreseen = model.decode_near(shown).clamp(0.0, 1.0)
     seen = rollout.near[b, [s + k for k in STRIP]]
     return Strip(interest, s, seen.cpu().numpy(), foreseen.cpu().numpy())
