@@ -62,8 +62,8 @@ def filter_sequence(
 ) -> Rollout:
     """Run the posterior over whole sequences, as `WorldModel.observe` does step by step.
 
-    Training samples z with ``noise`` (`latent_noise`), sampled here if None. Without ``sample`` z is
-    the posterior mean, as in deployment.
+    Training samples z with ``noise`` (`latent_noise`), sampled here if None. Without ``sample`` z
+    is the posterior mean, as in deployment.
     """
     size, length = batch.valid.shape
     near = nearness(batch.depth.flatten(0, 1), model.config.depth_max_m)

@@ -1,11 +1,11 @@
 """Losses of states imagined several steps ahead, against the recorded observations.
 
-Equation 8 compares prior and posterior one step ahead, where errors that grow over several steps are
-still small. These losses imagine several steps from some rows of a window, with the recorded actions,
-and compare the decoded images and proprioception with the recorded ones.
+Equation 8 compares prior and posterior one step ahead, where errors that grow over several steps
+are still small. These losses imagine several steps from some rows of a window, with the recorded
+actions, and compare the decoded images and proprioception with the recorded ones.
 
-Autoregressive training does so at every step and replaces equation 8: from filtered states the model
-continues with its own predictions,
+Autoregressive training does so at every step and replaces equation 8: from filtered states the
+model continues with its own predictions,
 
     h_{k+1} = f(h_k, z^_k, a_k)
     z^_{k+1} = mean of p(z | h_{k+1})
@@ -75,7 +75,7 @@ def autoregressive_losses(
     weight: Tensor,
     first: int,
 ) -> dict[str, Tensor]:
-    """The same at each of ``autoregressive_steps`` steps, with the weights of the reconstruction."""
+    """The same at each of ``autoregressive_steps`` steps, weighted like the reconstruction."""
     config = model.config.loss
     weights = _TermWeights(config.depth, config.state)
     seen = imagine_ahead(model, rollout.carry, batch, autoregressive_horizons(config), first)

@@ -14,8 +14,9 @@ from egovcp import spec
 class SplitLinear(nn.Module):
     """A Linear on the concatenation of several inputs, computed part by part.
 
-    Leading dimensions of the parts broadcast: a state shared by many candidate actions is multiplied
-    once, and the part of an observation can be computed for all steps before a recurrence.
+    Leading dimensions of the parts broadcast: a state shared by many candidate actions is
+    multiplied once, and the part of an observation can be computed for all steps before a
+    recurrence.
     """
 
     def __init__(self, inputs: Sequence[int], outputs: int, bias: bool = False) -> None:
@@ -72,8 +73,8 @@ class SplitMlp(nn.Module):
 class GruCell(nn.Module):
     """A GRU cell with one normalised projection of input and h (equation 1).
 
-    A negative ``update_bias`` makes the update gate keep ``h`` initially, so that gradients reach far
-    back from the first training step.
+    A negative ``update_bias`` makes the update gate keep ``h`` initially, so that gradients reach
+    far back from the first training step.
     """
 
     def __init__(self, inputs: int, hidden: int, update_bias: float) -> None:

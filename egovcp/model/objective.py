@@ -1,9 +1,9 @@
 """The training objective: equation 6, the sum of its terms, and its gradient.
 
 The terms of filtered states and those of states imagined several steps ahead share nothing but the
-filtered states, and cost about the same. So the gradient is computed in three parts: of either group
-of terms with respect to the states and the weights, in parallel on a CPU with several threads; then
-of the filter, from the sum of the two.
+filtered states, and cost about the same. So the gradient is computed in three parts: of either
+group of terms with respect to the states and the weights, in parallel on a CPU with several
+threads; then of the filter, from the sum of the two.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ def _detach(rollout: Rollout) -> tuple[Rollout, list[Tensor], list[Tensor]]:
     detached = rollout._replace(
         carry=rollout.carry.map(leaf),
         posterior=Gaussian(*map(leaf, rollout.posterior)),
-        prior=Gaussian(*map(ending, rollout.prior)),
+        prior=Gaussian(*map(leaf, rollout.prior)),
     )
     return detached, outer, inner
 

@@ -254,7 +254,7 @@ class WorldModel(nn.Module):
         return r.squeeze(-1).float()
 
     def termination_logit(self, carry: Carry) -> Tensor:
-        """Logit of the probability that the episode has failed at this state, (...,); equation 4."""
+        """Logit of the probability that the episode has failed here, (...,); equation 4."""
         d: Tensor = self.termination_head(carry.h, carry.z)
         return d.squeeze(-1).float()
 
