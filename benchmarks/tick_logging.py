@@ -6,7 +6,7 @@ is felt), then writes a tick with everything in it to an MCAP file and to Rerun.
     none          no log
     inline        the sinks are called by the loop
     thread        a queue and a thread
-    process       `BackgroundFanout`
+    process       `AsyncFanout`
     stalled_disk  the same; the process that writes the MCAP file is stopped, as by a disk
     dead_viewer   the same; Rerun goes to a viewer that has been killed
 
@@ -31,14 +31,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from egovcp.log.background import BackgroundFanout, BackgroundSink
-from egovcp.log.destination import LOOPBACK, Viewer
-from egovcp.log.info import RunInfo
-from egovcp.log.live import LiveRerun
+from egovcp.log.async_sink import AsyncFanout, AsyncSink
 from egovcp.log.mcap import McapSink
 from egovcp.log.rerun import RerunSink
 from egovcp.log.sink import Fanout, Sink
-from egovcp.log.tick import BasePose, Candidates, Tick
+from egovcp.log.tick import BasePose, Candidates, RunInfo, Tick
+from egovcp.log.viewer import LOOPBACK, LiveRerun, Viewer
 from egovcp.plan import PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.spec import PLANNER_DT, PLANNER_HZ, STATE_DIM
 from egovcp.testing import toy_model
@@ -194,13 +192,10 @@ def _cases(stack: contextlib.ExitStack) -> dict[str, contextlib.AbstractContextM
     }
 
 
-def _fanout(mcap: Sink, rerun: Sink) -> BackgroundFanout:
+def _fanout(mcap: Sink, rerun: Sink) -> AsyncFanout:
     sinks = {"MCAP": mcap, "Rerun": rerun}
-    return BackgroundFanout(
-        [
-            BackgroundSink(s, n, close_timeout_s=2.0, tell=lambda line: None)
-            for n, s in sinks.items()
-        ]
+    return AsyncFanout(
+        [AsyncSink(s, n, close_timeout_s=2.0, warn=lambda line: None) for n, s in sinks.items()]
     )
 
 

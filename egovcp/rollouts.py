@@ -13,8 +13,7 @@ import numpy as np
 
 from egovcp.data import DatasetReader, Episode
 from egovcp.errors import DataError
-from egovcp.log.info import CameraView, RunInfo
-from egovcp.log.tick import Tick
+from egovcp.log.tick import CameraView, RunInfo, Tick
 from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, PLANNER_HZ, TASKS
 
 TICK_NS: Final = 1_000_000_000 // PLANNER_HZ

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from egovcp.artifact import Artifact
-from egovcp.log.background import BackgroundFanout, BackgroundSink
-from egovcp.log.info import CameraView, RunInfo
-from egovcp.log.live import LiveRerun
+from egovcp.log.async_sink import AsyncFanout, AsyncSink
 from egovcp.log.mcap import McapSink
 from egovcp.log.rerun import RerunSink
 from egovcp.log.sink import Fanout, Sink
+from egovcp.log.tick import CameraView, RunInfo
+from egovcp.log.viewer import LiveRerun
 from egovcp.packages import is_installed
 from egovcp.terminal import echo
 from egovcp_deploy.options import versions
@@ -52,8 +52,8 @@ def recording(
         if waits:
             sink = Fanout([*files.values(), *viewers])
         else:
-            writers = [BackgroundSink(file, name) for name, file in files.items()]
-            sink = BackgroundFanout([*writers, *viewers])
+            writers = [AsyncSink(file, name) for name, file in files.items()]
+            sink = AsyncFanout([*writers, *viewers])
         stack.callback(sink.close)
         sink.open(info)
         yield sink
@@ -62,7 +62,7 @@ def recording(
 def missing_ticks(sink: Sink) -> dict[str, int]:
     """Log -> ticks that are not in it, or may not be, once it is closed; only of `recording` on
     the wall clock, which drops rather than waits."""
-    sinks = sink.sinks if isinstance(sink, BackgroundFanout) else ()
+    sinks = sink.sinks if isinstance(sink, AsyncFanout) else ()
     return {each.name: each.dropped + each.lost for each in sinks}
 
 
@@ -79,12 +79,12 @@ def _files(stem: Path, episode: int, options: LogOptions) -> dict[str, Sink]:
     return sinks
 
 
-def _viewers(options: LogOptions, stack: ExitStack) -> Iterator[BackgroundSink]:
+def _viewers(options: LogOptions, stack: ExitStack) -> Iterator[AsyncSink]:
     if options.live:
         live = stack.enter_context(LiveRerun.of(options.live))
         if live.page:
             echo(f"look at it: {live.page}")
-        yield BackgroundSink(RerunSink(live.viewer), "Rerun")
+        yield AsyncSink(RerunSink(live.viewer), "Rerun")
 
 
 def run_info(

@@ -12,8 +12,7 @@ from tqdm import tqdm
 
 from egovcp.artifact import Artifact
 from egovcp.atomic import write_json
-from egovcp.log.info import RunInfo
-from egovcp.log.tick import Tick
+from egovcp.log.tick import RunInfo, Tick
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import PLANNER_HZ
 from egovcp.terminal import echo

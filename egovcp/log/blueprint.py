@@ -1,4 +1,4 @@
-"""How a recording looks when it is opened: nothing to click before something is seen."""
+"""Layouts of the Rerun viewer for recordings."""
 
 from __future__ import annotations
 
@@ -31,8 +31,10 @@ from egovcp.log.paths import (
 
 
 def blueprint(imagined: tuple[int, ...] = ()) -> rrb.Blueprint:
-    """Two tabs. The first: 3D view over value maps and events at the left; at the right depth over
-    the time series. The second: motors, connection and state of a robot that is not simulated.
+    """Layout for a run with a planner.
+
+    Tab ``plan``: left, the 3D view above value maps and events; right, depth images above curves.
+    Tab ``robot``: motors, connection and state of the runner.
 
     Args:
         imagined: horizons of the imagined depth images, ticks ahead; none leaves them out.
@@ -41,7 +43,7 @@ def blueprint(imagined: tuple[int, ...] = ()) -> rrb.Blueprint:
         rrb.Tabs(
             rrb.Horizontal(
                 rrb.Vertical(_scene(), _below_scene(), row_shares=[5, 2]),
-                rrb.Vertical(*_pictures(imagined), *_curves(), row_shares=_shares(imagined)),
+                rrb.Vertical(*_images(imagined), *_curves(), row_shares=_shares(imagined)),
                 column_shares=[3, 2],
                 name="plan",
             ),
@@ -54,7 +56,7 @@ def blueprint(imagined: tuple[int, ...] = ()) -> rrb.Blueprint:
 
 
 def signals_blueprint() -> rrb.Blueprint:
-    """3D view and depth at the left; at the right the curves of reward, action and state."""
+    """Layout for a recording without a planner: left, 3D view and depth; right, curves."""
     seen = rrb.Spatial2DView(name="depth seen", origin=CAMERA, contents=[DEPTH])
     return rrb.Blueprint(
         rrb.Horizontal(
@@ -68,7 +70,7 @@ def signals_blueprint() -> rrb.Blueprint:
 
 
 def _robot_tab() -> rrb.Container:
-    """What a motor that overheats or drops out, or a bad connection, looks like."""
+    """Motors and connection."""
     return rrb.Vertical(
         rrb.Horizontal(
             rrb.TimeSeriesView(name="motor temperature (deg C)", origin=MOTOR_TEMPERATURE),
@@ -158,8 +160,8 @@ def _below_scene() -> rrb.Container:
 
 
 _DARK: Final = [24, 26, 32]
-_FRONT: Final = (1.9, 1.5, 1.2)  # both the hands and what approaches are seen
-_SIDE: Final = (0.3, 3.1, 1.6)  # a surface before the robot, seen edge on, does not hide it
+_FRONT: Final = (1.9, 1.5, 1.2)  # shows both hands and approaching objects
+_SIDE: Final = (0.3, 3.1, 1.6)  # a surface in front of the robot does not hide it
 
 
 def _scene(eye: tuple[float, float, float] = _FRONT) -> rrb.View:
@@ -175,7 +177,7 @@ def _scene(eye: tuple[float, float, float] = _FRONT) -> rrb.View:
     )
 
 
-def _pictures(imagined: tuple[int, ...]) -> list[rrb.Container]:
+def _images(imagined: tuple[int, ...]) -> list[rrb.Container]:
     seen = rrb.Spatial2DView(name="depth seen", origin=CAMERA, contents=[DEPTH])
     decoded = rrb.Spatial2DView(name="reconstructed", origin=RECONSTRUCTED)
     rows: list[rrb.Container] = [rrb.Horizontal(seen, decoded)]

@@ -1,12 +1,10 @@
-"""Reads recorded runs: what `McapSink` wrote, also from a torn or damaged file.
+"""Reads recordings of `McapSink`, including torn and damaged files.
 
-::
-
-    reader = RecordingReader(path)
-    for moment in reader.moments():
-        moment.tick()
-    reader.complete  # False: the file is torn or damaged
-    reader.losses  # where ticks could not be read
+reader = RecordingReader(path)
+for raw in reader.raw_ticks():
+    raw.tick()
+reader.complete  # False: the file is torn or damaged
+reader.losses  # ticks that could not be read
 """
 
 from __future__ import annotations
@@ -21,63 +19,61 @@ from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 from mcap_ros2.decoder import DecoderFactory
 
 from egovcp.errors import DataError
-from egovcp.log.info import RunInfo
-from egovcp.log.mcap import METADATA_NAME, Line, checksum_matches, without_checksum
-from egovcp.log.mcap_decode import decode_mode, decode_tick, motor_readings
+from egovcp.log.mcap import METADATA_NAME, RecordedTopic, checksum_matches, without_checksum
 from egovcp.log.mcap_records import MAGIC, Damage, RecordFile
-from egovcp.log.messages import Topic
-from egovcp.log.tick import MotorReadings, Tick
+from egovcp.log.messages import Topic, decode_mode, decode_tick, motor_readings
+from egovcp.log.tick import MotorReadings, RunInfo, Tick
 from egovcp.rate import NS_PER_S
 from egovcp.safe_files import UnsafeFileError, open_regular
 
-#: What a row of a dataset needs of a tick.
+#: Topics of a dataset row.
 ROW_TOPICS: Final = frozenset(
     {Topic.DEPTH, Topic.STATE, Topic.ACTION, Topic.REWARD, Topic.MODE, Topic.LOG}
 )
-#: What every tick has.
+#: Topics of every tick.
 REQUIRED_TOPICS: Final = frozenset({Topic.DEPTH, Topic.STATE, Topic.ACTION, Topic.REWARD})
 _MOTOR_TOPICS: Final = frozenset({Topic.JOINTS, Topic.MOTOR_TEMPERATURE, Topic.MOTOR_STATUS})
 
 
 @dataclass(frozen=True)
 class Recording:
-    """One run as it was recorded."""
+    """A recording in memory."""
 
     info: RunInfo
     ticks: list[Tick]
     complete: bool
-    """False if the end is missing (the process died, the disk was full), or a part is damaged."""
+    """False if the end is missing (killed process, full disk) or a part is damaged."""
 
 
 def read_recording(path: Path, damaged_ok: bool = True) -> Recording:
     """Read all readable ticks of ``path`` into memory.
 
     Raises:
-        DataError: not an MCAP file, not one of ours, or damaged without ``damaged_ok``.
+        DataError: not an MCAP file of egovcp, or damaged without ``damaged_ok``.
     """
     reader = RecordingReader(path)
-    ticks = [moment.tick() for moment in reader.moments()]
+    ticks = [raw.tick() for raw in reader.raw_ticks()]
     if not damaged_ok:
         reader.require_undamaged()
     return Recording(reader.info, ticks, reader.complete)
 
 
 @dataclass
-class Moment:
+class RawTick:
     """The messages of one tick, not decoded."""
 
     index: int
     time_ns: int
-    lines: Mapping[str, Line]
+    topics: Mapping[str, RecordedTopic]
     decoders: DecoderFactory
-    """Of this file: it remembers them by the numbers that the file gives its schemas."""
+    """Decoders of this file; it caches them by schema id."""
     messages: dict[str, Message] = field(default_factory=dict)
 
     def tick(self, topics: Collection[str] | None = None) -> Tick:
-        """Decode the tick, or only those of its parts that are on ``topics``.
+        """Decode the tick, or only the messages on ``topics``.
 
         Raises:
-            DataError: it lacks what every tick has, or a message is damaged.
+            DataError: it lacks a required topic, or a message is damaged.
         """
         wanted = self.messages.keys() if topics is None else self.messages.keys() & set(topics)
         try:
@@ -90,7 +86,7 @@ class Moment:
             raise DataError(f"tick {self.index} is damaged: {error}") from error
 
     def text(self, topic: str) -> str:
-        """The words on ``topic``, a log; empty where there are none."""
+        """Text of the log message on ``topic``; empty without one."""
         return str(self._decode(topic).msg) if topic in self.messages else ""
 
     def mode(self) -> str:
@@ -113,23 +109,23 @@ class Moment:
             raise DataError(f"tick {self.index} is damaged: {error}") from error
 
     def _decoded(self, topics: Collection[str]) -> dict[str, Any]:
-        """Topic -> decoded message, of those of ``topics`` that the tick has."""
+        """Topic -> decoded message, for those of ``topics`` that the tick has."""
         try:
             return {name: self._decode(name) for name in self.messages.keys() & set(topics)}
         except (struct.error, ValueError, IndexError, AttributeError) as error:
             raise DataError(f"tick {self.index} is damaged: {error}") from error
 
     def _decode(self, topic: str) -> Any:
-        line = self.lines[topic]
-        decode = self.decoders.decoder_for(line.encoding, line.schema)
+        known = self.topics[topic]
+        decode = self.decoders.decoder_for(known.encoding, known.schema)
         if decode is None:
-            raise DataError(f"topic {topic} is {line.schema.name} in {line.encoding}, not ROS 2")
+            raise DataError(f"topic {topic} is {known.schema.name} in {known.encoding}, not ROS 2")
         return decode(self.messages[topic].data)
 
 
 @dataclass(frozen=True)
 class Loss:
-    """Damage to a recording, and the ticks that it made unreadable."""
+    """Ticks made unreadable by damage."""
 
     after: tuple[int, int] | None
     """Index and time, ns, of the last readable tick before it; None: there is none."""
@@ -140,12 +136,10 @@ class Loss:
 
 
 class RecordingReader:
-    """Goes through a recording, in memory that does not grow with its length.
-
-    A damaged part is skipped: all ticks before and after it are read. `mcap_records` says how.
+    """Iterates over a recording in constant memory; skips damaged parts (see `mcap_records`).
 
     Raises:
-        DataError: not an MCAP file, or not one of ours.
+        DataError: not an MCAP file of egovcp.
     """
 
     def __init__(self, path: Path) -> None:
@@ -153,12 +147,11 @@ class RecordingReader:
         _require_mcap(path)
         self._file = RecordFile(path)
         self.complete = False
-        """Whether `moments` has reached the end of the file and found everything intact."""
+        """Whether `raw_ticks` has read the whole file without damage."""
         self.losses: list[Loss] = []
-        """The damage that `moments` has met. What is missing at the end of a torn file is not
-        listed."""
-        self.lines: dict[str, Line] = {}
-        """The topics met so far."""
+        """Losses that `raw_ticks` has found, without those at the end of a torn file."""
+        self.topics: dict[str, RecordedTopic] = {}
+        """The topics found so far."""
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
         self._decoders = DecoderFactory()
@@ -175,36 +168,32 @@ class RecordingReader:
 
     @property
     def damaged(self) -> bool:
-        """Whether `moments` has met damage, other than a missing end."""
+        """Whether `raw_ticks` has found damage, other than a missing end."""
         return self._file.damaged or self._metadata_damaged
 
-    def moments(self) -> Iterator[Moment]:
+    def raw_ticks(self) -> Iterator[RawTick]:
         """The readable ticks in order."""
         self.losses, self.complete = [], False
         count, last, open_loss = 0, None, False
-        for moment in self._grouped():
-            if isinstance(moment, Damage):
+        for raw in self._grouped():
+            if isinstance(raw, Damage):
                 open_loss = True
                 continue
-            if self._file.damage and not moment.messages.keys() >= REQUIRED_TOPICS:
+            if self._file.damage and not raw.messages.keys() >= REQUIRED_TOPICS:
                 open_loss = True  # some of its chunks were damaged
                 continue
             if open_loss:
-                self._add_loss(last, moment)
+                self._add_loss(last, raw)
             if last is None:
-                self._start_ns = moment.time_ns - moment.index * NS_PER_S // self.info.fps
-            last, open_loss, count = moment, False, count + 1
-            yield moment
+                self._start_ns = raw.time_ns - raw.index * NS_PER_S // self.info.fps
+            last, open_loss, count = raw, False, count + 1
+            yield raw
         if open_loss:
             self._add_final_loss(last, count)
         self.complete = not self.torn and not self.damaged
 
     def require_undamaged(self) -> None:
-        """Check what `moments` has read.
-
-        Raises:
-            DataError: a part is damaged. A missing end is no damage.
-        """
+        """Raise `DataError` if `raw_ticks` has found damage, other than a missing end."""
         if self.damaged:
             raise DataError(
                 f"{self._path} is damaged: {self.loss_text()}; keep the readable ticks: "
@@ -212,7 +201,7 @@ class RecordingReader:
             )
 
     def loss_text(self) -> str:
-        """How many ticks were lost, and where; "no tick is lost" if damage hit none."""
+        """Number and place of lost ticks, or "no tick is lost"."""
         lost = [loss for loss in self.losses if loss.ticks != 0]
         if not lost:
             return "no tick is lost"
@@ -237,14 +226,14 @@ class RecordingReader:
         )
         return f"{ticks} between {start:.2f} and {stop:.2f} s"
 
-    def _add_loss(self, last: Moment | None, moment: Moment) -> None:
+    def _add_loss(self, last: RawTick | None, raw: RawTick) -> None:
         after = (last.index, last.time_ns) if last else None
         first = last.index + 1 if last else 0
-        before = (moment.index, moment.time_ns)
-        self.losses.append(Loss(after, before, max(0, moment.index - first)))
+        before = (raw.index, raw.time_ns)
+        self.losses.append(Loss(after, before, max(0, raw.index - first)))
 
-    def _add_final_loss(self, last: Moment | None, count: int) -> None:
-        """Damage after which no tick follows: the statistics say how many ticks there were."""
+    def _add_final_loss(self, last: RawTick | None, count: int) -> None:
+        """Add damage at the end; the statistics give the number of lost ticks."""
         after = (last.index, last.time_ns) if last else None
         summary, ticks = self._file.summary, None
         if summary and summary.statistics:
@@ -256,32 +245,32 @@ class RecordingReader:
             ticks = max(0, sum(written) - count - sum(loss.ticks or 0 for loss in self.losses))
         self.losses.append(Loss(after, None, ticks))
 
-    def _grouped(self) -> Iterator[Moment | Damage]:
-        """The messages of each tick together."""
-        moment: Moment | None = None
+    def _grouped(self) -> Iterator[RawTick | Damage]:
+        """The messages of each tick, and damage, in file order."""
+        raw: RawTick | None = None
         for record in self._file.records():
             if isinstance(record, Schema):
                 self._schemas[record.id] = record
             elif isinstance(record, Channel):
                 self._add_channel(record)
             elif isinstance(record, Message | Damage):
-                same = isinstance(record, Message) and moment and moment.index == record.sequence
-                if moment is not None and not same:
-                    yield moment
-                    moment = None
+                same = isinstance(record, Message) and raw and raw.index == record.sequence
+                if raw is not None and not same:
+                    yield raw
+                    raw = None
                 if isinstance(record, Damage):
                     yield record
                 elif channel := self._channel(record.channel_id):
-                    moment = moment or self._moment(record)
-                    moment.messages[channel.topic] = record
-        if moment is not None:
-            yield moment
+                    raw = raw or self._raw_tick(record)
+                    raw.messages[channel.topic] = record
+        if raw is not None:
+            yield raw
 
-    def _moment(self, first: Message) -> Moment:
-        return Moment(first.sequence, first.log_time, self.lines, self._decoders)
+    def _raw_tick(self, first: Message) -> RawTick:
+        return RawTick(first.sequence, first.log_time, self.topics, self._decoders)
 
     def _channel(self, number: int) -> Channel | None:
-        """A channel; one whose own record was damaged is taken from the summary."""
+        """A channel; if its own record is damaged, it is taken from the summary."""
         if number not in self._channels and self._file.summary:
             channel = self._file.summary.channels.get(number)
             if channel is not None:
@@ -293,7 +282,9 @@ class RecordingReader:
         schema = self._schemas.get(channel.schema_id) or repeated.get(channel.schema_id)
         if schema is not None:
             self._channels[channel.id] = channel
-            self.lines[channel.topic] = Line(channel.topic, schema, channel.message_encoding)
+            self.topics[channel.topic] = RecordedTopic(
+                channel.topic, schema, channel.message_encoding
+            )
 
     def _read_metadata(self) -> Mapping[str, str]:
         """The metadata record before the first tick, or its copy at the end."""
@@ -337,7 +328,7 @@ _SHOWN_LOSSES: Final = 5
 
 
 def _require_mcap(path: Path) -> None:
-    """Raise `DataError` for a file that neither begins nor ends like an MCAP file."""
+    """Raise `DataError` for a file that neither starts nor ends with the MCAP magic bytes."""
     try:
         with open_regular(path) as file:  # a FIFO would block
             start = file.read(len(MAGIC))

@@ -1,4 +1,4 @@
-"""Reads the records of an MCAP file in order and skips those that are damaged.
+"""Reads the records of an MCAP file in order and skips damaged ones.
 
 `mcap.stream_reader.StreamReader` stops at the first damaged record. Here a record that does not
 parse, or a chunk whose checksum does not match, is skipped: reading continues at the next chunk
@@ -91,10 +91,10 @@ class Damage:
 
 @dataclass(frozen=True)
 class Summary:
-    """What the end of a complete file repeats of its content."""
+    """The summary section at the end of a complete file."""
 
     start: int
-    """Offset at which it begins."""
+    """Offset of its first byte."""
     schemas: dict[int, Schema] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
     metadata: list[MetadataIndex] = field(default_factory=list)
@@ -112,26 +112,26 @@ class RecordFile:
         self.path = path
         self.size = path.stat().st_size
         self.damage: list[Damage] = []
-        """The damaged ranges of the data section that `records` has met."""
+        """Damaged ranges of the data section, as far as `records` has read."""
         self.checksum_matches = True
-        """False if `records` has found another checksum of the data section than the file has."""
+        """False if `records` found that the checksum of the data section is wrong."""
         with path.open("rb") as file:
             self.summary = self._summary(file)
             """None if the file is torn, or its summary damaged."""
             self.torn = not self._has_end(file)
             """Whether the end of the file is missing, as after a kill."""
             file.seek(0)
-            self._starts_right = file.read(len(MAGIC)) == MAGIC
+            self._has_magic = file.read(len(MAGIC)) == MAGIC
 
     @property
     def damaged(self) -> bool:
         """Whether something before the end of the file is damaged, as far as `records` has read."""
-        frame_matches = self._starts_right and (self.torn or self.summary is not None)
+        frame_matches = self._has_magic and (self.torn or self.summary is not None)
         return bool(self.damage) or not self.checksum_matches or not frame_matches
 
     def records(self) -> Iterator[McapRecord | Damage]:
-        """Schemas, channels, messages and metadata in the order of the file, those in chunks
-        included; a `Damage` in place of what is damaged."""
+        """Schemas, channels, messages and metadata in file order, including those in chunks; a
+        `Damage` in place of each damaged range."""
         self.damage, self.checksum_matches = [], True
         with self.path.open("rb") as file:
             position, checksum = len(MAGIC), zlib.crc32(MAGIC)
@@ -180,8 +180,8 @@ class RecordFile:
         yield damage
 
     def _next_chunk(self, file: IO[bytes], start: int) -> _ChunkAt | None:
-        """The first chunk at or after ``start`` whose checksum matches. The record header is not
-        looked at: it may be what is damaged."""
+        """The first chunk at or after ``start`` whose checksum matches; its record header may be
+        damaged and is ignored."""
         end = self.summary.start if self.summary else self.size
         position = start + _BEFORE_COMPRESSION
         while position < end:
@@ -231,7 +231,7 @@ class RecordFile:
         return summary
 
     def _has_end(self, file: IO[bytes]) -> bool:
-        """Whether the file was closed by its writer: it ends with a footer or the magic bytes."""
+        """Whether the writer closed the file: it ends with a footer or the magic bytes."""
         if self.size < _FOOTER_BYTES:
             return False
         file.seek(self.size - _FOOTER_BYTES)
@@ -241,7 +241,7 @@ class RecordFile:
 
 @dataclass(frozen=True)
 class _ChunkAt:
-    """A chunk found by its content."""
+    """A chunk found by its content, not by its header."""
 
     start: int
     end: int
@@ -265,7 +265,7 @@ def _chunk_at(file: IO[bytes], start: int, limit: int) -> _ChunkAt | None:
 
 
 def read_record(file: IO[bytes], position: int, limit: int) -> tuple[McapRecord | None, bytes]:
-    """The record at ``position`` and its bytes; None for a kind that recordings do not need.
+    """The record at ``position`` and its bytes; None for kinds that are not used here.
 
     Raises:
         DamagedRecord, McapError, ValueError, struct.error: there is no whole record.

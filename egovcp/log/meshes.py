@@ -1,8 +1,7 @@
-"""Surfaces of the G1's links for drawing: read from the model file, thinned out.
+"""Simplified meshes of the G1's links, and the colours of drawings.
 
-Needs the model in the mjlab wheel but no simulator: binary STL and the ``visual`` geoms of
-the MJCF are read directly. The full meshes hold 390 000 triangles, 19 MB in every log;
-merging vertices on a grid keeps the shape at a tenth of that.
+The meshes come from the model in the mjlab wheel (binary STL and the ``visual`` geoms of the MJCF),
+without a simulator. Merging vertices on a grid reduces 390 000 triangles (19 MB) to a tenth.
 """
 
 from __future__ import annotations
@@ -24,6 +23,14 @@ _STL_HEADER_BYTES: Final = 84
 _STL_TRIANGLE: Final = np.dtype([("normal", "<f4", 3), ("vertices", "<f4", (3, 3)), ("_", "<u2")])
 _DARK: Final = (60, 60, 65)
 _LIGHT: Final = (190, 192, 198)
+#: Viridis at 0, 1/4, 1/2, 3/4 and 1.
+_STOPS: Final = np.array(
+    [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], np.float64
+)
+LEFT: Final = (230, 97, 1)
+RIGHT: Final = (94, 60, 153)
+SPHERE: Final = (214, 39, 40)
+OBSTACLE: Final = (150, 140, 120)
 
 
 @dataclass(frozen=True)
@@ -41,7 +48,7 @@ class LinkMesh:
 
 
 def link_meshes(grid: float = GRID_M) -> dict[str, LinkMesh]:
-    """Link name -> mesh; empty where the model is not installed, as on a robot computer.
+    """Link name -> mesh; empty where the model is not installed, for example on a robot.
 
     Args:
         grid: vertices within one cell of this size, m, become one.
@@ -67,7 +74,7 @@ def _load(path: Path, grid: float) -> dict[str, LinkMesh]:
 
 
 def _geom(geom: ElementTree.Element, file: Path, grid: float) -> LinkMesh:
-    """One visual geom, thinned, in the frame of its link (no geom of the G1 is rotated)."""
+    """One simplified visual geom in the frame of its link (no geom of the G1 is rotated)."""
     vertices, triangles = thin(_read_stl(file), grid)
     offset = np.array(geom.get("pos", "0 0 0").split(), np.float32)
     colour = _DARK if geom.get("material") == "black" else _LIGHT
@@ -92,8 +99,8 @@ def thin(
 ) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
     """Triangles (F, 3, 3) -> (V, 3) vertices and (F', 3) indices, one vertex per grid cell.
 
-    A cell's vertex is the mean of those it holds; triangles that fall into fewer than three
-    cells vanish, and so do repetitions.
+    The vertex of a cell is the mean of its vertices. Triangles in fewer than three cells and
+    repeated triangles are removed.
     """
     points = corners.reshape(-1, 3)
     cells = np.round(points / grid).astype(np.int64)
@@ -136,3 +143,15 @@ def _merge(parts: list[LinkMesh]) -> LinkMesh:
         np.concatenate([part.normals for part in parts]),
         np.concatenate([part.colours for part in parts]),
     )
+
+
+def value_colours(values: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """(n,) values -> (n, 3) RGB, from dark blue for the lowest to yellow for the highest."""
+    v = np.nan_to_num(np.asarray(values, np.float64))
+    span = float(v.max() - v.min()) if v.size else 0.0
+    share = (v - v.min()) / span if span > 0 else np.ones_like(v)
+    at = share * (len(_STOPS) - 1)
+    low = np.minimum(at.astype(int), len(_STOPS) - 2)
+    rest = (at - low)[:, None]
+    mixed: NDArray[np.float64] = _STOPS[low] * (1 - rest) + _STOPS[low + 1] * rest
+    return np.rint(mixed).astype(np.uint8)

@@ -1,22 +1,32 @@
-"""One tick as ROS 2 messages: which topic holds what."""
+"""Encodes a tick as ROS 2 messages, one per topic, and decodes them."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import StrEnum
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log import ros2
-from egovcp.log.info import CameraView
 from egovcp.log.pose import RobotPose, robot_pose
-from egovcp.log.tick import MODES, Candidates, Hand, MotorReadings, Tick, ValueMap
+from egovcp.log.tick import (
+    MODES,
+    BasePose,
+    CameraView,
+    Candidates,
+    Hand,
+    MotorReadings,
+    SceneObject,
+    Tick,
+    ValueMap,
+)
 from egovcp.robot.kinematics import LINK_NAMES, quaternion
-from egovcp.spec import ACTION_NAMES, JOINT_NAMES, STATE_NAMES, STATE_SLICES
+from egovcp.spec import ACTION_NAMES, DEPTH_COLS, JOINT_NAMES, STATE_NAMES, STATE_SLICES
 
 CAMERA_FRAME: Final = "head_camera_optical"
-_NO_FRAME: Final = ""  # with the camera's, viewers would mix decoded points into the scene
+_NO_FRAME: Final = ""  # in the camera frame, viewers would draw decoded points into the scene
 HEADING_FRAME: Final = "pelvis_heading"
 _FRAMES: Final = (
     *LINK_NAMES,
@@ -28,21 +38,25 @@ _FRAMES: Final = (
 CANDIDATE_FIELDS: Final = ("x", "y", "z", "value")
 #: Number of temperatures per motor -> their names.
 TEMPERATURE_SENSORS: Final = {1: ("motor",), 2: ("casing", "winding")}
+_JOINTS: Final = ",".join(JOINT_NAMES)
+_ACTIONS: Final = ",".join(ACTION_NAMES)
+_STATES: Final = ",".join(STATE_NAMES)
+_FLAGS: Final = ("terminated", "truncated", "success")
 MOTOR_STATUS_ROWS: Final = ("faults", "lost", "enabled")
 
 
 class Topic(StrEnum):
-    """What is where in the file."""
+    """Topics of a recording."""
 
     DEPTH = "/head/depth"
     RECONSTRUCTED = "/head/depth_reconstructed"
     IMAGINED = "/head/depth_imagined"  # 1..K ticks ahead, side by side
     CAMERA_INFO = "/head/camera_info"
     TF = "/tf"
-    BASE = "/robot/base_pose"  # simulator truth
+    BASE = "/robot/base_pose"  # from the simulator
     JOINTS = "/robot/joint_states"
     MOTOR_TEMPERATURE = "/robot/motor_temperature"  # rows: casing and winding, or one value
-    MOTOR_STATUS = "/robot/motor_status"  # rows: those of faults, lost, enabled that are reported
+    MOTOR_STATUS = "/robot/motor_status"  # rows: the reported ones of faults, lost, enabled
     STATE = "/policy/state"
     ACTION = "/policy/action"  # as sent
     ACTION_PLANNED = "/policy/action_planned"
@@ -53,7 +67,7 @@ class Topic(StrEnum):
     VALUE_MAP_RIGHT = "/plan/value_map/right"
     REWARD = "/reward"
     TIMING = "/timing"
-    MODE = "/runner/state"  # 1 at the state that the runner is in
+    MODE = "/runner/state"  # 1 for the state of the runner, 0 for others
     LINK = "/runner/link"  # rate, jitter, loss and age of the robot's messages
     SCENE = "/scene/objects"
     LOG = "/rosout"
@@ -84,7 +98,7 @@ def message_type(topic: Topic) -> str:
 
 
 def encode_tick(tick: Tick, view: CameraView) -> dict[Topic, bytes]:
-    """All messages of one tick; what the tick does not have is left out."""
+    """All messages of one tick; topics without data are left out."""
     pose = robot_pose(tick)
     return {
         **_camera_messages(tick, view),
@@ -155,11 +169,6 @@ def _motor_messages(motors: MotorReadings) -> dict[Topic, bytes]:
     return messages
 
 
-_JOINTS: Final = ",".join(JOINT_NAMES)
-_ACTIONS: Final = ",".join(ACTION_NAMES)
-_STATES: Final = ",".join(STATE_NAMES)
-
-
 def _plan_messages(tick: Tick) -> dict[Topic, bytes]:
     messages = {}
     if tick.plan is not None:
@@ -181,8 +190,7 @@ def _plan_messages(tick: Tick) -> dict[Topic, bytes]:
 
 
 def _outcome_messages(tick: Tick) -> dict[Topic, bytes]:
-    flags = ("terminated", "truncated", "success")
-    reward = {"reward": tick.reward} | {flag: float(getattr(tick, flag)) for flag in flags}
+    reward = {"reward": tick.reward} | {flag: float(getattr(tick, flag)) for flag in _FLAGS}
     messages = {Topic.REWARD: _named(reward | dict(tick.reward_terms))}
     if tick.mode:
         messages[Topic.MODE] = _named({mode: float(mode == tick.mode) for mode in MODES})
@@ -200,12 +208,12 @@ def _outcome_messages(tick: Tick) -> dict[Topic, bytes]:
 
 
 def _named(scalars: dict[str, float]) -> bytes:
-    """A vector whose axis label lists what its elements are."""
+    """A vector whose axis label lists the names of its elements."""
     return ros2.multi_array(list(scalars.values()), [",".join(scalars)])
 
 
 def to_millimetres(depth_m: NDArray[np.floating]) -> NDArray[np.uint16]:
-    """Metres -> whole millimetres; what is not a number, negative or too far becomes 0."""
+    """Metres -> whole millimetres; NaN, negative and too large values become 0."""
     mm = np.rint(np.nan_to_num(np.asarray(depth_m, np.float64), posinf=0.0) * 1000.0)
     return np.where((mm > 0) & (mm < 65536), mm, 0).astype(np.uint16)
 
@@ -219,6 +227,147 @@ def candidate_cloud(candidates: Candidates) -> NDArray[np.float32]:
 
 
 def value_map_cloud(value_map: ValueMap) -> NDArray[np.float32]:
-    """(n, m, 4) points x, y, z, value: an organised cloud, which viewers place in the scene."""
+    """(n, m, 4) points x, y, z, value: an organised point cloud."""
     z, x = np.meshgrid(value_map.z_b, value_map.x_b, indexing="ij")
     return np.stack([x, np.full_like(x, value_map.y_b), z, value_map.values], axis=-1)
+
+
+# --- decoding ---------------------------------------------------------------------
+def decode_tick(index: int, time_ns: int, messages: Mapping[str, Any]) -> Tick:
+    """The inverse of `encode_tick`; decoded depths are rounded to millimetres."""
+    reward = _scalars(messages[Topic.REWARD])
+    plan = _scalars(messages.get(Topic.PLAN_SCALARS))
+    flags = {name: bool(reward.pop(name)) for name in _FLAGS}
+    total = reward.pop("reward")
+    log = messages.get(Topic.LOG)
+    sent = _array(messages[Topic.ACTION]).astype(np.float32)
+    planned = messages.get(Topic.ACTION_PLANNED)
+    return Tick(
+        index=index,
+        time_ns=time_ns,
+        depth=_image(messages[Topic.DEPTH]),
+        state=_array(messages[Topic.STATE]).astype(np.float32),
+        action_planned=sent if planned is None else _array(planned).astype(np.float32),
+        action_sent=sent,
+        depth_reconstructed=_metres(messages.get(Topic.RECONSTRUCTED)),
+        depth_imagined=_imagined(messages.get(Topic.IMAGINED)),
+        plan=_array(messages[Topic.PLAN]) if Topic.PLAN in messages else None,
+        candidates=_candidates(messages.get(Topic.CANDIDATES)),
+        value=plan.get("value"),
+        termination=plan.get("termination"),
+        value_maps=_value_maps(messages),
+        reward=total,
+        reward_terms=reward,
+        timing_ms=_scalars(messages.get(Topic.TIMING)),
+        base=_base(messages.get(Topic.BASE)),
+        scene=_scene(messages.get(Topic.SCENE)),
+        events=tuple(log.msg.split("\n")) if log else (),
+        mode=decode_mode(messages.get(Topic.MODE)),
+        motors=motor_readings(messages),
+        link=_scalars(messages.get(Topic.LINK)),
+        terminated=flags["terminated"],
+        truncated=flags["truncated"],
+        success=flags["success"],
+    )
+
+
+def motor_readings(messages: Mapping[str, Any]) -> MotorReadings | None:
+    """Motor readings in the messages of a tick, topic -> message; None without a torque."""
+    joints = messages.get(Topic.JOINTS)
+    if joints is None or not len(joints.effort):
+        return None
+    temperature = messages.get(Topic.MOTOR_TEMPERATURE)
+    status = _rows(messages.get(Topic.MOTOR_STATUS))
+    return MotorReadings(
+        torque=np.array(joints.effort, np.float64),
+        temperature=None if temperature is None else _array(temperature).T,
+        faults=_integers(status.get("faults")),
+        lost=_integers(status.get("lost")),
+        enabled=None if "enabled" not in status else status["enabled"] != 0.0,
+    )
+
+
+def _rows(message: Any) -> dict[str, NDArray[np.float64]]:
+    """Label -> row of a matrix."""
+    if message is None:
+        return {}
+    names = message.layout.dim[0].label.split(",")
+    return dict(zip(names, _array(message), strict=True))
+
+
+def _integers(row: NDArray[np.float64] | None) -> NDArray[np.int64] | None:
+    return None if row is None else row.astype(np.int64)
+
+
+def _array(message: Any) -> NDArray[np.float64]:
+    shape = [dimension.size for dimension in message.layout.dim]
+    return np.array(message.data, np.float64).reshape(shape)
+
+
+def _scalars(message: Any) -> dict[str, float]:
+    if message is None:
+        return {}
+    names = message.layout.dim[0].label.split(",")
+    return dict(zip(names, map(float, message.data), strict=True))
+
+
+def decode_mode(message: Any) -> str:
+    """State of the runner; empty if none was recorded."""
+    return "".join(name for name, is_in in _scalars(message).items() if is_in)
+
+
+def _image(message: Any) -> NDArray[np.uint16]:
+    return np.frombuffer(message.data, "<u2").reshape(message.height, message.width)
+
+
+def _metres(message: Any) -> NDArray[np.float64] | None:
+    return None if message is None else _image(message) / 1000.0
+
+
+def _imagined(message: Any) -> NDArray[np.float64] | None:
+    strip = _metres(message)
+    return None if strip is None else np.stack(np.split(strip, strip.shape[1] // DEPTH_COLS, 1))
+
+
+def _candidates(message: Any) -> Candidates | None:
+    if message is None:
+        return None
+    points = np.frombuffer(message.data, "<f4").reshape(message.height, -1, 2, 4)
+    return Candidates(hands_b=points[..., :3], values=points[:, 0, 0, 3])
+
+
+def _value_maps(messages: Mapping[str, Any]) -> tuple[ValueMap, ...]:
+    maps = []
+    for hand, topic in VALUE_MAPS.items():
+        if topic in messages:
+            message = messages[topic]
+            cloud = np.frombuffer(message.data, "<f4").reshape(message.height, message.width, 4)
+            x, z, y = cloud[0, :, 0], cloud[:, 0, 2], float(cloud[0, 0, 1])
+            maps.append(ValueMap(hand, x, y, z, cloud[..., 3]))
+    return tuple(maps)
+
+
+def _base(message: Any) -> BasePose | None:
+    if message is None:
+        return None
+    p, q = message.pose.position, message.pose.orientation
+    return BasePose(np.array([p.x, p.y, p.z]), np.array([q.w, q.x, q.y, q.z]))
+
+
+def _scene(message: Any) -> tuple[SceneObject, ...]:
+    if message is None:
+        return ()
+    names = [label.split(":") for label in message.layout.dim[0].label.split(",")]
+    rows = _array(message).tolist()
+    return tuple(
+        SceneObject(name, "sphere" if shape == "sphere" else "box", *_split(row))
+        for (name, shape), row in zip(names, rows, strict=True)
+    )
+
+
+type _Triple = tuple[float, float, float]
+
+
+def _split(row: list[float]) -> tuple[_Triple, tuple[float, float, float, float], _Triple]:
+    x, y, z, qw, qx, qy, qz, sx, sy, sz = row
+    return (x, y, z), (qw, qx, qy, qz), (sx, sy, sz)

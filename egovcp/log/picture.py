@@ -1,8 +1,7 @@
-"""A rollout as one picture: a film strip over the curves of value and reward.
+"""Draws a rollout as one PNG: key frames above the curves of value and return.
 
-Rows: the robot, the depth it saw, what the world model reconstructed, and what it had
-imagined of this moment some ticks before; what the run knows nothing of (no world model
-played) is left out. No graphics card and no display are needed.
+Rows: the robot, the depth image, its reconstruction, and the image of the same tick imagined
+`AHEAD` ticks before. Rows without data are left out. Needs neither a GPU nor a display.
 """
 
 from __future__ import annotations
@@ -16,17 +15,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import EnvironmentFailure
-from egovcp.log.info import RunInfo
 from egovcp.log.meshes import LinkMesh, link_meshes
 from egovcp.log.pose import robot_pose
-from egovcp.log.sketch import Eye, paint, paint_floor, paint_skeleton, robot_surface, scene_surface
-from egovcp.log.tick import Tick
+from egovcp.log.sketch import (
+    Viewpoint,
+    paint,
+    paint_floor,
+    paint_skeleton,
+    robot_surface,
+    scene_surface,
+)
+from egovcp.log.tick import RunInfo, Tick
 from egovcp.spec import DEPTH_MAX_M, PLANNER_DT
 
-MOMENTS: Final = 7  # columns of the film strip
-AHEAD: Final = 8  # how many ticks before a moment the imagination shown for it was made
-_BEFORE_TICKS: Final = 2  # the strip starts this long before the first event
-_AFTER_TICKS: Final = 6  # and ends this long after the last one
+KEY_FRAMES: Final = 7
+AHEAD: Final = 8  # ticks between the imagining of the shown image and its tick
+_BEFORE_TICKS: Final = 2  # from the first key frame to the first event
+_AFTER_TICKS: Final = 6  # from the last event to the last key frame
 _MESH_GRID_M: Final = 0.024
 _STYLES: Final = {
     "value of the plan": "C0",
@@ -34,16 +39,16 @@ _STYLES: Final = {
     "return so far": "C2",
 }
 _TOP_INCH: Final = 0.516  # title and times
-_ROW_INCH: Final = 1.419  # one row of the film strip
-_CURVES_INCH: Final = 2.408  # what lies below the strip
+_ROW_INCH: Final = 1.419  # a row of images
+_CURVES_INCH: Final = 2.408  # the curves
 
 
-type Films = dict[str, list[NDArray[np.floating] | None]]
+type DepthRows = dict[str, list[NDArray[np.floating] | None]]
 type Curves = dict[str, list[float | None]]
 
 
 class PictureSink:
-    """Keeps the ticks of one run and draws them when closed."""
+    """Collects the ticks of a run and draws them on `close`."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -51,7 +56,7 @@ class PictureSink:
         self._ticks: list[Tick] = []
 
     def open(self, info: RunInfo) -> None:
-        """Start; nothing is written before `close`."""
+        """Check that the file does not exist."""
         if self._path.exists():
             raise EnvironmentFailure(
                 f"{self._path} exists already; recordings are never overwritten: choose another"
@@ -59,19 +64,16 @@ class PictureSink:
         self._title = f"{info.task}, seed {info.seed}, episode {info.episode}"
 
     def write(self, tick: Tick) -> None:
-        """Keep the tick, but of what was imagined only the frame that is shown."""
-        film = tick.depth_imagined
-        self._ticks.append(replace(tick, candidates=None, depth_imagined=_last_shown(film)))
+        """Keep the tick without candidates and later imagined images."""
+        images = tick.depth_imagined
+        shown = None if images is None else images[:AHEAD]
+        self._ticks.append(replace(tick, candidates=None, depth_imagined=shown))
 
     def close(self) -> None:
-        """Draw the picture of what was written, if anything was."""
+        """Draw the picture, if there are ticks."""
         if self._ticks:
             rollout_picture(self._ticks, self._path, self._title)
             self._ticks = []
-
-
-def _last_shown(film: NDArray[np.floating] | None) -> NDArray[np.floating] | None:
-    return None if film is None else film[:AHEAD]
 
 
 def rollout_picture(ticks: Sequence[Tick], path: Path, title: str = "") -> None:
@@ -79,26 +81,26 @@ def rollout_picture(ticks: Sequence[Tick], path: Path, title: str = "") -> None:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    moments = key_moments(ticks)
-    rows = films(ticks, moments)
+    frames = key_frames(ticks)
+    rows = depth_rows(ticks, frames)
     height = _TOP_INCH + _ROW_INCH * (1 + len(rows)) + _CURVES_INCH
-    figure = Figure(figsize=(2.1 * len(moments) + 0.5, height), facecolor="white")
+    figure = Figure(figsize=(2.1 * len(frames) + 0.5, height), facecolor="white")
     FigureCanvasAgg(figure)
-    _film_strip(figure, ticks, moments, rows)
-    _curves(figure, ticks, moments)
+    _draw_images(figure, ticks, frames, rows)
+    _curves(figure, ticks, frames)
     figure.suptitle(title, fontsize=12, y=1.0 - 0.086 / height)
     figure.savefig(path, dpi=110)
 
 
 def _place(figure: Any, bottom_inch: float, top_inch: float) -> dict[str, float]:
-    """Where in the figure a grid of plots goes, as shares of its size."""
+    """Position of a grid of plots as fractions of the figure."""
     height = figure.get_figheight()
     return {"left": 0.05, "right": 0.995, "bottom": bottom_inch / height, "top": top_inch / height}
 
 
-def key_moments(ticks: Sequence[Tick], count: int = MOMENTS) -> list[int]:
-    """Indices of up to ``count`` ticks, evenly spread from just before the first event to
-    just after the last; over the whole run when nothing happened."""
+def key_frames(ticks: Sequence[Tick], count: int = KEY_FRAMES) -> list[int]:
+    """Indices of up to ``count`` ticks, evenly spaced from just before the first event to just
+    after the last, or over the whole run without events."""
     last = len(ticks) - 1
     eventful = [i for i, tick in enumerate(ticks) if tick.events]
     begin = max(0, eventful[0] - _BEFORE_TICKS) if eventful else 0
@@ -106,46 +108,48 @@ def key_moments(ticks: Sequence[Tick], count: int = MOMENTS) -> list[int]:
     return sorted({int(i) for i in np.rint(np.linspace(begin, end, count))})
 
 
-def films(ticks: Sequence[Tick], moments: Sequence[int]) -> Films:
-    """The rows of depth pictures; none for what is missing at every moment."""
-    rows: Films = {
-        "depth seen": [ticks[i].depth / 1000.0 for i in moments],
-        "reconstructed": [ticks[i].depth_reconstructed for i in moments],
-        f"imagined\n{AHEAD * PLANNER_DT:.2f} s before": [imagined_of(ticks, i) for i in moments],
+def depth_rows(ticks: Sequence[Tick], frames: Sequence[int]) -> DepthRows:
+    """The rows of depth images; a row without any image is left out."""
+    rows: DepthRows = {
+        "depth seen": [ticks[i].depth / 1000.0 for i in frames],
+        "reconstructed": [ticks[i].depth_reconstructed for i in frames],
+        f"imagined\n{AHEAD * PLANNER_DT:.2f} s before": [imagined_of(ticks, i) for i in frames],
     }
     return {name: row for name, row in rows.items() if any(depth is not None for depth in row)}
 
 
-def _film_strip(figure: Any, ticks: Sequence[Tick], moments: Sequence[int], rows: Films) -> None:
+def _draw_images(
+    figure: Any, ticks: Sequence[Tick], frames: Sequence[int], rows: DepthRows
+) -> None:
     place = _place(figure, _CURVES_INCH, figure.get_figheight() - _TOP_INCH)
-    grid = figure.add_gridspec(1 + len(rows), len(moments), hspace=0.04, wspace=0.03, **place)
+    grid = figure.add_gridspec(1 + len(rows), len(frames), hspace=0.04, wspace=0.03, **place)
     first, *others = grid.subplots(squeeze=False)
     meshes = link_meshes(_MESH_GRID_M)
-    for axes, i in zip(first, moments, strict=True):
+    for axes, i in zip(first, frames, strict=True):
         _robot(axes, ticks[i], meshes)
         axes.set_title(f"{ticks[i].index * PLANNER_DT:.2f} s", fontsize=9)
-    for row, (name, film) in zip(others, rows.items(), strict=True):
+    for row, (name, images) in zip(others, rows.items(), strict=True):
         row[0].set_ylabel(name, fontsize=9)
-        for axes, depth in zip(row, film, strict=True):
+        for axes, depth in zip(row, images, strict=True):
             _depth(axes, depth)
 
 
 def imagined_of(ticks: Sequence[Tick], i: int) -> NDArray[np.floating] | None:
-    """What tick i - AHEAD imagined of tick i, (48, 64) m; None where there is nothing."""
-    film = ticks[i - AHEAD].depth_imagined if i >= AHEAD else None
-    return film[AHEAD - 1] if film is not None and len(film) >= AHEAD else None
+    """The image of tick i imagined at tick i - AHEAD, (48, 64) m; None: there is none."""
+    images = ticks[i - AHEAD].depth_imagined if i >= AHEAD else None
+    return images[AHEAD - 1] if images is not None and len(images) >= AHEAD else None
 
 
 def _robot(axes: Any, tick: Tick, meshes: dict[str, LinkMesh]) -> None:
     pose = robot_pose(tick)
     pelvis_w = pose.positions_w[0]
-    eye = Eye().following(pelvis_w)
-    paint_floor(axes, eye, pelvis_w)
+    view = Viewpoint().following(pelvis_w)
+    paint_floor(axes, view, pelvis_w)
     surfaces = robot_surface(pose, meshes) + scene_surface(tick.scene)
     if not meshes:
-        paint_skeleton(axes, pose, eye)
+        paint_skeleton(axes, pose, view)
     if surfaces:
-        paint(axes, surfaces, eye)
+        paint(axes, surfaces, view)
     axes.set(xlim=(-1.0, 1.0), ylim=(-0.75, 0.75), xticks=[], yticks=[], aspect="equal")
     axes.set_frame_on(False)
 
@@ -157,12 +161,12 @@ def _depth(axes: Any, depth_m: NDArray[np.floating] | None) -> None:
         axes.set_box_aspect(48 / 64)
         return
     shown = np.where(np.asarray(depth_m) > 0.0, depth_m, np.nan)
-    axes.set_facecolor("0.15")  # shows through where nothing was measured
+    axes.set_facecolor("0.15")  # colour of invalid pixels
     axes.imshow(shown, cmap="viridis_r", vmin=0.3, vmax=DEPTH_MAX_M)
 
 
 def curves(ticks: Sequence[Tick]) -> Curves:
-    """What changed over the run; without what no tick knows."""
+    """Curve name -> value per tick; curves without any value are left out."""
     known: Curves = {
         "value of the plan": [tick.value for tick in ticks],
         "termination probability": [tick.termination for tick in ticks],
@@ -171,14 +175,14 @@ def curves(ticks: Sequence[Tick]) -> Curves:
     return {name: row for name, row in known.items() if any(value is not None for value in row)}
 
 
-def _curves(figure: Any, ticks: Sequence[Tick], moments: Sequence[int]) -> None:
+def _curves(figure: Any, ticks: Sequence[Tick], frames: Sequence[int]) -> None:
     shown = curves(ticks)
     place = _place(figure, 0.516, 2.021)
     plots = figure.add_gridspec(1, len(shown), wspace=0.13, **place).subplots(squeeze=False)[0]
     for axes, (name, values) in zip(plots, shown.items(), strict=True):
         _curve(axes, ticks, values, _STYLES[name])
         axes.set_title(name, fontsize=9, loc="left")
-        for i in moments:
+        for i in frames:
             axes.axvline(ticks[i].index * PLANNER_DT, color="0.9", linewidth=1, zorder=0)
 
 
@@ -196,12 +200,12 @@ def _mark_events(axes: Any, ticks: Sequence[Tick], time: list[float]) -> None:
     """A dashed line and its text per event, one below the other at the top of the plot."""
     eventful = [(t, tick.events) for t, tick in zip(time, ticks, strict=True) if tick.events]
     lines = [(t, text) for t, events in eventful for text in events]
-    for row, (moment, text) in enumerate(lines):
-        axes.axvline(moment, color="0.4", linewidth=0.8, linestyle="--")
-        late = moment > 0.6 * time[-1]
+    for row, (time_s, text) in enumerate(lines):
+        axes.axvline(time_s, color="0.4", linewidth=0.8, linestyle="--")
+        late = time_s > 0.6 * time[-1]
         axes.annotate(
             text,
-            (moment, 1.0),
+            (time_s, 1.0),
             xycoords=("data", "axes fraction"),
             xytext=(-3 if late else 3, -2 - 9 * row),
             textcoords="offset points",

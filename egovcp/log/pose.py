@@ -1,7 +1,7 @@
-"""Where the robot, its camera and its hand targets are in the world at one tick.
+"""World poses of the robot's links, its camera and its hand targets at a tick.
 
-With simulator truth the pelvis pose is exact. Without it (a real robot) the pelvis stands
-at the origin at its commanded height, tilted as its IMU says, heading along x.
+In simulation the pelvis pose is exact. On a real robot the pelvis is drawn at the origin, at its
+commanded height, with the tilt of the IMU, heading along x.
 """
 
 from __future__ import annotations
@@ -13,8 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.info import CameraView
-from egovcp.log.tick import Tick
+from egovcp.log.tick import CameraView, Tick
 from egovcp.robot.kinematics import (
     LINK_NAMES,
     PALM_OFFSET,
@@ -66,7 +65,7 @@ def robot_pose(tick: Tick) -> RobotPose:
 
 
 def robot_poses(ticks: Sequence[Tick]) -> list[RobotPose]:
-    """`robot_pose` of several ticks at once, which costs little more than one."""
+    """`robot_pose` of several ticks at once, about as fast as of one."""
     states = np.stack([tick.state for tick in ticks]).astype(np.float64)
     positions, rotations = link_transforms(states[:, STATE_SLICES["joint_position"]])
     tilts = heading_rotation(states[:, STATE_SLICES["projected_gravity"]])

@@ -1,7 +1,7 @@
-"""A Rerun recording of a run: 3D robot and scene, depth seen and imagined, plans, curves.
+"""Writes a Rerun recording: robot and scene in 3D, depth images, plans, and curves.
 
-Ticks are sent in batches of columns: a batch costs about as many calls as one tick would.
-What must survive a killed process goes to the MCAP file; here up to a batch may be lost.
+Ticks are sent in batches, which take about as many calls as one tick. A killed process loses up to
+one batch (an MCAP file loses none).
 """
 
 from __future__ import annotations
@@ -18,37 +18,33 @@ import rerun as rr
 from egovcp.errors import EnvironmentFailure
 from egovcp.log import paths
 from egovcp.log.blueprint import blueprint, signals_blueprint
-from egovcp.log.colour import LEFT, OBSTACLE, RIGHT, SPHERE
-from egovcp.log.destination import Destination, RrdFile
-from egovcp.log.info import CameraView, RunInfo
-from egovcp.log.meshes import LinkMesh, link_meshes
-from egovcp.log.motor_columns import log_motor_styles, motor_columns
+from egovcp.log.meshes import LEFT, OBSTACLE, RIGHT, SPHERE, LinkMesh, link_meshes
 from egovcp.log.pose import robot_poses
-from egovcp.log.rerun_columns import Columns, Frame, all_columns, skeleton_columns
-from egovcp.log.signals import log_styles, signal_columns
-from egovcp.log.tick import SceneObject, Tick
-from egovcp.log.value_map_columns import log_value_map_styles, value_map_columns
+from egovcp.log.rerun_columns import Frame, all_columns, log_value_map_styles, skeleton_columns
+from egovcp.log.signals import log_motor_styles, log_styles, motor_columns, signal_columns
+from egovcp.log.tick import CameraView, RunInfo, SceneObject, Tick
+from egovcp.log.viewer import Destination, RrdFile
 from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_ROWS
 
 BATCH_TICKS: Final = 25  # one second
-LIVE_BATCH_TICKS: Final = 3  # what is looked at must not lag behind
-_VIEWER_PATIENCE_S: Final = 10.0
-_DISK_PATIENCE_S: Final = 60.0
+LIVE_BATCH_TICKS: Final = 3  # for a low delay
+_VIEWER_TIMEOUT_S: Final = 10.0
+_DISK_TIMEOUT_S: Final = 60.0
 _NS: Final = "ns"
 
 
 class RerunSink:
     """Sends ticks to a Rerun file or viewer.
 
-    A viewer may die or hang: put the sink behind a `BackgroundSink`, which does not wait for it.
+    A viewer may end or hang: wrap the sink in an `AsyncSink`, which does not wait for it.
 
     Args:
-        destination: the ``.rrd`` to create, or where else to; `open` raises `EnvironmentFailure`
-            when the file exists or nobody listens.
+        destination: path of the ``.rrd`` file to create, or another destination. `open` raises
+            `EnvironmentFailure` if the file exists or no viewer listens.
         imagined: horizons of the imagined depth to show, planner ticks ahead.
-        meshes: draw the links' surfaces where the model is installed, else a skeleton.
-        signals: show action and proprioception as curves in the place of a planner's thoughts,
-            for what was recorded without one.
+        meshes: draw the meshes of the links if the model is installed, else a skeleton.
+        signals: show curves of action and proprioception instead of plans and values, for
+            recordings without a planner.
     """
 
     def __init__(
@@ -69,18 +65,18 @@ class RerunSink:
         self._batch: list[Tick] = []
         self._known: set[str] = set()
         self._stream: rr.RecordingStream | None = None
-        self._gone = False
+        self._failed = False
 
     @property
-    def _patience_s(self) -> float:
-        return _VIEWER_PATIENCE_S if self._destination.is_live else _DISK_PATIENCE_S
+    def _timeout_s(self) -> float:
+        return _VIEWER_TIMEOUT_S if self._destination.is_live else _DISK_TIMEOUT_S
 
     @property
     def _batch_ticks(self) -> int:
         return LIVE_BATCH_TICKS if self._destination.is_live else BATCH_TICKS
 
     def open(self, info: RunInfo) -> None:
-        """Begin the recording and log all that does not change."""
+        """Start the recording and log static data."""
         self._view = info.camera
         name = f"{info.task} seed {info.seed} episode {info.episode}"
         stream = rr.RecordingStream("egovcp", recording_id=name)
@@ -105,10 +101,10 @@ class RerunSink:
             stream.log(f"{paths.ROBOT}/{link}", surface, static=True)
 
     def write(self, tick: Tick) -> None:
-        """Take the tick; a full batch goes out.
+        """Add the tick to the batch; send a full batch.
 
         Raises:
-            EnvironmentFailure: the disk is full, the viewer is gone, or one of them hangs.
+            EnvironmentFailure: the disk is full, the viewer has ended, or one of them hangs.
         """
         self._batch.append(tick)
         if len(self._batch) >= self._batch_ticks:
@@ -116,8 +112,8 @@ class RerunSink:
             self._flush()
 
     def close(self) -> None:
-        """Send what is left and finish the file."""
-        if self._stream is None or self._gone:  # who is gone cannot be said goodbye to
+        """Send the last batch and close the recording."""
+        if self._stream is None or self._failed:
             return
         if self._batch:
             self._send()
@@ -128,9 +124,9 @@ class RerunSink:
     def _flush(self) -> None:
         assert self._stream is not None, "open the sink before writing to it"
         try:
-            self._stream.flush(timeout_sec=self._patience_s)
+            self._stream.flush(timeout_sec=self._timeout_s)
         except RuntimeError as error:
-            self._gone = True
+            self._failed = True
             raise EnvironmentFailure(
                 f"the recording could not be sent (disk full, viewer gone?): {error}"
             ) from error
@@ -141,7 +137,6 @@ class RerunSink:
         frames = [Frame(*pair) for pair in zip(self._batch, poses, strict=True)]
         self._log_new_objects()
         groups = [*all_columns(frames, self._view, self._imagined)]
-        groups += [Columns(*group) for group in value_map_columns(self._batch)]
         if not self._meshes:
             groups.append(skeleton_columns(frames))
         if self._signals:
@@ -180,9 +175,9 @@ def _shape(thing: SceneObject) -> rr.Boxes3D | rr.Ellipsoids3D:
 def _log_static(stream: rr.RecordingStream, info: RunInfo, imagined: tuple[int, ...]) -> None:
     stream.log(paths.WORLD, rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     stream.log(paths.CAMERA, _pinhole(info.camera), static=True)
-    pictures = [paths.DEPTH, paths.RECONSTRUCTED]
-    pictures += [f"{paths.IMAGINED}/{i}" for i in range(len(imagined))]
-    for path in pictures:
+    images = [paths.DEPTH, paths.RECONSTRUCTED]
+    images += [f"{paths.IMAGINED}/{i}" for i in range(len(imagined))]
+    for path in images:
         stream.log(path, depth_style(), static=True)
     hands = rr.Points3D.from_fields(colors=[LEFT, RIGHT], radii=[0.03], show_labels=False)
     stream.log(paths.HAND_TARGETS, hands, static=True)
@@ -206,7 +201,7 @@ def _pinhole(view: CameraView) -> rr.Pinhole:
 
 
 def depth_style() -> rr.DepthImage:
-    """What all depth pictures share: size, millimetres, one colour scale for all."""
+    """Format and colour scale of all depth images."""
     return rr.DepthImage.from_fields(
         format=rr.components.ImageFormat(
             width=DEPTH_COLS,

@@ -1,11 +1,11 @@
-"""The numbers of a tick as curves: action, proprioception and outcome, in groups of a few.
+"""Rerun curves of action, proprioception, outcome, motors and connection.
 
-Each group is one entity with one line per number: a batch of many costs as much as one.
+Each group of curves is one entity, so that sending a batch is one call per group.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -14,9 +14,9 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from egovcp.log import paths
-from egovcp.log.colour import LEFT
-from egovcp.log.rerun_columns import Columns
-from egovcp.log.tick import Tick
+from egovcp.log.meshes import LEFT
+from egovcp.log.rerun_columns import Columns, named_columns
+from egovcp.log.tick import MODES, Tick
 from egovcp.spec import ACTION_BOX, ACTION_NAMES, JOINT_NAMES, STATE_NAMES, STATE_SLICES
 
 _LEG_JOINTS: Final = ("hip", "knee", "ankle")
@@ -27,7 +27,7 @@ LIMBS: Final = ("left_leg", "right_leg", "waist", "left_arm", "right_arm")
 
 @dataclass(frozen=True)
 class Signal:
-    """A few numbers of a tick that belong into one plot."""
+    """The curves of one plot."""
 
     path: str
     names: tuple[str, ...]
@@ -37,17 +37,22 @@ class Signal:
 
     @property
     def colours(self) -> list[tuple[int, int, int]] | None:
-        """One per line, the same for the same axis everywhere; None: the viewer's choice."""
+        """One per line; x, y and z have fixed colours. None: chosen by the viewer."""
         known = [_COLOURS[name] for name in self.names if name in _COLOURS]
         return known if len(known) == len(self.names) else None
 
 
 def limb(joint: str) -> str:
-    """Which of the five limbs a joint belongs to, such as ``left_arm``."""
+    """The limb of a joint, one of `LIMBS`."""
     side, _, rest = joint.partition("_")
     if side == "waist":
         return side
     return f"{side}_{'leg' if rest.startswith(_LEG_JOINTS) else 'arm'}"
+
+
+_JOINTS_OF: Final = {
+    name: [i for i, joint in enumerate(JOINT_NAMES) if limb(joint) == name] for name in LIMBS
+}
 
 
 def _metric(tick: Tick) -> NDArray[np.float64]:
@@ -67,8 +72,7 @@ def _states() -> Iterator[Signal]:
             yield _state(group, group, range(part.start, part.stop))
     for group in ("joint_position", "joint_velocity"):
         first = STATE_SLICES[group].start
-        for name in LIMBS:
-            joints = [i for i, joint in enumerate(JOINT_NAMES) if limb(joint) == name]
+        for name, joints in _JOINTS_OF.items():
             yield _state(f"{group}/{name}", "", [first + i for i in joints])
 
 
@@ -91,7 +95,7 @@ SIGNALS: Final = (*_actions(), *_states(), *_outcomes())
 
 
 def log_styles(stream: rr.RecordingStream) -> None:
-    """Name the lines of every signal, once per recording."""
+    """Log names and colours of the lines of every signal, once per recording."""
     for signal in SIGNALS:
         lines = rr.SeriesLines(names=list(signal.names), colors=signal.colours)
         stream.log(signal.path, lines, static=True)
@@ -103,3 +107,63 @@ def signal_columns(ticks: Sequence[Tick]) -> Iterator[Columns]:
         values = np.array([signal.values(tick) for tick in ticks], np.float64)  # (n, lines)
         columns = rr.Scalars.columns(scalars=values.ravel())
         yield Columns(signal.path, ticks, columns.partition([len(signal.names)] * len(ticks)))
+
+
+def log_motor_styles(stream: rr.RecordingStream) -> None:
+    """Log the names of the lines of torque and temperature, once per recording."""
+    for name, joints in _JOINTS_OF.items():
+        lines = rr.SeriesLines(names=[JOINT_NAMES[i].removesuffix("_joint") for i in joints])
+        for path in (paths.MOTOR_TORQUE, paths.MOTOR_TEMPERATURE):
+            stream.log(f"{path}/{name}", lines, static=True)
+
+
+def motor_columns(ticks: Sequence[Tick], shown: dict[str, set[int]]) -> Iterator[Columns]:
+    """Torque, temperature, faults, lost packets, connection and state of the runner.
+
+    Args:
+        shown: path -> joints with a curve of faults or lost packets. Joints with a first non-zero
+            value are added; they keep their curve in later batches.
+    """
+    read = [(tick, tick.motors) for tick in ticks if tick.motors is not None]
+    yield from _limbs(paths.MOTOR_TORQUE, [(tick, m.torque) for tick, m in read])
+    hottest = [
+        (tick, np.fmax.reduce(m.temperature, axis=1))
+        for tick, m in read
+        if m.temperature is not None
+    ]
+    yield from _limbs(paths.MOTOR_TEMPERATURE, hottest)
+    for path, field in ((paths.MOTOR_FAULTS, "faults"), (paths.MOTOR_LOST, "lost")):
+        yield from named_columns(path, ticks, _nonzero(ticks, field, shown.setdefault(path, set())))
+    yield from named_columns(paths.LINK, ticks, lambda tick: tick.link)
+    yield from named_columns(paths.RUNNER, ticks, _mode)
+
+
+def _limbs(path: str, rows: Sequence[tuple[Tick, NDArray[np.floating]]]) -> Iterator[Columns]:
+    """One entity per limb from (29,) values at some ticks."""
+    if not rows:
+        return
+    ticks = [tick for tick, _ in rows]
+    values = np.array([row for _, row in rows], np.float64)
+    for name, joints in _JOINTS_OF.items():
+        columns = rr.Scalars.columns(scalars=values[:, joints].ravel())
+        yield Columns(f"{path}/{name}", ticks, columns.partition([len(joints)] * len(ticks)))
+
+
+def _nonzero(
+    ticks: Sequence[Tick], field: str, shown: set[int]
+) -> Callable[[Tick], Mapping[str, float]]:
+    """A function from a tick to the values of the joints in ``shown``."""
+    rows = [getattr(tick.motors, field, None) for tick in ticks]
+    known = [row for row in rows if row is not None]
+    if known:
+        shown.update(map(int, np.flatnonzero(np.any(known, axis=0))))
+
+    def values(tick: Tick) -> Mapping[str, float]:
+        row = getattr(tick.motors, field, None)
+        return {} if row is None else {JOINT_NAMES[i]: float(row[i]) for i in sorted(shown)}
+
+    return values
+
+
+def _mode(tick: Tick) -> Mapping[str, float]:
+    return {mode: float(mode == tick.mode) for mode in MODES} if tick.mode else {}

@@ -1,4 +1,4 @@
-"""Where ticks go: one small Protocol, and a fan-out to several of them."""
+"""The protocol of what writes ticks, and a sink that writes to several others."""
 
 from __future__ import annotations
 
@@ -6,37 +6,36 @@ from collections.abc import Sequence
 from contextlib import ExitStack
 from typing import Protocol, runtime_checkable
 
-from egovcp.log.info import RunInfo
-from egovcp.log.tick import Tick
+from egovcp.log.tick import RunInfo, Tick
 
 
 class Sink(Protocol):
-    """Takes the ticks of one run: ``open`` once, ``write`` in time order, ``close`` once."""
+    """Writes the ticks of one run: ``open`` once, ``write`` in time order, ``close`` once."""
 
     def open(self, info: RunInfo) -> None:
-        """Start the log with what describes the run."""
+        """Start the log of a run."""
         ...
 
     def write(self, tick: Tick) -> None:
-        """Record one tick."""
+        """Write one tick."""
         ...
 
     def close(self) -> None:
-        """Finish the log; it is complete on disk afterwards. Further calls do nothing."""
+        """Complete the log on disk; further calls do nothing."""
         ...
 
 
 @runtime_checkable
 class RetryingSink(Sink, Protocol):
-    """A sink that keeps a tick for which there was no room, until there is."""
+    """A sink that keeps a tick in memory while the disk is full."""
 
     def retry(self) -> None:
-        """Write that tick; raises OSError if it still does not fit."""
+        """Write that tick; raises OSError if the disk is still full."""
         ...
 
 
 class Fanout:
-    """Writes every tick to several sinks; a sink itself."""
+    """A sink that writes every tick to several sinks."""
 
     def __init__(self, sinks: Sequence[Sink]) -> None:
         self._sinks = tuple(sinks)
@@ -52,7 +51,7 @@ class Fanout:
             sink.write(tick)
 
     def close(self) -> None:
-        """Close every sink, even when an earlier one fails; what failed is raised."""
+        """Close every sink, even if one fails; its error is raised."""
         with ExitStack() as stack:
             for sink in reversed(self._sinks):
                 stack.callback(sink.close)

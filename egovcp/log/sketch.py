@@ -1,7 +1,7 @@
-"""Draws robot and scene as shaded triangles without a graphics card: painter's algorithm.
+"""Draws robot and scene as shaded triangles on the CPU with the painter's algorithm.
 
-A point at camera coordinates (x right, y up, z away) lands at f (x, y) / z; triangles are
-painted from the farthest to the nearest, lit by one lamp.
+A point (x right, y up, z away) in camera coordinates projects to f (x, y) / z. Triangles are
+painted from the farthest to the nearest, lit by one directional light.
 """
 
 from __future__ import annotations
@@ -13,44 +13,43 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.colour import OBSTACLE, SPHERE
-from egovcp.log.meshes import LinkMesh
+from egovcp.log.meshes import OBSTACLE, SPHERE, LinkMesh
 from egovcp.log.pose import RobotPose, rotation_matrix
 from egovcp.log.tick import SceneObject
 from egovcp.robot.kinematics import LINK_NAMES, PARENT
 
 Array = NDArray[np.float64]
 
-_LAMP: Final = np.array([0.35, 0.45, 0.82])  # direction to the light, world
+_LIGHT: Final = np.array([0.35, 0.45, 0.82])  # direction to the light, world
 _AMBIENT: Final = 0.45
-_LEASH_M: Final = 0.3  # how far a robot walks before the eye follows it
-_GLASS: Final = 0.45  # opacity of obstacles
-_BONE: Final = (120, 122, 130)
+_FREE_M: Final = 0.3  # distance from the origin beyond which the viewpoint follows the robot
+_OBSTACLE_OPACITY: Final = 0.45
+_SKELETON: Final = (120, 122, 130)
 
 
 @dataclass(frozen=True)
-class Eye:
-    """Where the picture is taken from."""
+class Viewpoint:
+    """Position, target and focal length of the virtual camera."""
 
     position: tuple[float, float, float] = (2.3, 3.3, 1.5)
     """World, m."""
     target: tuple[float, float, float] = (0.72, 0.0, 0.68)
-    """World point in the middle of the picture, m."""
+    """World point at the image centre, m."""
     focal: float = 3.3
-    """Half the picture's height is 1 / focal of the distance."""
+    """Focal length; half the image height spans distance / focal."""
 
-    def following(self, pelvis_w: NDArray[np.floating]) -> Eye:
-        """The eye moved over the ground with a robot whose pelvis (3,) m has left the origin.
+    def following(self, pelvis_w: NDArray[np.floating]) -> Viewpoint:
+        """The viewpoint moved horizontally with the pelvis (3,) m.
 
-        Within `_LEASH_M` it stays, so that a stumble is seen; beyond, it is dragged along.
+        It stays in place within `_FREE_M` of the origin, so that a stumble remains visible.
         """
-        way = np.array([*pelvis_w[:2], 0.0])
-        drag = way * max(0.0, 1.0 - _LEASH_M / max(float(np.linalg.norm(way)), 1e-9))
-        position, target = (np.add(point, drag).tolist() for point in (self.position, self.target))
+        offset = np.array([*pelvis_w[:2], 0.0])
+        shift = offset * max(0.0, 1.0 - _FREE_M / max(float(np.linalg.norm(offset)), 1e-9))
+        position, target = (np.add(point, shift).tolist() for point in (self.position, self.target))
         return replace(self, position=tuple(position), target=tuple(target))
 
     def project(self, points_w: NDArray[np.floating]) -> tuple[Array, Array]:
-        """(..., 3) world points -> picture coordinates (..., 2) and distances (...)."""
+        """(..., 3) world points -> image coordinates (..., 2) and depths (...)."""
         away = np.subtract(self.target, self.position)
         away = away / np.linalg.norm(away)
         right = np.cross(away, [0.0, 0.0, 1.0])
@@ -70,7 +69,7 @@ class Surface:
     colours: Array
     """(F, 3) RGB, 0 to 255."""
     opacity: float = 1.0
-    """From 0, not to be seen, to 1."""
+    """From 0 (invisible) to 1."""
 
     @property
     def normals(self) -> Array:
@@ -80,15 +79,15 @@ class Surface:
         unit: Array = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
         return unit
 
-    def facing(self, eye: Eye) -> Surface:
-        """The triangles that turn their outside to the eye."""
-        towards = np.subtract(eye.position, self.corners_w[:, 0])
+    def facing(self, view: Viewpoint) -> Surface:
+        """The triangles whose outside faces the viewpoint."""
+        towards = np.subtract(view.position, self.corners_w[:, 0])
         seen = np.sum(self.normals * towards, axis=1) > 0
         return Surface(self.corners_w[seen], self.colours[seen], self.opacity)
 
     def shaded(self) -> Array:
-        """(F, 4) RGB and opacity in [0, 1] under the lamp."""
-        light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(self.normals @ _LAMP, 0.0, 1.0)
+        """(F, 4) RGB and opacity in [0, 1] under the light."""
+        light = _AMBIENT + (1.0 - _AMBIENT) * np.clip(self.normals @ _LIGHT, 0.0, 1.0)
         colours = np.clip(self.colours / 255.0 * light[:, None], 0.0, 1.0)
         return np.column_stack([colours, np.full(len(colours), self.opacity)])
 
@@ -106,10 +105,10 @@ def robot_surface(pose: RobotPose, meshes: Mapping[str, LinkMesh]) -> list[Surfa
 
 
 def scene_surface(scene: Iterable[SceneObject]) -> list[Surface]:
-    """What stands in the scene; walls and posts let through what they would hide."""
+    """The objects of the scene; boxes are translucent."""
     surfaces = []
     for thing in scene:
-        shape, colour, opacity = _box(), OBSTACLE, _GLASS
+        shape, colour, opacity = _box(), OBSTACLE, _OBSTACLE_OPACITY
         if thing.shape == "sphere":
             shape, colour, opacity = _sphere(), SPHERE, 1.0
         turned = (shape * thing.size) @ rotation_matrix(np.array(thing.quaternion_w)).T
@@ -141,41 +140,43 @@ def _sphere(rings: int = 10) -> Array:
     return np.concatenate([half.reshape(-1, 3, 3) for half in halves])
 
 
-def paint(axes: Any, surfaces: list[Surface], eye: Eye) -> None:
+def paint(axes: Any, surfaces: list[Surface], view: Viewpoint) -> None:
     """Paint ``surfaces`` on matplotlib ``axes``, the farthest triangle first."""
     from matplotlib.collections import PolyCollection
 
-    seen = [surface.facing(eye) for surface in surfaces]
-    points, depth = eye.project(np.concatenate([surface.corners_w for surface in seen]))
+    seen = [surface.facing(view) for surface in surfaces]
+    points, depth = view.project(np.concatenate([surface.corners_w for surface in seen]))
     colours = np.concatenate([surface.shaded() for surface in seen])
     order = np.argsort(-depth.mean(axis=1))
     faces = PolyCollection(list(points[order]), facecolors=colours[order], edgecolors="face")
-    faces.set_linewidth(np.where(colours[order, 3] < 1.0, 0.0, 0.2).tolist())  # no seams in glass
+    faces.set_linewidth(np.where(colours[order, 3] < 1.0, 0.0, 0.2).tolist())  # no seams
     axes.add_collection(faces, autolim=False)
 
 
-def paint_skeleton(axes: Any, pose: RobotPose, eye: Eye) -> None:
-    """The robot as bones, where no meshes are installed."""
-    points, _ = eye.project(pose.positions_w)
+def paint_skeleton(axes: Any, pose: RobotPose, view: Viewpoint) -> None:
+    """Draw the robot as lines between joints, for a machine without meshes."""
+    points, _ = view.project(pose.positions_w)
     for child, parent in enumerate(PARENT):
         if parent >= 0:
-            bone = points[[parent, child]]
-            axes.plot(*bone.T, color=np.array(_BONE) / 255.0, linewidth=3, solid_capstyle="round")
+            line = points[[parent, child]]
+            axes.plot(
+                *line.T, color=np.array(_SKELETON) / 255.0, linewidth=3, solid_capstyle="round"
+            )
 
 
 def paint_floor(
     axes: Any,
-    eye: Eye,
+    view: Viewpoint,
     pelvis_w: NDArray[np.floating],
     extent: float = 3.0,
     spacing: float = 0.5,
 ) -> None:
-    """A grid on the ground around the robot; it reaches on by whole squares, so that a walk past
-    its lines is seen."""
+    """Draw a grid on the ground around the robot. The lines stay fixed in the world, so that
+    walking is visible."""
     middle = spacing * np.round(np.asarray(pelvis_w[:2]) / spacing)
     marks = np.arange(-extent, extent + spacing / 2, spacing)
     ends = np.array([-extent, extent])
     for mark in marks:
         for line in (np.stack([ends, np.full(2, mark)], 1), np.stack([np.full(2, mark), ends], 1)):
-            points, _ = eye.project(np.column_stack([line + middle, np.zeros(2)]))
+            points, _ = view.project(np.column_stack([line + middle, np.zeros(2)]))
             axes.plot(*points.T, color="0.85", linewidth=0.6, zorder=0)

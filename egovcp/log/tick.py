@@ -1,24 +1,28 @@
-"""One planner tick, as every log sees it, and what describes the run it belongs to."""
+"""The records of a log: a planner tick, and the description of its run."""
 
 from __future__ import annotations
 
+import json
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, FEATURES, PLANNER_HZ, SPEC_VERSION
+
 Array = NDArray[np.floating]
 
-#: What a robot that is driven by a runner can be doing.
+#: States of the runner of a robot.
 MODES: Final = ("init", "stand", "armed", "run", "hold", "damp")
 type Hand = Literal["left", "right"]
 
 
 @dataclass(frozen=True)
 class SceneObject:
-    """A thing in the simulated scene; known in simulation only."""
+    """An object in the scene; recorded in simulation only."""
 
     name: str
     """Unique within the scene, such as ``wall``."""
@@ -28,12 +32,12 @@ class SceneObject:
     quaternion_w: tuple[float, float, float, float]
     """Rotation to the world frame, (w, x, y, z)."""
     size: tuple[float, float, float]
-    """Half extents along its own axes, m; a sphere repeats its radius."""
+    """Half extents along its own axes, m; for a sphere three times the radius."""
 
 
 @dataclass(frozen=True)
 class BasePose:
-    """Pelvis pose in the world: simulator truth, never an input of the policy."""
+    """Pose of the pelvis in the world frame, from the simulator; not an input of the policy."""
 
     position_w: Array
     """(3,) m."""
@@ -43,27 +47,27 @@ class BasePose:
 
 @dataclass(frozen=True)
 class MotorReadings:
-    """What the motors report besides position and velocity, (29,) in ``spec.JOINT_NAMES`` order.
+    """Motor measurements besides position and velocity, in the order of ``spec.JOINT_NAMES``.
 
-    Only the torque is always there: what a robot or its bridge does not report is None.
+    Fields that the robot or its bridge does not report are None.
     """
 
     torque: Array
-    """(29,) N m, as the motors estimate it."""
+    """(29,) N m, estimated by the motors."""
     temperature: Array | None = None
-    """(29, 1) or (29, 2) deg C: one value, or casing and winding; not-a-number where a motor
-    reports none."""
+    """(29, 1) or (29, 2) deg C: one value, or casing and winding; NaN where a motor reports
+    none."""
     faults: NDArray[np.integer] | None = None
     """(29,) status bits of each motor, 0 without a fault."""
     lost: NDArray[np.integer] | None = None
-    """(29,) packets to or from each motor that were lost since it was switched on."""
+    """(29,) packets lost to or from each motor since it was switched on."""
     enabled: NDArray[np.bool_] | None = None
-    """(29,) whether each motor is in the mode that obeys commands."""
+    """(29,) whether each motor follows commands."""
 
 
 @dataclass(frozen=True)
 class Candidates:
-    """Some of the plans that the planner weighed, drawn as paths of both hands."""
+    """Some candidates of the planner, as paths of both hands."""
 
     hands_b: Array
     """(n, N, 2, 3) targets of the left and right hand, m, pelvis heading frame."""
@@ -73,16 +77,16 @@ class Candidates:
 
 @dataclass(frozen=True)
 class ValueMap:
-    """What the policy thinks of putting one hand elsewhere, all else as planned (paper fig. 7a).
+    """Q of the planned action with the target of one hand moved over a grid (paper, figure 7a).
 
-    A grid in the hand's x-z plane of the pelvis heading frame.
+    The grid lies in the hand's x-z plane of the pelvis heading frame.
     """
 
     hand: Hand
     x_b: NDArray[np.float32]
     """(m,) hand target, m forward, ascending."""
     y_b: float
-    """Planned hand target, m to the left: where the plane lies."""
+    """y of the grid: the planned hand target, m to the left."""
     z_b: NDArray[np.float32]
     """(n,) hand target, m up, ascending."""
     values: NDArray[np.float32]
@@ -91,10 +95,10 @@ class ValueMap:
 
 @dataclass(frozen=True)
 class Tick:
-    """Everything that one planner tick saw, thought and did.
+    """Observation, plan, action and outcome of one planner tick.
 
-    ``depth`` and ``state`` are o_t, the actions a_t, and the reward and flags follow from a_t,
-    so a recording converts to dataset rows without shifting anything.
+    ``depth`` and ``state`` are o_t, the actions are a_t, reward and flags follow from a_t: a tick
+    is a row of a dataset without a shift.
     """
 
     index: int
@@ -106,9 +110,9 @@ class Tick:
     state: Array
     """(74,) proprioception, `spec.STATE_SLICES`."""
     action_planned: Array
-    """(7,) what the planner asked for, box units."""
+    """(7,) action of the planner, box units."""
     action_sent: Array
-    """(7,) what the robot was sent after the safety filter, box units."""
+    """(7,) action after the safety filter, as sent to the robot, box units."""
     depth_reconstructed: Array | None = None
     """(48, 64) decoded from the posterior, m."""
     depth_imagined: Array | None = None
@@ -134,9 +138,81 @@ class Tick:
     events: tuple[str, ...] = ()
     """Human-readable lines: start of the task, contacts, faults."""
     mode: str = ""
-    """State of the runner's state machine, one of `MODES`; empty: there is none."""
+    """State of the runner, one of `MODES`; empty without a runner."""
     motors: MotorReadings | None = None
-    """None: the robot is simulated in lock-step, or nothing was read yet."""
+    """None in lock-step simulation, or before the first reading."""
     link: Mapping[str, float] = field(default_factory=dict)
-    """Rate, jitter, loss and age of the robot's messages, and its mode machine; the names carry
-    their units."""
+    """Rate, jitter, loss and age of the robot's messages, and its mode machine; names end in their
+    units."""
+
+
+@dataclass(frozen=True)
+class CameraView:
+    """A pinhole depth camera fixed to a link, looking along that link's x axis."""
+
+    link: str = "torso_link"
+    position: tuple[float, float, float] = (0.06, 0.0, 0.43)
+    """Optical centre in the link frame, m."""
+    pitch: float = math.radians(3.0)
+    """Downward tilt of the optical axis, rad."""
+    vertical_fov: float = math.radians(58.0)
+    """Angle between the top and the bottom edge of the image, rad."""
+
+    @property
+    def focal_px(self) -> float:
+        """Focal length in pixels, f = (H / 2) / tan(fov / 2); pixels are square."""
+        return DEPTH_ROWS / 2 / math.tan(self.vertical_fov / 2)
+
+    @property
+    def centre_px(self) -> tuple[float, float]:
+        """Principal point (column, row), the image centre."""
+        return DEPTH_COLS / 2, DEPTH_ROWS / 2
+
+    @property
+    def rotation(self) -> NDArray[np.float64]:
+        """(3, 3) optical axes (x right, y down, z forward) as columns in the link frame."""
+        c, s = math.cos(self.pitch), math.sin(self.pitch)
+        return np.array([[0.0, -s, c], [-1.0, 0.0, 0.0], [0.0, -c, -s]])
+
+
+@dataclass(frozen=True)
+class RunInfo:
+    """Description of a run, the first record of every log; ticks can be read without it."""
+
+    task: str
+    seed: int = 0
+    episode: int = 0
+    fps: int = PLANNER_HZ
+    camera: CameraView = CameraView()
+    config: Mapping[str, object] = field(default_factory=dict)
+    """Resolved configuration of the run; JSON values."""
+    hashes: Mapping[str, str] = field(default_factory=dict)
+    """Hashes or ids of artifact files, low-level controller and dataset."""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    """Distribution name -> version."""
+    backend: str = ""
+    """Planner backend, such as int8 or float32; empty: none, or unknown."""
+
+    def to_metadata(self) -> dict[str, str]:
+        """Strings for an MCAP metadata record; structured values are JSON."""
+        record = asdict(self) | {"features": FEATURES, "spec_version": SPEC_VERSION}
+        return {
+            key: value if isinstance(value, str) else json.dumps(value, sort_keys=True)
+            for key, value in record.items()
+        }
+
+    @staticmethod
+    def from_metadata(record: Mapping[str, str]) -> RunInfo:
+        """The inverse of `to_metadata`."""
+        camera = json.loads(record["camera"])
+        return RunInfo(
+            task=record["task"],
+            seed=int(record["seed"]),
+            episode=int(record["episode"]),
+            fps=int(record["fps"]),
+            camera=CameraView(**camera | {"position": tuple(camera["position"])}),
+            config=json.loads(record["config"]),
+            hashes=json.loads(record["hashes"]),
+            versions=json.loads(record["versions"]),
+            backend=record.get("backend", ""),  # absent in older recordings
+        )

@@ -12,8 +12,8 @@ import pytest
 from egovcp.artifact import load_artifact, save_artifact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.flags import flags_of
-from egovcp.log.info import RunInfo
 from egovcp.log.mcap import McapSink
+from egovcp.log.tick import RunInfo
 from egovcp.plan import PlannerConfig
 from egovcp.robot.stance import StanceController
 from egovcp.rollouts import CONTROLLER, ticks_of

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from egovcp.log.info import CameraView
-from egovcp.log.tick import Tick
+from egovcp.log.tick import CameraView, Tick
 from egovcp.plan import PolicyStep
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig

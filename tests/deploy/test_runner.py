@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from egovcp.log.info import CameraView
+from egovcp.log.tick import CameraView
 from egovcp.plan import PolicyStep
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM, STATE_SLICES

@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 from huggingface_hub import HfApi
 
-from egovcp.log.destination import Viewer
-from egovcp.log.live import LiveRerun
+from egovcp.log.viewer import LiveRerun, Viewer
 from tests.support.hub import FakeHub, in_this_process
 from tests.support.ports import free_port
 

@@ -13,7 +13,7 @@ from egovcp.plan import PlannerConfig
 from egovcp.testing import toy_model
 
 
-def test_json_is_complete_or_absent(tmp_path: Path) -> None:
+def test_json_is_written_completely_or_not_at_all(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     write_json(path, {"a": 1})
     assert json.loads(path.read_text()) == {"a": 1}

@@ -78,7 +78,7 @@ def test_defaults_are_what_they_were_without_bounds() -> None:
         "--spare=[{area: 3}]",
     ],
 )
-def test_what_is_within_is_taken(flag: str) -> None:
+def test_values_within_bounds_are_accepted(flag: str) -> None:
     _parse(flag)
 
 
@@ -95,7 +95,7 @@ def test_what_is_within_is_taken(flag: str) -> None:
         ("--spare=[{}, {area: -2}]", "--spare[1].area=-2.0: expected more than 0"),
     ],
 )
-def test_what_is_not_is_refused_under_its_flag(flag: str, message: str) -> None:
+def test_values_out_of_bounds_are_refused_with_their_flag(flag: str, message: str) -> None:
     """Whether the command checks it or the config itself."""
     with pytest.raises(UsageError) as caught:
         _parse(flag)
@@ -112,7 +112,7 @@ def test_a_command_whose_whole_config_checks_itself_names_the_flag_too() -> None
         parse_config(Keel, ["--depth=-1"], "egovcp-test")
 
 
-def test_help_tells_the_bounds(capsys: pytest.CaptureFixture[str]) -> None:
+def test_help_shows_the_bounds(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         _parse("--help=all")
     words = " ".join(capsys.readouterr().out.split())

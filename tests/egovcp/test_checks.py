@@ -90,7 +90,7 @@ class _KeepsADimension(WorldModel):
         (_KeepsADimension, "value has shape"),
     ],
 )
-def test_a_model_that_breaks_the_contract_is_named(broken: type[WorldModel], message: str) -> None:
+def test_a_broken_contract_of_a_model_is_reported(broken: type[WorldModel], message: str) -> None:
     model = broken(DEBUG).eval()
     model.load_state_dict(toy_model().state_dict())
     with pytest.raises(ConformanceError, match=message):
@@ -118,7 +118,7 @@ def test_a_good_artifact_passes(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["value_head", "gru"])
-def test_an_artifact_that_learned_nonsense_is_refused(tmp_path: Path, name: str) -> None:
+def test_an_artifact_with_nan_weights_is_refused(tmp_path: Path, name: str) -> None:
     model = toy_model()
     with torch.no_grad():
         for parameter in getattr(model, name).parameters():
@@ -211,7 +211,7 @@ class _NotANumber(_Altered):
         (_NotANumber, "tick 3: state is not finite"),
     ],
 )
-def test_an_environment_that_breaks_the_contract_is_named(
+def test_a_broken_contract_of_an_environment_is_reported(
     broken: type[CountingEnv], message: str
 ) -> None:
     with pytest.raises(ConformanceError, match=message):

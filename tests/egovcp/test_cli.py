@@ -270,7 +270,7 @@ def test_a_wrong_value_is_shown_with_what_was_expected(flag: str, expected: str)
         _parse("--count=2", flag)
 
 
-def test_what_a_config_says_against_its_values_is_said_alone() -> None:
+def test_an_error_of_a_config_class_is_reported_unchanged() -> None:
     """Neither the parser's own words around it, nor another exit code."""
     with pytest.raises(DataError, match=r"^expected low <= high, found \(2\.0, 1\.0\) in \w+$"):
         _parse("--lamp.stand.height_range=[2,1]")
@@ -318,7 +318,7 @@ def _run(*argv: str, error: BaseException | None = None) -> int:
         (OSError(errno.ENOSPC, "No space left on device"), 5),
     ],
 )
-def test_the_exit_code_tells_the_kind_of_failure(error: BaseException | None, code: int) -> None:
+def test_exit_codes_follow_the_kind_of_error(error: BaseException | None, code: int) -> None:
     assert _run(error=error) == code
 
 
@@ -353,7 +353,7 @@ def test_debug_is_no_option_of_the_command_itself() -> None:
 @pytest.mark.parametrize(
     "bug", [RuntimeError("bug"), KeyError("bug"), OSError(errno.EBADF, "Bad file descriptor")]
 )
-def test_a_bug_is_not_dressed_up_as_a_users_error(bug: Exception) -> None:
+def test_a_bug_raises(bug: Exception) -> None:
     with pytest.raises(type(bug)):
         _run(error=bug)
 

@@ -32,7 +32,7 @@ def _arguments(size: int, seed: int, third: bool = True) -> tuple[Tensor, Any]:
     return a, (b, c if third else None)
 
 
-def test_a_recording_serves_all_of_its_shape_and_no_other() -> None:
+def test_a_graph_is_reused_for_equal_shapes_only() -> None:
     recorder = RecomputingRecorder()
     recorded = Recorded(_function, recorder)
     for seed in range(3):
@@ -44,7 +44,7 @@ def test_a_recording_serves_all_of_its_shape_and_no_other() -> None:
     assert recorder.made == recorded.shapes == 3
 
 
-def test_what_was_answered_and_what_was_given_stay_as_they_are() -> None:
+def test_inputs_and_earlier_results_do_not_change() -> None:
     recorded = Recorded(_function, RecomputingRecorder())
     given = _arguments(4, 0)
     before = [given[0].clone(), given[1][0].clone()]
@@ -56,7 +56,7 @@ def test_what_was_answered_and_what_was_given_stay_as_they_are() -> None:
     assert given[1][0].equal(before[1])
 
 
-def test_recordings_serve_under_either_mode_of_torch() -> None:
+def test_graphs_work_under_no_grad_and_inference_mode() -> None:
     recorded = Recorded(_function, RecomputingRecorder())
     for mode in (torch.inference_mode, torch.no_grad, torch.inference_mode):
         with mode():
@@ -64,7 +64,7 @@ def test_recordings_serve_under_either_mode_of_torch() -> None:
             assert recorded(*given).sum.equal(_function(*given).sum)
 
 
-def test_what_cannot_be_recorded_is_computed_and_not_tried_again() -> None:
+def test_a_failed_capture_is_not_repeated() -> None:
     tried = []
 
     def refuse(
@@ -82,7 +82,7 @@ def test_what_cannot_be_recorded_is_computed_and_not_tried_again() -> None:
     assert recorded.refused == "operation not permitted when stream is capturing"
 
 
-def test_shapes_beyond_the_most_are_computed_without_a_recording() -> None:
+def test_shapes_beyond_the_limit_are_computed_without_a_graph() -> None:
     recorder = RecomputingRecorder()
     recorded = Recorded(_function, recorder)
     for size in range(1, MOST_RECORDINGS + 4):
@@ -91,7 +91,7 @@ def test_shapes_beyond_the_most_are_computed_without_a_recording() -> None:
     assert recorder.made == MOST_RECORDINGS
 
 
-def test_what_is_no_tensor_has_a_recording_of_its_own() -> None:
+def test_other_arguments_are_part_of_the_key() -> None:
     def scaled(x: Tensor, by: int) -> tuple[str, Tensor]:
         return f"by {by}", by * x
 
@@ -105,7 +105,7 @@ def test_what_is_no_tensor_has_a_recording_of_its_own() -> None:
     assert recorder.made == 2
 
 
-def test_results_that_are_not_copied_are_those_of_the_last_call() -> None:
+def test_uncopied_results_are_overwritten_by_the_next_call() -> None:
     recorded = Recorded(_function, RecomputingRecorder(), copies=False)
     first = recorded(*_arguments(4, 0))
     second = recorded(*_arguments(4, 1))
@@ -115,7 +115,7 @@ def test_results_that_are_not_copied_are_those_of_the_last_call() -> None:
 
 @pytest.mark.gpu
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
-def test_on_a_gpu_a_replayed_judge_says_what_the_model_says() -> None:
+def test_a_replayed_evaluator_agrees_with_the_model_on_a_gpu() -> None:
     model = toy_model(PRESETS["debug"]).cuda()
     evaluator = FloatEvaluator(model, PlannerConfig())
     reference = ReferenceEvaluator(model, PlannerConfig())

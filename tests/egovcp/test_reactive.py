@@ -27,14 +27,14 @@ def _seen(eyes: Eyes, metres: list[float], fresh: list[bool]) -> list[list[float
     return [[round(float(x.mean()), 3) for x in robot] for robot in pictures]
 
 
-def test_the_present_comes_first_and_a_new_episode_has_no_past() -> None:
+def test_frames_are_newest_first_and_repeat_after_a_reset() -> None:
     eyes = Eyes(2, ReactiveConfig(frames=3, depth_max_m=5.0))
     assert _seen(eyes, [1.0, 2.0], [True, True]) == [[0.8] * 3, [0.6] * 3]
     assert _seen(eyes, [2.0, 3.0], [False, False]) == [[0.6, 0.8, 0.8], [0.4, 0.6, 0.6]]
     assert _seen(eyes, [3.0, 4.0], [False, True]) == [[0.4, 0.6, 0.8], [0.2] * 3]
 
 
-def test_what_was_seen_does_not_change_afterwards() -> None:
+def test_frames_are_copied() -> None:
     eyes = Eyes(1, ReactiveConfig(frames=2))
     first = eyes.look(_flat([1.0]), np.array([True]))
     before = first.clone()
@@ -42,7 +42,7 @@ def test_what_was_seen_does_not_change_afterwards() -> None:
     assert torch.equal(first, before)
 
 
-def test_a_policy_sees_what_came_before_and_forgets_it_at_a_reset() -> None:
+def test_reset_clears_the_frames() -> None:
     policy, state = ReactivePolicy(toy_reactive("c"), 1), np.zeros((1, spec.STATE_DIM))
     alone = policy.act(_flat([1.0]), state).action
     policy.observe(_flat([3.0]), state)
@@ -54,7 +54,7 @@ def test_a_policy_sees_what_came_before_and_forgets_it_at_a_reset() -> None:
     assert np.abs(alone).max() <= 1.0
 
 
-def test_a_file_holds_all_of_it(tmp_path: Path) -> None:
+def test_save_and_load_round_trip(tmp_path: Path) -> None:
     network = toy_reactive("walk-1")
     network.save(tmp_path / "ppo.safetensors")
     loaded = ReactiveNetwork.load(tmp_path / "ppo.safetensors")
@@ -77,7 +77,7 @@ def test_a_file_holds_all_of_it(tmp_path: Path) -> None:
         ({"cnn.0.bias": None}, "cnn.0.bias"),
     ],
 )
-def test_a_file_that_is_none_is_refused(
+def test_damaged_files_are_refused(
     tmp_path: Path, change: dict[str, torch.Tensor | None], message: str
 ) -> None:
     path = tmp_path / "ppo.safetensors"

@@ -31,7 +31,7 @@ def test_a_regular_file_is_read(tmp_path: Path) -> None:
     [("fifo", "a FIFO"), ("device", "a device"), ("folder", "a folder"), ("socket", "a socket")],
 )
 @pytest.mark.parametrize("linked", [False, True])
-def test_what_is_no_regular_file_is_refused_at_once(
+def test_special_files_are_refused(
     kind: str, words: str, linked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)  # a socket's path is short
@@ -118,7 +118,7 @@ def test_other_encodings_are_refused(tmp_path: Path) -> None:
         safe_files.read_json(path)
 
 
-def test_values_are_counted_each_time_they_are_repeated() -> None:
+def test_repeated_values_count_each_time() -> None:
     value: list[object] = [0] * 10
     safe_files.require_bounded(value, limit_items=11)
     for _ in range(8):
@@ -127,7 +127,7 @@ def test_values_are_counted_each_time_they_are_repeated() -> None:
         safe_files.require_bounded(value)
 
 
-def test_a_value_that_holds_itself_is_refused() -> None:
+def test_a_recursive_value_is_refused() -> None:
     value: list[object] = []
     value.append({"inner": value})
     with pytest.raises(UnsafeFileError, match="nested more than 32 levels"):

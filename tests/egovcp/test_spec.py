@@ -99,7 +99,7 @@ def test_left_and_right_hand_have_mirrored_boxes() -> None:
         assert left == pytest.approx(right), name
 
 
-def test_the_walk_of_the_data_is_not_cut_by_the_rate_limit() -> None:
+def test_the_random_walk_stays_within_the_rate_limit() -> None:
     assert spec.ACTION_RATE_LIMIT >= spec.ACTION_ETA
 
 

@@ -77,7 +77,7 @@ def test_a_damaged_file_is_not_read_and_can_be_replaced(damage: object, folder: 
     assert len(list(folder.iterdir())) == 2, "temporary files were left"
 
 
-def test_what_is_written_is_flushed_before_it_gets_its_name(
+def test_data_is_synchronised_before_the_rename(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     calls: list[str] = []

@@ -6,8 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from egovcp.log.info import RunInfo
-from egovcp.log.tick import Tick
+from egovcp.log.tick import RunInfo, Tick
 
 
 @dataclass

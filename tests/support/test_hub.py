@@ -50,7 +50,7 @@ def test_a_repository_is_made_once(api: HfApi) -> None:
         api.dataset_info("me/none")
 
 
-def test_what_is_put_there_is_there(api: HfApi, tmp_path: Path) -> None:
+def test_uploaded_files_can_be_read(api: HfApi, tmp_path: Path) -> None:
     assert set(api.list_repo_files(REPO, repo_type="dataset")) == {
         ".gitattributes",
         "README.md",
@@ -70,7 +70,7 @@ def test_any_part_of_a_file_can_be_read(api: HfApi) -> None:
         assert file.read() == LARGE[-3:]
 
 
-def test_large_content_is_taken_once(api: HfApi, hub: FakeHub) -> None:
+def test_large_content_is_uploaded_once(api: HfApi, hub: FakeHub) -> None:
     hub.heal()
     commit(api, CommitOperationAdd("data/b/same.parquet", LARGE))
     assert (hub.requests["lfs_batch"], hub.requests["lfs_upload"]) == (1, 0)
@@ -126,7 +126,7 @@ def locked(tmp_path: Path) -> Iterator[FakeHub]:
         yield hub
 
 
-def test_only_the_owner_writes_and_sees_what_is_private(locked: FakeHub) -> None:
+def test_a_token_is_needed_to_write_and_to_read_private_data(locked: FakeHub) -> None:
     owner, other = HfApi(token="hf_right"), HfApi(token="hf_wrong")
     with pytest.raises(HfHubHTTPError, match="401"):
         other.create_repo(REPO, repo_type="dataset")
@@ -146,7 +146,7 @@ def test_repositories_outlive_the_server(api: HfApi, hub: FakeHub, tmp_path: Pat
         assert HfApi(endpoint=other.endpoint).dataset_info(REPO).sha == head
 
 
-def test_faults_befall_the_requests_they_were_ordered_for(api: HfApi, hub: FakeHub) -> None:
+def test_faults_apply_to_the_given_requests(api: HfApi, hub: FakeHub) -> None:
     hub.heal()
     hub.fail("info", 418, times=1, after=1, message="out of tea")
     api.dataset_info(REPO)
@@ -156,7 +156,7 @@ def test_faults_befall_the_requests_they_were_ordered_for(api: HfApi, hub: FakeH
     assert hub.requests == {"info": 3}
 
 
-def test_the_command_says_where_it_is(tmp_path: Path) -> None:
+def test_the_command_prints_its_endpoint(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "tests.support.hub", "--root", str(tmp_path)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as process:
         assert process.stdout is not None

@@ -15,8 +15,7 @@ from egovcp.artifact import Artifact
 from egovcp.atomic import write_json
 from egovcp.errors import EgovcpError, SafetyStop, UsageError
 from egovcp.hardware import available_cores
-from egovcp.log.info import CameraView, RunInfo
-from egovcp.log.tick import Tick
+from egovcp.log.tick import CameraView, RunInfo, Tick
 from egovcp.robot.controllers import make_controller
 from egovcp.terminal import echo, one_line
 from egovcp_deploy.config import DeployConfig

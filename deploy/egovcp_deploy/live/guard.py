@@ -9,7 +9,7 @@ from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import Final
 
-from egovcp.log.background import tell_on_stderr
+from egovcp.log.async_sink import warn_on_stderr
 from egovcp_deploy.live.process import last_words
 from egovcp_deploy.robots.body import Body
 from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
@@ -30,7 +30,7 @@ def spare_body(config: BridgeConfig) -> Iterator[BridgeBody]:
     body.connect()
     try:
         if body.warning:
-            tell_on_stderr(f"egovcp-deploy: warning: {body.warning}")
+            warn_on_stderr(f"egovcp-deploy: warning: {body.warning}")
         body.deafen()
         yield body
     finally:

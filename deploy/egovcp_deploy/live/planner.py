@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from egovcp.errors import EgovcpError
-from egovcp.log.background import tell_on_stderr
+from egovcp.log.async_sink import warn_on_stderr
 from egovcp.log.sink import Sink
 from egovcp.log.tick import Tick
 from egovcp.rate import Clock
@@ -86,7 +86,7 @@ class PlannerLoop:
         control_alive: Callable[[], bool],
         stays: bool = False,
         stands: bool = True,
-        tell: Callable[[str], None] = tell_on_stderr,
+        tell: Callable[[str], None] = warn_on_stderr,
     ) -> None:
         self._thinker, self._link, self._operator = thinker, link, operator
         self._sink, self._clock, self._control_alive = sink, clock, control_alive

@@ -9,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.mcap_reader import Moment
+from egovcp.log.mcap_reader import RawTick
 from egovcp.log.messages import Topic
 from egovcp.log.tick import MODES, MotorReadings
 from egovcp.rate import NS_PER_S
@@ -82,18 +82,18 @@ class History:
     _mode: str = ""
     _begin_ns: int | None = None
 
-    def add(self, moment: Moment) -> None:
+    def add(self, raw: RawTick) -> None:
         """Take the next tick.
 
         Raises:
             DataError: a message is damaged.
         """
         if self._begin_ns is None:
-            self._begin_ns = moment.time_ns
-        lines = moment.text(Topic.LOG).splitlines()
-        self._add_changes((moment.time_ns - self._begin_ns) / NS_PER_S, moment.mode(), lines)
+            self._begin_ns = raw.time_ns
+        lines = raw.text(Topic.LOG).splitlines()
+        self._add_changes((raw.time_ns - self._begin_ns) / NS_PER_S, raw.mode(), lines)
         self.ending = lines[-1] if lines else self.ending
-        motors = moment.motors()
+        motors = raw.motors()
         if motors is not None:
             self.joints = self.joints or JointMaxima()
             self.joints.add(motors)

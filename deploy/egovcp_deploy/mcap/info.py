@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from egovcp.errors import UsageError
-from egovcp.log.info import RunInfo
-from egovcp.log.mcap_reader import Moment, RecordingReader
+from egovcp.log.mcap_reader import RawTick, RecordingReader
 from egovcp.log.messages import Topic
+from egovcp.log.tick import RunInfo
 from egovcp.outputs import STDOUT, output_file, write_report
 from egovcp.rate import NS_PER_S
 from egovcp.terminal import echo, echo_lines
@@ -139,27 +139,27 @@ def _summarise(path: Path, reader: RecordingReader) -> Summary:
     summary = Summary(str(path), path.stat().st_size, reader.info)
     period_ns = NS_PER_S // reader.info.fps
     first_ns, last = 0, None
-    for moment in reader.moments():
+    for raw in reader.raw_ticks():
         if last is None:
-            first_ns = moment.time_ns
-        elif gap := _gap(last, moment, period_ns):
+            first_ns = raw.time_ns
+        elif gap := _gap(last, raw, period_ns):
             summary.gaps.append(gap)
-        last = moment
+        last = raw
         summary.ticks += 1
-        summary.messages.update(moment.messages.keys())
-        summary.history.add(moment)
-        summary.events += len(moment.text(Topic.LOG).splitlines())
+        summary.messages.update(raw.messages.keys())
+        summary.history.add(raw)
+        summary.events += len(raw.text(Topic.LOG).splitlines())
     if last is not None:
         summary.duration_s = (last.time_ns - first_ns + period_ns) / NS_PER_S
     summary.complete, summary.damaged = reader.complete, reader.damaged
     summary.lost = reader.loss_text() if reader.damaged else ""
-    summary.types = {line.topic: line.schema.name for line in reader.lines.values()}
+    summary.types = {line.topic: line.schema.name for line in reader.topics.values()}
     return summary
 
 
-def _gap(before: Moment, moment: Moment, period_ns: int) -> Gap | None:
-    missing = moment.index - before.index - 1
-    passed = moment.time_ns - before.time_ns
+def _gap(before: RawTick, raw: RawTick, period_ns: int) -> Gap | None:
+    missing = raw.index - before.index - 1
+    passed = raw.time_ns - before.time_ns
     late = passed - (missing + 1) * period_ns > period_ns / 2
     return Gap(before.index, missing, passed / NS_PER_S) if missing or late else None
 

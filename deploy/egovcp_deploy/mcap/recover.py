@@ -57,9 +57,9 @@ def recover(source: Path, output: Path) -> tuple[int, RecordingReader]:
     copy.open(reader.metadata)
     ticks = 0
     try:
-        for moment in reader.moments():
-            for topic, message in moment.messages.items():
-                copy.add(reader.lines[topic], moment.index, moment.time_ns, message.data)
+        for raw in reader.raw_ticks():
+            for topic, message in raw.messages.items():
+                copy.add(reader.topics[topic], raw.index, raw.time_ns, message.data)
             copy.flush()
             ticks += 1
         copy.close()

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Literal
 
 from egovcp.cli import DatasetConfig
 from egovcp.errors import DataError, UsageError
-from egovcp.log.info import RunInfo
 from egovcp.log.mcap_reader import ROW_TOPICS, RecordingReader
-from egovcp.log.tick import Tick
+from egovcp.log.tick import RunInfo, Tick
 from egovcp.packages import DATA_MODULES, require_packages
 from egovcp.terminal import echo
 from egovcp_deploy.pilot.states import State
@@ -152,8 +151,8 @@ def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
 
     reader = RecordingReader(path)
     try:
-        moments = reader.moments()
-        ticks = _until_over(_driven(moment.tick(ROW_TOPICS) for moment in moments))
+        moments = reader.raw_ticks()
+        ticks = _until_over(_driven(raw.tick(ROW_TOPICS) for raw in moments))
         deque(moments, maxlen=0)  # read on to the end: damage may follow the episode
         reader.require_undamaged()
         whole, why = _before_gap(ticks)

@@ -9,8 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.info import CameraView
-from egovcp.log.tick import BasePose, SceneObject
+from egovcp.log.tick import BasePose, CameraView, SceneObject
 
 
 @dataclass(frozen=True)

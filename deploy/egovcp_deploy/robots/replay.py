@@ -16,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import DataError, UsageError
-from egovcp.log.info import CameraView
 from egovcp.log.mcap_reader import read_recording
-from egovcp.log.tick import Tick
+from egovcp.log.tick import CameraView, Tick
 from egovcp.packages import DATA_MODULES, require_packages
 from egovcp.sim.config import CameraConfig
 from egovcp_deploy.pilot.states import State

@@ -7,8 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.info import CameraView
-from egovcp.log.tick import BasePose, SceneObject
+from egovcp.log.tick import BasePose, CameraView, SceneObject
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import Observation, VectorEnv
 from egovcp.sim.tasks.base import Solid

@@ -13,10 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from egovcp.log.info import RunInfo
 from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
-from egovcp.log.tick import Tick
+from egovcp.log.tick import RunInfo, Tick
 from egovcp.rate import MonotonicClock
 from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario

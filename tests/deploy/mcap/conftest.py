@@ -9,9 +9,8 @@ from pathlib import Path
 import pytest
 
 from egovcp.data import DatasetReader, DatasetWriter, Provenance, open_dataset
-from egovcp.log.info import RunInfo
 from egovcp.log.mcap import McapSink
-from egovcp.log.tick import Tick
+from egovcp.log.tick import RunInfo, Tick
 from egovcp.rollouts import CONTROLLER, ticks_of
 from egovcp.testing import random_episode
 

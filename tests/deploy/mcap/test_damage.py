@@ -40,8 +40,8 @@ def flip(source: Path, target: Path, *positions: int, mask: int = 0xFF) -> Path:
 
 def messages(path: Path) -> dict[int, dict[str, bytes]]:
     return {
-        moment.index: {topic: message.data for topic, message in moment.messages.items()}
-        for moment in RecordingReader(path).moments()
+        raw.index: {topic: message.data for topic, message in raw.messages.items()}
+        for raw in RecordingReader(path).raw_ticks()
     }
 
 
@@ -55,8 +55,8 @@ def test_a_flipped_byte_costs_at_most_the_tick_that_it_hits(record: Record, tmp_
         path = flip(whole, tmp_path / "b.mcap", position, mask=int(random.integers(1, 256)))
         reader = RecordingReader(path)
         kept = {
-            moment.index: {topic: message.data for topic, message in moment.messages.items()}
-            for moment in reader.moments()
+            raw.index: {topic: message.data for topic, message in raw.messages.items()}
+            for raw in reader.raw_ticks()
         }
         lost = expected.keys() - kept.keys()
         assert lost <= {i for i, chunk in enumerate(chunks) if position in chunk}, position
@@ -99,7 +99,7 @@ def test_a_hole_of_zeros_costs_the_ticks_in_it(record: Record, tmp_path: Path) -
     content[chunks[2][50] : chunks[4][50]] = bytes(chunks[4][50] - chunks[2][50])
     (tmp_path / "b.mcap").write_bytes(content)
     reader = RecordingReader(tmp_path / "b.mcap")
-    assert [moment.index for moment in reader.moments()] == [0, 1, 5, 6, 7]
+    assert [raw.index for raw in reader.raw_ticks()] == [0, 1, 5, 6, 7]
     assert [loss.ticks for loss in reader.losses] == [3]
 
 
@@ -142,7 +142,7 @@ def test_damaged_metadata_is_taken_from_its_copy(record: Record, tmp_path: Path)
         path = flip(whole, tmp_path / "b.mcap", position, mask=1)
         reader = RecordingReader(path)
         assert reader.info == RecordingReader(whole).info
-        assert len(list(reader.moments())) == TICKS
+        assert len(list(reader.raw_ticks())) == TICKS
         assert reader.damaged
 
 

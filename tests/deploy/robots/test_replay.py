@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from egovcp.artifact import load_artifact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.errors import DataError, UsageError
-from egovcp.log.info import RunInfo
 from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.sink import Sink
-from egovcp.log.tick import Tick
+from egovcp.log.tick import RunInfo, Tick
 from egovcp.plan import Policy, PolicyStep
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig

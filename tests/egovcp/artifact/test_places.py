@@ -43,7 +43,7 @@ def test_a_folder_has_no_revision(original: Path) -> None:
         load_artifact(str(original), "v1")
 
 
-def test_a_card_beside_it_does_no_harm(folder: Path) -> None:
+def test_other_files_beside_the_artifact_are_ignored(folder: Path) -> None:
     (folder / "README.md").write_text("# A policy")
     (folder / "assets").mkdir()
     load_artifact(str(folder))
@@ -79,7 +79,7 @@ def test_a_dataset_of_that_name_is_no_policy(hub: FakeHub, original: Path) -> No
     ("name", "revision", "message"),
     [("me/none", "", "no model me/none"), ("me/policy", "v9", "but not me/policy@v9")],
 )
-def test_what_the_hub_does_not_have_is_an_artifact_error(
+def test_an_unknown_hub_id_is_an_artifact_error(
     commit: str, name: str, revision: str, message: str
 ) -> None:
     with pytest.raises(ArtifactError, match=message):
@@ -87,7 +87,7 @@ def test_what_the_hub_does_not_have_is_an_artifact_error(
 
 
 @pytest.mark.parametrize("trouble", [403, 429, 503, "reset"])
-def test_a_failing_hub_is_asked_again_and_then_reported(
+def test_hub_errors_are_retried_and_then_reported(
     hub: FakeHub, commit: str, trouble: Trouble
 ) -> None:
     hub.fail("*", trouble, retry_after=0 if trouble == 429 else None)
@@ -110,7 +110,7 @@ def test_without_the_hub_an_earlier_download_serves(
     assert f"earlier download of commit {commit}" in caplog.text
 
 
-def test_what_was_tampered_with_on_the_hub_is_refused(hub: FakeHub, original: Path) -> None:
+def test_a_changed_file_on_the_hub_is_refused(hub: FakeHub, original: Path) -> None:
     contents = {path.name: Content(path) for path in original.iterdir()}
     contents[WEIGHTS] = Content(b"x" + (original / WEIGHTS).read_bytes()[1:])
     publish(Publication("me/odd", contents, "tampered", repo_type="model"), QUICK)

@@ -34,7 +34,7 @@ def test_a_changed_byte_is_noticed(folder: Path, name: str, where: int) -> None:
 
 
 @pytest.mark.parametrize("word", ["stance-1", "sha256", "schema_version", "files"])
-def test_no_word_of_the_manifest_changes_unnoticed(folder: Path, word: str) -> None:
+def test_every_change_of_the_manifest_is_noticed(folder: Path, word: str) -> None:
     text = (folder / MANIFEST).read_text()
     assert word in text
     (folder / MANIFEST).write_text(text.replace(word, word.upper(), 1))
@@ -84,7 +84,7 @@ def test_a_manifest_of_something_else_is_refused(
 
 
 @pytest.mark.parametrize("content", ["[]", "3", "null", "not json", '{"a": ', "\xff\xfe"])
-def test_a_manifest_that_is_none_is_refused(folder: Path, content: str) -> None:
+def test_a_damaged_manifest_is_refused(folder: Path, content: str) -> None:
     (folder / MANIFEST).write_text(content, encoding="latin-1")
     with pytest.raises(ArtifactError, match=MANIFEST):
         load_artifact(str(folder))
@@ -105,7 +105,7 @@ def test_a_manifest_that_is_none_is_refused(folder: Path, content: str) -> None:
         lambda c: c.update(planner=None),
     ],
 )
-def test_a_configuration_that_cannot_be_is_refused(
+def test_an_invalid_configuration_is_refused(
     folder: Path, change: Callable[[Json], object]
 ) -> None:
     """Even where somebody has signed it again."""

@@ -57,7 +57,7 @@ def test_saving_what_was_loaded_is_the_identity(original: Path, tmp_path: Path) 
         assert (tmp_path / "again" / name).read_bytes() == (original / name).read_bytes()
 
 
-def test_another_planner_can_be_asked_for(original: Path) -> None:
+def test_the_planner_can_be_replaced(original: Path) -> None:
     other = PlannerConfig(samples=8, elites=2, horizon=2)
     assert load_artifact(str(original)).make_policy(planner=other).config == other
 
@@ -77,7 +77,7 @@ def test_absent_options_have_their_defaults(folder: Path) -> None:
     assert found.planner == expected.planner
 
 
-def test_options_that_the_weights_contradict_are_refused(folder: Path) -> None:
+def test_options_that_contradict_the_weights_are_refused(folder: Path) -> None:
     edit(folder / CONFIG, lambda config: config["world_model"]["loss"].update(reward=1.0))
     sign(folder)
     with pytest.raises(ArtifactError, match=rf"{WEIGHTS}.*missing: reward_head"):

@@ -15,11 +15,10 @@ from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 
 from egovcp.errors import DataError, EnvironmentFailure
-from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.messages import Topic
-from egovcp.log.tick import Tick
+from egovcp.log.tick import CameraView, RunInfo, Tick
 from egovcp.robot.kinematics import LINK_NAMES
 
 ROOT = Path(__file__).parents[3]
@@ -68,7 +67,7 @@ def test_write_then_read_is_the_identity(tmp_path: Path, make_tick: Any) -> None
         assert_same(written, read)
 
 
-def test_two_files_that_number_their_topics_differently(tmp_path: Path, make_tick: Any) -> None:
+def test_files_may_number_their_topics_differently(tmp_path: Path, make_tick: Any) -> None:
     bare, full = [make_tick(0, bare=True)], [make_tick(0)]
     for name, ticks in (("a", bare), ("b", full), ("c", bare)):
         (read,) = read_recording(record(tmp_path / f"{name}.mcap", ticks)).ticks
@@ -124,7 +123,7 @@ DISPLAYED = {
 }
 
 
-def test_every_schema_is_one_that_viewers_know(tmp_path: Path, make_tick: Any) -> None:
+def test_every_schema_is_known_to_viewers(tmp_path: Path, make_tick: Any) -> None:
     path = record(tmp_path / "a.mcap", [make_tick(1)])
     with path.open("rb") as file:
         reader = make_reader(file)
@@ -145,7 +144,7 @@ def _panels(node: Any, by_id: dict[str, Any]) -> list[str]:
     return _panels(node["first"], by_id) + _panels(node["second"], by_id)
 
 
-def test_the_foxglove_layout_shows_topics_that_there_are() -> None:
+def test_the_foxglove_layout_names_existing_topics() -> None:
     layout = json.loads((ROOT / "docs" / "foxglove_layout.json").read_text())
     panels = layout["configById"]
     assert sorted(_panels(layout["layout"], panels)) == sorted(panels)
@@ -186,7 +185,7 @@ def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [None, b"", b"not an mcap file at all, but longer than magic"])
-def test_what_is_not_a_recording_is_refused(tmp_path: Path, content: bytes | None) -> None:
+def test_other_files_are_refused(tmp_path: Path, content: bytes | None) -> None:
     path = tmp_path / "a.mcap"
     if content is not None:
         path.write_bytes(content)
@@ -194,7 +193,7 @@ def test_what_is_not_a_recording_is_refused(tmp_path: Path, content: bytes | Non
         read_recording(path)
 
 
-def test_closing_twice_or_unopened_is_harmless(tmp_path: Path, make_tick: Any) -> None:
+def test_close_may_be_repeated_or_come_before_open(tmp_path: Path, make_tick: Any) -> None:
     McapSink(tmp_path / "unopened.mcap").close()
     sink = McapSink(tmp_path / "a.mcap")
     sink.open(INFO)

@@ -23,7 +23,7 @@ def sphere(rows: int = 60) -> np.ndarray:
     return faces.reshape(-1, 3, 3).astype(np.float32)
 
 
-def test_thinning_stays_within_one_cell_of_the_surface() -> None:
+def test_simplified_vertices_stay_within_one_cell() -> None:
     corners = sphere()
     vertices, triangles = thin(corners, 0.2)
     assert len(triangles) < len(corners) / 5
@@ -33,7 +33,7 @@ def test_thinning_stays_within_one_cell_of_the_surface() -> None:
     assert triangles.max() == len(vertices) - 1
 
 
-def test_a_grid_finer_than_the_mesh_changes_nothing() -> None:
+def test_a_fine_grid_changes_nothing() -> None:
     corners = sphere(8)
     vertices, triangles = thin(corners, 1e-4)
     area = np.linalg.norm(
@@ -45,7 +45,7 @@ def test_a_grid_finer_than_the_mesh_changes_nothing() -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("mjlab") is None, reason="needs the G1 model")
-def test_the_robot_has_a_surface_on_every_link() -> None:
+def test_every_visible_link_has_a_mesh() -> None:
     surfaces = link_meshes()
     assert set(surfaces) == set(LINK_NAMES)
     for name, mesh in surfaces.items():

@@ -13,25 +13,24 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from egovcp.errors import EnvironmentFailure
-from egovcp.log.info import RunInfo
 from egovcp.log.picture import (
     AHEAD,
     PictureSink,
     curves,
-    films,
+    depth_rows,
     imagined_of,
-    key_moments,
+    key_frames,
     rollout_picture,
 )
-from egovcp.log.sketch import Eye, Surface, paint, scene_surface
-from egovcp.log.tick import SceneObject
+from egovcp.log.sketch import Surface, Viewpoint, paint, scene_surface
+from egovcp.log.tick import RunInfo, SceneObject
 
 
-def test_moments_span_the_events(make_tick: Any) -> None:
+def test_key_frames_span_the_events(make_tick: Any) -> None:
     ticks = [make_tick(i, bare=True) for i in range(60)]
     ticks[20] = replace(ticks[20], events=("ball thrown",))
     ticks[38] = replace(ticks[38], events=("blocked",))
-    moments = key_moments(ticks, count=7)
+    moments = key_frames(ticks, count=7)
     assert len(moments) == 7
     assert 15 <= moments[0] < 20
     assert 38 < moments[-1] < 50
@@ -39,14 +38,14 @@ def test_moments_span_the_events(make_tick: Any) -> None:
 
 
 @pytest.mark.parametrize("length", [1, 3, 60])
-def test_without_events_the_moments_span_the_run(make_tick: Any, length: int) -> None:
-    moments = key_moments([make_tick(0, bare=True)] * length)
+def test_key_frames_span_the_run_without_events(make_tick: Any, length: int) -> None:
+    moments = key_frames([make_tick(0, bare=True)] * length)
     assert moments[0] == 0
     assert moments[-1] == length - 1
     assert len(set(moments)) == len(moments) == min(length, 7)
 
 
-def test_imagination_is_shown_for_the_moment_it_was_about(make_tick: Any) -> None:
+def test_imagined_images_are_shown_at_the_tick_they_predict(make_tick: Any) -> None:
     bare = make_tick(0, bare=True)
     film = lambda i: np.full((AHEAD, 48, 64), 100.0 * i) + np.arange(AHEAD)[:, None, None]  # noqa: E731
     ticks = [replace(bare, depth_imagined=film(i)) for i in range(AHEAD + 3)]
@@ -56,20 +55,20 @@ def test_imagination_is_shown_for_the_moment_it_was_about(make_tick: Any) -> Non
     assert imagined_of(ticks, AHEAD - 1) is None
 
 
-def test_what_a_run_knows_nothing_of_has_no_row_and_no_curve(make_tick: Any) -> None:
+def test_missing_data_has_neither_row_nor_curve(make_tick: Any) -> None:
     ticks = [make_tick(i, bare=True) for i in range(AHEAD + 2)]
     last = len(ticks) - 1
-    assert list(films(ticks, [0, last])) == ["depth seen"]
+    assert list(depth_rows(ticks, [0, last])) == ["depth seen"]
     assert list(curves(ticks)) == ["return so far"]
     ticks[-1] = replace(ticks[-1], depth_reconstructed=np.ones((48, 64)), value=0.5)
-    assert list(films(ticks, [0, last])) == ["depth seen", "reconstructed"]
-    assert list(films(ticks, [0])) == ["depth seen"]
+    assert list(depth_rows(ticks, [0, last])) == ["depth seen", "reconstructed"]
+    assert list(depth_rows(ticks, [0])) == ["depth seen"]
     assert list(curves(ticks)) == ["value of the plan", "return so far"]
     ticks[last - AHEAD] = replace(ticks[last - AHEAD], depth_imagined=np.ones((AHEAD, 48, 64)))
-    assert len(films(ticks, [0, last])) == 3
+    assert len(depth_rows(ticks, [0, last])) == 3
 
 
-def test_a_row_less_makes_a_lower_picture_of_the_same_width(tmp_path: Path, make_tick: Any) -> None:
+def test_fewer_rows_make_a_lower_picture(tmp_path: Path, make_tick: Any) -> None:
     sizes = []
     for bare in (False, True):
         path = tmp_path / f"{bare}.png"
@@ -81,7 +80,7 @@ def test_a_row_less_makes_a_lower_picture_of_the_same_width(tmp_path: Path, make
 
 
 @pytest.mark.parametrize("bare", [False, True])
-def test_the_sink_writes_a_picture_when_closed(tmp_path: Path, make_tick: Any, bare: bool) -> None:
+def test_close_writes_the_picture(tmp_path: Path, make_tick: Any, bare: bool) -> None:
     path = tmp_path / "a.png"
     sink = PictureSink(path)
     sink.open(RunInfo("ball"))
@@ -100,8 +99,8 @@ def test_a_picture_is_never_overwritten(tmp_path: Path) -> None:
         PictureSink(tmp_path / "a.png").open(RunInfo("ball"))
 
 
-def test_the_eye_sees_its_target_in_the_middle_and_left_to_the_left() -> None:
-    eye = Eye(position=(-3.0, 0.0, 1.0), target=(0.0, 0.0, 1.0))
+def test_the_target_projects_to_the_centre() -> None:
+    eye = Viewpoint(position=(-3.0, 0.0, 1.0), target=(0.0, 0.0, 1.0))
     points, depth = eye.project(np.array([[0.0, 0.0, 1.0], [0.0, 0.5, 1.0], [0.0, 0.0, 1.5]]))
     np.testing.assert_allclose(points[0], 0.0, atol=1e-12)
     assert depth[0] == pytest.approx(3.0)
@@ -111,18 +110,18 @@ def test_the_eye_sees_its_target_in_the_middle_and_left_to_the_left() -> None:
 
 
 @pytest.mark.parametrize("way", [(8.0, 0.0), (0.0, -5.0), (-3.0, 4.0)])
-def test_the_eye_follows_a_robot_that_walks_but_not_one_that_stumbles(
+def test_the_viewpoint_follows_walking_but_not_stumbling(
     way: tuple[float, float],
 ) -> None:
     stumble = np.array(way) / np.hypot(*way) * 0.2
-    assert Eye().following(np.array([*stumble, 0.74])) == Eye()
+    assert Viewpoint().following(np.array([*stumble, 0.74])) == Viewpoint()
     for share in (0.2, 0.5, 1.0):
         pelvis = np.array([way[0] * share, way[1] * share, 0.74])
-        eye = Eye().following(pelvis)
+        eye = Viewpoint().following(pelvis)
         (points, _) = eye.project(pelvis[None])
         assert np.all(np.abs(points) < [0.85, 0.5]), "it stays in the picture"
-        moved = np.subtract(eye.target, Eye().target)
-        np.testing.assert_allclose(np.subtract(eye.position, Eye().position), moved)
+        moved = np.subtract(eye.target, Viewpoint().target)
+        np.testing.assert_allclose(np.subtract(eye.position, Viewpoint().position), moved)
         assert moved[2] == 0.0
 
 
@@ -146,7 +145,7 @@ def test_solids_are_closed_and_face_outwards(shape: Any) -> None:
 def test_nearer_triangles_are_painted_over_farther_ones() -> None:
     near = np.array([[[0.0, -1, 0], [0.0, 1, 0], [0.0, 0, 1]]])
     far = near + np.array([1.0, 0.0, 0.0])
-    eye = Eye(position=(-3.0, 0.0, 0.3), target=(0.0, 0.0, 0.3))
+    eye = Viewpoint(position=(-3.0, 0.0, 0.3), target=(0.0, 0.0, 0.3))
     surfaces = [
         Surface(near[:, ::-1], np.array([[255.0, 0, 0]])),
         Surface(far[:, ::-1], np.array([[0, 0, 255.0]])),
@@ -161,7 +160,7 @@ def test_nearer_triangles_are_painted_over_farther_ones() -> None:
 @pytest.mark.parametrize(("shape", "hides"), [("sphere", True), ("box", False)])
 def test_a_ball_hides_what_is_behind_it_and_a_wall_does_not(shape: Any, hides: bool) -> None:
     thing = SceneObject("a", shape, (0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), (0.3, 0.3, 0.3))
-    eye = Eye(position=(-3.0, 0.0, 0.0), target=(0.0, 0.0, 0.0))
+    eye = Viewpoint(position=(-3.0, 0.0, 0.0), target=(0.0, 0.0, 0.0))
     middles = []
     for behind in ((255.0, 0.0, 0.0), (0.0, 0.0, 255.0)):
         corners = np.array([[[1.0, 0.9, -0.9], [1.0, -0.9, -0.9], [1.0, 0.0, 0.9]]])

@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egovcp.log.info import CameraView, RunInfo
 from egovcp.log.pose import robot_pose, robot_poses, rotation_matrix
-from egovcp.log.tick import BasePose
+from egovcp.log.tick import BasePose, CameraView, RunInfo
 from egovcp.robot.kinematics import palm_positions
 from egovcp.spec import STATE_SLICES
 
@@ -20,13 +19,13 @@ def turned(angle: float) -> np.ndarray:
     return np.array([np.cos(angle / 2), 0.0, 0.0, np.sin(angle / 2)])
 
 
-def test_without_truth_the_pelvis_stands_at_its_commanded_height(make_tick: Any) -> None:
+def test_without_base_pose_the_pelvis_is_at_its_commanded_height(make_tick: Any) -> None:
     pose = robot_pose(make_tick(0, bare=True))
     np.testing.assert_allclose(pose.positions_w[0], [0, 0, 0.7], atol=1e-6)
     np.testing.assert_allclose(pose.rotations_w[0], np.eye(3), atol=1e-6)
 
 
-def test_without_truth_the_pelvis_tilts_as_the_imu_says(make_tick: Any) -> None:
+def test_without_base_pose_the_pelvis_has_the_tilt_of_the_imu(make_tick: Any) -> None:
     tick = make_tick(0, bare=True)
     tick.state[STATE_SLICES["projected_gravity"]] = (np.sin(0.3), 0.0, -np.cos(0.3))
     pose = robot_pose(tick)
@@ -74,7 +73,7 @@ def test_quaternion_to_matrix_turns_x_to_y() -> None:
     )
 
 
-def test_run_info_survives_the_flat_record() -> None:
+def test_run_info_round_trips_through_metadata() -> None:
     info = RunInfo(
         "wall", 5, 6, camera=CameraView(position=(0.1, 0.2, 0.3)), config={"a": {"b": [1]}}
     )

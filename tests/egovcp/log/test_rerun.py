@@ -15,11 +15,10 @@ from rerun.experimental import RrdReader
 from egovcp.errors import EnvironmentFailure
 from egovcp.log import paths
 from egovcp.log.blueprint import blueprint
-from egovcp.log.info import RunInfo
 from egovcp.log.pose import robot_pose
 from egovcp.log.rerun import BATCH_TICKS, RerunSink
-from egovcp.log.tick import Tick, ValueMap
-from egovcp.log.value_map_columns import chosen_pixel
+from egovcp.log.rerun_columns import chosen_pixel
+from egovcp.log.tick import RunInfo, Tick, ValueMap
 from egovcp.robot.kinematics import LINK_NAMES
 from egovcp.spec import ACTION_BOX
 
@@ -52,7 +51,7 @@ def entities(store: Any) -> set[str]:
     return set(store.schema().entity_paths())
 
 
-def test_every_part_of_a_tick_has_its_entity(tmp_path: Path, make_tick: Any) -> None:
+def test_every_field_of_a_tick_is_logged(tmp_path: Path, make_tick: Any) -> None:
     ticks = [make_tick(i) for i in range(3)]
     found = entities(record(tmp_path / "a.rrd", ticks, imagined=(1, 5)))
     fixed = [paths.DEPTH, paths.RECONSTRUCTED, paths.CAMERA, paths.CANDIDATES, paths.BEST]
@@ -65,7 +64,7 @@ def test_every_part_of_a_tick_has_its_entity(tmp_path: Path, make_tick: Any) -> 
 
 
 @pytest.mark.parametrize("count", [1, BATCH_TICKS, BATCH_TICKS + 1])
-def test_no_tick_is_lost_at_the_edge_of_a_batch(tmp_path: Path, make_tick: Any, count: int) -> None:
+def test_the_last_partial_batch_is_sent(tmp_path: Path, make_tick: Any, count: int) -> None:
     ticks = [make_tick(i) for i in range(count)]
     store = record(tmp_path / "a.rrd", ticks, meshes=False)
     rewards = column(store, "/reward/total", "Scalars:scalars")
@@ -80,7 +79,7 @@ def test_depth_is_logged_bit_for_bit(tmp_path: Path, make_tick: Any) -> None:
         np.testing.assert_array_equal(image, tick.depth)
 
 
-def test_parts_that_a_tick_lacks_are_left_out(tmp_path: Path, make_tick: Any) -> None:
+def test_missing_fields_are_left_out(tmp_path: Path, make_tick: Any) -> None:
     found = entities(record(tmp_path / "a.rrd", [make_tick(0, bare=True)], meshes=False))
     assert paths.DEPTH in found
     assert not any(path.startswith((paths.SCENE, paths.PLAN)) for path in found)
@@ -100,7 +99,9 @@ def test_a_recording_is_never_overwritten(tmp_path: Path) -> None:
     assert path.read_bytes() == b"precious"
 
 
-def test_value_maps_are_pictures_with_the_best_point_bright(tmp_path: Path, make_tick: Any) -> None:
+def test_value_maps_are_images_with_the_best_point_brightest(
+    tmp_path: Path, make_tick: Any
+) -> None:
     tick = make_tick(1)
     store = record(tmp_path / "a.rrd", [tick], meshes=False)
     for value_map in tick.value_maps:
@@ -111,7 +112,7 @@ def test_value_maps_are_pictures_with_the_best_point_bright(tmp_path: Path, make
         assert image[row, best[1]].tolist() == [253, 231, 37]
 
 
-def test_the_dot_marks_where_the_plan_puts_the_hand(make_tick: Any) -> None:
+def test_the_dot_marks_the_planned_hand_target(make_tick: Any) -> None:
     grid = np.array([0.1, 0.2, 0.3], np.float32)
     value_map = ValueMap("right", grid, -0.2, grid, np.zeros((3, 3), np.float32))
     target = ACTION_BOX.to_metric(np.zeros(7))
@@ -120,9 +121,7 @@ def test_the_dot_marks_where_the_plan_puts_the_hand(make_tick: Any) -> None:
     np.testing.assert_allclose(chosen_pixel(tick, value_map), (1.5, 0.5), atol=1e-5)
 
 
-def test_candidates_are_paths_in_the_world_coloured_by_value(
-    tmp_path: Path, make_tick: Any
-) -> None:
+def test_candidates_are_world_paths_coloured_by_value(tmp_path: Path, make_tick: Any) -> None:
     tick = make_tick(1)
     store = record(tmp_path / "a.rrd", [tick], meshes=False)
     (strips,) = column(store, paths.CANDIDATES, "LineStrips3D:strips")
@@ -136,7 +135,7 @@ def test_candidates_are_paths_in_the_world_coloured_by_value(
     assert [i for i in range(n) if colours[i] == 0xFDE725FF] == [best]
 
 
-def test_every_view_of_the_blueprint_has_something_to_show(tmp_path: Path, make_tick: Any) -> None:
+def test_every_view_of_the_blueprint_has_data(tmp_path: Path, make_tick: Any) -> None:
     found = entities(record(tmp_path / "a.rrd", [make_tick(i) for i in range(3)], imagined=(1, 5)))
     origins = [view.origin for view in views(blueprint((1, 5)).root_container)]
     assert len(origins) == 20

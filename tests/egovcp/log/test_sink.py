@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from egovcp.log.info import RunInfo
 from egovcp.log.sink import Fanout
-from egovcp.log.tick import Tick
+from egovcp.log.tick import RunInfo, Tick
 
 
 class Memory:

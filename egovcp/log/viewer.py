@@ -1,14 +1,15 @@
-"""A Rerun viewer beside the run: the native one, or a server for browsers.
+"""Destinations of a Rerun recording: a file, or a viewer, which `LiveRerun` can start.
 
-It runs in a process of its own and listens on the loopback only; for remote eyes, forward both
-ports: ``ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 ROBOT``.
+A started viewer is a separate process that listens on the loopback only. To view it from another
+machine, forward both ports: ``ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 ROBOT``.
 
     with LiveRerun.of("web") as live:
-        sink = BackgroundSink(RerunSink(live.viewer), "Rerun")
+        sink = AsyncSink(RerunSink(live.viewer), "Rerun")
 """
 
 from __future__ import annotations
 
+import re
 import socket
 import subprocess
 import time
@@ -16,30 +17,128 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final, Literal, Self
+from typing import Final, Literal, Protocol, Self
 
-from egovcp.errors import EnvironmentFailure
-from egovcp.log.destination import GRPC_PORT, LOOPBACK, Viewer
+import rerun as rr
+import rerun.blueprint as rrb
+
+from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.parent_death import command
 
+LOOPBACK: Final = "127.0.0.1"
+GRPC_PORT: Final = 9876  # Rerun's default
 WEB_PORT: Final = 9090
+_URL: Final = re.compile(r"rerun\+http://([\w.-]+):(\d{1,5})/proxy", re.ASCII)
+_ANSWER_S: Final = 2.0
 _START_TIMEOUT_S: Final = 30.0
 _END_TIMEOUT_S: Final = 3.0
+
+
+class Destination(Protocol):
+    """Receives a recording."""
+
+    @property
+    def is_live(self) -> bool:
+        """Whether it is shown while it is written."""
+        ...
+
+    def attach(self, stream: rr.RecordingStream, look: rrb.Blueprint) -> None:
+        """Send the stream to the destination.
+
+        Args:
+            look: layout of the viewer.
+
+        Raises:
+            EnvironmentFailure: the file cannot be created, or no viewer listens.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class RrdFile:
+    """A new file."""
+
+    path: Path
+
+    @property
+    def is_live(self) -> bool:
+        """False: a file is shown later."""
+        return False
+
+    def attach(self, stream: rr.RecordingStream, look: rrb.Blueprint) -> None:
+        """Create the file."""
+        if self.path.exists():
+            raise EnvironmentFailure(
+                f"{self.path} exists already; recordings are never overwritten: choose another"
+            )
+        try:
+            stream.save(self.path, default_blueprint=look)
+        except RuntimeError as error:  # Rerun has no other type for it
+            raise EnvironmentFailure(f"cannot create {self.path}: {error}") from error
+
+
+@dataclass(frozen=True)
+class Viewer:
+    """A viewer, or a server for several, at ``rerun+http://HOST:PORT/proxy``.
+
+    Raises:
+        UsageError: the address has another form.
+    """
+
+    url: str = f"rerun+http://{LOOPBACK}:{GRPC_PORT}/proxy"
+
+    def __post_init__(self) -> None:
+        if not _URL.fullmatch(self.url):
+            raise UsageError(
+                f"{self.url!r} is no address of a Rerun viewer; "
+                f"expected rerun+http://{LOOPBACK}:{GRPC_PORT}/proxy or the like"
+            )
+
+    @property
+    def is_live(self) -> bool:
+        """True."""
+        return True
+
+    @property
+    def address(self) -> tuple[str, int]:
+        """Host and port."""
+        match = _URL.fullmatch(self.url)
+        assert match is not None
+        return match[1], int(match[2])
+
+    @property
+    def answers(self) -> bool:
+        """Whether something listens there."""
+        try:
+            with socket.create_connection(self.address, timeout=_ANSWER_S):
+                return True
+        except OSError:
+            return False
+
+    def attach(self, stream: rr.RecordingStream, look: rrb.Blueprint) -> None:
+        """Connect to the viewer."""
+        if not self.answers:
+            raise EnvironmentFailure(
+                f"no Rerun viewer answers at {self.url}; "
+                f"start one: rerun --bind {LOOPBACK} --port {self.address[1]}"
+            )
+        stream.connect_grpc(self.url, default_blueprint=look)
+
 
 type Kind = Literal["spawn", "web", "connect"]
 
 
 @dataclass
 class LiveRerun:
-    """A viewer that is started by `start`, unless it runs already (``connect``).
+    """A viewer process.
 
-    ``spawn``: the native viewer, which stays open after the run. ``web``: a server that ends
-    with the run, however the run ends; `page` is what to open in a browser.
+    ``spawn``: the native viewer, which stays open after the run. ``web``: a server for browsers,
+    which ends with this process; `page` is its URL. ``connect``: a viewer that runs already.
     """
 
     kind: Kind
     viewer: Viewer = field(default_factory=Viewer)
-    """Where recordings are sent."""
+    """Destination of recordings."""
     web_port: int = WEB_PORT
     """Port of the web page."""
     _process: subprocess.Popen[bytes] | None = None
@@ -57,7 +156,7 @@ class LiveRerun:
 
     @property
     def page(self) -> str:
-        """The web page that shows what is sent; empty without a server for it."""
+        """URL of the web page; empty unless ``web``."""
         if self.kind != "web":
             return ""
         port = self.viewer.address[1]
@@ -66,11 +165,11 @@ class LiveRerun:
 
     @property
     def pid(self) -> int | None:
-        """Number of the process that was started."""
+        """Process id of the started viewer; None: there is none."""
         return self._process.pid if self._process else None
 
     def start(self) -> None:
-        """Start the viewer and wait until it listens; call it from a thread that lasts.
+        """Start the viewer and wait until it listens; call it from the main thread.
 
         Raises:
             EnvironmentFailure: a port is in use, or the viewer ends at once (no display?).
@@ -91,7 +190,7 @@ class LiveRerun:
         self._await(ports)
 
     def close(self) -> None:
-        """End the web server; a native viewer stays open."""
+        """Stop the web server; a native viewer stays open."""
         if self.kind == "web":
             self._end()
 
@@ -133,7 +232,7 @@ class LiveRerun:
 
 
 def _program() -> Path:
-    """The viewer itself: ``python -m rerun`` would start it as a child that outlives it."""
+    """Path of the viewer; ``python -m rerun`` would start it as a grandchild."""
     found = find_spec("rerun_cli")
     if found is None or found.origin is None:
         raise EnvironmentFailure("the viewer comes with rerun-sdk, which is not installed")

@@ -9,16 +9,15 @@ from typing import Any
 
 import pytest
 
-from egovcp.log import append
-from egovcp.log.append import AppendFile
-from egovcp.log.background import BackgroundSink
-from egovcp.log.info import RunInfo
-from egovcp.log.mcap import McapSink
+from egovcp.log import mcap
+from egovcp.log.async_sink import AsyncSink
+from egovcp.log.mcap import AppendFile, McapSink
 from egovcp.log.mcap_reader import read_recording
 from egovcp.log.rerun import RerunSink
+from egovcp.log.tick import RunInfo
 
 
-def test_nothing_is_there_before_the_flush_and_all_of_it_after(tmp_path: Path) -> None:
+def test_flush_writes_the_buffer(tmp_path: Path) -> None:
     file = AppendFile(tmp_path / "a")
     file.write(b"one")
     file.write(b"two")
@@ -29,7 +28,7 @@ def test_nothing_is_there_before_the_flush_and_all_of_it_after(tmp_path: Path) -
     file.close()
 
 
-def test_a_piece_that_does_not_fit_is_taken_back(small: Path) -> None:
+def test_a_failed_flush_leaves_the_file_unchanged(small: Path) -> None:
     file = AppendFile(small / "a")
     file.write(b"whole")
     file.flush()
@@ -40,7 +39,7 @@ def test_a_piece_that_does_not_fit_is_taken_back(small: Path) -> None:
         assert (small / "a").read_bytes() == b"whole"
 
 
-def test_a_piece_that_did_not_fit_is_there_once_it_does(small: Path) -> None:
+def test_a_later_flush_writes_what_did_not_fit(small: Path) -> None:
     filler = small / "filler"
     filler.write_bytes(bytes(700_000))
     file = AppendFile(small / "a")
@@ -55,11 +54,13 @@ def test_a_piece_that_did_not_fit_is_there_once_it_does(small: Path) -> None:
     assert (small / "a").read_bytes() == b"x" * 500_000 + b"y"
 
 
-def test_the_disk_is_told_once_a_second(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_file_is_synchronised_once_a_second(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     now, synced = [0.0], []
-    monkeypatch.setattr(append.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(mcap.time, "monotonic", lambda: now[0])
     file = AppendFile(tmp_path / "a")
-    monkeypatch.setattr(append.os, "fsync", lambda descriptor: synced.append(now[0]))
+    monkeypatch.setattr(mcap.os, "fsync", lambda descriptor: synced.append(now[0]))
     for tick in range(76):
         now[0] = tick * 0.04
         file.write(b"tick")
@@ -69,11 +70,9 @@ def test_the_disk_is_told_once_a_second(tmp_path: Path, monkeypatch: pytest.Monk
     assert len(synced) == 4
 
 
-def test_a_full_disk_keeps_every_whole_tick_and_never_reaches_the_loop(
-    small: Path, make_tick: Any
-) -> None:
-    told: list[str] = []
-    sink = BackgroundSink(McapSink(small / "a.mcap"), "a.mcap", lossless=True, tell=told.append)
+def test_a_full_disk_keeps_all_written_ticks(small: Path, make_tick: Any) -> None:
+    lines: list[str] = []
+    sink = AsyncSink(McapSink(small / "a.mcap"), "a.mcap", lossless=True, warn=lines.append)
     sink.open(RunInfo("ball"))
     index = 0
     while sink.failure is None:
@@ -85,15 +84,13 @@ def test_a_full_disk_keeps_every_whole_tick_and_never_reaches_the_loop(
     assert not recording.complete
     assert [tick.index for tick in recording.ticks] == list(range(len(recording.ticks)))
     assert len(recording.ticks) + sink.lost + sink.dropped == index + 1
-    assert told[0] == "a.mcap: No space left on device; the run goes on without this log"
-    assert len(told) == 2
+    assert lines[0] == "a.mcap: No space left on device; the run goes on without this log"
+    assert len(lines) == 2
 
 
-def test_a_disk_that_is_full_for_10_s_loses_nothing(small: Path, make_tick: Any) -> None:
-    told: list[str] = []
-    sink = BackgroundSink(
-        McapSink(small / "a.mcap"), "a.mcap", close_timeout_s=60.0, tell=told.append
-    )
+def test_a_disk_full_for_10_s_loses_nothing(small: Path, make_tick: Any) -> None:
+    lines: list[str] = []
+    sink = AsyncSink(McapSink(small / "a.mcap"), "a.mcap", close_timeout_s=60.0, warn=lines.append)
     sink.open(RunInfo("ball"))
     written = 0
 
@@ -103,16 +100,16 @@ def test_a_disk_that_is_full_for_10_s_loses_nothing(small: Path, make_tick: Any)
             sink.write(make_tick(written, bare=True))
             written += 1
 
-    while not told:
+    while not lines:
         write(1)
         time.sleep(0.002)
     write(250)  # 10 s at 25 Hz
     subprocess.run(["mount", "-o", "remount,size=64m", str(small)], check=True)
-    while len(told) < 2:
+    while len(lines) < 2:
         write(1)
         time.sleep(0.05)
     sink.close()
-    assert told == [
+    assert lines == [
         "a.mcap: No space left on device; ticks wait until there is room",
         "a.mcap: there is room again",
     ]
@@ -121,12 +118,14 @@ def test_a_disk_that_is_full_for_10_s_loses_nothing(small: Path, make_tick: Any)
     assert [tick.index for tick in recording.ticks] == list(range(written))
 
 
-def test_a_disk_that_stays_full_is_waited_for_no_longer_than_the_run_lasts(
-    small: Path, make_tick: Any
-) -> None:
-    told: list[str] = []
-    sink = BackgroundSink(
-        McapSink(small / "a.mcap"), "a.mcap", queue_ticks=20, close_timeout_s=0.5, tell=told.append
+def test_close_does_not_wait_for_a_full_disk(small: Path, make_tick: Any) -> None:
+    lines: list[str] = []
+    sink = AsyncSink(
+        McapSink(small / "a.mcap"),
+        "a.mcap",
+        queue_ticks=20,
+        close_timeout_s=0.5,
+        warn=lines.append,
     )
     sink.open(RunInfo("ball"))
     index = 0
@@ -138,21 +137,21 @@ def test_a_disk_that_stays_full_is_waited_for_no_longer_than_the_run_lasts(
     assert not recording.complete
     assert [tick.index for tick in recording.ticks] == list(range(len(recording.ticks)))
     assert len(recording.ticks) + sink.lost + sink.dropped == index
-    assert told[0] == "a.mcap: No space left on device; ticks wait until there is room"
-    assert f"{sink.dropped} of {index} ticks were dropped" in told[1]
-    assert len(told) == 2
+    assert lines[0] == "a.mcap: No space left on device; ticks wait until there is room"
+    assert f"{sink.dropped} of {index} ticks were dropped" in lines[1]
+    assert len(lines) == 2
 
 
-def test_a_full_disk_under_rerun_is_told_once(small: Path, make_tick: Any) -> None:
-    told: list[str] = []
+def test_a_full_disk_under_rerun_is_reported_once(small: Path, make_tick: Any) -> None:
+    lines: list[str] = []
     rerun = RerunSink(small / "a.rrd", meshes=False)
-    sink = BackgroundSink(rerun, "a.rrd", lossless=True, tell=told.append)
+    sink = AsyncSink(rerun, "a.rrd", lossless=True, warn=lines.append)
     sink.open(RunInfo("ball"))
     index = 0
     while sink.failure is None:
         sink.write(make_tick(index))
         index += 1
     sink.close()
-    assert "disk full" in told[0]
-    assert "the run goes on without this log" in told[0]
-    assert len(told) == 2
+    assert "disk full" in lines[0]
+    assert "the run goes on without this log" in lines[0]
+    assert len(lines) == 2

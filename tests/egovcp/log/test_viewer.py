@@ -16,11 +16,10 @@ import psutil
 import pytest
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.log.background import BackgroundSink
-from egovcp.log.destination import Viewer
-from egovcp.log.info import RunInfo
-from egovcp.log.live import LiveRerun
+from egovcp.log.async_sink import AsyncSink
 from egovcp.log.rerun import RerunSink
+from egovcp.log.tick import RunInfo
+from egovcp.log.viewer import LiveRerun, Viewer
 from tests.support.ports import free_port
 
 INFO = RunInfo("ball")
@@ -36,16 +35,14 @@ def web() -> Iterator[LiveRerun]:
         yield live
 
 
-def connection(live: LiveRerun, told: list[str], **options: Any) -> BackgroundSink:
+def connection(live: LiveRerun, warnings: list[str], **options: Any) -> AsyncSink:
     """An open recording that goes to the viewer."""
-    sink = BackgroundSink(
-        RerunSink(live.viewer, meshes=False), "Rerun", tell=told.append, **options
-    )
+    sink = AsyncSink(RerunSink(live.viewer, meshes=False), "Rerun", warn=warnings.append, **options)
     sink.open(INFO)
     return sink
 
 
-def test_nothing_listens_beyond_the_loopback(web: LiveRerun, make_tick: Any) -> None:
+def test_the_viewer_listens_on_the_loopback_only(web: LiveRerun, make_tick: Any) -> None:
     sink = connection(web, [])
     sink.write(make_tick(0))
     mine = psutil.Process()
@@ -61,12 +58,12 @@ def test_nothing_listens_beyond_the_loopback(web: LiveRerun, make_tick: Any) -> 
 
 
 def test_ticks_arrive_and_the_server_ends_with_the_run(web: LiveRerun, make_tick: Any) -> None:
-    told: list[str] = []
-    sink = connection(web, told)
+    warnings: list[str] = []
+    sink = connection(web, warnings)
     for index in range(5):
         sink.write(make_tick(index))
     sink.close()
-    assert (sink.lost, sink.dropped, told) == (0, 0, [])
+    assert (sink.lost, sink.dropped, warnings) == (0, 0, [])
     assert str(web.web_port) in web.page
     assert web.pid is not None
     process = psutil.Process(web.pid)
@@ -74,9 +71,9 @@ def test_ticks_arrive_and_the_server_ends_with_the_run(web: LiveRerun, make_tick
     assert not process.is_running()
 
 
-def test_a_dead_viewer_is_told_once_and_given_up(web: LiveRerun, make_tick: Any) -> None:
-    told: list[str] = []
-    sink = connection(web, told)
+def test_a_killed_viewer_is_reported_once(web: LiveRerun, make_tick: Any) -> None:
+    warnings: list[str] = []
+    sink = connection(web, warnings)
     assert web.pid is not None
     os.kill(web.pid, signal.SIGKILL)
     index, end = 0, time.monotonic() + 60
@@ -86,14 +83,14 @@ def test_a_dead_viewer_is_told_once_and_given_up(web: LiveRerun, make_tick: Any)
         time.sleep(0.02)
     sink.close()
     assert isinstance(sink.failure, EnvironmentFailure)
-    assert "could not be sent" in told[0]
-    assert "the run goes on without this log" in told[0]
-    assert len(told) == 2
+    assert "could not be sent" in warnings[0]
+    assert "the run goes on without this log" in warnings[0]
+    assert len(warnings) == 2
 
 
-def test_a_viewer_that_hangs_does_not_hold_up_the_end(web: LiveRerun, make_tick: Any) -> None:
-    told: list[str] = []
-    sink = connection(web, told, close_timeout_s=0.5)
+def test_a_hanging_viewer_does_not_block_close(web: LiveRerun, make_tick: Any) -> None:
+    warnings: list[str] = []
+    sink = connection(web, warnings, close_timeout_s=0.5)
     pid = sink.pid
     assert web.pid is not None
     os.kill(web.pid, signal.SIGSTOP)
@@ -102,7 +99,7 @@ def test_a_viewer_that_hangs_does_not_hold_up_the_end(web: LiveRerun, make_tick:
     sink.close()
     os.kill(web.pid, signal.SIGCONT)
     assert not psutil.pid_exists(pid)
-    assert len(told) == 1
+    assert len(warnings) == 1
 
 
 _RUN = """
@@ -111,20 +108,20 @@ from contextlib import closing
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from conftest import _tick
-from egovcp.log.background import BackgroundFanout, BackgroundSink
-from egovcp.log.destination import Viewer
-from egovcp.log.info import RunInfo
-from egovcp.log.live import LiveRerun
+from egovcp.log.async_sink import AsyncFanout, AsyncSink
+from egovcp.log.viewer import Viewer
+from egovcp.log.tick import RunInfo
+from egovcp.log.viewer import LiveRerun
 from egovcp.log.mcap import McapSink
 from egovcp.log.rerun import RerunSink
 folder = Path({folder!r})
 with LiveRerun("web", Viewer({address!r}), {port}) as live:
     sinks = [
-        BackgroundSink(McapSink(folder / "a.mcap"), "a.mcap"),
-        BackgroundSink(RerunSink(folder / "a.rrd"), "a.rrd"),
-        BackgroundSink(RerunSink(live.viewer), "Rerun"),
+        AsyncSink(McapSink(folder / "a.mcap"), "a.mcap"),
+        AsyncSink(RerunSink(folder / "a.rrd"), "a.rrd"),
+        AsyncSink(RerunSink(live.viewer), "Rerun"),
     ]
-    with closing(BackgroundFanout(sinks)) as log:
+    with closing(AsyncFanout(sinks)) as log:
         log.open(RunInfo("ball"))
         for index in range(10_000):
             log.write(_tick(index))
@@ -133,7 +130,7 @@ with LiveRerun("web", Viewer({address!r}), {port}) as live:
 """
 
 
-def test_nothing_outlives_a_run_that_was_killed(tmp_path: Path) -> None:
+def test_no_process_survives_a_killed_run(tmp_path: Path) -> None:
     tests, ports = str(Path(__file__).parent), (free_port(), free_port())
     code = _RUN.format(tests=tests, folder=str(tmp_path), address=address(ports[0]), port=ports[1])
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True) as run:
@@ -147,13 +144,13 @@ def test_nothing_outlives_a_run_that_was_killed(tmp_path: Path) -> None:
     assert left == []
 
 
-def test_nobody_to_connect_to(tmp_path: Path) -> None:
-    sink = BackgroundSink(RerunSink(Viewer(address(free_port())), meshes=False), "Rerun")
+def test_a_viewer_that_does_not_run_is_an_error(tmp_path: Path) -> None:
+    sink = AsyncSink(RerunSink(Viewer(address(free_port())), meshes=False), "Rerun")
     with pytest.raises(EnvironmentFailure, match="no Rerun viewer answers"):
         sink.open(INFO)
 
 
-def test_a_port_in_use() -> None:
+def test_a_port_in_use_is_an_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         live = LiveRerun("web", Viewer(address(free_port())), web_port=port)
@@ -162,6 +159,6 @@ def test_a_port_in_use() -> None:
 
 
 @pytest.mark.parametrize("words", ["", "http://127.0.0.1:9876", "rerun+http://a b:1/proxy", "x"])
-def test_what_is_no_address_is_refused(words: str) -> None:
+def test_other_addresses_are_refused(words: str) -> None:
     with pytest.raises(UsageError, match="expected rerun"):
         LiveRerun.of(words)

@@ -7,11 +7,11 @@ import os
 import numpy as np
 import pytest
 
-from egovcp.log.frames import Inbox, Outbox, enlarge, pack, receive
+from egovcp.log.pipe import Inbox, Outbox, enlarge, pack, receive
 
 
 @pytest.mark.parametrize("large", [False, True])
-def test_what_goes_in_comes_out(large: bool) -> None:
+def test_messages_arrive_complete_and_in_order(large: bool) -> None:
     rng = np.random.default_rng(0)
     messages = [rng.bytes(int(size)) for size in rng.integers(0, 300_000, 40)]
     reader, writer = os.pipe()
@@ -35,7 +35,7 @@ def test_what_goes_in_comes_out(large: bool) -> None:
     os.close(reader)
 
 
-def test_a_message_that_was_cut_off_is_not_handed_out() -> None:
+def test_a_truncated_message_is_dropped() -> None:
     reader, writer = os.pipe()
     whole = pack("whole")
     os.write(writer, len(whole).to_bytes(4, "little") + whole + b"\x20\x00\x00\x00half")
@@ -44,7 +44,7 @@ def test_a_message_that_was_cut_off_is_not_handed_out() -> None:
     os.close(reader)
 
 
-def test_a_reader_that_is_gone_is_told() -> None:
+def test_a_closed_reader_raises_broken_pipe() -> None:
     reader, writer = os.pipe()
     outbox = Outbox(writer)
     os.close(reader)

@@ -1,9 +1,8 @@
-"""The other end of `BackgroundSink`: a process that writes to one sink what comes down a pipe.
+"""The process of an `AsyncSink`: writes the ticks that arrive through a pipe to one sink.
 
-    python -m egovcp.log.scribe COMMANDS REPORTS     the numbers of two inherited pipes
+    python -m egovcp.log.writer_process COMMANDS REPORTS     two inherited pipe descriptors
 
-It outlives the process that feeds it for as long as it takes to write what lies in the pipe
-and to finish the log, and then ends.
+If the parent ends first, it writes what is left in the pipe, closes the sink and exits.
 """
 
 from __future__ import annotations
@@ -20,18 +19,29 @@ from contextlib import suppress
 from typing import Final
 
 from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.log.commands import Closed, Failed, Open, Opened, Report, Resumed, Waiting, Written
-from egovcp.log.frames import Outbox, pack, receive
+from egovcp.log.pipe import (
+    Closed,
+    Failed,
+    Open,
+    Opened,
+    Outbox,
+    Resumed,
+    Waiting,
+    WriterReport,
+    Written,
+    pack,
+    receive,
+)
 from egovcp.log.sink import RetryingSink, Sink
 from egovcp.log.tick import Tick
 
-NICENESS: Final = 5  # the loop comes first where both want the same core
-RETRY_S: Final = 0.25  # between two looks whether a full disk has room again
+NICENESS: Final = 5  # the control loop has priority on a shared core
+RETRY_S: Final = 0.25  # between two attempts while the disk is full
 
 
 def serve(commands: int, reports: int) -> None:
-    """Obey the commands from one pipe and report into the other, until the first is closed."""
-    outbox, run = Outbox(reports), os.getppid()
+    """Execute the commands of one pipe and report to the other, until the first is closed."""
+    outbox, parent = Outbox(reports), os.getppid()
     sink: Sink | None = None
     waits, count = False, 0
     try:
@@ -48,7 +58,7 @@ def serve(commands: int, reports: int) -> None:
                         if not waits or not isinstance(sink, RetryingSink) or not _is_full(error):
                             raise
                         _report(outbox, Waiting(error))
-                        _wait_for_room(sink, lambda: os.getppid() == run)
+                        _wait_for_room(sink, lambda: os.getppid() == parent)
                         _report(outbox, Resumed())
                     count += 1
                     _report(outbox, Written(count))
@@ -57,8 +67,8 @@ def serve(commands: int, reports: int) -> None:
         if sink is not None:
             sink.close()
         _report(outbox, Closed())
-    except Exception as error:  # noqa: BLE001 - whatever it is, the run must hear of it
-        _report(outbox, Failed(_portable(error)))
+    except Exception as error:  # noqa: BLE001 - every error is reported to the parent
+        _report(outbox, Failed(_picklable(error)))
         with suppress(Exception):
             if sink is not None:
                 sink.close()
@@ -68,26 +78,26 @@ def _is_full(error: OSError) -> bool:
     return error.errno in (errno.ENOSPC, errno.EDQUOT)
 
 
-def _wait_for_room(sink: RetryingSink, wanted: Callable[[], bool]) -> None:
-    """Until the disk takes the tick; raises OSError when it fails otherwise, or the run is over."""
+def _wait_for_room(sink: RetryingSink, parent_runs: Callable[[], bool]) -> None:
+    """Retry until the disk takes the tick; raise OSError on another error or without a parent."""
     while True:
         time.sleep(RETRY_S)
         try:
             return sink.retry()
         except OSError as error:
-            if not _is_full(error) or not wanted():
+            if not _is_full(error) or not parent_runs():
                 raise
 
 
-def _report(outbox: Outbox, report: Report) -> None:
-    """Say it, or leave it where nobody listens: the log is worth more than its report."""
+def _report(outbox: Outbox, report: WriterReport) -> None:
+    """Send a report; without a reader it is dropped and the log is still written."""
     with suppress(BrokenPipeError):
         outbox.put(pack(report))
         outbox.pump()
 
 
-def _portable(error: Exception) -> Exception:
-    """The error as it can be sent: ours and the system's as they are, others in words."""
+def _picklable(error: Exception) -> Exception:
+    """The error itself if it is ours or the system's and can be pickled, else its text."""
     if isinstance(error, EgovcpError | OSError):
         with suppress(Exception):
             pickle.dumps(error)
@@ -97,13 +107,13 @@ def _portable(error: Exception) -> Exception:
 
 
 def main() -> None:
-    """Entry point of the process."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the run answers it, and then closes the log
+    """Run the process."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it and closes the log
     with suppress(OSError):
         os.nice(NICENESS)
     serve(int(sys.argv[1]), int(sys.argv[2]))
     sys.stderr.flush()
-    os._exit(0)  # a library's clean-up may wait for a viewer that hangs
+    os._exit(0)  # a library's exit handler may wait for a viewer that hangs
 
 
 if __name__ == "__main__":

@@ -16,28 +16,28 @@ from typing import Any
 import pytest
 
 from egovcp.errors import EnvironmentFailure
-from egovcp.log.background import BackgroundFanout, BackgroundSink
-from egovcp.log.info import RunInfo
+from egovcp.log.async_sink import AsyncFanout, AsyncSink
 from egovcp.log.mcap import McapSink
 from egovcp.log.mcap_reader import read_recording
+from egovcp.log.tick import RunInfo
 from tests.support.sinks import FaultySink
 
 INFO = RunInfo("ball")
-type Start = Callable[..., BackgroundSink]
+type Start = Callable[..., AsyncSink]
 
 
 @pytest.fixture
-def told() -> list[str]:
+def warnings() -> list[str]:
     return []
 
 
 @pytest.fixture
-def start(told: list[str]) -> Iterator[Start]:
+def start(warnings: list[str]) -> Iterator[Start]:
     """An open background sink around the given one; closed after the test."""
-    sinks: list[BackgroundSink] = []
+    sinks: list[AsyncSink] = []
 
-    def start(sink: Any, **options: Any) -> BackgroundSink:
-        sinks.append(BackgroundSink(sink, "the log", tell=told.append, **options))
+    def start(sink: Any, **options: Any) -> AsyncSink:
+        sinks.append(AsyncSink(sink, "the log", warn=warnings.append, **options))
         sinks[-1].open(INFO)
         return sinks[-1]
 
@@ -57,8 +57,8 @@ def until(condition: Callable[[], object], seconds: float = 20.0) -> None:
     assert condition()
 
 
-def test_every_call_arrives_in_order(
-    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+def test_calls_arrive_in_order(
+    tmp_path: Path, start: Start, make_tick: Any, warnings: list[str]
 ) -> None:
     sink = start(FaultySink(tmp_path / "diary"))
     for index in range(40):
@@ -66,12 +66,10 @@ def test_every_call_arrives_in_order(
     sink.close()
     ticks = [f"tick {index}" for index in range(40)]
     assert lines(tmp_path / "diary") == ["open ball", *ticks, "close"]
-    assert (sink.dropped, sink.lost, sink.failure, told) == (0, 0, None, [])
+    assert (sink.dropped, sink.lost, sink.failure, warnings) == (0, 0, None, [])
 
 
-def test_a_tick_is_recorded_as_it_was_handed_over(
-    tmp_path: Path, start: Start, make_tick: Any
-) -> None:
+def test_a_tick_may_change_after_write(tmp_path: Path, start: Start, make_tick: Any) -> None:
     sink = start(McapSink(tmp_path / "a.mcap"))
     tick = make_tick(0)
     depth = tick.depth.copy()
@@ -83,8 +81,8 @@ def test_a_tick_is_recorded_as_it_was_handed_over(
     assert (recording.ticks[0].depth == depth).all()
 
 
-def test_what_does_not_fit_is_dropped_counted_and_told_in_the_log(
-    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+def test_dropped_ticks_are_counted_and_logged(
+    tmp_path: Path, start: Start, make_tick: Any, warnings: list[str]
 ) -> None:
     diary = tmp_path / "diary"
     sink = start(FaultySink(diary), queue_ticks=3)
@@ -107,11 +105,11 @@ def test_what_does_not_fit_is_dropped_counted_and_told_in_the_log(
     assert gaps == [(b, b - a - 1) for a, b in pairwise(kept) if b > a + 1]
     assert sink.lost == 0
     drops = f"{sink.dropped} of {index + 1} ticks were dropped"
-    assert told == [f"the log: {drops}, 0 more may be missing at its end"]
+    assert warnings == [f"the log: {drops}, 0 more may be missing at its end"]
 
 
-def test_a_disk_that_hangs_loses_nothing_if_the_queue_is_long_enough(
-    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+def test_a_long_queue_survives_a_hanging_disk(
+    tmp_path: Path, start: Start, make_tick: Any, warnings: list[str]
 ) -> None:
     sink = start(FaultySink(tmp_path / "diary"), close_timeout_s=60.0)
     os.kill(sink.pid, signal.SIGSTOP)
@@ -120,11 +118,11 @@ def test_a_disk_that_hangs_loses_nothing_if_the_queue_is_long_enough(
     os.kill(sink.pid, signal.SIGCONT)
     sink.close()
     assert sum(line.startswith("tick") for line in lines(tmp_path / "diary")) == 250
-    assert (sink.dropped, told) == (0, [])
+    assert (sink.dropped, warnings) == (0, [])
 
 
-def test_close_does_not_wait_for_a_disk_that_hangs(
-    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+def test_close_times_out_on_a_hanging_disk(
+    tmp_path: Path, start: Start, make_tick: Any, warnings: list[str]
 ) -> None:
     sink = start(FaultySink(tmp_path / "diary", stall_at=1, stall_s=200.0), close_timeout_s=0.3)
     for index in range(4):
@@ -132,13 +130,13 @@ def test_close_does_not_wait_for_a_disk_that_hangs(
     until(lambda: "stall" in lines(tmp_path / "diary"))
     sink.close()
     assert sink.lost == 3
-    assert told == [
+    assert warnings == [
         "the log: 0 of 4 ticks were dropped, 3 more may be missing at its end; it is not finished"
     ]
 
 
-def test_a_full_disk_is_told_once_and_the_run_goes_on(
-    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+def test_a_full_disk_is_reported_once(
+    tmp_path: Path, start: Start, make_tick: Any, warnings: list[str]
 ) -> None:
     sink = start(FaultySink(tmp_path / "diary", raise_at=2))
     for index in range(3):
@@ -147,14 +145,14 @@ def test_a_full_disk_is_told_once_and_the_run_goes_on(
     for index in range(3, 6):
         sink.write(make_tick(index, bare=True))
     assert isinstance(sink.failure, OSError)
-    assert told == ["the log: No space left on device; the run goes on without this log"]
+    assert warnings == ["the log: No space left on device; the run goes on without this log"]
     sink.close()
     assert sink.dropped + sink.lost == 4
-    assert len(told) == 2
+    assert len(warnings) == 2
 
 
-def test_the_death_of_its_process_is_told_once(
-    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+def test_a_killed_writer_is_reported_once(
+    tmp_path: Path, start: Start, make_tick: Any, warnings: list[str]
 ) -> None:
     sink = start(FaultySink(tmp_path / "diary"))
     os.kill(sink.pid, signal.SIGKILL)
@@ -164,22 +162,22 @@ def test_the_death_of_its_process_is_told_once(
         index += 1
         time.sleep(0.01)
     sink.write(make_tick(index, bare=True))
-    assert told == [
-        "the log: the process that writes it ended by signal 9; the run goes on without this log"
+    assert warnings == [
+        "the log: its writer process ended by signal 9; the run goes on without this log"
     ]
 
 
-def test_a_sink_that_cannot_be_opened_raises_there(tmp_path: Path, told: list[str]) -> None:
+def test_open_raises_the_error_of_the_sink(tmp_path: Path, warnings: list[str]) -> None:
     (tmp_path / "a.mcap").write_bytes(b"precious")
-    sink = BackgroundSink(McapSink(tmp_path / "a.mcap"), "the log", tell=told.append)
+    sink = AsyncSink(McapSink(tmp_path / "a.mcap"), "the log", warn=warnings.append)
     with pytest.raises(EnvironmentFailure, match="exists already"):
         sink.open(INFO)
     sink.close()
-    assert told == []
+    assert warnings == []
 
 
-def test_lossless_waits_instead_of_dropping(
-    tmp_path: Path, start: Start, make_tick: Any, told: list[str]
+def test_lossless_blocks_instead_of_dropping(
+    tmp_path: Path, start: Start, make_tick: Any, warnings: list[str]
 ) -> None:
     sink = start(
         FaultySink(tmp_path / "diary", stall_at=1, stall_s=0.5), queue_ticks=2, lossless=True
@@ -188,33 +186,33 @@ def test_lossless_waits_instead_of_dropping(
         sink.write(make_tick(index))
     sink.close()
     assert sum(line.startswith("tick") for line in lines(tmp_path / "diary")) == 60
-    assert (sink.dropped, told) == (0, [])
+    assert (sink.dropped, warnings) == (0, [])
 
 
-def test_one_that_hangs_does_not_hold_up_its_neighbours(
-    tmp_path: Path, make_tick: Any, told: list[str]
+def test_a_hanging_sink_does_not_block_the_others(
+    tmp_path: Path, make_tick: Any, warnings: list[str]
 ) -> None:
     sinks = [
-        BackgroundSink(FaultySink(tmp_path / "a", stall_at=0, stall_s=200.0), "a",
-                       close_timeout_s=0.2, tell=told.append),
-        BackgroundSink(FaultySink(tmp_path / "b"), "b", tell=told.append),
+        AsyncSink(FaultySink(tmp_path / "a", stall_at=0, stall_s=200.0), "a",
+                       close_timeout_s=0.2, warn=warnings.append),
+        AsyncSink(FaultySink(tmp_path / "b"), "b", warn=warnings.append),
     ]  # fmt: skip
-    with closing(BackgroundFanout(sinks)) as both:
+    with closing(AsyncFanout(sinks)) as both:
         both.open(INFO)
         for index in range(3):
             both.write(make_tick(index, bare=True))
     assert lines(tmp_path / "b") == ["open ball", "tick 0", "tick 1", "tick 2", "close"]
-    assert [line[:2] for line in told] == ["a:"]
+    assert [line[:2] for line in warnings] == ["a:"]
 
 
-def test_if_one_cannot_be_opened_none_is_left_running(tmp_path: Path, told: list[str]) -> None:
+def test_open_closes_all_sinks_if_one_fails(tmp_path: Path, warnings: list[str]) -> None:
     (tmp_path / "a.mcap").write_bytes(b"precious")
     sinks = [
-        BackgroundSink(FaultySink(tmp_path / "b"), "b", tell=told.append),
-        BackgroundSink(McapSink(tmp_path / "a.mcap"), "a", tell=told.append),
+        AsyncSink(FaultySink(tmp_path / "b"), "b", warn=warnings.append),
+        AsyncSink(McapSink(tmp_path / "a.mcap"), "a", warn=warnings.append),
     ]
     with pytest.raises(EnvironmentFailure):
-        BackgroundFanout(sinks).open(INFO)
+        AsyncFanout(sinks).open(INFO)
     assert lines(tmp_path / "b") == ["open ball", "close"]
 
 
@@ -223,11 +221,11 @@ import sys, time
 from pathlib import Path
 sys.path.insert(0, {tests!r})
 from conftest import _tick
-from egovcp.log.background import BackgroundSink
-from egovcp.log.info import RunInfo
+from egovcp.log.async_sink import AsyncSink
+from egovcp.log.tick import RunInfo
 from egovcp.log.mcap import McapSink
 sink = McapSink(Path({path!r}))
-sink = BackgroundSink(sink, "log") if {background} else sink
+sink = AsyncSink(sink, "log") if {background} else sink
 sink.open(RunInfo("ball"))
 for index in range(10_000):
     sink.write(_tick(index))

@@ -1,0 +1,323 @@
+"""A sink that never blocks the control loop: a separate process writes the ticks.
+
+    write(tick) -> bounded queue -> pipe -> writer process: sink.write(tick)
+
+A thread would not do: encoding a tick holds the interpreter lock for milliseconds, and a disk that
+hangs would block the exit. The loop only pickles the tick and writes to a non-blocking pipe
+(`benchmarks/tick_logging.py` measures both).
+
+A tick that does not fit into the queue is dropped and counted, also while the disk is full. Any
+other failure of the writer (a closed viewer, a broken disk, a killed process) is reported once, as
+one line; the sink then ignores further ticks and the run continues.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from typing import Final
+
+from egovcp.errors import EgovcpError, EnvironmentFailure
+from egovcp.log.pipe import (
+    Close,
+    Closed,
+    Failed,
+    Inbox,
+    Open,
+    Opened,
+    Outbox,
+    Resumed,
+    Waiting,
+    WriterReport,
+    Written,
+    enlarge,
+    pack,
+)
+from egovcp.log.sink import Sink
+from egovcp.log.tick import RunInfo, Tick
+from egovcp.terminal import echo
+
+QUEUE_TICKS: Final = 300  # 12 s at 25 Hz: a disk may hang for 10 s without loss
+START_TIMEOUT_S: Final = 60.0
+CLOSE_TIMEOUT_S: Final = 10.0
+_KILL_TIMEOUT_S: Final = 1.0  # a process that waits for a disk does not end on SIGKILL
+
+
+def warn_on_stderr(line: str) -> None:
+    """Print ``line`` to stderr."""
+    echo(line, error=True)
+
+
+class AsyncSink:
+    """Writes to ``sink`` in a separate process.
+
+    `write` always returns at once. `open` waits until the sink is open and raises its errors, so
+    that a run does not start with a log that cannot be written.
+
+    Args:
+        sink: the sink to open and write; must be picklable before it is opened.
+        name: its name in messages, such as ``rollout-0.mcap``.
+        lossless: block instead of dropping ticks, for a simulation in lock-step. A full disk is
+            then an error.
+        queue_ticks: capacity of the queue in this process.
+        close_timeout_s: how long `close` waits for queued ticks.
+        warn: receives each message, one line.
+    """
+
+    def __init__(
+        self,
+        sink: Sink,
+        name: str,
+        *,
+        lossless: bool = False,
+        queue_ticks: int = QUEUE_TICKS,
+        close_timeout_s: float = CLOSE_TIMEOUT_S,
+        warn: Callable[[str], None] = warn_on_stderr,
+    ) -> None:
+        self._sink, self.name = sink, name
+        self._lossless, self._capacity = lossless, queue_ticks
+        self._close_timeout_s, self._warn = close_timeout_s, warn
+        self._process: _WriterProcess | None = None
+        self._opened = self._closed = False
+        self._accepted = self._written = self._gap = 0
+        self._dropped = 0
+        self._failure: Exception | None = None
+
+    @property
+    def dropped(self) -> int:
+        """Number of ticks dropped because the queue was full or the sink had failed."""
+        return self._dropped
+
+    @property
+    def lost(self) -> int:
+        """Number of accepted ticks without a confirmation that they were written."""
+        return self._accepted - self._written
+
+    @property
+    def failure(self) -> Exception | None:
+        """The error of the sink; None while it works."""
+        return self._failure
+
+    @property
+    def pid(self) -> int:
+        """Process id of the writer, from `start` to `close`."""
+        assert self._process is not None, "it runs from `start` to `close`"
+        return self._process.pid
+
+    def start(self) -> None:
+        """Start the process without waiting for it. `open` calls this; starting several sinks
+        before opening the first saves time."""
+        if self._process is None:
+            self._process = _WriterProcess()
+
+    def open(self, info: RunInfo) -> None:
+        """Open the sink in its process, and wait for it.
+
+        Raises:
+            EgovcpError, OSError: the error of the sink.
+            EnvironmentFailure: the process did not start in time.
+        """
+        self.start()
+        assert self._process is not None
+        self._process.outbox.put(pack(Open(self._sink, info, waits=not self._lossless)))
+        self._await(lambda: self._opened, START_TIMEOUT_S)
+        if not self._opened:
+            self.close()
+            raise self._failure or EnvironmentFailure(
+                f"{self.name}: its writer process was not ready in {START_TIMEOUT_S:.0f} s"
+            )
+
+    def write(self, tick: Tick) -> None:
+        """Queue the tick, or drop it."""
+        self.write_packed(tick, pack(tick))
+
+    def write_packed(self, tick: Tick, packed: bytes) -> None:
+        """`write` for a tick that is already serialised."""
+        process = self._process
+        assert process is not None, "open the sink before writing to it"
+        self._pump()
+        if self._lossless:
+            self._await(lambda: len(process.outbox) < self._capacity, float("inf"))
+        if self._failure is not None or len(process.outbox) >= self._capacity:
+            self._dropped += 1
+            self._gap += 1
+            return
+        process.outbox.put(pack(self._with_gap(tick)) if self._gap else packed)
+        self._accepted += 1
+        self._pump()
+
+    def close(self) -> None:
+        """Close the sink, waiting at most ``close_timeout_s``; report lost ticks."""
+        if self._process is None:
+            return
+        if self._opened and self._failure is None:
+            self._process.outbox.put(pack(Close()))
+            self._await(lambda: self._closed, self._close_timeout_s)
+        self._process.kill()
+        self._process = None
+        self._report_losses()
+
+    def _with_gap(self, tick: Tick) -> Tick:
+        """The first tick after a gap, with an event that says how many were dropped."""
+        gap, self._gap = self._gap, 0
+        return replace(tick, events=(*tick.events, f"{gap} ticks missing: the log was too slow"))
+
+    def _await(self, ready: Callable[[], bool], timeout_s: float) -> None:
+        """Pump until ``ready``, a failure, or the timeout."""
+        assert self._process is not None
+        end = time.monotonic() + timeout_s
+        while self._failure is None and not ready() and (left := end - time.monotonic()) > 0:
+            self._process.wait(left)
+            self._pump()
+
+    def _pump(self) -> None:
+        """Exchange bytes with the process without blocking."""
+        assert self._process is not None
+        if self._failure is not None or self._closed:
+            return
+        try:
+            for report in self._process.exchange():
+                self._handle(report)
+        except (EOFError, BrokenPipeError):
+            if not self._closed and self._failure is None:
+                self._fail(EnvironmentFailure(self._process.exit_text()))
+
+    def _handle(self, report: WriterReport) -> None:
+        match report:
+            case Opened():
+                self._opened = True
+            case Written():
+                self._written = report.count
+            case Waiting():
+                self._warn(f"{self.name}: {_text(report.error)}; ticks wait until there is room")
+            case Resumed():
+                self._warn(f"{self.name}: there is room again")
+            case Closed():
+                self._closed = True
+            case Failed():
+                self._fail(report.error)
+
+    def _fail(self, error: Exception) -> None:
+        self._failure = error
+        if self._opened:  # otherwise `open` raises it
+            self._warn(f"{self.name}: {_text(error)}; the run goes on without this log")
+
+    def _report_losses(self) -> None:
+        if self._opened and (self._dropped or self.lost):
+            total = self._accepted + self._dropped
+            unfinished = "" if self._closed else "; it is not finished"
+            self._warn(
+                f"{self.name}: {self._dropped} of {total} ticks were dropped, "
+                f"{self.lost} more may be missing at its end{unfinished}"
+            )
+        elif self._opened and not self._closed:
+            self._warn(f"{self.name}: not finished in time; it has every tick but no index")
+
+
+class AsyncFanout:
+    """A sink that writes to several `AsyncSink`; a tick is serialised once for all of them."""
+
+    def __init__(self, sinks: Sequence[AsyncSink]) -> None:
+        self.sinks = tuple(sinks)
+
+    def open(self, info: RunInfo) -> None:
+        """Open every sink; if one fails, close all and raise its error."""
+        for sink in self.sinks:
+            sink.start()
+        try:
+            for sink in self.sinks:
+                sink.open(info)
+        except BaseException:
+            self.close()
+            raise
+
+    def write(self, tick: Tick) -> None:
+        """Queue ``tick`` for every sink."""
+        packed = pack(tick)
+        for sink in self.sinks:
+            sink.write_packed(tick, packed)
+
+    def close(self) -> None:
+        """Close every sink, one after the other."""
+        for sink in self.sinks:
+            sink.close()
+
+
+class _WriterProcess:
+    """The process and the two pipes to it."""
+
+    def __init__(self) -> None:
+        theirs, self._commands = os.pipe()
+        self._reports, theirs_too = os.pipe()
+        enlarge(self._commands)
+        self.outbox = Outbox(self._commands)
+        self._inbox = Inbox(self._reports)
+        command = [sys.executable, "-m", "egovcp.log.writer_process", str(theirs), str(theirs_too)]
+        modules = os.pathsep.join(path for path in sys.path if path)
+        self._process = subprocess.Popen(
+            command,
+            pass_fds=(theirs, theirs_too),
+            stdin=subprocess.DEVNULL,
+            # Rerun stays quiet: errors are reported through the pipe
+            env={"RUST_LOG": "off"} | os.environ | {"PYTHONPATH": modules},
+            start_new_session=True,  # Ctrl-C in the terminal does not reach it
+        )
+        os.close(theirs)
+        os.close(theirs_too)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def exchange(self) -> Iterator[WriterReport]:
+        """Send what fits into the pipe; yield the reports that have arrived.
+
+        Raises:
+            EOFError, BrokenPipeError: the process has ended.
+        """
+        broken: BrokenPipeError | None = None
+        try:
+            self.outbox.pump()
+        except BrokenPipeError as error:
+            broken = error
+        yield from self._inbox.ready()  # includes the last reports of a process that has ended
+        if broken is not None:
+            raise broken
+
+    def wait(self, seconds: float) -> None:
+        """Wait until a pipe is readable or writable, at most ``seconds``."""
+        poll = select.poll()
+        poll.register(self._reports, select.POLLIN)
+        if len(self.outbox):
+            poll.register(self._commands, select.POLLOUT)
+        poll.poll(min(seconds, 1.0) * 1e3)
+
+    def exit_text(self) -> str:
+        """How the process ended."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_KILL_TIMEOUT_S)
+        code = self._process.poll()
+        how = f"by signal {-code}" if code is not None and code < 0 else f"with code {code}"
+        return f"its writer process ended {how}"
+
+    def kill(self) -> None:
+        """Kill the process unless it has ended, and close the pipes."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(0.05)
+        self._process.kill()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(_KILL_TIMEOUT_S)
+        for descriptor in (self._commands, self._reports):
+            os.close(descriptor)
+
+
+def _text(error: Exception) -> str:
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    return str(error) if isinstance(error, EgovcpError) else f"{type(error).__name__}: {error}"
