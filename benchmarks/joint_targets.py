@@ -1,4 +1,4 @@
-"""How far each joint's target passes the joint's range: what `egovcp.robot.targets` allows.
+"""How far each joint's target passes the joint's range: what `egovcp.robot.kinematics` allows.
 
 Plays every task with both low-level controllers, once with random hands and once with the oracle
 (blocks, braces after pushes, walks under the arch). Robots that fall are left out: a controller
@@ -13,13 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from report import parser, publish
 
-from egovcp.robot.controller import LowLevelController
-from egovcp.robot.controllers import make_controller
+from egovcp.robot.controllers import LowLevelController, make_controller
 from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER
-from egovcp.sim.config import eventful
+from egovcp.sim.config import evaluation_config
 from egovcp.sim.env import VectorEnv
-from egovcp.sim.oracles import Oracle
-from egovcp.sim.policies import Policy, RandomWalk
+from egovcp.sim.policies import EnvPolicy, Oracle, RandomWalk
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import JOINT_NAMES, TASKS
 
@@ -45,17 +43,17 @@ class TargetRecorder:
         return target
 
 
-def excess(which: str, task: str, policy: Policy, robots: int, seed: int) -> tuple[Array, Array]:
+def excess(which: str, task: str, policy: EnvPolicy, robots: int, seed: int) -> tuple[Array, Array]:
     """(29,) rad below and above the range, the greatest of all robots that did not fall."""
     recorder = TargetRecorder(make_controller(which), robots)
-    config = replace(eventful(), controller=which)
-    env = VectorEnv(config, robots, recorder, pictures=False)  # type: ignore[arg-type]
+    config = replace(evaluation_config(), controller=which)
+    env = VectorEnv(config, robots, recorder, render_depth=False)  # type: ignore[arg-type]
     scenarios = [Scenario(task, seed, i) for i in range(robots)]
     env.reset(scenarios)
     policy.reset(env, scenarios)
     while not env.done.all():
         env.step(policy.act(env))
-    stood = np.array([not lane.terminated for lane in env.lanes])
+    stood = np.array([not lane.terminated for lane in env.instances])
     below = recorder.below[stood].max(axis=0, initial=-np.inf)
     above = recorder.above[stood].max(axis=0, initial=-np.inf)
     return below, above

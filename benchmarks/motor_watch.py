@@ -13,13 +13,13 @@ from report import parser, publish
 
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.controllers import make_controller
+from egovcp.robot.geometry import rotation_matrix
 from egovcp.sim.config import SensorConfig
-from egovcp.sim.sensors import noise_std
+from egovcp.sim.robot import noise_std
 from egovcp.spec import CONTROLLER_HZ, JOINT_NAMES, STATE_SLICES
 from egovcp_deploy.pilot.motor_watch import MotorWatch
 from egovcp_deploy.robots.body import BodyState, MotorCommand
 from egovcp_train.lowlevel import events
-from egovcp_train.lowlevel.geometry import rotation
 from egovcp_train.lowlevel.physics import Physics
 from egovcp_train.lowlevel.sensing import measure
 from egovcp_train.lowlevel.skills import SKILLS, Skill
@@ -59,7 +59,7 @@ def play(
         physics.step(sent, delay)
         x = physics.snapshot()
         state = measure(x, command, std, rng)
-        standing &= (rotation(x.quaternion)[:, 2, 2] > np.cos(_FALLEN_TILT)) & ~x.broken
+        standing &= (rotation_matrix(x.quaternion)[:, 2, 2] > np.cos(_FALLEN_TILT)) & ~x.broken
         for i in np.flatnonzero(standing):
             torque = x.torque[i].copy()
             if dropped and tick >= _DROPPED_TICK:

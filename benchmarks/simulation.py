@@ -25,7 +25,7 @@ from report import parser, publish
 
 from egovcp.hardware import available_cores
 from egovcp.robot import arms
-from egovcp.sim.camera import DepthCamera, DepthNoise
+from egovcp.sim.camera import DepthNoise, RayCastCamera
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import RandomWalk
@@ -114,7 +114,7 @@ def timed_parts(env: VectorEnv) -> Iterator[dict[str, float]]:
         "controller": (env.controller, "step"),
         "ik": (arms, "improve"),
         "physics": (mujoco, "mj_step"),
-        "depth": (DepthCamera, "render"),
+        "depth": (RayCastCamera, "render"),
         "depth_noise": (DepthNoise, "apply"),
     }
     spent = dict.fromkeys(places, 0.0)

@@ -24,7 +24,7 @@ from report import parser, publish
 
 from egovcp.intervals import Interval, wilson
 from egovcp.robot.controllers import make_controller
-from egovcp.sim.config import EnvConfig, eventful
+from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.sim.scenario import Scenario
 from egovcp_deploy.constant_search import Action, search_constant
 from egovcp_deploy.episodes import Group, Setup, Stage
@@ -167,7 +167,7 @@ def main() -> None:
         help="m/s, speeds at which the wall is also played",
     )
     args = options.parse_args()
-    base = replace(eventful(), controller=args.controller)
+    base = replace(evaluation_config(), controller=args.controller)
     published: dict[str, object] = {}
 
     def measured(name: str, env: EnvConfig, task: str, players: Sequence[str]) -> dict[str, Result]:

@@ -18,11 +18,10 @@ from tqdm import tqdm
 from egovcp import spec
 from egovcp.data import DatasetReader, Episode
 from egovcp.errors import DataError
-from egovcp.sim.env import VectorEnv
+from egovcp.robot.geometry import rotation_matrix
+from egovcp.sim.env import PrivilegedState, VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import PARTS
-from egovcp.sim.sensors import base_rotation
-from egovcp.sim.truth import Truth
 from egovcp_collect.dataset.again import changed_versions, scenario_of, simulated_again
 
 type Array = NDArray[np.float32]
@@ -48,9 +47,9 @@ class Watch:
 
     def __call__(self, env: VectorEnv, live: NDArray[np.bool_]) -> None:
         """Note a row for each robot whose episode is not over."""
-        truth = env.snapshot()
+        truth = env.privileged_state()
         for row in np.flatnonzero(live).tolist():
-            lane = env.lanes[row]
+            lane = env.instances[row]
             found = _columns(truth, row) | {"delay": np.array([lane.action_delay * 0.02])}
             self._rows.setdefault(lane.scenario, []).append(found)
 
@@ -60,10 +59,10 @@ class Watch:
         return {name: np.stack([row[name] for row in rows]).astype(np.float32) for name in rows[0]}
 
 
-def _columns(truth: Truth, row: int) -> dict[str, NDArray[np.float64]]:
+def _columns(truth: PrivilegedState, row: int) -> dict[str, NDArray[np.float64]]:
     """One robot's truth. ``_b``: heading frame, from the pelvis; SI units."""
     pelvis = truth.pelvis_w[row]
-    rotation = base_rotation(pelvis[3:])
+    rotation = rotation_matrix(pelvis[3:])
     heading = _heading(rotation)
 
     def seen(points_w: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -92,11 +91,11 @@ def _columns(truth: Truth, row: int) -> dict[str, NDArray[np.float64]]:
     }
 
 
-def _facing(truth: Truth, row: int, heading: NDArray[np.float64]) -> NDArray[np.float64]:
+def _facing(truth: PrivilegedState, row: int, heading: NDArray[np.float64]) -> NDArray[np.float64]:
     """(3,) x axis of the thing in the scene; zeros if there is none."""
     if not truth.solids[row]:
         return np.zeros(3)
-    return np.asarray(base_rotation(truth.solids[row][0].quaternion_w)[:, 0] @ heading)
+    return np.asarray(rotation_matrix(truth.solids[row][0].quaternion_w)[:, 0] @ heading)
 
 
 def _heading(rotation: NDArray[np.float64]) -> NDArray[np.float64]:

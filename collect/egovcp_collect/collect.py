@@ -17,7 +17,7 @@ from egovcp.data.committer import Committer, committing
 from egovcp.data.source import local_root
 from egovcp.packages import require_packages
 from egovcp.robot.controllers import make_controller
-from egovcp.sim.env import decided
+from egovcp.sim.env import resolve_config
 from egovcp.sim.scenario import Scenario
 from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
@@ -62,7 +62,7 @@ def collect(config: CollectConfig, command: str = "") -> None:
     config.check()
     if config.backend == "ray":
         require_packages("egovcp-collect", "--backend=ray", "ray")
-    config = replace(config, env=decided(config.env))
+    config = replace(config, env=resolve_config(config.env))
     provenance = _provenance(config, command)
     agree = partial(require_same, provenance) if config.resume else None
     root = local_root(config.dataset)

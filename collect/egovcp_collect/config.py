@@ -10,8 +10,7 @@ from egovcp.data import DatasetConfig
 from egovcp.data.schema import SHARD_EPISODES
 from egovcp.errors import UsageError, suggest
 from egovcp.hardware import available_cores
-from egovcp.sim.capacity import require_robots
-from egovcp.sim.config import EnvConfig
+from egovcp.sim.config import EnvConfig, require_memory_for_robots
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT, TASKS
 
@@ -76,7 +75,8 @@ class CollectConfig:
         if self.backend == "local":  # a cluster has other cores and other memory
             require_cores("--num_workers", self.num_workers)
             workers = self.num_workers or available_cores()
-            require_robots("--num_envs", self.num_envs, min(self.num_envs * workers, self.episodes))
+            robots = min(self.num_envs * workers, self.episodes)
+            require_memory_for_robots("--num_envs", self.num_envs, robots)
         choices = (*TASKS, ALL_TASKS)
         if self.task not in choices:
             raise UsageError(f"unknown task --task={self.task}{suggest(self.task, choices)}")

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from egovcp import spec
 from egovcp.data import Episode
 from egovcp.sim.env import Observation, StepResult
-from egovcp.sim.lane import Lane
+from egovcp.sim.instance import EnvInstance
 from egovcp.sim.scene import HANDS
 
 #: The arrays that a record and an `Episode` share: shape and type per tick.
@@ -67,42 +67,42 @@ class Record:
             acted = self._ticks.setdefault(name, np.zeros(len(live), dtype=np.int64))
             acted[rows] += term[rows] != 0
 
-    def touch(self, row: int, lane: Lane) -> None:
+    def touch(self, row: int, instance: EnvInstance) -> None:
         """Count the contacts of a row's last tick."""
-        touched = lane.task.forces > 0
+        touched = instance.task.forces > 0
         hands = touched[list(HANDS)].any()
         self._contacts[row] += hands, touched.sum() > touched[list(HANDS)].sum()
 
-    def episode(self, row: int, lane: Lane) -> Episode:
+    def episode(self, row: int, instance: EnvInstance) -> Episode:
         """The finished episode of a row."""
         length = int(self._length[row])
         return Episode(
             **{name: array[row, :length].copy() for name, array in self._arrays.items()},
-            task=lane.scenario.task,
-            time_limit=lane.task.ticks_limit,
-            metadata={**_facts(lane), **self._counts(row, lane)},
+            task=instance.scenario.task,
+            time_limit=instance.task.ticks_limit,
+            metadata={**_facts(instance), **self._counts(row, instance)},
         )
 
-    def _counts(self, row: int, lane: Lane) -> dict[str, Any]:
+    def _counts(self, row: int, instance: EnvInstance) -> dict[str, Any]:
         """Sum of each reward term and the ticks in which it was not zero; ticks with contacts."""
         hands, other = self._contacts[row].tolist()
         return {
             "reward_terms": {
                 name: {"sum": float(self._sums[name][row]), "ticks": int(self._ticks[name][row])}
-                for name in lane.task.terms
+                for name in instance.task.terms
             },
             "contact_ticks": {"hands": hands, "other": other},
         }
 
 
-def _facts(lane: Lane) -> dict[str, Any]:
+def _facts(instance: EnvInstance) -> dict[str, Any]:
     return {
-        "seed": lane.scenario.seed,
-        "episode": lane.scenario.episode,
-        "event_tick": lane.task.event_tick,
-        "action_delay": lane.action_delay,
-        "image_age": lane.image_age,
-        "camera_pitch": lane.camera_pitch,
-        "physics": asdict(lane.physics),
-        "scene": lane.task.parameters,
+        "seed": instance.scenario.seed,
+        "episode": instance.scenario.episode,
+        "event_tick": instance.task.event_tick,
+        "action_delay": instance.action_delay,
+        "image_age": instance.image_age,
+        "camera_pitch": instance.camera_pitch,
+        "physics": asdict(instance.physics),
+        "scene": instance.task.parameters,
     }

@@ -82,11 +82,11 @@ class Simulation:
         self._observation = result.observation
         progress.steps += int(live.sum())
         for row in np.flatnonzero(live):
-            lane = env.lanes[row]
-            self._record.touch(row, lane)
-            if lane.done:
-                episode = self._record.episode(row, lane)
-                progress.episodes.append((lane.scenario.episode, episode))
+            instance = env.instances[row]
+            self._record.touch(row, instance)
+            if instance.done:
+                episode = self._record.episode(row, instance)
+                progress.episodes.append((instance.scenario.episode, episode))
 
     def _filled(self) -> VectorEnv:
         """The environment, every robot busy as long as episodes wait."""
@@ -103,7 +103,7 @@ class Simulation:
         first = self._next(min(config.num_envs, len(self._waiting)))
         limits = [config.env.episode(task).ticks for task in TASKS]
         self._record = Record(len(first), max(limits))
-        self._env = VectorEnv(config.env, len(first), pictures=self._pictures)
+        self._env = VectorEnv(config.env, len(first), render_depth=self._pictures)
         self._observation = self._env.reset(first)
         self._policy.reset(self._env, first)
         return self._env

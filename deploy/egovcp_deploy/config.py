@@ -10,7 +10,7 @@ import draccus
 from egovcp.bounds import bounded
 from egovcp.policy_options import PlannerOptions, PolicyOptions
 from egovcp.robot.controllers import absolute_controller
-from egovcp.sim.config import EnvConfig, eventful
+from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp_deploy.live.gamepad import GamepadOptions
 from egovcp_deploy.live.hardware import CameraOptions
 from egovcp_deploy.options import PLANNER, absolute_path
@@ -91,7 +91,7 @@ class DeployConfig:
     imagine: int = bounded(16, least=0, most=1000)
     """How far ahead the world model imagines depth for the recordings, ticks of 40 ms; 0: not at
     all."""
-    env: EnvConfig = field(default_factory=eventful)
+    env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation of the simulated robot."""
 
     def encoded(self) -> dict[str, Any]:

@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 
 from egovcp.plan import PolicyStep, blank_observation
 from egovcp.sim.env import Observation, VectorEnv
-from egovcp.sim.oracles import Oracle
-from egovcp.sim.policies import Hold, RandomWalk
-from egovcp.sim.policies import Policy as ReferencePolicy
+from egovcp.sim.policies import EnvPolicy as ReferencePolicy
+from egovcp.sim.policies import Hold, Oracle, RandomWalk
 from egovcp.sim.scenario import Scenario
 from egovcp_deploy.options import PLANNER
 from egovcp_deploy.policy import RolloutPolicy

@@ -11,7 +11,7 @@ from egovcp.cli import run_command
 from egovcp.errors import EgovcpError, UsageError
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.policy_options import load_policy
-from egovcp.sim.scenario import PLAYABLE
+from egovcp.sim.scenario import EPISODE_TASKS
 from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.drive import check_live, drive, drive_simulated
@@ -73,7 +73,7 @@ def deploy(config: DeployConfig) -> None:
 
 
 def _check(config: DeployConfig) -> None:
-    check_choice("--task", config.task, PLAYABLE)
+    check_choice("--task", config.task, EPISODE_TASKS)
     check_choice("--robot.type", config.robot.type, ROBOTS)
     check_choice("--controller", config.controller, DRIVERS)
     held_out(config.task, config.seed, 0)

@@ -21,10 +21,9 @@ from egovcp.hardware import available_cores
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork
 from egovcp.robot.controllers import make_controller
-from egovcp.sim.capacity import require_robots
-from egovcp.sim.config import EnvConfig, eventful
-from egovcp.sim.env import decided
-from egovcp.sim.scenario import PLAYABLE, Scenario
+from egovcp.sim.config import EnvConfig, evaluation_config, require_memory_for_robots
+from egovcp.sim.env import resolve_config
+from egovcp.sim.scenario import EPISODE_TASKS, Scenario
 from egovcp.spec import TASKS
 from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
@@ -104,7 +103,7 @@ class EvalConfig:
     """Robots that each process plays side by side."""
     num_workers: int = bounded(0, least=0, per_core=MOST_PER_CORE)
     """Processes; 0: one per processor core."""
-    env: EnvConfig = field(default_factory=eventful)
+    env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation."""
 
     @property
@@ -120,13 +119,13 @@ class EvalConfig:
 
     def check(self) -> None:
         """Raise `UsageError` for values that make no sense."""
-        check_choice("--task", self.task, (*PLAYABLE, _ALL))
+        check_choice("--task", self.task, (*EPISODE_TASKS, _ALL))
         for name in self.players:
             check_choice("--controllers", name, (*CONTROLLERS, PPO))
         check_bounds(self, "--")
         workers = self.num_workers or available_cores()
         robots = min(self.num_envs * workers, self.episodes * len(self.tasks))
-        require_robots("--num_envs", self.num_envs, robots)
+        require_memory_for_robots("--num_envs", self.num_envs, robots)
         held_out(self.tasks[0], self.seed, 0)
         if "planner" in self.players:
             self.policy.require("leave planner out of --controllers")
@@ -157,7 +156,7 @@ def evaluate(config: EvalConfig) -> None:
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     config.check()
-    config = replace(config, env=decided(config.env))
+    config = replace(config, env=resolve_config(config.env))
     constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
     artifact = _load_policy(config)
     ppo = _load_ppo(config)

@@ -1,17 +1,18 @@
-"""Which low-level controller: by name, or by the file of a trained one."""
+"""Low-level controllers: the interface between commands and joints, and choice by name or file."""
 
 from __future__ import annotations
 
 import os
 from importlib import resources
 from pathlib import Path
-from typing import Final
+from typing import Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
-from egovcp.robot.controller import LowLevelController
 from egovcp.robot.stance import StanceController
-from egovcp.robot.walk_onnx import OnnxPolicy
-from egovcp.robot.walk_policy import WalkPolicy
+from egovcp.robot.walk_policy import OnnxPolicy, WalkPolicy
 from egovcp.robot.walking import WalkingController
 
 STANCE: Final = "stance"
@@ -19,13 +20,61 @@ WALK: Final = "walk"
 _SHIPPED: Final = "g1_walk.safetensors"
 
 
+class LowLevelController(Protocol):
+    """Tracks the command c = [v, p_ee, h_body] in the observation; batched over robots, 50 Hz.
+
+    It reads proprioception only, as a real G1 measures it (section III-A of the paper).
+    """
+
+    @property
+    def id(self) -> str:
+        """Identity of the control law and its numbers; datasets with different ids never mix."""
+        ...
+
+    @property
+    def walks(self) -> bool:
+        """Whether it follows the velocity part of the command."""
+        ...
+
+    @property
+    def stepping(self) -> NDArray[np.bool_]:
+        """(B,) which robots were taking steps in the last `step`."""
+        ...
+
+    @property
+    def stiffness(self) -> NDArray[np.float64]:
+        """(J,) proportional gains that the joint servos must run, N m/rad."""
+        ...
+
+    @property
+    def damping(self) -> NDArray[np.float64]:
+        """(J,) derivative gains that the joint servos must run, N m s/rad."""
+        ...
+
+    def reset(self, state: NDArray[np.floating], rows: NDArray[np.intp] | None = None) -> None:
+        """Reset the internal state of ``rows`` to the measured posture.
+
+        Args:
+            state: (B, 74) observations in the layout of ``spec.STATE_SLICES``, all rows.
+            rows: indices of the rows to reset; None resets the batch size too.
+        """
+        ...
+
+    def step(self, state: NDArray[np.floating]) -> NDArray[np.float64]:
+        """(B, 74) observations -> (B, 29) joint position targets, rad, ``JOINT_NAMES`` order.
+
+        Gravity feed-forward torques are part of the targets, divided by the stiffness.
+        """
+        ...
+
+
 def is_controller_file(which: str) -> bool:
-    """Whether a controller is named by a file, not as ``stance`` or ``walk``."""
+    """Whether ``which`` is the path of a controller's file."""
     return which.endswith((".safetensors", ".onnx"))
 
 
 def absolute_controller(which: str) -> str:
-    """The name of a controller that means the same in any working directory."""
+    """``which``, as an absolute path if it is a file."""
     return os.path.abspath(os.path.expanduser(which)) if is_controller_file(which) else which
 
 
@@ -45,9 +94,9 @@ def load_walk_policy(which: str) -> WalkPolicy:
 
 
 def make_controller(which: str) -> LowLevelController:
-    """``stance``, ``walk``, or the path of a ``walk.safetensors`` or of its export to ONNX.
+    """The controller ``which``: ``stance`` (LQR), ``walk`` (trained, shipped), or a file.
 
-    ``stance`` is the LQR, ``walk`` the trained controller that the package ships.
+    A file is a ``walk.safetensors`` or its export to ONNX.
 
     Raises:
         UsageError: neither.

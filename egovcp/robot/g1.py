@@ -1,8 +1,7 @@
-"""The Unitree G1 (29 joints): model file, actuator constants, gains and home pose.
+"""The Unitree G1 (29 joints): model file, actuator constants and servo gains.
 
-Actuator numbers restate ``g1_constants.py`` of the mjlab wheel (Apache-2.0),
-where Unitree's motor data are published: rotor inertias, gear stages, effort and
-velocity limits. Arrays are (J,) in the order of ``spec.JOINT_NAMES``.
+Actuator numbers are those of ``g1_constants.py`` in the mjlab wheel (Apache-2.0): rotor inertias,
+gear stages, effort and velocity limits. Arrays are (J,) in the order of ``spec.JOINT_NAMES``.
 """
 
 from __future__ import annotations
@@ -85,8 +84,8 @@ _MOTORS: Final[dict[str, tuple[Motor, int]]] = {
     "wrist_yaw": (M4010, 1),
 }
 
-#: Arm gains that replace the published 10 Hz ones (kp 14, a 1.6 Hz arm that lags 6-8 cm
-#: behind the random walk): joint name ending -> (kp N m/rad, kd N m s/rad).
+#: Arm gains that replace the published ones (kp 14), with which hands lag 6-8 cm behind the random
+#: walk: joint name ending -> (kp N m/rad, kd N m s/rad).
 _ARM_GAINS: Final[dict[str, tuple[float, float]]] = {
     "shoulder_pitch": (80.0, 5.0),
     "shoulder_roll": (80.0, 5.0),
@@ -101,13 +100,13 @@ _NATURAL_FREQUENCY: Final = 10.0 * 2.0 * math.pi  # rad/s
 _DAMPING_RATIO: Final = 2.0
 
 
-def _kind(joint: str) -> str:
+def joint_kind(joint: str) -> str:
     """``left_hip_pitch_joint`` -> ``hip_pitch``."""
     return joint.removesuffix("_joint").removeprefix("left_").removeprefix("right_")
 
 
 def _per_joint(value: dict[str, float]) -> NDArray[np.float64]:
-    array = np.array([value[_kind(name)] for name in JOINT_NAMES])
+    array = np.array([value[joint_kind(name)] for name in JOINT_NAMES])
     array.setflags(write=False)
     return array
 
@@ -122,7 +121,7 @@ PUBLISHED_DAMPING: Final = 2.0 * _DAMPING_RATIO * ARMATURE * _NATURAL_FREQUENCY 
 
 
 def _with_arm_gains(published: NDArray[np.float64], which: int) -> NDArray[np.float64]:
-    gains = dict(zip(map(_kind, JOINT_NAMES), published.tolist(), strict=True))
+    gains = dict(zip(map(joint_kind, JOINT_NAMES), published.tolist(), strict=True))
     return _per_joint(gains | {kind: pair[which] for kind, pair in _ARM_GAINS.items()})
 
 
@@ -130,10 +129,5 @@ def _with_arm_gains(published: NDArray[np.float64], which: int) -> NDArray[np.fl
 STIFFNESS: Final = _with_arm_gains(PUBLISHED_STIFFNESS, 0)  # N m/rad
 DAMPING: Final = _with_arm_gains(PUBLISHED_DAMPING, 1)  # N m s/rad
 
-LEFT_LEG: Final = slice(0, 6)
-RIGHT_LEG: Final = slice(6, 12)
-LEGS: Final = slice(0, 12)
 WAIST: Final = slice(12, 15)
-LEFT_ARM: Final = slice(15, 22)
-RIGHT_ARM: Final = slice(22, 29)
 ARMS: Final = slice(15, 29)

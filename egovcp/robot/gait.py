@@ -1,16 +1,16 @@
-"""Walking by hand: a clock, footholds that catch the fall, and legs that carry and push.
+"""The gait: a clock, footholds by the capture point, and leg motion.
 
 The phase phi runs from 0 to 2 pi in one stride: the left foot swings while sin phi > 0, the
-right one while sin phi < 0. ``amount`` says how much of the gait is blended into standing.
-The robot steps when a velocity is commanded, and when it is about to fall over.
+right one while sin phi < 0. ``amount`` is the share of the gait that is blended into standing.
+The robot steps if a velocity is commanded, or if it is about to fall.
 
-The foot that swings aims at where a linear inverted pendulum of the pelvis's height would be
-caught: at touchdown its extrapolated centre of mass xi = v / omega lies beside the foothold by
+The swinging foot aims where a linear inverted pendulum of the pelvis's height is captured: at
+touchdown its extrapolated centre of mass xi = v / omega lies beside the foothold by
 a constant offset that keeps the commanded speed and the stance width (Hof, "The 'extrapolated
 center of mass' concept suggests a simple control of balance in walking", Human Movement
-Science 27, 2008). The leg that stands carries the weight (its share of the static torques is
-fed forward, because the servos are soft), keeps the angle it has, and turns the pelvis upright.
-A policy trained by PPO (`walking`) corrects what this leaves.
+Science 27, 2008). The stance leg carries the weight (its share of the static torques is fed
+forward, as the servos are soft), keeps its angle, and turns the pelvis upright. A policy trained by
+PPO (`walking`) adds corrections.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.robot.arms import DT
 from egovcp.robot.g1 import STIFFNESS
-from egovcp.robot.kinematics import Array, foot_positions, heading_rotation, rotate
-from egovcp.robot.reach import DT
+from egovcp.robot.geometry import Array, heading_rotation, rotate
+from egovcp.robot.kinematics import foot_positions
 from egovcp.robot.stance_table import NU, StanceRow
 from egovcp.spec import STATE_SLICES
 
@@ -48,11 +49,11 @@ class GaitConfig:
     step_time: float = 0.31
     """s per step; a stride is two."""
     lift: float = 0.0565
-    """m by which the swinging leg is shortened."""
+    """m, shortening of the swinging leg."""
     width: float = 0.234
     """m across between the feet that the footholds aim at."""
     capture: tuple[float, float] = (0.826, 1.41)
-    """How much of the expected velocity a foothold catches: along, across."""
+    """Share of the expected velocity that a foothold captures: along, across."""
     ahead: float = 0.0363
     """m by which footholds lie ahead of that."""
     reach: tuple[float, float, float] = (0.35, 0.06, 0.30)
@@ -99,7 +100,7 @@ class GaitConfig:
 
 @dataclass
 class Gait:
-    """Memory of the clock and of the legs' odometry; leading axis B."""
+    """State of the clock and of the legs' odometry; leading axis B."""
 
     phase: Array  # (B,) rad
     amount: Array  # (B,) 0 standing .. 1 walking
@@ -201,10 +202,10 @@ def _tick(
     rate: Array,
     config: GaitConfig,
 ) -> None:
-    """Turn the clock on, or set it to where the first step begins.
+    """Advance the clock; in a standing robot, set it to the begin of the first step.
 
-    A step that is wanted begins with the weight on the leg that will swing, which shifts it
-    onto the other one; a robot that tips over swings at once, on the side it falls to.
+    A commanded step first shifts the weight to the other leg; a robot that tips over swings the leg
+    of the side to which it falls at once.
     """
     leftwards = command[:, 1] + 0.3 * command[:, 2] - 0.3 * rate[:, 0] >= 0
     first = np.where(leftwards, 0.0, np.pi)
@@ -224,7 +225,7 @@ def _load(m: Gait, config: GaitConfig) -> Array:
 
 
 def _bounded(x: Array, low: float, high: float) -> Array:
-    """As np.clip, but quicker for a few numbers."""
+    """As np.clip, but faster for small arrays."""
     return np.asarray(np.minimum(np.maximum(x, low), high))
 
 

@@ -1,6 +1,6 @@
-"""Writes the numbers that the robot package ships: ``python -m egovcp.robot.generate``.
+"""Generates the tables that the robot package ships: ``python -m egovcp.robot.generate``.
 
-Needs MuJoCo and SciPy (the simulator extra); the robot itself needs only the results.
+Needs MuJoCo and SciPy (the simulator extra).
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from egovcp.robot.mjcf import robot_spec
 from egovcp.robot.stance_design import (
     StanceModel,
     balanced_pose,
+    compensator,
     linearise,
     load_response,
     pitch_at,
 )
-from egovcp.robot.stance_gains import compensator
 from egovcp.robot.stance_table import NU
 from egovcp.spec import JOINT_NAMES
 

@@ -1,4 +1,4 @@
-"""Forward kinematics of the G1 in numpy, batched over robots; needs no MuJoCo.
+"""Forward kinematics and joint limits of the G1 in numpy, batched over robots; without MuJoCo.
 
 Every joint is a hinge at its link's origin, so a link's pose follows from its parent's:
 
@@ -19,10 +19,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.robot.g1 import WAIST
-from egovcp.spec import STATE_SLICES
-
-Array = NDArray[np.float64]
+from egovcp.robot.g1 import WAIST, joint_kind
+from egovcp.robot.geometry import Array, heading_rotation, rotate
+from egovcp.spec import JOINT_NAMES, STATE_SLICES
 
 _TABLE: Final = json.loads(
     resources.files("egovcp.robot").joinpath("g1_kinematics.json").read_text(encoding="utf-8")
@@ -57,17 +56,49 @@ REST_ROTATION, SIN_ROTATION, COS_ROTATION = _rotation_constants(
 )
 
 
+#: How far the targets of low-level controllers may leave a joint's range: joint name ending -> rad
+#: below and above, left side; roll and yaw of the right side are mirrored. A servo's torque is
+#: proportional to target minus position, so a loaded joint near its stop needs a target beyond it:
+#: 0.6 rad for an ankle to hold 17 N m with 29 N m/rad. Comments: the greatest excess measured with
+#: ``benchmarks/joint_targets.py`` over all tasks and both controllers, which clip at 0.6.
+_SLACK: Final[dict[str, tuple[float, float]]] = {
+    "hip_pitch": (0.6, 0.1),  # 0.58, -
+    "hip_roll": (0.4, 0.1),  # 0.25, -
+    "hip_yaw": (0.1, 0.1),
+    "knee": (0.6, 0.1),  # 0.46, -
+    "ankle_pitch": (0.6, 0.6),  # 0.6, 0.6
+    "ankle_roll": (0.6, 0.6),  # 0.6, 0.6
+    "waist_yaw": (0.1, 0.1),
+    "waist_roll": (0.6, 0.6),  # 0.6, 0.6
+    "waist_pitch": (0.6, 0.6),  # 0.55, 0.43
+    "shoulder_pitch": (0.1, 0.1),
+    "shoulder_roll": (0.3, 0.6),  # 0.17, 0.6
+    "shoulder_yaw": (0.1, 0.1),
+    "elbow": (0.6, 0.1),  # 0.56, -
+    "wrist_roll": (0.1, 0.1),
+    "wrist_pitch": (0.1, 0.1),
+    "wrist_yaw": (0.1, 0.1),
+}
+
+
+def _slack(joint: str) -> tuple[float, float]:
+    """rad below and above the joint's range."""
+    kind = joint_kind(joint)
+    below, above = _SLACK[kind]
+    mirrored = joint.startswith("right_") and kind.endswith(("roll", "yaw"))
+    return (above, below) if mirrored else (below, above)
+
+
+_BELOW, _ABOVE = np.array([_slack(name) for name in JOINT_NAMES]).T
+TARGET_LOW: Final[NDArray[np.float64]] = JOINT_LOWER - _BELOW  # (J,) rad
+TARGET_HIGH: Final[NDArray[np.float64]] = JOINT_UPPER + _ABOVE  # (J,) rad
+
+
 def joint_rotations(joint_position: Array, joints: slice = slice(None)) -> Array:
     """Rotation from each joint's child frame to its parent's: (..., J') -> (..., J', 3, 3)."""
     s = np.sin(joint_position)[..., None, None]
     c = 1.0 - np.cos(joint_position)[..., None, None]
     out: Array = REST_ROTATION[joints] + s * SIN_ROTATION[joints] + c * COS_ROTATION[joints]
-    return out
-
-
-def rotate(rotation: Array, vector: Array) -> Array:
-    """(..., 3, 3) times (..., 3), broadcast; the same bits for a row whatever the batch."""
-    out: Array = (rotation @ vector[..., None])[..., 0]
     return out
 
 
@@ -121,60 +152,6 @@ def foot_positions(joint_position: Array) -> Array:
         position = position + rotate(rotation, offset[:, k])
         rotation = rotation @ local[:, :, k]
     return np.asarray(position)
-
-
-def link_poses(joint_position: NDArray[np.floating]) -> tuple[Array, Array]:
-    """Poses of all links (``LINK_NAMES``) in the pelvis frame, for logging.
-
-    Args:
-        joint_position: (B, J) rad.
-
-    Returns:
-        positions (B, L, 3) in metres and unit quaternions wxyz (B, L, 4).
-    """
-    position, rotation = link_transforms(np.asarray(joint_position, dtype=np.float64))
-    return position, quaternion(rotation)
-
-
-def quaternion(rotation: Array) -> Array:
-    """Rotation matrices (..., 3, 3) -> unit quaternions wxyz (..., 4).
-
-    The largest of the four squared components, read off the diagonal, picks the row of
-    the symmetric matrix 4 q q^T that is normalised, so no division is by a small number.
-    """
-    m = rotation
-    xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]
-    wx, xy = m[..., 2, 1] - m[..., 1, 2], m[..., 0, 1] + m[..., 1, 0]
-    wy, xz = m[..., 0, 2] - m[..., 2, 0], m[..., 0, 2] + m[..., 2, 0]
-    wz, yz = m[..., 1, 0] - m[..., 0, 1], m[..., 1, 2] + m[..., 2, 1]
-    rows = (
-        (1 + xx + yy + zz, wx, wy, wz),
-        (wx, 1 + xx - yy - zz, xy, xz),
-        (wy, xy, 1 - xx + yy - zz, yz),
-        (wz, xz, yz, 1 - xx - yy + zz),
-    )
-    outer = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    largest = np.argmax(np.diagonal(outer, axis1=-2, axis2=-1), axis=-1)
-    row = np.take_along_axis(outer, largest[..., None, None], axis=-2)[..., 0, :]
-    out: Array = row / np.sqrt(np.sum(row * row, axis=-1, keepdims=True))
-    return out
-
-
-def heading_rotation(gravity: Array) -> Array:
-    """Rotation (B, 3, 3) from the pelvis frame to the pelvis heading frame.
-
-    ``gravity`` (B, 3) is the unit gravity vector in the pelvis frame. The heading frame's
-    z is -gravity; its x is the pelvis' x made horizontal. Rows are the frame's axes. A
-    pelvis that points straight up or down has no heading; the result then stays finite.
-    """
-    up = -gravity / np.maximum(np.sqrt((gravity**2).sum(axis=-1, keepdims=True)), 1e-9)
-    ux, uy, uz = up[:, 0], up[:, 1], up[:, 2]
-    norm = np.maximum(np.sqrt(uy * uy + uz * uz), 1e-6)
-    out = np.empty((len(up), 3, 3))  # filled by hand: nested np.stack is slower for few robots
-    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = norm, -ux * uy / norm, -ux * uz / norm
-    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = 0.0, uz / norm, -uy / norm
-    out[:, 2] = up
-    return out
 
 
 def palm_positions(state: NDArray[np.floating]) -> Array:

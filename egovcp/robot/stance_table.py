@@ -12,7 +12,7 @@ import numpy as np
 
 from egovcp.robot.arms import REST
 from egovcp.robot.g1 import ARMS, WAIST
-from egovcp.robot.kinematics import Array
+from egovcp.robot.geometry import Array
 from egovcp.spec import NUM_JOINTS
 
 NZ: Final = 9  # coordinates: pelvis pose 6, waist 3

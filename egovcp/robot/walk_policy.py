@@ -1,8 +1,10 @@
-"""The trained part of walking: a small network in a safetensors file, evaluated with numpy.
+"""The trained part of walking: a small network in a safetensors or ONNX file.
 
-The file holds ``mean`` and ``std`` of the observation and ``layers.I.weight``/``.bias``; its
-metadata hold, as JSON, the schema's version, the `WalkConfig` that the network was trained
-with, and where it comes from (command, seed, steps).
+A safetensors file has ``mean`` and ``std`` of the observation and ``layers.I.weight``/``.bias``;
+its metadata are the schema's version, the `WalkConfig` of the training, and the provenance
+(command, seed, steps). numpy evaluates it. The graph of an ONNX file maps the raw observation
+(B, 95) to the action (B, 15); its metadata add joint names, gains, the neutral pose and the
+observation's layout.
 """
 
 from __future__ import annotations
@@ -10,8 +12,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,14 +27,37 @@ from safetensors.numpy import load, save
 
 from egovcp.atomic import write_bytes
 from egovcp.bounds import check_bounds
-from egovcp.decode import decode, shown
+from egovcp.decode import decode, require_type, shown
 from egovcp.errors import ArtifactError
+from egovcp.packages import require_packages
+from egovcp.robot.g1 import DAMPING, STIFFNESS
+from egovcp.robot.stance_table import standing_pose
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
+from egovcp.safe_files import parse_json, read_bytes
+from egovcp.spec import ACTION_BOX, JOINT_NAMES, STATE_NAMES
 from egovcp.tensor_file import TensorFile, read_tensor_file
 
 SCHEMA: Final = "egovcp-walk-1"
-OBSERVATION_CLIP: Final = 10.0  # standard deviations: one wild measurement must not kick
+OBSERVATION_CLIP: Final = 10.0  # standard deviations
 _LIMIT_BYTES: Final = 64 << 20
+
+ONNX_SCHEMA: Final = "egovcp-walk-onnx-1"
+_OPSET: Final = 17
+_OPERATORS: Final = frozenset(("Sub", "Div", "Clip", "Gemm", "Elu"))
+_DIGEST: Final = re.compile("[0-9a-f]{8}")
+_INPUT, _OUTPUT = "observation", "action"
+
+#: Names of the numbers of the observation.
+OBSERVATION_NAMES: Final = (
+    *STATE_NAMES,
+    "gait.sin_phase",
+    "gait.cos_phase",
+    "gait.amount",
+    "odometry.velocity_x",
+    "odometry.velocity_y",
+    "odometry.turned",
+    *(f"last_action.{name}" for name in JOINT_NAMES[:ACTIONS]),
+)
 
 Array32 = NDArray[np.float32]
 
@@ -51,7 +78,7 @@ class WalkPolicy:
     std: Array32  # (95,)
     layers: tuple[tuple[Array32, Array32], ...]  # weight (out, in), bias (out,)
     config: WalkConfig
-    """What surrounds the network (`walking.Walk`)."""
+    """Of `walking.Walk`."""
     provenance: Mapping[str, Any]
     """Command, seed and steps of its training."""
 
@@ -139,3 +166,156 @@ class WalkPolicy:
             raise ValueError("expected finite numbers of type float32")
         if (self.std <= 0).any():
             raise ValueError("a standard deviation is not positive")
+
+
+def export_onnx(policy: WalkPolicy, path: Path) -> None:
+    """Write ``policy`` to ``path``.
+
+    Raises:
+        EnvironmentFailure: the package onnx is missing.
+    """
+    require_packages("egovcp", "exporting a controller", "onnx")
+    import onnx
+
+    model = onnx.helper.make_model(
+        _graph(policy), opset_imports=[onnx.helper.make_opsetid("", _OPSET)], ir_version=9
+    )
+    onnx.helper.set_model_props(model, {k: _text(v) for k, v in metadata(policy).items()})
+    onnx.checker.check_model(model, full_check=True)
+    onnx.save(model, str(path))
+
+
+def metadata(policy: WalkPolicy) -> dict[str, Any]:
+    """What is needed to run the graph, and the policy's provenance."""
+    return {
+        "schema": ONNX_SCHEMA,
+        "digest": policy.digest,
+        "joint_names": list(JOINT_NAMES),
+        "stiffness": STIFFNESS.tolist(),
+        "damping": DAMPING.tolist(),
+        "default_joint_position": standing_pose(ACTION_BOX.neutral[-1]).joints.tolist(),
+        "action_joint_names": list(JOINT_NAMES[:ACTIONS]),
+        "action_scale": policy.config.action_scale,
+        "observation_names": list(OBSERVATION_NAMES),
+        "config": draccus.encode(policy.config),
+        "provenance": dict(policy.provenance),
+    }
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _graph(policy: WalkPolicy) -> Any:
+    """Sub, Div, Clip, then Gemm and Elu per layer."""
+    from onnx import TensorProto, helper, numpy_helper
+
+    constants = {
+        "mean": policy.mean,
+        "std": policy.std,
+        "low": np.float32(-OBSERVATION_CLIP),
+        "high": np.float32(OBSERVATION_CLIP),
+    }
+    nodes = [
+        helper.make_node("Sub", [_INPUT, "mean"], ["centred"]),
+        helper.make_node("Div", ["centred", "std"], ["scaled"]),
+        helper.make_node("Clip", ["scaled", "low", "high"], ["hidden0"]),
+    ]
+    last = len(policy.layers) - 1
+    for i, (weight, bias) in enumerate(policy.layers):
+        constants |= {f"weight{i}": weight, f"bias{i}": bias}
+        out = _OUTPUT if i == last else f"linear{i}"
+        inputs = [f"hidden{i}", f"weight{i}", f"bias{i}"]
+        nodes.append(helper.make_node("Gemm", inputs, [out], transB=1))
+        if i < last:
+            nodes.append(helper.make_node("Elu", [out], [f"hidden{i + 1}"]))
+    return helper.make_graph(
+        nodes,
+        "egovcp_walk",
+        [helper.make_tensor_value_info(_INPUT, TensorProto.FLOAT, ["batch", OBSERVATION_DIM])],
+        [helper.make_tensor_value_info(_OUTPUT, TensorProto.FLOAT, ["batch", ACTIONS])],
+        [numpy_helper.from_array(np.asarray(v), name) for name, v in constants.items()],
+    )
+
+
+class OnnxPolicy:
+    """A `walking.Residual` that onnxruntime runs."""
+
+    def __init__(self, path: Path) -> None:
+        """Load and check a file.
+
+        Raises:
+            ArtifactError: missing, damaged, or not of this observation and action.
+            EnvironmentFailure: the package onnxruntime is missing.
+        """
+        require_packages("egovcp", "a controller in ONNX", "onnx", "onnxruntime")
+        import onnxruntime
+
+        if not os.path.lexists(path):
+            raise ArtifactError(f"{path}: no such controller; expected an exported .onnx file")
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = 1
+        try:
+            content = read_bytes(path, _LIMIT_BYTES)
+            _check_graph(content)
+            self._session = onnxruntime.InferenceSession(
+                content, options, providers=["CPUExecutionProvider"]
+            )
+            self._metadata = self._session.get_modelmeta().custom_metadata_map
+            self.config: WalkConfig = self._check()
+        except Exception as error:  # onnx and onnxruntime raise a class per kind of damage
+            reason = " ".join(str(error).split())[:200]
+            raise ArtifactError(
+                f"{path}: not a controller of schema {ONNX_SCHEMA} ({reason})"
+            ) from error
+
+    def _check(self) -> WalkConfig:
+        if self._metadata.get("schema") != ONNX_SCHEMA:
+            raise ValueError(f"its schema is {shown(self._metadata.get('schema'))}")
+        shapes = [v.shape[1:] for v in (*self._session.get_inputs(), *self._session.get_outputs())]
+        if shapes != [[OBSERVATION_DIM], [ACTIONS]]:
+            raise ValueError(f"its shapes are {shapes}")
+        expected = {"joint_names": list(JOINT_NAMES), "observation_names": list(OBSERVATION_NAMES)}
+        for name, value in expected.items():
+            if parse_json(self._metadata[name]) != value:
+                raise ValueError(f"its {name} are others")
+        require_type(parse_json(self._metadata["provenance"]), dict[str, Any], "provenance")
+        if _DIGEST.fullmatch(self._metadata["digest"]) is None:
+            raise ValueError("its digest is not one")
+        config = decode(WalkConfig, parse_json(self._metadata["config"]), "config")
+        check_bounds(config, "config.")
+        action = self(np.zeros((1, OBSERVATION_DIM), np.float32))
+        if action.shape != (1, ACTIONS) or not np.isfinite(action).all():
+            raise ValueError("its action on an observation of zeros is not finite")
+        return config
+
+    @cached_property
+    def digest(self) -> str:
+        return str(self._metadata["digest"])
+
+    @property
+    def provenance(self) -> Mapping[str, Any]:
+        out: Mapping[str, Any] = json.loads(self._metadata["provenance"])
+        return out
+
+    def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]:
+        """(B, 95) -> actions (B, 15)."""
+        out: NDArray[np.float32] = self._session.run([_OUTPUT], {_INPUT: observation})[0]
+        return out
+
+
+def _check_graph(content: bytes) -> None:
+    """Raise ValueError unless a model has only what `export_onnx` writes."""
+    import onnx
+
+    model = onnx.load_model_from_string(content)
+    operators = {node.op_type if not node.domain else "?" for node in model.graph.node}
+    if model.functions or not operators <= _OPERATORS:
+        raise ValueError(f"its operators are not only {', '.join(sorted(_OPERATORS))}")
+    for tensor in model.graph.initializer:
+        if tensor.data_location != onnx.TensorProto.DEFAULT:
+            raise ValueError("its weights are in another file")
+        if tensor.data_type != onnx.TensorProto.FLOAT:
+            raise ValueError("expected weights of type float32")
+        if not np.isfinite(onnx.numpy_helper.to_array(tensor)).all():
+            raise ValueError("expected finite weights")

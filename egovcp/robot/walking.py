@@ -5,7 +5,7 @@ The targets of legs and waist are
     q* = q_ref(h) + (1 - g) u_lqr + g q_gait(phi, v) + s a
 
 with the standing targets of the height h, the stance law's correction u_lqr, the gait's leg
-motion (`gait`), how much of the gait is in, g, and the action a of a policy trained by PPO
+motion (`gait`), the share of the gait g, and the action a of a policy trained by PPO
 (``egovcp-train-lowlevel``) times a scale s. The arms follow inverse kinematics as in standing.
 """
 
@@ -18,16 +18,22 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.robot import arms, balance, gait, reach
-from egovcp.robot.balance import Balance, BalanceConfig
+from egovcp.robot import gait
+from egovcp.robot.arms import IDENTITY as ARM_IDENTITY
+from egovcp.robot.arms import TORSO_ORIGIN, ArmReference, ReachConfig, track_hands
 from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS, WAIST
 from egovcp.robot.gait import Gait, GaitConfig
-from egovcp.robot.kinematics import Array, heading_rotation, rotate, torso_rotation
-from egovcp.robot.memory import replace_rows
-from egovcp.robot.reach import TORSO_ORIGIN, Reach, ReachConfig
-from egovcp.robot.stance import pelvis_height
+from egovcp.robot.geometry import Array, heading_rotation, rotate
+from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW, torso_rotation
+from egovcp.robot.stance import (
+    BalanceConfig,
+    BalanceState,
+    balance,
+    follow_height,
+    pelvis_height,
+    replace_rows,
+)
 from egovcp.robot.stance_table import NU, stance_table
-from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import NUM_JOINTS, STATE_DIM, STATE_SLICES
 
 ACTIONS: Final = NU  # legs and waist
@@ -37,14 +43,13 @@ OBSERVATION_DIM: Final = STATE_DIM + 3 + 3 + ACTIONS
 
 @dataclass(frozen=True)
 class WalkConfig:
-    """All that the policy was trained with."""
+    """Parameters of the walking law, with which the policy was trained."""
 
     balance: BalanceConfig = field(default_factory=BalanceConfig)
     reach: ReachConfig = field(
         default_factory=lambda: ReachConfig(speed=14.0, acceleration=1000.0, bandwidth=34.0)
     )
-    """Brisker arms than the stance law alone can balance for long; the motors' limits bound
-    their acceleration."""
+    """Faster arms than the stance law alone can balance."""
     gait: GaitConfig = field(default_factory=GaitConfig)
     action_scale: float = 0.3
     """rad per unit of the policy's action."""
@@ -54,17 +59,16 @@ class WalkConfig:
 
 @dataclass
 class _Memory:
-    balance: Balance
-    reach: Reach
+    balance: BalanceState
+    arms: ArmReference
     gait: Gait
     action: Array  # (B, 15) last action
 
 
 class Walk:
-    """What surrounds the policy, the same in training and on the robot; batched over B robots.
+    """The law around the policy, the same in training and on the robot; batched over B robots.
 
-    Each tick: ``observe`` gives what the policy sees, ``targets`` turns its answer into joint
-    targets.
+    Each tick, ``observe`` gives the policy's observation, ``targets`` converts its action.
     """
 
     def __init__(self, config: WalkConfig | None = None) -> None:
@@ -85,11 +89,10 @@ class Walk:
 
     @property
     def gait(self) -> Gait:
-        """The clock."""
         return self._memory.gait
 
     def reset(self, state: NDArray[np.floating], rows: NDArray[np.intp] | None = None) -> None:
-        """Forget ``rows`` (None: all) and start standing in the measured posture."""
+        """Reset ``rows`` (None: all) to standing in the measured posture."""
         s = np.asarray(state, dtype=np.float64)
         if rows is None or len(self._memory.action) != len(s):
             self._memory = self._start(s)
@@ -100,16 +103,16 @@ class Walk:
         q = state[:, STATE_SLICES["joint_position"]]
         gravity = state[:, STATE_SLICES["projected_gravity"]]
         height, walking = pelvis_height(q, gravity), gait.start(q, gravity)
-        hands = reach.start(q[:, ARMS])
-        standing = balance.start(self._table.clamp(height), hands, self._table)
+        hands = ArmReference.at_rest(q[:, ARMS])
+        standing = BalanceState.standing(self._table.clamp(height), hands, self._table)
         return _Memory(standing, hands, walking, np.zeros((len(state), ACTIONS)))
 
     def observe(self, state: NDArray[np.floating]) -> NDArray[np.float32]:
-        """(B, 74) measurements -> (B, 95) what the policy sees; the memory advances."""
+        """(B, 74) measurements -> (B, 95) observations of the policy; the memory advances."""
         s = np.asarray(state, dtype=np.float64)
         m = self._memory
         command = s[:, STATE_SLICES["command_height"]][:, 0]
-        balance.follow_height(m.balance, self._table.clamp(command), self.config.balance)
+        follow_height(m.balance, self._table.clamp(command), self.config.balance)
         tilt = self._tilt(s)
         gait.sense(m.gait, s, self.config.gait)
         row = self._table.at(m.balance.height)
@@ -117,7 +120,7 @@ class Walk:
         self._restart_standing(stands)
         amount = m.gait.amount[:, None]
         arm_targets = self._reach(s, amount[:, 0] > 0)
-        body = balance.balance(m.balance, s, row, m.reach, self.config.balance)
+        body = balance(m.balance, s, row, m.arms, self.config.balance)
         motion = gait.leg_motion(m.gait, row, m.balance.height, tilt, s, self.config.gait)
         body += amount * (motion - m.balance.correction)
         self._nominal = np.asarray(np.concatenate([body, arm_targets], axis=1))
@@ -127,7 +130,7 @@ class Walk:
         return np.concatenate(seen, axis=1, dtype=np.float32)
 
     def targets(self, action: NDArray[np.floating]) -> Array:
-        """The policy's answer (B, 15) -> joint position targets (B, 29), rad."""
+        """The policy's action (B, 15) -> joint position targets (B, 29), rad."""
         limit = self.config.action_limit
         wanted = np.asarray(action, dtype=np.float64)
         self._memory.action = np.minimum(np.maximum(wanted, -limit), limit)
@@ -155,22 +158,24 @@ class Walk:
         gravity = np.where(
             walking[:, None],
             state[:, STATE_SLICES["projected_gravity"]],
-            balance.gravity_estimate(m.balance),
+            m.balance.gravity,
         )
         heading = heading_rotation(gravity)
         torso = torso_rotation(heading, waist)
         hands = state[:, STATE_SLICES["command_hands"]].reshape(-1, 2, 3)
         relative = hands - rotate(heading, TORSO_ORIGIN)[:, None]
-        return reach.follow(m.reach, relative, torso, self.config.reach)
+        return track_hands(m.arms, relative, torso, self.config.reach)
 
     def _restart_standing(self, which: NDArray[np.bool_]) -> None:
-        """The stance law's filter believes in planted feet: after steps it starts anew."""
+        """Restart the stance law's filter, which assumes planted feet, after steps."""
         rows = np.flatnonzero(which)
         if len(rows) == 0:
             return
         m = self._memory.balance
-        hands = Reach(*(getattr(self._memory.reach, n)[rows] for n in ("goal", "joints", "rate")))
-        fresh = balance.start(m.height[rows], hands, self._table)
+        hands = ArmReference(
+            *(getattr(self._memory.arms, n)[rows] for n in ("goal", "joints", "rate"))
+        )
+        fresh = BalanceState.standing(m.height[rows], hands, self._table)
         fresh.height_rate = m.height_rate[rows]
         replace_rows(m, fresh, rows)
 
@@ -188,7 +193,7 @@ class Residual(Protocol):
 
 
 class WalkingController:
-    """`LowLevelController` that stands, squats, reaches and walks; see the module's docstring."""
+    """`LowLevelController` that stands, squats, reaches and walks."""
 
     def __init__(self, policy: Residual) -> None:
         self._policy = policy
@@ -198,38 +203,34 @@ class WalkingController:
     @property
     def id(self) -> str:
         """Changes with every number of the policy, the stance law, the gait and the servos."""
-        digest = hashlib.sha256(repr((self._policy.digest, arms.IDENTITY)).encode())
+        digest = hashlib.sha256(repr((self._policy.digest, ARM_IDENTITY)).encode())
         digest.update(stance_table().fingerprint().encode())
         digest.update(np.concatenate([STIFFNESS, DAMPING]).tobytes())
         return f"g1-walk-ppo-{digest.hexdigest()[:8]}"
 
     @property
     def walks(self) -> bool:
-        """Yes."""
         return True
 
     @property
     def stepping(self) -> NDArray[np.bool_]:
-        """(B,) which robots have any of the gait blended in."""
+        """(B,) robots whose targets contain any of the gait."""
         return self._walk.gait.amount > 0
 
     @property
     def stiffness(self) -> Array:
-        """(J,) N m/rad."""
         return STIFFNESS
 
     @property
     def damping(self) -> Array:
-        """(J,) N m s/rad."""
         return DAMPING
 
     def reset(self, state: NDArray[np.floating], rows: NDArray[np.intp] | None = None) -> None:
-        """Forget the memory of ``rows`` (None: all) and stand in the measured posture."""
+        """See `LowLevelController`."""
         self._walk.reset(state, rows)
         self._rows = len(state)
 
     def step(self, state: NDArray[np.floating]) -> Array:
-        """(B, 74) observations -> (B, 29) joint position targets, rad."""
         if len(state) != self._rows:
             self.reset(state)
         return self._walk.targets(self._policy(self._walk.observe(state)))

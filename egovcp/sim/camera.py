@@ -1,36 +1,170 @@
-"""Depth pictures by ray casting: planar depth and the faults of a stereo camera.
+"""Depth images by ray casting: planar depth, and the faults of a stereo camera.
 
-A pixel (row i, column j) looks along d = (1, -(j - cx)/f, -(i - cy)/f) in the camera frame
-(x along the optical axis, y left, z up), f = (rows / 2) / tan(fov / 2). The depth of a hit
-at range s along d/|d| is its coordinate along the optical axis, z = s / |d|.
+The depth of a hit at range s along the ray d/|d| of a pixel (`egovcp.robot.geometry`) is its
+coordinate along the optical axis, z = s / |d|.
+
+Only rays that can hit something besides the floor are cast. The ray o + s d hits a level floor at
+height z_f at s = (z_f - o_z) / d_z, as MuJoCo computes it; any other geom is inside the rectangle
+of pixels that its bounding box projects to.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Final
 
 import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.robot.geometry import focal_length, pixel_rays
 from egovcp.sim.config import CameraConfig
-from egovcp.sim.rays import Pinhole, View
 from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_MIN_M, DEPTH_ROWS
 
 Array = NDArray[np.float64]
 
+_GROUPS: Final = np.array([1, 0, 0, 1, 0, 0], dtype=np.uint8)
+_UPRIGHT: Final = np.array([1.0, 0.0, 0.0, 0.0])
+_SLACK: Final = 1e-3  # pixels and metres; rounding is a billionth of it
+_CORNERS: Final = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
-class DepthCamera:
-    """Casts one ray per pixel from a mount on the torso, which itself stays unseen."""
+
+class PixelGrid:
+    """Projects spheres and boxes into the image of a camera."""
+
+    def __init__(self, rows: int, columns: int, focal: float) -> None:
+        self.shape = (rows, columns)
+        self._focal = focal
+        self._last = np.array([columns - 1.0, rows - 1.0])
+        # inward normals of the planes that bound what the outermost pixels see
+        wide, high = self._last / 2 / focal
+        planes = np.array([[wide, 1, 0], [wide, -1, 0], [high, 0, 1], [high, 0, -1]])
+        self._planes = (planes / np.linalg.norm(planes, axis=1, keepdims=True)).T.copy()
+
+    def visible(self, centre: Array, radius: Array) -> NDArray[np.intp]:
+        """Which of the spheres with centres (G, 3) (m, camera frame) may be in the image."""
+        inside = (centre @ self._planes).min(axis=1) > -radius - _SLACK
+        return np.flatnonzero(inside)
+
+    def covered(self, corners: Array) -> NDArray[np.bool_]:
+        """(H, W) the pixels in which boxes with ``corners`` (G, 8, 3) (m, camera frame) can be."""
+        covered = np.zeros(self.shape, dtype=np.bool_)
+        ahead = corners[..., :1]
+        where = self._last / 2 - self._focal * corners[..., 1:] / np.maximum(ahead, _SLACK)
+        low = np.ceil(np.maximum(where.min(axis=1), 0.0) - _SLACK)
+        high = np.floor(np.minimum(where.max(axis=1), self._last) + _SLACK) + 1.0
+        # a box that reaches behind the camera has no bounded projection
+        bounded = ahead.min(axis=(1, 2)) > _SLACK
+        for i, ((left, top), (right, bottom)) in enumerate(
+            zip(low.astype(int).tolist(), high.astype(int).tolist(), strict=True)
+        ):
+            if not bounded[i]:
+                covered[:] = True
+            elif right > left and bottom > top:
+                covered[top:bottom, left:right] = True
+        return covered
+
+
+class RayCaster:
+    """Ranges from a camera on a body of ``model`` to its geoms, whose shapes are read once.
+
+    Args:
+        model: geoms of groups 0 and 3 are visible.
+        body: carries the camera, and is itself invisible.
+    """
+
+    def __init__(self, model: mujoco.MjModel, body: int) -> None:
+        self.model, self.body = model, body
+        seen = _GROUPS.astype(np.bool_)[model.geom_group] & (model.geom_bodyid != body)
+        plane = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
+        self._floor = _level_floor(model, np.flatnonzero(seen & plane))
+        self._solid = np.flatnonzero(seen & ~plane)
+        self._radius = model.geom_rbound[self._solid].copy()
+        box = model.geom_aabb[self._solid, None]
+        self._corners = box[..., :3] + _CORNERS * box[..., 3:]
+
+    def ranges(
+        self,
+        data: mujoco.MjData,
+        grid: PixelGrid,
+        origin: Array,
+        rotation: Array,
+        rays: Array,
+        cutoff: float,
+    ) -> Array:
+        """Range (H * W,) m to the first visible surface; negative or beyond ``cutoff``: none.
+
+        Args:
+            data: with current geom poses.
+            origin: (3,) of all rays, m, world.
+            rotation: (3, 3) from the camera frame to the world.
+            rays: (H * W, 3) unit directions, world.
+            cutoff: m; ranges beyond it may be wrong.
+        """
+        if self._floor is None:
+            return self._cast(data, origin, rays, cutoff)
+        needed = self._needed(data, grid, origin, rotation)
+        if len(needed) == len(rays):
+            return self._cast(data, origin, rays, cutoff)
+        out = _floor_range(self._floor, origin, rays)
+        if len(needed):
+            out[needed] = self._cast(data, origin, rays[needed], cutoff)
+        return out
+
+    def _needed(
+        self, data: mujoco.MjData, grid: PixelGrid, origin: Array, rotation: Array
+    ) -> NDArray[np.intp]:
+        """Indices of the pixels in which more than the floor may be."""
+        centre = (data.geom_xpos[self._solid] - origin) @ rotation
+        near = grid.visible(centre, self._radius)
+        if len(near) == 0:
+            return near
+        turn = data.geom_xmat[self._solid[near]].reshape(-1, 3, 3).swapaxes(1, 2) @ rotation
+        corners = self._corners[near] @ turn + centre[near, None]
+        return np.flatnonzero(grid.covered(corners))
+
+    def _cast(self, data: mujoco.MjData, origin: Array, rays: Array, cutoff: float) -> Array:
+        """Ranges by MuJoCo alone."""
+        count = len(rays)
+        # fresh for each call, because threads share the camera
+        geom, out = np.empty(count, dtype=np.int32), np.empty(count)
+        mujoco.mj_multiRay(
+            self.model, data, origin, rays.ravel(), _GROUPS, True, self.body,
+            geom, out, None, count, cutoff,
+        )  # fmt: skip
+        return out
+
+
+def _level_floor(model: mujoco.MjModel, planes: NDArray[np.intp]) -> float | None:
+    """Height of the floor, m; -inf: no floor, None: not a single level infinite plane."""
+    if len(planes) == 0:
+        return -np.inf
+    floor = planes[0]
+    simple = len(planes) == 1 and model.geom_bodyid[floor] == 0
+    level = (model.geom_quat[floor] == _UPRIGHT).all()
+    if not simple or not level or (model.geom_size[floor, :2] > 0).any():
+        return None
+    return float(model.geom_pos[floor, 2])
+
+
+def _floor_range(height: float, origin: Array, rays: Array) -> Array:
+    """Range (H * W,) to a level floor; negative for rays that ascend, infinite from below."""
+    drop = height - origin[2] if origin[2] >= height else -np.inf
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(drop / rays[:, 2])
+
+
+class RayCastCamera:
+    """Renders depth images by ray casting from a mount on the torso."""
 
     def __init__(self, config: CameraConfig) -> None:
         self.position = np.array(config.position)
-        self.focal = DEPTH_ROWS / 2 / math.tan(config.vertical_fov / 2)  # pixels
+        self.focal = focal_length(config.vertical_fov)
         rays = pixel_rays(self.focal)
         self._axial = 1.0 / np.linalg.norm(rays, axis=1)  # cosine to the optical axis
         self._directions = rays * self._axial[:, None]
         self._cutoff = DEPTH_MAX_M / float(self._axial.min())
-        self._pinhole = Pinhole(DEPTH_ROWS, DEPTH_COLS, self.focal)
+        self._grid = PixelGrid(DEPTH_ROWS, DEPTH_COLS, self.focal)
 
     def pose(
         self, data: mujoco.MjData, torso_body: int, pitch: float
@@ -41,27 +175,19 @@ class DepthCamera:
         tilt = np.array([[c, 0.0, s], [0.0, 1.0, 0.0], [-s, 0.0, c]])
         return data.xpos[torso_body] + torso @ self.position, torso @ tilt
 
-    def render(self, view: View, data: mujoco.MjData, pitch: float) -> NDArray[np.float32]:
+    def render(self, caster: RayCaster, data: mujoco.MjData, pitch: float) -> NDArray[np.float32]:
         """True planar depth (H, W), m; 0 where nothing is within the camera's range.
 
         Args:
-            view: of the body that carries the camera.
+            caster: of the body that carries the camera.
             data: with current body poses (``mj_kinematics``).
             pitch: rad below the body's horizontal.
         """
-        origin, rotation = self.pose(data, view.body, pitch)
+        origin, rotation = self.pose(data, caster.body, pitch)
         rays = self._directions @ np.ascontiguousarray(rotation.T)
-        ranges = view.ranges(data, self._pinhole, origin, rotation, rays, self._cutoff)
+        ranges = caster.ranges(data, self._grid, origin, rotation, rays, self._cutoff)
         ranges *= self._axial
         return within_range(ranges.astype(np.float32)).reshape(DEPTH_ROWS, DEPTH_COLS)
-
-
-def pixel_rays(focal: float) -> Array:
-    """Directions (H * W, 3) of all pixels with unit length along the optical axis."""
-    row, column = np.mgrid[:DEPTH_ROWS, :DEPTH_COLS]
-    left = -(column - (DEPTH_COLS - 1) / 2) / focal
-    up = -(row - (DEPTH_ROWS - 1) / 2) / focal
-    return np.stack([np.ones(left.shape), left, up], axis=-1).reshape(-1, 3)
 
 
 def within_range(depth: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -71,7 +197,7 @@ def within_range(depth: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 class DepthNoise:
-    """The faults of one camera in one episode: noise growing with z^2, holes, lost edges."""
+    """Noise that grows with z^2, holes and lost edges, of one camera in one episode."""
 
     def __init__(self, config: CameraConfig, rng: np.random.Generator) -> None:
         self._rng = rng
@@ -101,12 +227,12 @@ def quantise(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
 def discontinuity(depth: NDArray[np.float32], ratio: np.float32) -> NDArray[np.bool_]:
     """(H, W) pixels beside a jump of more than ``ratio`` of the greater depth.
 
-    The floor, seen at a slant, is no discontinuity; the border of nothing (0) is.
+    The border of invalid pixels (0) counts as one.
     """
     width = depth.shape[1]
-    flat = np.ascontiguousarray(depth).reshape(-1)  # long rows are quicker than many
+    flat = np.ascontiguousarray(depth).reshape(-1)
     across = _jumps(flat[:-1], flat[1:], ratio)
-    across[width - 1 :: width] = False  # the next pixel is on the other side of the picture
+    across[width - 1 :: width] = False  # row ends are not neighbours
     down = _jumps(flat[:-width], flat[width:], ratio)
     edge = np.zeros(flat.shape, dtype=np.bool_)
     for jump, step in ((across, 1), (down, width)):

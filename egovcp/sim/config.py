@@ -1,7 +1,7 @@
-"""Every scene, sensor and randomisation parameter of the simulated robot.
+"""Configuration of the simulated robot: scenes, sensors and randomisation.
 
-Frozen data only. Ranges are (low, high) and drawn uniformly once per episode. The bounds are what
-the physics can simulate, which is far more than what makes sense to train on.
+Ranges are (low, high), sampled uniformly once per episode. The bounds of an option are what the
+physics can simulate, not what is sensible to train on.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import Final, Literal
 
 from egovcp.bounds import MOST_PER_CORE, bounded, check_bounds
 from egovcp.errors import UsageError, suggest
+from egovcp.hardware import require_memory
 from egovcp.spec import TASKS
 
 Range = tuple[float, float]
@@ -26,6 +27,7 @@ STEPPING_PUSHES: Range = (0.80, 1.20)
 #: s after a push in which bracing is rewarded, likewise.
 STANDING_DISTURBED = 6.0
 STEPPING_DISTURBED = 2.0
+_ROBOT_BYTES: Final = 900_000  # MuJoCo state of one robot and its scene, measured
 
 
 def _check_ranges(where: str, part: object) -> None:
@@ -47,7 +49,7 @@ class EpisodeConfig:
     event_ticks: tuple[int, int] = bounded((20, 60), least=0, most=MAX_TICKS)
     """First and last tick at which the throw, the push or the arch may start."""
     empty_probability: float = bounded(0.1, least=0, most=1)
-    """Share of episodes in which nothing happens, so that doing nothing is learned too."""
+    """Share of episodes without an event, from which resting is learned."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class BallConfig:
     """A ball thrown at the upper body; a first contact with hand or wrist blocks it."""
 
     shape: Literal["sphere", "box"] = "sphere"
-    """What is thrown: a ball, or a cube of the same volume that starts at any angle and tumbles."""
+    """Shape: a ball, or a tumbling cube of the same volume."""
     radius_range: Range = bounded((0.09, 0.12), least=0.01, most=0.3)
     """Radius of the ball, m."""
     mass_range: Range = bounded((0.15, 0.35), least=0.001, most=10)
@@ -81,7 +83,7 @@ class BallConfig:
     hit_cost: float = bounded(1.0, least=0, most=MAX_REWARD)
     """Once, when the ball touches torso, head or leg."""
     pose_cost: float = bounded(0.01, least=0, most=MAX_REWARD)
-    """Per tick, times the mean squared action: the price of leaving the neutral pose."""
+    """Per tick, times the mean squared action, which is 0 in the neutral pose."""
     fall_cost: float = bounded(1.0, least=0, most=MAX_REWARD)
     """Once, at a fall."""
 
@@ -97,8 +99,8 @@ class WallConfig:
     friction_range: Range = bounded((0.6, 1.0), least=0, most=5)
     """Sliding friction of the wall."""
     push_speed_range: Range | None = bounded(None, least=0, most=5)
-    """Change of base velocity by a push towards the wall, m/s. None: what hands must brace and
-    can, for a controller that steps or one that does not (benchmarks/tasks.py)."""
+    """Change of base velocity by a push towards the wall, m/s. None: calibrated for a controller
+    that steps or one that does not (benchmarks/tasks.py)."""
     push_bearing_range: Range = bounded((-0.20, 0.20), least=-math.pi, most=math.pi)
     """Direction of a push towards the wall, rad from straight ahead."""
     away_probability: float = bounded(0.1, least=0, most=1)
@@ -108,9 +110,8 @@ class WallConfig:
     push_time: float = bounded(0.02, least=0.005, most=1)
     """Time over which a push acts, s."""
     disturbed_time: float | None = bounded(None, least=0, most=3600)
-    """Time after a push in which bracing is rewarded, s. None: 2 s for a controller that steps,
-    which stands by itself again then; 6 s, the rest of the episode, for one that does not: it leans
-    on the wall and falls against it when its hands let go."""
+    """Time after a push in which bracing is rewarded, s. None: 2 s for a controller that steps;
+    6 s, the rest of the episode, for one that does not and has to keep leaning on the wall."""
     brace_reward: float = bounded(0.03, least=0, most=MAX_REWARD)
     """Per tick upright with a hand and nothing else on the wall while disturbed."""
     upright_reward: float = bounded(0.02, least=0, most=MAX_REWARD)
@@ -124,8 +125,7 @@ class WallConfig:
     pose_cost: float = bounded(0.03, least=0, most=MAX_REWARD)
     """Per tick, times the mean squared action."""
     guard_cost: float = bounded(0.27, least=0, most=MAX_REWARD)
-    """In addition, as long as nothing has pushed: an episode stands for a life in which pushes are
-    rarer, and waiting for one with raised hands is paid for all the while."""
+    """Extra pose cost before the push, so that permanently raised hands are not optimal."""
     fall_cost: float = bounded(1.0, least=0, most=MAX_REWARD)
     """Once, at a fall."""
 
@@ -135,10 +135,8 @@ class ArchConfig:
     """An arch that an upright robot would hit and a crouched one passes under."""
 
     motion: Literal["auto", "walk", "rail"] = "auto"
-    """`walk`: the arch stands and the robot walks, which needs a controller that can
-    (--env.controller). `rail`: the robot stands and the arch comes to it at the commanded
-    speed, the same relative motion; for controllers that cannot walk. `auto`: whichever the
-    controller can."""
+    """`walk`: the robot walks to a fixed arch. `rail`: the arch moves towards the standing robot at
+    the commanded speed, for controllers that cannot walk. `auto`: as the controller allows."""
     clearance_range: Range = bounded((1.16, 1.24), least=0.5, most=3)
     """Lower edge of the lintel above ground, m."""
     width_range: Range = bounded((1.1, 1.5), least=0.4, most=10)
@@ -173,15 +171,14 @@ class ArchConfig:
 
 @dataclass(frozen=True)
 class SequenceConfig:
-    """Several tasks in one episode, one after the other (--task=sequence)."""
+    """Several tasks in one episode, in turn (--task=sequence)."""
 
     parts: tuple[str, ...] = ("arch", "ball")
-    """Its tasks in their order, each at most once. The wall can only be the last: it would stand in
-    the way of what comes next, and the robot leans on it."""
+    """Its tasks in their order, each at most once. The wall, on which the robot leans, can only be
+    the last."""
     pause_ticks: int = bounded(25, least=0, most=MAX_TICKS)
-    """Planner ticks from the moment that decides a part (arch passed, ball on the floor) until its
-    object is taken away and the next part begins; a part that remains undecided ends after the
-    ticks of its own episodes."""
+    """Planner ticks from the end of a part (arch passed, ball on the floor) to the next one. A part
+    ends at the latest after the ticks of its own episodes."""
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -198,7 +195,7 @@ class SequenceConfig:
 
 @dataclass(frozen=True)
 class CameraConfig:
-    """Depth camera on the head, and the noise of its pictures."""
+    """Depth camera on the head, and the noise of its images."""
 
     position: tuple[float, float, float] = bounded((0.058, 0.0, 0.42), least=-1, most=1)
     """Mount in the torso frame, m."""
@@ -237,7 +234,7 @@ class DelayConfig:
     action_ticks: tuple[int, int] = bounded((0, 2), least=0, most=50)
     """Controller ticks from an action to its effect."""
     image_age: Range = bounded((0.02, 0.08), least=0, most=1)
-    """Age of the picture in an observation, s; rounded to controller ticks."""
+    """Age of the depth image in an observation, s; rounded to controller ticks."""
 
 
 @dataclass(frozen=True)
@@ -299,10 +296,10 @@ class EnvConfig:
                 _check_ranges(name, part)
 
     def for_controller(self, walks: bool) -> EnvConfig:
-        """What is left to the controller, decided for one that walks or does not.
+        """The config with the values that depend on whether the controller walks.
 
         Raises:
-            UsageError: a motion of the arch that does not go with it.
+            UsageError: the motion of the arch does not suit the controller.
         """
         motion: Literal["walk", "rail"] = "walk" if walks else "rail"
         if self.arch.motion not in ("auto", motion):
@@ -342,9 +339,8 @@ class EnvConfig:
         return episodes[task]
 
 
-def eventful() -> EnvConfig:
-    """The defaults with an event in every episode, to evaluate with: an empty scene tests no
-    block."""
+def evaluation_config() -> EnvConfig:
+    """The defaults with an event in every episode."""
     config = EnvConfig()
     return replace(
         config,
@@ -352,3 +348,14 @@ def eventful() -> EnvConfig:
         wall_episode=replace(config.wall_episode, empty_probability=0.0),
         arch_episode=replace(config.arch_episode, empty_probability=0.0),
     )
+
+
+def require_memory_for_robots(option: str, count: int, robots: int | None = None) -> None:
+    """Raise `UsageError` unless there is memory to simulate the robots.
+
+    Args:
+        option: that sets their number, such as ``--num_envs``.
+        count: its value.
+        robots: number of robots that this value means; None: ``count``.
+    """
+    require_memory(f"{option}={count}", _ROBOT_BYTES * (count if robots is None else robots))

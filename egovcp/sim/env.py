@@ -1,8 +1,8 @@
 """The vectorised environment: many robots, one controller call for all of them.
 
-Time inside one planner tick t: the action is limited and sent, then twice: the command
-that is due after the action delay goes to the controller (50 Hz, whole batch), and every
-robot does four physics steps of 5 ms under the joint targets.
+Within a planner tick the action is limited and sent. Then, twice, the command that is due after
+the action delay goes to the controller (50 Hz, whole batch), and every robot does four physics
+steps of 5 ms under the joint targets.
 """
 
 from __future__ import annotations
@@ -11,19 +11,18 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
+import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
-from egovcp.robot.controller import LowLevelController
-from egovcp.robot.controllers import absolute_controller, make_controller
-from egovcp.sim.camera import DepthCamera
+from egovcp.robot.controllers import LowLevelController, absolute_controller, make_controller
+from egovcp.sim.camera import RayCastCamera
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.lane import Lane
+from egovcp.sim.instance import EnvInstance, settle
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import build_scene
-from egovcp.sim.standing import settle
-from egovcp.sim.truth import Truth, snapshot
+from egovcp.sim.tasks.base import Solid
 from egovcp.spec import (
     ACTION_BOX,
     ACTION_DIM,
@@ -39,8 +38,104 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class PrivilegedState:
+    """Simulator state of all rows, for oracles, probes and logs, never for a policy.
+
+    ``_w``: world, ``_b``: pelvis heading frame.
+    """
+
+    task: tuple[str, ...]
+    """(B,) the current task; in a sequence it changes."""
+    time: Array
+    """(B,) s since the start of the episode."""
+    since_event: Array
+    """(B,) s since throw, push or start of the arch; negative before, -inf if there is none."""
+    pelvis_w: Array
+    """(B, 7) position m, quaternion wxyz."""
+    pelvis_velocity_w: Array
+    """(B, 3) m/s."""
+    joint_position: Array
+    """(B, J) rad, without sensor noise."""
+    joint_velocity: Array
+    """(B, J) rad/s, without sensor noise."""
+    hands_w: Array
+    """(B, 2, 3) palm sites, left and right, m."""
+    hands_b: Array
+    """(B, 2, 3) palm sites, m."""
+    object_w: Array
+    """(B, 3) ball centre (NaN before the throw), point of the wall nearest to the pelvis'
+    x axis, or arch centre on the ground, m."""
+    object_b: Array
+    """(B, 3) the same, m."""
+    object_velocity_w: Array
+    """(B, 3) m/s."""
+    object_velocity_b: Array
+    """(B, 3) in the axes of the heading frame, not relative to the pelvis, m/s."""
+    object_size: Array
+    """(B,) ball radius or arch clearance, m; NaN for a wall."""
+    object_active: NDArray[np.bool_]
+    """(B,) ball in flight and untouched, push still felt, arch on the move."""
+    contact_force: Array
+    """(B, parts) peak force between each of ``scene.PARTS`` and the object in the last
+    planner tick, N."""
+    body_position_w: Array
+    """(B, N, 3) robot bodies in the order of ``body_names``, m."""
+    body_quaternion_w: Array
+    """(B, N, 4) wxyz."""
+    body_names: tuple[str, ...]
+    """Names of the N robot bodies, as in the MJCF."""
+    camera_w: Array
+    """(B, 7) position m, quaternion wxyz; x is the optical axis, y left, z up."""
+    solids: tuple[tuple[Solid, ...], ...]
+    """Per row, the objects in the scene."""
+
+
+def privileged_state(instances: Sequence[EnvInstance]) -> PrivilegedState:
+    """The state of all rows."""
+    states = [i.task.state() for i in instances]
+    datas = [i.robot.data for i in instances]
+    index = instances[0].robot.index
+    position = np.array([state.position_w for state in states])
+    velocity = np.array([state.velocity_w for state in states])
+    hands = np.array([i.robot.palms_w for i in instances])
+    heading = np.array([i.robot.heading for i in instances])
+    pelvis = np.array([data.qpos[:7] for data in datas])
+    bodies = [i.robot.index.robot_bodies for i in instances]
+    return PrivilegedState(
+        task=tuple(i.task.current_name for i in instances),
+        time=np.array([i.task.time for i in instances]),
+        since_event=np.array([i.task.since_event for i in instances]),
+        pelvis_w=pelvis,
+        pelvis_velocity_w=np.array([data.qvel[:3] for data in datas]),
+        joint_position=np.array([d.qpos[index.joint_qpos] for d in datas]),
+        joint_velocity=np.array([d.qvel[index.joint_qvel] for d in datas]),
+        hands_w=hands,
+        hands_b=np.einsum("bhi,bij->bhj", hands - pelvis[:, None, :3], heading),
+        object_w=position,
+        object_b=np.einsum("bi,bij->bj", position - pelvis[:, :3], heading),
+        object_velocity_w=velocity,
+        object_velocity_b=np.einsum("bi,bij->bj", velocity, heading),
+        object_size=np.array([state.size for state in states]),
+        object_active=np.array([state.active for state in states]),
+        contact_force=np.array([i.task.forces for i in instances]),
+        body_position_w=np.array([d.xpos[b] for d, b in zip(datas, bodies, strict=True)]),
+        body_quaternion_w=np.array([d.xquat[b] for d, b in zip(datas, bodies, strict=True)]),
+        body_names=index.body_names,
+        camera_w=np.array([_camera_pose(i) for i in instances]),
+        solids=tuple(i.task.solids() for i in instances),
+    )
+
+
+def _camera_pose(instance: EnvInstance) -> Array:
+    position, rotation = instance.camera_pose
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, rotation.ravel())
+    return np.concatenate([position, quaternion])
+
+
+@dataclass(frozen=True)
 class Observation:
-    """What the robots measure at a planner tick."""
+    """Measurements of all robots at a planner tick."""
 
     depth: NDArray[np.uint16]
     """(B, H, W) planar depth, mm, 0 invalid."""
@@ -50,8 +145,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class StepResult:
-    """What a planner tick brought. Rows whose episode is over repeat their last observation
-    with zero reward."""
+    """Result of a planner tick; a row whose episode is over repeats its last observation."""
 
     observation: Observation
     reward: NDArray[np.float64]
@@ -70,19 +164,20 @@ class StepResult:
     """(B,) ``success`` of each part of a sequence; empty in a row of a single task."""
 
 
-def decided(config: EnvConfig) -> EnvConfig:
-    """``config`` with what it leaves to its low-level controller (see
-    `EnvConfig.for_controller`); what a command checks, hands on and records. The file of a
-    controller is named by its absolute path."""
+def resolve_config(config: EnvConfig) -> EnvConfig:
+    """``config`` with the values that depend on its low-level controller filled in.
+
+    See `EnvConfig.for_controller`. The path of a controller's file becomes absolute.
+    """
     config = config.for_controller(make_controller(config.controller).walks)
     return replace(config, controller=absolute_controller(config.controller))
 
 
 class VectorEnv:
-    """B robots, each in an episode of its own.
+    """B robots, each in its own episode.
 
     Args:
-        pictures: false: depth stays empty, which saves the rays; all else is as with them.
+        render_depth: if false, depth images are zero, which is faster; all else is the same.
 
     Raises:
         UsageError: unknown task, wrong shapes, or actions that are not numbers.
@@ -93,7 +188,7 @@ class VectorEnv:
         config: EnvConfig,
         num_envs: int,
         controller: LowLevelController | None = None,
-        pictures: bool = True,
+        render_depth: bool = True,
     ) -> None:
         if num_envs < 1 or config.threads < 1:
             raise UsageError(
@@ -102,25 +197,25 @@ class VectorEnv:
         self.num_envs = num_envs
         self.controller = controller or make_controller(config.controller)
         self.config = config = config.for_controller(self.controller.walks)
-        self.lanes: list[Lane] = []
-        self._camera = DepthCamera(config.camera)
-        self._pictures = pictures
+        self.instances: list[EnvInstance] = []
+        self._camera = RayCastCamera(config.camera)
+        self._render_depth = render_depth
         self._standing = settle(build_scene("ball", config.feet), self.controller)
         self._pool = ThreadPoolExecutor(config.threads) if config.threads > 1 else None
         self._controller_state = np.zeros((num_envs, STATE_DIM))
-        # newest first: sent actions that may still be on their way
+        # newest first: sent actions that may not have taken effect yet
         slowest = -(-config.delay.action_ticks[1] // CONTROLLER_TICKS_PER_PLAN)
         self._sent = np.zeros((num_envs, 1 + slowest, ACTION_DIM))
 
     @property
     def scenarios(self) -> tuple[Scenario, ...]:
         """The episode of each row."""
-        return tuple(lane.scenario for lane in self.lanes)
+        return tuple(instance.scenario for instance in self.instances)
 
     @property
     def parameters(self) -> tuple[dict[str, float], ...]:
-        """What was drawn for each row's episode, for the record: physics, delays, geometry."""
-        return tuple(lane.parameters for lane in self.lanes)
+        """Sampled parameters of each row's episode: physics, delays, geometry."""
+        return tuple(instance.parameters for instance in self.instances)
 
     @property
     def sent_action(self) -> Array:
@@ -130,39 +225,39 @@ class VectorEnv:
     @property
     def tick(self) -> NDArray[np.int64]:
         """(B,) planner ticks done in each episode."""
-        return np.array([lane.tick for lane in self.lanes])
+        return np.array([instance.tick for instance in self.instances])
 
     @property
     def done(self) -> NDArray[np.bool_]:
         """(B,) rows whose episode is over."""
-        return np.array([lane.done for lane in self.lanes])
+        return np.array([instance.done for instance in self.instances])
 
     def reset(self, scenarios: Sequence[Scenario]) -> Observation:
         """Start an episode in every row."""
         if len(scenarios) != self.num_envs:
             raise UsageError(f"expected {self.num_envs} scenarios, found {len(scenarios)}")
-        if not self.lanes:
-            self.lanes = [self._lane(scenario) for scenario in scenarios]
-            return self._begin(np.arange(self.num_envs), None)
-        self._start_lanes(range(self.num_envs), scenarios)
+        if not self.instances:
+            self.instances = [self._instance(scenario) for scenario in scenarios]
+        else:
+            self._start_instances(range(self.num_envs), scenarios)
         return self._begin(np.arange(self.num_envs), None)
 
     def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> Observation:
         """Start a new episode in some rows, the others stay as they are."""
-        if not self.lanes:
+        if not self.instances:
             raise UsageError("reset_rows before the first reset; call reset first")
         if len(rows) != len(scenarios):
             raise UsageError(f"expected {len(rows)} scenarios, found {len(scenarios)}")
-        self._start_lanes(rows, scenarios)
+        self._start_instances(rows, scenarios)
         which = np.asarray(rows, dtype=np.intp)
         return self._begin(which, which)
 
-    def _lane(self, scenario: Scenario) -> Lane:
-        return Lane(self.config, self._camera, self._standing, scenario, self._pictures)
+    def _instance(self, scenario: Scenario) -> EnvInstance:
+        return EnvInstance(self.config, self._camera, self._standing, scenario, self._render_depth)
 
-    def _start_lanes(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
+    def _start_instances(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
         for row, scenario in zip(rows, scenarios, strict=True):
-            self.lanes[row].start(scenario)
+            self.instances[row].start(scenario)
 
     def _begin(
         self, rows: NDArray[np.intp], controller_rows: NDArray[np.intp] | None
@@ -179,11 +274,13 @@ class VectorEnv:
         for k in range(CONTROLLER_TICKS_PER_PLAN):
             self._measure(self._due_action(k))
             self._advance(self.controller.step(self._controller_state))
-        terms = [lane.end_tick(self._sent[row, 0]) for row, lane in enumerate(self.lanes)]
+        terms = [
+            instance.end_tick(self._sent[row, 0]) for row, instance in enumerate(self.instances)
+        ]
         return self._result(terms)
 
     def _send(self, action: NDArray[np.floating], live: NDArray[np.bool_]) -> None:
-        """Limit the rate, clip to the box, and put the action on its way."""
+        """Limit the rate, clip to the box, and queue the action."""
         wanted = np.asarray(action, dtype=np.float64)
         if wanted.shape != (self.num_envs, ACTION_DIM):
             raise UsageError(
@@ -199,42 +296,42 @@ class VectorEnv:
 
     def _due_action(self, k: int) -> Array:
         """(B, 7) the action in effect in controller tick ``k`` of this planner tick."""
-        delay = np.array([lane.action_delay for lane in self.lanes])
+        delay = np.array([instance.action_delay for instance in self.instances])
         age = np.maximum(0, -((k - delay) // CONTROLLER_TICKS_PER_PLAN))
         due: Array = self._sent[np.arange(self.num_envs), age]
         return due
 
     def _measure(self, action: Array) -> None:
         """The controllers' observations: fresh measurements and the command in effect."""
-        for row, lane in enumerate(self.lanes):
-            self._controller_state[row] = lane.state
+        for row, instance in enumerate(self.instances):
+            self._controller_state[row] = instance.state
         self._controller_state[:, COMMAND_SLICE] = self._command(action)
 
     def _command(self, action: Array) -> Array:
         """(B, 7) normalised actions -> (B, 10) commands [v, hands, height]."""
-        velocity = np.array([lane.task.velocity_command for lane in self.lanes])
+        velocity = np.array([instance.task.velocity_command for instance in self.instances])
         return np.concatenate([velocity, ACTION_BOX.to_metric(action)], axis=1)
 
     def _observe(self) -> Observation:
-        state = np.array([lane.state for lane in self.lanes])
+        state = np.array([instance.state for instance in self.instances])
         state[:, COMMAND_SLICE] = self._command(self._sent[:, 0])
         depth = np.empty((self.num_envs, DEPTH_ROWS, DEPTH_COLS), dtype=np.uint16)
-        for row, lane in enumerate(self.lanes):
-            depth[row] = lane.depth
+        for row, instance in enumerate(self.instances):
+            depth[row] = instance.depth
         return Observation(depth, state.astype(np.float32))
 
     def _result(self, terms: list[dict[str, float]]) -> StepResult:
-        names = dict.fromkeys(name for lane in self.lanes for name in lane.task.terms)
+        names = dict.fromkeys(name for instance in self.instances for name in instance.task.terms)
         by_name = {name: np.array([t.get(name, 0.0) for t in terms]) for name in names}
         return StepResult(
             observation=self._observe(),
             reward=np.sum(list(by_name.values()), axis=0),
             reward_terms=by_name,
-            terminated=np.array([lane.terminated for lane in self.lanes]),
-            truncated=np.array([lane.truncated for lane in self.lanes]),
-            success=np.array([lane.task.success for lane in self.lanes]),
+            terminated=np.array([instance.terminated for instance in self.instances]),
+            truncated=np.array([instance.truncated for instance in self.instances]),
+            success=np.array([instance.task.success for instance in self.instances]),
             sent_action=self.sent_action,
-            parts=tuple(lane.task.parts for lane in self.lanes),
+            parts=tuple(instance.task.parts for instance in self.instances),
         )
 
     def _advance(self, targets: Array) -> None:
@@ -242,7 +339,7 @@ class VectorEnv:
 
         def work(rows: NDArray[np.intp]) -> None:
             for row in rows:
-                self.lanes[row].advance(targets[row])
+                self.instances[row].advance(targets[row])
 
         chunks = np.array_split(np.arange(self.num_envs), self.config.threads)
         if self._pool is None:
@@ -252,12 +349,12 @@ class VectorEnv:
             pending.result()
 
     def damp(self, row: int) -> None:
-        """Damp the motors of ``row`` until its next episode, whatever the controller says."""
-        self.lanes[row].robot.damp()
+        """Damp the motors of ``row`` until its next episode."""
+        self.instances[row].robot.damp()
 
-    def snapshot(self) -> Truth:
-        """The simulator's truth now: for oracles, probes and logs, never for a policy."""
-        return snapshot(self.lanes)
+    def privileged_state(self) -> PrivilegedState:
+        """The simulator's state now, for oracles, probes and logs, never for a policy."""
+        return privileged_state(self.instances)
 
     def close(self) -> None:
         """End the threads."""

@@ -1,4 +1,4 @@
-"""Gymnasium's view of one simulated robot: ``gymnasium.make("egovcp/ball-v0")``."""
+"""Gymnasium environment of one simulated robot: ``gymnasium.make("egovcp/ball-v0")``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.robot.controller import LowLevelController
+from egovcp.robot.controllers import LowLevelController
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import Observation, VectorEnv
 from egovcp.sim.scenario import Scenario

@@ -1,7 +1,7 @@
-"""One simulated robot and its task under commands to the motors, in steps of 5 ms.
+"""One simulated robot and its task under motor commands, in steps of 5 ms.
 
-`VectorEnv` brings its own low-level controller; here whoever holds the wire brings one, as with
-the real robot. Nothing waits: `LiveRobot.advance` lets time pass, in lock-step or on a clock.
+Unlike `VectorEnv` it has no low-level controller: the caller sends motor commands, as to a real
+robot. Time passes only in `LiveRobot.advance`.
 
     HELD  ->  FREE  ->  EPISODE  ->  OVER
     crane     stands    task runs    fallen, or at the time limit; physics goes on
@@ -19,14 +19,12 @@ from numpy.typing import NDArray
 
 from egovcp.robot.controllers import make_controller
 from egovcp.robot.g1 import DAMPING
-from egovcp.sim.camera import DepthCamera
+from egovcp.sim.camera import RayCastCamera
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.lane import Lane
-from egovcp.sim.robot import SimulatedRobot
+from egovcp.sim.instance import EnvInstance, settle
+from egovcp.sim.robot import Proprioception, SimulatedRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import PARTS, build_scene
-from egovcp.sim.sensors import Proprioception
-from egovcp.sim.standing import settle
 from egovcp.sim.tasks.base import PHYSICS_STEPS_PER_TICK
 from egovcp.spec import (
     ACTION_BOX,
@@ -40,11 +38,11 @@ from egovcp.spec import (
 Array = NDArray[np.float64]
 
 GRAVITY: Final = 9.81  # m/s^2
-_PICTURE_STEPS: Final = 6  # 30 ms, nearest to the 30 Hz of a D435i
+_IMAGE_STEPS: Final = 6  # 30 ms, nearest to the 30 Hz of a D435i
 
 
 class Phase(Enum):
-    """Where the robot is in its episode."""
+    """Phase of an episode."""
 
     HELD = "held"
     """A crane holds the pelvis where the robot would stand."""
@@ -55,8 +53,8 @@ class Phase(Enum):
 
 
 @dataclass(frozen=True)
-class Servos:
-    """What the motors are told: torque = kp (q* - q) + kd (dq* - dq) + tau, (29,) each."""
+class ServoCommand:
+    """Command of a servo: torque = kp (q* - q) + kd (dq* - dq) + tau; (29,) each."""
 
     position: Array
     """rad."""
@@ -70,13 +68,13 @@ class Servos:
     """N m."""
 
 
-#: Motors that only damp.
-LIMP: Final = Servos(np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS), DAMPING)
+#: The motors only damp.
+DAMPED: Final = ServoCommand(np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS), DAMPING)
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """What the sensors of the robot say, with their noise."""
+    """A noisy reading of the robot's sensors."""
 
     joint_position: Array
     """(29,) rad."""
@@ -93,8 +91,8 @@ class Measurement:
 
 
 @dataclass
-class Outcome:
-    """What came of an episode."""
+class EpisodeOutcome:
+    """Result of an episode, up to now."""
 
     scenario: Scenario
     ticks: int = 0
@@ -102,8 +100,7 @@ class Outcome:
     success: bool = False
     fallen: bool = False
     reward_terms: dict[str, float] = field(default_factory=dict)
-    """Sum of each term. The cost of a pose is that of the pose the robot was in: which one it was
-    told to take is not known here."""
+    """Sum of each term; pose costs are those of the measured pose, as actions are unknown."""
     contacts: dict[str, float] = field(default_factory=dict)
     """Part of the robot -> its greatest force on the task's object, N."""
 
@@ -127,55 +124,52 @@ class LiveRobot:
     def __init__(self, config: EnvConfig) -> None:
         controller = make_controller(config.controller)
         self.config = config.for_controller(controller.walks)
-        self._camera = DepthCamera(config.camera)
+        self._camera = RayCastCamera(config.camera)
         self._standing = settle(build_scene("ball", config.feet), controller)
-        self._lane: Lane | None = None
+        self._instance: EnvInstance | None = None
 
     def start(self, scenario: Scenario) -> None:
-        """Put the robot on the crane in the scene of ``scenario``, motors limp."""
-        if self._lane is None:
-            self._lane = Lane(self.config, self._camera, self._standing, scenario, pictures=False)
+        """Hold the robot up in the scene of ``scenario``, with damped motors."""
+        if self._instance is None:
+            self._instance = EnvInstance(
+                self.config, self._camera, self._standing, scenario, render_depth=False
+            )
         else:
-            self._lane.start(scenario)
+            self._instance.start(scenario)
         self.phase = Phase.HELD
         self.steps = 0
         """Physics steps since `start`."""
-        self.outcome = Outcome(scenario)
+        self.outcome = EpisodeOutcome(scenario)
         rng = scenario.rng("proprioception")
         self._sensors = Proprioception(self.config.sensors, self.robot.index, rng)
         self._measured = np.zeros(STATE_DIM)
-        self._film: deque[tuple[int, NDArray[np.uint16]]] = deque([(0, self.lane.look())])
-        self.drive(LIMP)
+        self._images: deque[tuple[int, NDArray[np.uint16]]] = deque([(0, self.instance.render())])
+        self.drive(DAMPED)
 
     @property
-    def lane(self) -> Lane:
+    def instance(self) -> EnvInstance:
         """The episode and its sensors."""
-        assert self._lane is not None, "start an episode first"
-        return self._lane
+        assert self._instance is not None, "start an episode first"
+        return self._instance
 
     @property
     def robot(self) -> SimulatedRobot:
         """The physics."""
-        return self.lane.robot
+        return self.instance.robot
 
     @property
-    def time(self) -> float:
-        """s since `start`."""
-        return self.steps * PHYSICS_DT
-
-    @property
-    def velocity_wish(self) -> Array:
-        """(3,) base velocity that an operator would ask for now: vx, vy (m/s), yaw rate (rad/s)."""
-        return self.lane.task.velocity_command if self.phase is Phase.EPISODE else np.zeros(3)
+    def operator_velocity(self) -> Array:
+        """(3,) base velocity that an operator commands now: vx, vy (m/s), yaw rate (rad/s)."""
+        return self.instance.task.velocity_command if self.phase is Phase.EPISODE else np.zeros(3)
 
     def release(self) -> None:
-        """The crane lets go."""
+        """Release the robot from the crane."""
         if self.phase is Phase.HELD:
             self.phase = Phase.FREE
 
     def begin(self) -> None:
-        """The task begins, around the robot as it stands now."""
-        self.lane.task.place()
+        """Start the task around the robot at its current pose."""
+        self.instance.task.place()
         self.robot.refresh_poses()
         self.phase = Phase.EPISODE
 
@@ -183,65 +177,63 @@ class LiveRobot:
         """Change the velocity of the base at once, (3,) m/s, world."""
         self.robot.data.qvel[:3] += velocity
 
-    def drive(self, servos: Servos) -> None:
-        """Tell the motors what to do until the next call; effort limits hold as ever."""
-        model, physics = self.robot.model, self.lane.physics
-        stiffness = servos.stiffness * physics.stiffness_scale
-        damping = servos.damping * physics.damping_scale
+    def drive(self, command: ServoCommand) -> None:
+        """Set the motor command until the next call; effort limits apply."""
+        model, physics = self.robot.model, self.instance.physics
+        stiffness = command.stiffness * physics.stiffness_scale
+        damping = command.damping * physics.damping_scale
         model.actuator_gainprm[:, 0] = 1.0
         model.actuator_biasprm[:, 1] = -stiffness
         model.actuator_biasprm[:, 2] = -damping
-        feed = stiffness * servos.position + damping * servos.velocity + servos.torque
+        feed = stiffness * command.position + damping * command.velocity + command.torque
         self.robot.data.ctrl[:] = feed
 
     def advance(self, steps: int = 1) -> None:
-        """Let ``steps`` of 5 ms pass."""
+        """Simulate ``steps`` of 5 ms."""
         for _ in range(steps):
             if self.phase is Phase.EPISODE:
                 self._step_task()
             else:
                 self._step_physics()
             self.steps += 1
-            if self.steps % _PICTURE_STEPS == 0:
+            if self.steps % _IMAGE_STEPS == 0:
                 self.robot.refresh_poses()
-                self._film.append((self.steps, self.lane.look()))
+                self._images.append((self.steps, self.instance.render()))
 
     def _step_physics(self) -> None:
         self.robot.step()
         if self.phase is not Phase.OVER:
-            self.lane.require_valid_physics()
+            self.instance.require_valid_physics()
         if self.phase is Phase.HELD:
             data = self.robot.data
-            data.qpos[:7] = self._standing.pelvis
+            data.qpos[:3] = self._standing.position
+            data.qpos[3:7] = self._standing.quaternion
             data.qvel[:6] = 0.0
-        elif self.phase is Phase.FREE and self.lane.task.has_fallen():
+        elif self.phase is Phase.FREE and self.instance.task.has_fallen():
             self.outcome.fallen = True
             self.phase = Phase.OVER
 
     def _step_task(self) -> None:
-        self.lane.step()
-        if self.lane.task.physics_steps % PHYSICS_STEPS_PER_TICK:
+        self.instance.step()
+        if self.instance.task.physics_steps % PHYSICS_STEPS_PER_TICK:
             return
         totals = self.outcome.reward_terms
-        for name, value in self.lane.end_tick(self._pose()).items():
+        for name, value in self.instance.end_tick(self._pose()).items():
             totals[name] = totals.get(name, 0.0) + value
         self._record()
-        if self.lane.done:
+        if self.instance.done:
             self.phase = Phase.OVER
 
     def _record(self) -> None:
-        lane, outcome = self.lane, self.outcome
-        outcome.ticks, outcome.fallen, outcome.success = (
-            lane.tick,
-            lane.terminated,
-            lane.task.success,
-        )
-        for part, force in zip(PARTS, lane.task.forces.tolist(), strict=True):
+        instance, outcome = self.instance, self.outcome
+        outcome.ticks, outcome.fallen = instance.tick, instance.terminated
+        outcome.success = instance.task.success
+        for part, force in zip(PARTS, instance.task.forces.tolist(), strict=True):
             if force > 0.0:
                 outcome.contacts[part] = max(force, outcome.contacts.get(part, 0.0))
 
     def _pose(self) -> Array:
-        """(7,) the action that would ask for the pose the robot is in, box units."""
+        """(7,) the action that commands the robot's present pose, box units."""
         robot = self.robot
         hands = (robot.palms_w - robot.data.qpos[:3]) @ robot.heading
         pose = np.append(hands.ravel(), robot.pelvis_height)
@@ -262,20 +254,19 @@ class LiveRobot:
         )
 
     @property
-    def picture(self) -> tuple[int, NDArray[np.uint16]]:
-        """The newest picture that has come out of the camera, and the step it was taken at.
+    def depth_image(self) -> tuple[int, NDArray[np.uint16]]:
+        """The newest available depth image and the physics step at which it was rendered.
 
-        It comes out after the delay of the episode, less the 20 ms that a picture waits on
-        average for the planner's tick.
+        Available after the episode's image delay, less the mean 20 ms to the next planner tick.
         """
-        late = max(0, self.lane.image_age - 1) / CONTROLLER_HZ / PHYSICS_DT
-        while len(self._film) > 1 and self._film[1][0] + late <= self.steps:
-            self._film.popleft()
-        return self._film[0]
+        late = max(0, self.instance.image_age - 1) / CONTROLLER_HZ / PHYSICS_DT
+        while len(self._images) > 1 and self._images[1][0] + late <= self.steps:
+            self._images.popleft()
+        return self._images[0]
 
 
 def _tilted(quaternion: Array, rotation: Array, gravity: Array) -> Array:
-    """(4,) ``quaternion``, turned by the least angle after which gravity is as measured (3,).
+    """(4,) ``quaternion``, turned by the smallest angle that makes gravity the measured one (3,).
 
     For unit vectors near each other, measured g' and true g in the pelvis frame, the rotation
     vector is g' x g.

@@ -1,57 +1,64 @@
-"""Reference policies that need no learning: hold, constant, random walks.
+"""Policies that need no learning: constant actions, random walks, and scripted oracles.
 
-A policy sees the environment, scripted oracles even its truth, and returns normalised
-actions (B, 7); the environment applies the same delays and rate limits to all of them.
+A policy returns normalised actions (B, 7). The environment applies the same delays and rate limits
+to all of them; only oracles read the simulator's privileged state.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, Protocol
+from dataclasses import dataclass
+from typing import Final, Literal, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
-from egovcp.sim.env import VectorEnv
+from egovcp.sim.env import PrivilegedState, VectorEnv
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import ACTION_DIM, ACTION_ETA, reflect
+from egovcp.spec import ACTION_BOX, ACTION_DIM, ACTION_ETA, reflect
 
 Array = NDArray[np.float64]
 
+_GRAVITY: Final = np.array([0.0, 0.0, -9.81])
+_LOOKAHEAD: Final = np.arange(0.0, 1.2, 0.01)  # s
 
-class Policy(Protocol):
-    """Acts on a whole batch."""
+
+class EnvPolicy(Protocol):
+    """Acts on all rows of an environment."""
 
     def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
-        """Every row has just begun one of ``scenarios``."""
+        """Each row starts one of ``scenarios``."""
         ...
 
     def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
-        """Only ``rows`` have begun new episodes."""
+        """``rows`` start ``scenarios``."""
         ...
 
     def act(self, env: VectorEnv) -> Array:
-        """(B, 7) normalised actions for the present planner tick."""
+        """(B, 7) normalised actions for this planner tick."""
         ...
 
 
-class Constant:
-    """The same action always; what a fixed guard or a permanent crouch would earn."""
+class _Stateless:
+    """A policy without memory."""
+
+    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
+        """See `EnvPolicy`."""
+
+    def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
+        """See `EnvPolicy`."""
+
+
+class Constant(_Stateless):
+    """The same action always."""
 
     def __init__(self, action: Sequence[float] | NDArray[np.floating]) -> None:
         self._action = np.asarray(action, dtype=np.float64)
         if self._action.shape != (ACTION_DIM,):
             raise UsageError(f"expected {ACTION_DIM} numbers, found shape {self._action.shape}")
 
-    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
-        """Nothing to forget."""
-
-    def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
-        """Nothing to forget."""
-
     def act(self, env: VectorEnv) -> Array:
-        """(B, 7) the action."""
         return np.tile(self._action, (env.num_envs, 1))
 
 
@@ -65,11 +72,14 @@ class Hold(Constant):
 class RandomWalk:
     """The behaviour policy of the data: a_t = a_{t-1} + eta delta, delta ~ U(-1, 1)^7.
 
-    By default the paper's (section III-B). ``reflect`` folds what leaves the box back inside,
-    which keeps the walk's distribution uniform; ``clip`` piles it up on the walls. The next step
-    comes ``step_ticks`` (least, most) ticks after the last one, drawn anew each time. A step
-    beyond the environment's rate limit is sent as a ramp: an action then says where the hands will
-    be for a while, and its return what that was worth.
+    The defaults are the paper's (section III-B).
+
+    Args:
+        eta: largest change of an action per step; the environment sends a step beyond its rate
+            limit as a ramp.
+        bounds: ``reflect`` folds actions outside the box back inside, which keeps their
+            distribution uniform; ``clip`` accumulates them on its walls.
+        step_ticks: least and most ticks from one step to the next, sampled for each step.
     """
 
     def __init__(
@@ -86,56 +96,163 @@ class RandomWalk:
         self._rngs: list[np.random.Generator] = []
 
     def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
-        """Every row starts from neutral with its scenario's own randomness."""
+        """See `EnvPolicy`; rows start from neutral."""
         self._action = np.zeros((len(scenarios), ACTION_DIM))
         self._wait = np.zeros(len(scenarios), dtype=np.int64)
         self._rngs = [scenario.rng("policy") for scenario in scenarios]
 
     def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> None:
-        """``rows`` start from neutral with their scenarios' own randomness."""
+        """See `EnvPolicy`; rows start from neutral."""
         for row, scenario in zip(rows, scenarios, strict=True):
             self._action[row] = 0.0
             self._wait[row] = 0
             self._rngs[row] = scenario.rng("policy")
 
-    def stand(self, action: Array, rngs: Sequence[np.random.Generator]) -> None:
-        """Every row stands at its ``action`` (B, 7), as if looked at by chance: somewhere in a
-        rest, a long one more likely than a short one. What follows is drawn from its own ``rngs``.
+    def start_at(self, action: Array, rngs: Sequence[np.random.Generator]) -> None:
+        """Start each row at ``action`` (B, 7), at a random time between two of its steps.
+
+        The row's further steps are sampled from its generator in ``rngs``.
         """
         self._action = np.zeros((len(action), ACTION_DIM))
         self._wait = np.zeros(len(action), dtype=np.int64)
         self._rngs = list(rngs)
-        self.stand_rows(range(len(action)), action)
+        self.start_rows_at(range(len(action)), action)
 
-    def stand_rows(self, rows: Sequence[int], action: Array) -> None:
-        """`stand`, for ``rows`` alone, with the randomness they have."""
+    def start_rows_at(self, rows: Sequence[int], action: Array) -> None:
+        """As `start_at` for ``rows``, with their present generators."""
         for row, at in zip(rows, action, strict=True):
             self._action[row] = at
-            self._wait[row] = self._rest(self._rngs[row])
+            self._wait[row] = self._remaining_wait(self._rngs[row])
 
-    def _rest(self, rng: np.random.Generator) -> int:
-        """What is left of a rest, ticks."""
+    def _remaining_wait(self, rng: np.random.Generator) -> int:
+        """Ticks to the next step, seen at a random time: long waits are seen more often."""
         least, most = self._step_ticks
-        rests = np.arange(least, most + 1)
-        return int(rng.integers(rng.choice(rests, p=rests / rests.sum())))
+        waits = np.arange(least, most + 1)
+        return int(rng.integers(rng.choice(waits, p=waits / waits.sum())))
 
     def act(self, env: VectorEnv) -> Array:
-        """(B, 7) the next step of each row's walk."""
         delta = np.array([self._delta(row) for row in range(len(self._rngs))])
-        fold = reflect if self._bounds == "reflect" else _clip
-        self._action[:] = fold(self._action + self._eta * delta)
+        action = self._action + self._eta * delta
+        reflects = self._bounds == "reflect"
+        self._action[:] = reflect(action) if reflects else np.clip(action, -1.0, 1.0)
         return self._action.copy()
 
     def _delta(self, row: int) -> Array:
-        """(7,) of one robot; zeros between two steps."""
+        """(7,) the change of a row's action; zeros between two steps."""
         if self._wait[row] > 0:
             self._wait[row] -= 1
             return np.zeros(ACTION_DIM)
         rng, (least, most) = self._rngs[row], self._step_ticks
-        if most > 1:  # the paper's walk draws nothing else
+        if most > 1:  # else nothing is sampled, as in the paper's walk
             self._wait[row] = rng.integers(least, most, endpoint=True) - 1
         return rng.uniform(-1.0, 1.0, ACTION_DIM)
 
 
-def _clip(action: Array) -> Array:
-    return np.clip(action, -1.0, 1.0)
+class TaskOracle(Protocol):
+    """The scripted solution of one task."""
+
+    def act(self, state: PrivilegedState, row: int) -> Array:
+        """(7,) the action for one row."""
+        ...
+
+
+@dataclass(frozen=True)
+class BallOracleConfig:
+    """Where and how the ball oracle meets the ball."""
+
+    reach: float = 0.32
+    """Distance before the pelvis of the hand that waits for the ball, m."""
+    hand_offset: tuple[float, float, float] = (0.03, 0.0, 0.0)
+    """Middle of the hand capsule from the palm site, m, heading frame."""
+
+
+class BallOracle:
+    """Puts the nearer hand where the ball will cross a plane before the body."""
+
+    def __init__(self, config: BallOracleConfig = BallOracleConfig()) -> None:
+        self._config = config
+
+    def act(self, state: PrivilegedState, row: int) -> Array:
+        if not state.object_active[row]:
+            return np.zeros(7)
+        point = self._crossing(state.object_b[row], state.object_velocity_b[row])
+        target = np.asarray(ACTION_BOX.neutral).copy()
+        side = 0 if point[1] > 0 else 1
+        target[3 * side : 3 * side + 3] = point - self._config.hand_offset
+        return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
+
+    def _crossing(self, position: Array, velocity: Array) -> Array:
+        """Point of the ballistic path nearest to the plane x = reach."""
+        t = _LOOKAHEAD[:, None]
+        path = position + velocity * t + 0.5 * _GRAVITY * t * t
+        out: Array = path[np.argmin(np.abs(path[:, 0] - self._config.reach))]
+        return out
+
+
+@dataclass(frozen=True)
+class WallOracleConfig:
+    """How the wall oracle braces, m, heading frame."""
+
+    press: float = 0.05
+    """How far beyond the wall's surface the hands aim, so that they push."""
+    lateral: float = 0.20
+    """Hands left and right of the middle."""
+    height: float = 0.10
+    """Hands above the pelvis."""
+
+
+class WallOracle:
+    """From a push towards the wall onwards, presses both hands on the wall."""
+
+    def __init__(self, config: WallOracleConfig = WallOracleConfig()) -> None:
+        self._config = config
+
+    def act(self, state: PrivilegedState, row: int) -> Array:
+        if not state.object_active[row]:
+            return np.zeros(7)
+        c = self._config
+        ahead = state.object_b[row, 0] + c.press
+        left, right = (ahead, c.lateral, c.height), (ahead, -c.lateral, c.height)
+        target = np.array([*left, *right, ACTION_BOX.neutral[-1]])
+        return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class ArchOracleConfig:
+    """When and how the arch oracle ducks."""
+
+    before: float = 0.75
+    """Ducks while the arch is nearer than this ahead of the pelvis, m."""
+    behind: float = 0.30
+    """Stays down until the arch is this far behind the pelvis, m."""
+    height: float = 0.55
+    """Pelvis height under the arch, m."""
+
+
+class ArchOracle:
+    """Squats while the arch is near."""
+
+    def __init__(self, config: ArchOracleConfig = ArchOracleConfig()) -> None:
+        self._config = config
+
+    def act(self, state: PrivilegedState, row: int) -> Array:
+        ahead, c = state.object_b[row, 0], self._config
+        target = np.array(ACTION_BOX.neutral)
+        if state.object_active[row] and -c.behind < ahead < c.before:
+            target[6] = c.height
+        return ACTION_BOX.to_normalised(target)
+
+
+class Oracle(_Stateless):
+    """The scripted solution of each row's current task, from the simulator's state."""
+
+    def __init__(self) -> None:
+        self.by_task: dict[str, TaskOracle] = {
+            "ball": BallOracle(),
+            "wall": WallOracle(),
+            "arch": ArchOracle(),
+        }
+
+    def act(self, env: VectorEnv) -> Array:
+        state = env.privileged_state()
+        return np.array([self.by_task[name].act(state, row) for row, name in enumerate(state.task)])

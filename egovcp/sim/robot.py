@@ -1,4 +1,4 @@
-"""One simulated robot: its own model and data, stepped and watched for contacts."""
+"""One simulated robot: its MuJoCo model and data, contacts, divergence and proprioception."""
 
 from __future__ import annotations
 
@@ -11,11 +11,17 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.sim.scene import HEAD, TORSO, Scene
-from egovcp.sim.sensors import base_rotation
+from egovcp.robot.stance_table import StandingPose
+from egovcp.sim.config import SensorConfig
+from egovcp.sim.scene import HEAD, TORSO, Scene, SceneIndex
+from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES
 
 Array = NDArray[np.float64]
 
+_ANGULAR_VELOCITY: Final = STATE_SLICES["angular_velocity"]
+_GRAVITY: Final = STATE_SLICES["projected_gravity"]
+_POSITION: Final = STATE_SLICES["joint_position"]
+_VELOCITY: Final = STATE_SLICES["joint_velocity"]
 #: MuJoCo warnings after which the physics is wrong: for the first three, MuJoCo has also reset the
 #: state.
 _WARNINGS: Final = {
@@ -35,7 +41,7 @@ _LYING_HEIGHT = 0.5  # m, pelvis; above it no part of the trunk reaches the floo
 
 
 @dataclass(frozen=True)
-class Touch:
+class Contact:
     """A contact of the robot with the task's object in one physics step."""
 
     part: int
@@ -45,10 +51,7 @@ class Touch:
 
 
 class SimulatedRobot:
-    """Physics of one robot in one task's scene.
-
-    Each robot has a model of its own, so an episode may edit masses, sizes and gains.
-    """
+    """Physics of one robot in one task's scene, with its own copy of the model to edit."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -60,8 +63,7 @@ class SimulatedRobot:
     def shape_geom(self, geom: int, size: Sequence[float], centre: Sequence[float]) -> None:
         """Give a sphere or box of an object another size (m) and place in its body's frame.
 
-        Everything that the compiler derived from the size is kept consistent: contacts and
-        rays skip what these bounds exclude.
+        Updates the bounds that the compiler derived from the size: contacts and rays rely on them.
         """
         model, body = self.model, self.model.geom_bodyid[geom]
         extent = np.resize(np.asarray(size, dtype=np.float64), 3)
@@ -75,15 +77,15 @@ class SimulatedRobot:
         nodes[:, :3] = 0.0
         nodes[:, 3:] = np.maximum(nodes[:, 3:], reach)
 
-    def reset(self, joint_position: Array, pelvis: Array) -> None:
-        """Stand still at ``pelvis`` (7,) (position m, quaternion wxyz) with the joints (J,) rad."""
+    def reset(self, pose: StandingPose) -> None:
+        """Place the robot at rest in ``pose``."""
         mujoco.mj_setConst(self.model, self.data)
         mujoco.mj_resetData(self.model, self.data)
-        self.data.qpos[:7] = pelvis
-        self.data.qpos[self.index.joint_qpos] = joint_position
+        self.data.qpos[:3], self.data.qpos[3:7] = pose.position, pose.quaternion
+        self.data.qpos[self.index.joint_qpos] = pose.joints
 
     def damp(self) -> None:
-        """Let the servos only damp, until an episode's physics are applied again."""
+        """Make the servos damp only, until an episode's physics are applied again."""
         self.model.actuator_gainprm[:, 0] = 0.0
         self.model.actuator_biasprm[:, 1] = 0.0
 
@@ -95,23 +97,23 @@ class SimulatedRobot:
         """Bring body, geom and site poses up to date with the state."""
         mujoco.mj_kinematics(self.model, self.data)
 
-    def step(self) -> list[Touch]:
+    def step(self) -> list[Contact]:
         """One physics step; the contacts between robot and object that acted in it."""
         mujoco.mj_step(self.model, self.data)
-        return self._touches()
+        return self._contacts()
 
-    def _touches(self) -> list[Touch]:
+    def _contacts(self) -> list[Contact]:
         geoms = self.data.contact.geom
         of_object = self.index.is_object.take(geoms)
         if not of_object.any():
-            return []  # as in nearly every step
+            return []
         found = []
         for i in np.flatnonzero(of_object.any(axis=1)):
             other = geoms[i, 1] if of_object[i, 0] else geoms[i, 0]
             part = int(self.index.part[other])
             if part >= 0:
                 mujoco.mj_contactForce(self.model, self.data, int(i), self._wrench)
-                found.append(Touch(part, float(self._wrench[0])))
+                found.append(Contact(part, float(self._wrench[0])))
         return found
 
     @property
@@ -170,9 +172,52 @@ class SimulatedRobot:
 
     @property
     def on_floor(self) -> bool:
-        """Whether torso, pelvis or head touches the floor; a high pelvis says no by itself."""
+        """Whether torso, pelvis or head touches the floor."""
         if self.pelvis_height > _LYING_HEIGHT:
             return False
         geoms = self.data.contact.geom
         touching = geoms[(geoms == self.index.floor).any(axis=1)]
         return bool(np.isin(self.index.part[touching], (TORSO, HEAD)).any())
+
+
+def base_rotation(quaternion: Array) -> Array:
+    """Unit quaternion wxyz (4,) -> rotation (3, 3) from the pelvis frame to the world."""
+    out = np.empty(9)
+    mujoco.mju_quat2Mat(out, quaternion)
+    return out.reshape(3, 3)
+
+
+def noise_std(config: SensorConfig) -> Array:
+    """(S,) standard deviation of each number of a measurement; 0 for the command."""
+    out = np.zeros(STATE_DIM)
+    out[_ANGULAR_VELOCITY] = config.angular_velocity
+    out[_GRAVITY] = config.gravity
+    out[_POSITION] = config.joint_position
+    out[_VELOCITY] = config.joint_velocity
+    return out
+
+
+class Proprioception:
+    """IMU and joint encoders of one robot in one episode."""
+
+    def __init__(self, config: SensorConfig, index: SceneIndex, rng: np.random.Generator) -> None:
+        self._index = index
+        self._rng = rng
+        self._std = noise_std(config)
+        self._fresh = np.empty(STATE_DIM)
+        self._rotation = np.empty(9)
+
+    def measure(self, data: mujoco.MjData, out: Array) -> None:
+        """Write a noisy measurement into ``out`` (S,), all but its command part."""
+        fresh, qpos, qvel = self._fresh, data.qpos, data.qvel
+        self._rng.standard_normal(out=fresh)
+        fresh *= self._std
+        fresh[_ANGULAR_VELOCITY] += qvel[3:6]
+        mujoco.mju_quat2Mat(self._rotation, qpos[3:7])
+        gravity = fresh[_GRAVITY]
+        gravity -= self._rotation[6:]
+        gravity /= np.sqrt(gravity @ gravity)
+        fresh[_POSITION] += qpos[self._index.joint_qpos]
+        fresh[_VELOCITY] += qvel[self._index.joint_qvel]
+        out[: COMMAND_SLICE.start] = fresh[: COMMAND_SLICE.start]
+        out[COMMAND_SLICE.stop :] = fresh[COMMAND_SLICE.stop :]

@@ -1,4 +1,4 @@
-"""Which episode: everything random about it is a pure function of its scenario."""
+"""Identity and random streams of an episode, which is a pure function of its scenario."""
 
 from __future__ import annotations
 
@@ -11,41 +11,40 @@ import numpy as np
 from egovcp.errors import UsageError, suggest
 from egovcp.spec import TASKS
 
-#: Several tasks in one episode, for evaluation: nothing is collected from it, nothing learns it.
+#: Several tasks in one episode; for evaluation only.
 SEQUENCE: Final = "sequence"
-#: What an episode can be of. Their order is part of what is drawn: new ones come last.
-PLAYABLE: Final = (*TASKS, SEQUENCE)
+#: Tasks of an episode. Append new ones: random streams depend on the order.
+EPISODE_TASKS: Final = (*TASKS, SEQUENCE)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Names one episode. Equal scenarios give equal episodes, bit for bit.
+    """Identifies one episode. Equal scenarios give equal episodes, bit for bit.
 
     Raises:
         UsageError: the task is unknown, or a number is negative.
     """
 
     task: str
-    """One of `PLAYABLE`."""
+    """One of `EPISODE_TASKS`."""
     seed: int
     """Seed of the whole collection or evaluation."""
     episode: int
     """Index of the episode under that seed."""
 
     def __post_init__(self) -> None:
-        if self.task not in PLAYABLE:
-            raise UsageError(f"unknown task {self.task!r}{suggest(self.task, PLAYABLE)}")
+        if self.task not in EPISODE_TASKS:
+            raise UsageError(f"unknown task {self.task!r}{suggest(self.task, EPISODE_TASKS)}")
         if self.seed < 0 or self.episode < 0:
             raise UsageError(
                 f"seed and episode count from 0, found seed={self.seed} episode={self.episode}"
             )
 
     def rng(self, name: str) -> np.random.Generator:
-        """A generator of its own for the quantity ``name``.
+        """Random generator of the quantity ``name``.
 
-        Streams of different names, episodes, seeds and tasks are independent, so a new
-        random quantity leaves all others as they were.
+        Streams of different names, episodes, seeds and tasks are independent.
         """
-        key = (self.episode, PLAYABLE.index(self.task), zlib.crc32(name.encode()))
+        key = (self.episode, EPISODE_TASKS.index(self.task), zlib.crc32(name.encode()))
         entropy = np.random.SeedSequence(self.seed, spawn_key=key)
         return np.random.Generator(np.random.PCG64(entropy))

@@ -1,8 +1,7 @@
-"""Composes the MuJoCo model of a task: robot, floor, and ball, wall or arch, or all of them.
+"""MuJoCo models of the tasks: robot, floor, and ball, wall or arch, or all of them.
 
-A model is compiled once per task and foot model; each simulated robot owns a copy, whose
-fields the episode's randomisation edits. Visual meshes are left out: rays and contacts
-see the collision capsules, so a copy is 80 kB instead of 70 MB.
+A model is compiled once per task and foot model; each simulated robot edits its own copy. Visual
+meshes are left out: rays and contacts use the collision capsules, so a copy has 80 kB, not 70 MB.
 
 Geom groups: 0 floor and objects, 3 robot. Robot geoms meet the geoms with contype 1.
 """
@@ -26,8 +25,8 @@ from egovcp.spec import JOINT_NAMES
 
 _LOG = logging.getLogger(__name__)
 
-# MuJoCo would print its warnings and append them to MUJOCO_LOG.TXT in the working directory. Here
-# the counters in `MjData.warning` are checked.
+# Keeps MuJoCo from printing warnings and writing MUJOCO_LOG.TXT: `SimulatedRobot.diverged` checks
+# the counters of warnings.
 if mujoco.get_mju_user_warning() is None:
     mujoco.set_mju_user_warning(_LOG.debug)
 
@@ -38,8 +37,8 @@ ARCH: Final = "arch"
 ARCH_GEOMS: Final = ("arch_left_post", "arch_right_post", "arch_lintel")
 WALL_HALF_SIZE: Final = (0.05, 1.5, 1.3)  # m: thickness, width, height
 
-#: Parts of the robot that contacts are told apart by. The hand includes the wrist, the
-#: arm is forearm and upper arm, the torso includes the pelvis, the leg the foot.
+#: Parts of the robot that contacts distinguish. The hand includes the wrist, the torso the pelvis,
+#: the leg the foot; the arm is forearm and upper arm.
 PARTS: Final = ("left_hand", "right_hand", "left_arm", "right_arm", "torso", "head", "leg")
 HANDS: Final = (PARTS.index("left_hand"), PARTS.index("right_hand"))
 TORSO: Final = PARTS.index("torso")
@@ -95,7 +94,7 @@ class Scene:
     index: SceneIndex
 
     def copy_model(self) -> mujoco.MjModel:
-        """A model of its own for one robot, to be edited per episode."""
+        """A copy for one robot, to be edited per episode."""
         return copy.copy(self.model)
 
 
@@ -110,7 +109,7 @@ def build_scene(task: str, feet: FootModel) -> Scene:
     objects = tuple(_ADD) if task == SEQUENCE else (task,)
     for name in objects:
         _ADD[name](spec)
-    # proprioception reads the state itself; the model's own sensors would cost accelerations
+    # unused; they would compute accelerations
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_SENSOR
     model = spec.compile()
     return Scene(model, _index(model, objects))
@@ -163,7 +162,7 @@ def _add_arch(spec: mujoco.MjSpec) -> None:
         )
 
 
-#: In this order a ball, which alone has joints, has the last of them.
+#: The ball comes last: its free joint is the last joint of the model.
 _ADD: Final[dict[str, Callable[[mujoco.MjSpec], None]]] = {
     ARCH: _add_arch,
     WALL: _add_wall,

@@ -6,7 +6,7 @@ import pytest
 import tasks
 from tasks import Result
 
-from egovcp.sim.config import eventful
+from egovcp.sim.config import evaluation_config
 from egovcp_deploy.scores import EpisodeScore
 
 
@@ -50,7 +50,7 @@ def test_rows_are_narrow_and_name_the_best_constant_action():
 
 def test_all_players_play_a_task(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(tasks, "search_constant", lambda t, s, play: _Best(play))
-    env = replace(eventful(), controller="stance")
+    env = replace(evaluation_config(), controller="stance")
     found = tasks.measure(env, "ball", ("hold", "constant"), 1, 0, 1)
     assert found["hold"].reward == found["constant"].reward  # both hold the neutral pose
     assert found["constant"].action == (0.0,) * 7

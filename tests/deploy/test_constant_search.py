@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from egovcp.errors import DataError
-from egovcp.sim.scenario import PLAYABLE, Scenario
+from egovcp.sim.scenario import EPISODE_TASKS, Scenario
 from egovcp.spec import ACTION_DIM
 from egovcp_deploy.constant_search import Action, grid, load_constants, search_constant
 from egovcp_deploy.scenarios import held_out
@@ -36,7 +36,7 @@ class Landscape:
         return EpisodeScore(scenario.episode, 10, reward, reward > -1, False, [0.1])
 
 
-@pytest.mark.parametrize("task", PLAYABLE)
+@pytest.mark.parametrize("task", EPISODE_TASKS)
 @pytest.mark.parametrize("which", [0, 1, -1])
 def test_the_best_of_the_grid_wins_also_under_luck_that_all_share(task: str, which: int) -> None:
     best = grid(task)[which]
@@ -59,7 +59,7 @@ def test_all_candidates_of_a_round_play_the_same_scenarios_and_none_of_the_evalu
     assert not evaluated & {scenario for _, scenario in land.played}
 
 
-@pytest.mark.parametrize("task", PLAYABLE)
+@pytest.mark.parametrize("task", EPISODE_TASKS)
 def test_the_grid_is_symmetric_inside_the_box_and_holds_the_neutral_pose(task: str) -> None:
     actions = np.array(grid(task))
     assert np.abs(actions).max() <= 1.0

@@ -357,13 +357,13 @@ def test_an_error_keeps_what_was_played_before_it(
 
 
 def test_episodes_that_have_ended_in_an_interrupted_group_count(config: EnvConfig) -> None:
-    env, ticks = VectorEnv(config, 2, pictures=False), itertools.count()
+    env, ticks = VectorEnv(config, 2, render_depth=False), itertools.count()
     scenarios = [Scenario("ball", 0, number) for number in range(2)]
     toppled = reference("hold")
     advance = toppled.advance
 
     def push(sent: Any) -> None:
-        env.lanes[1].robot.data.qvel[0] = 5.0
+        env.instances[1].robot.data.qvel[0] = 5.0
         advance(sent)
 
     toppled.advance = push  # type: ignore[method-assign]

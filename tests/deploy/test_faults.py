@@ -224,7 +224,7 @@ def test_a_robot_that_is_pushed_over_is_damped_within_60_ms_of_tilting(sim: SimR
     tilts: list[float] = []
 
     def push(tick: int, sensed: Sensed, robot: SimRobot) -> Sensed:
-        body = robot.env.lanes[0].robot
+        body = robot.env.instances[0].robot
         if tick == 20:
             body.data.qvel[:3] += (0.0, 3.0, 0.0)
             body.data.qvel[3:6] += (-4.0, 0.0, 0.0)

@@ -11,7 +11,7 @@ from egovcp.cli import parse_config
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.plan import PlannerConfig
 from egovcp.policy_options import PlannerOptions
-from egovcp.sim.config import eventful
+from egovcp.sim.config import evaluation_config
 from egovcp.spec import TASKS
 from egovcp_deploy.evaluate import EvalConfig
 from egovcp_deploy.options import (
@@ -83,6 +83,6 @@ def test_played_scenarios_are_never_collected_ones_and_search_sees_none_of_them(
 
 
 def test_played_episodes_all_have_an_event() -> None:
-    assert {eventful().episode(t).empty_probability for t in TASKS} == {0.0}
+    assert {evaluation_config().episode(t).empty_probability for t in TASKS} == {0.0}
     given = parse_config(EvalConfig, ["--env.controller=stance"], "egovcp-eval").env
-    assert given == replace(eventful(), controller="stance")
+    assert given == replace(evaluation_config(), controller="stance")

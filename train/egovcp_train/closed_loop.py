@@ -65,10 +65,10 @@ class ClosedLoop:
     def _together(
         self, model: WorldModel, planner: PlannerConfig, scenarios: Sequence[Scenario]
     ) -> Played:
-        from egovcp.sim.config import eventful
+        from egovcp.sim.config import evaluation_config
         from egovcp.sim.env import VectorEnv
 
-        config = replace(eventful(), controller=self._controller)
+        config = replace(evaluation_config(), controller=self._controller)
         env = VectorEnv(config, len(scenarios))
         return _play(env, Policy(model, planner, len(scenarios), self._seed), scenarios)
 

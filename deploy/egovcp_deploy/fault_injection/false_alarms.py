@@ -17,11 +17,11 @@ from egovcp.log.tick import MotorReadings
 from egovcp.plan import PolicyStep
 from egovcp.rate import LockstepClock
 from egovcp.robot.controllers import make_controller
-from egovcp.sim.config import eventful
-from egovcp.sim.live import LiveRobot, Phase, Servos
-from egovcp.sim.oracles import Oracle
+from egovcp.sim.config import evaluation_config
+from egovcp.sim.env import privileged_state
+from egovcp.sim.live import LiveRobot, Phase, ServoCommand
+from egovcp.sim.policies import Oracle
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.truth import snapshot
 from egovcp.spec import CONTROLLER_HZ, PHYSICS_STEPS_PER_CONTROLLER_TICK
 from egovcp_deploy.live.control import ControlLoop, Wishes
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
@@ -109,7 +109,7 @@ class _Body:
 
     def write(self, command: MotorCommand) -> None:
         """From the next step on."""
-        self._robot.drive(Servos(command.position, command.stiffness, command.damping))
+        self._robot.drive(ServoCommand(command.position, command.stiffness, command.damping))
 
     def close(self) -> None:
         """Nothing is held."""
@@ -121,7 +121,7 @@ class _Eye:
 
     def read(self) -> Picture:
         """The newest picture."""
-        return Picture(self._clock.now_ns(), self._robot.picture[1])
+        return Picture(self._clock.now_ns(), self._robot.depth_image[1])
 
     def close(self) -> None:
         """Nothing is held."""
@@ -132,7 +132,7 @@ class _OraclePolicy:
 
     def __init__(self, robot: LiveRobot) -> None:
         self._robot = robot
-        self._oracle = Oracle()._by_task
+        self._oracle = Oracle().by_task
 
     def reset(self) -> None:
         """Nothing to forget."""
@@ -144,7 +144,7 @@ class _OraclePolicy:
         remaining: Callable[[], float] | None = None,
     ) -> PolicyStep:
         """One action, which is the whole plan."""
-        truth = snapshot([self._robot.lane])
+        truth = privileged_state([self._robot.instance])
         action = self._oracle[truth.task[0]].act(truth, 0).astype(np.float32)[None]
         return PolicyStep(action, action[:, None], iterations=1)
 
@@ -166,7 +166,7 @@ class HealthyRun:
     def __init__(self, situation: Situation, seed: int = 0) -> None:
         self._situation, self._seed = situation, seed
         self._rng = np.random.default_rng(seed)
-        self._robot = LiveRobot(replace(eventful(), controller=situation.controller))
+        self._robot = LiveRobot(replace(evaluation_config(), controller=situation.controller))
         self.alarms = Alarms()
 
     def play(self, episode: int, most_s: float = np.inf) -> None:
@@ -202,7 +202,7 @@ class HealthyRun:
         if tick == 0:
             return Wishes(Request.RUN)
         if not self._situation.steered:
-            vx, vy, turn = self._robot.velocity_wish.tolist()
+            vx, vy, turn = self._robot.operator_velocity.tolist()
             return Wishes(velocity=(vx, vy, turn))
         if tick % _STEERING_TICKS == 0:
             self._velocity = self._rng.uniform((-0.2, -0.2, -0.5), (0.6, 0.2, 0.5)).tolist()

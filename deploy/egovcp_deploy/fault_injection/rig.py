@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from egovcp.plan import PolicyStep
 from egovcp.rate import MonotonicClock
-from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
+from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.sim.config import EnvConfig, EpisodeConfig
-from egovcp.sim.live import LIMP, LiveRobot
+from egovcp.sim.live import DAMPED, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
 from egovcp_deploy.fault_injection.forked import start_control_process
@@ -213,7 +213,7 @@ class FaultRig:
 
     def _hang_up(self) -> None:
         self._robot.start(Scenario("ball", 0, 0))
-        self._robot.drive(LIMP)
+        self._robot.drive(DAMPED)
         self.fake.next_episode()
 
     def _start(self, stack: ExitStack) -> None:

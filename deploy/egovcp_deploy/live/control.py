@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.robot.controller import LowLevelController
+from egovcp.robot.controllers import LowLevelController
 from egovcp.spec import ACTION_BOX, CONTROLLER_TICKS_PER_PLAN
 from egovcp_deploy.live import motors
 from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch

@@ -1,6 +1,6 @@
 """What the motors are told in each state: damped, coming in, or following the controller.
 
-No position leaves these functions beyond the bounds of `egovcp.robot.targets`, whatever they are
+No position leaves these functions beyond the bounds of `egovcp.robot.kinematics`, whatever they are
 given; numbers that are not finite become the middle of the joint's range.
 """
 
@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
+from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import NUM_JOINTS
 from egovcp_deploy.robots.body import MotorCommand
 

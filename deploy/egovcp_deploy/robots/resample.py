@@ -16,6 +16,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.robot.geometry import focal_length
 from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_MIN_M, DEPTH_ROWS
 
 _NEAREST: Final = math.ceil(DEPTH_MIN_M * 1000)  # mm
@@ -48,7 +49,7 @@ class Resampler:
     """
 
     def __init__(self, camera: Intrinsics, vertical_fov: float) -> None:
-        focal = DEPTH_ROWS / 2 / math.tan(vertical_fov / 2)
+        focal = focal_length(vertical_fov)
         steps = np.array([-_SPREAD, 0.0, _SPREAD])
         down = (np.arange(DEPTH_ROWS)[:, None] - (DEPTH_ROWS - 1) / 2 + steps) / focal
         right = (np.arange(DEPTH_COLS)[:, None] - (DEPTH_COLS - 1) / 2 + steps) / focal

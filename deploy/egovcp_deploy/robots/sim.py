@@ -47,7 +47,7 @@ class SimRobot:
     @property
     def camera(self) -> CameraView:
         """The camera as this episode's randomisation has mounted it."""
-        pitch = self._env.lanes[0].camera_pitch if self._env.lanes else 0.0
+        pitch = self._env.instances[0].camera_pitch if self._env.instances else 0.0
         return CameraView("torso_link", self._mount, pitch, self._fov)
 
     @property
@@ -64,7 +64,7 @@ class SimRobot:
     def observe(self) -> Sensed:
         """The observation, with pelvis pose and scene as the simulator has them."""
         assert self._observation is not None, "start an episode first"
-        truth = self._env.snapshot()
+        truth = self._env.privileged_state()
         pelvis = truth.pelvis_w[0]
         return Sensed(
             depth=self._observation.depth[0],
@@ -90,7 +90,7 @@ class SimRobot:
 
     def _events(self, terms: dict[str, float]) -> list[str]:
         """What happened for the first time in this episode."""
-        truth = self._env.snapshot()
+        truth = self._env.privileged_state()
         begun = float(truth.since_event[0]) > 0.0
         happened = [_BEGINS[truth.task[0]]] if begun else []
         happened += [text for name, text in _MEANS.items() if terms.get(name, 0.0) != 0.0]

@@ -12,7 +12,7 @@ from typing import Final
 
 from egovcp.log.tick import MotorReadings
 from egovcp.rate import NS_PER_S
-from egovcp.sim.live import LIMP, LiveRobot, Servos
+from egovcp.sim.live import DAMPED, LiveRobot, ServoCommand
 from egovcp.spec import PHYSICS_DT
 from egovcp_deploy.robots.body import BodyState, MotorCommand, Picture
 from egovcp_deploy.robots.remote import Remote
@@ -44,7 +44,7 @@ class SimBody:
 
     def __init__(self, robot: LiveRobot) -> None:
         self._robot = robot
-        self._servos = LIMP
+        self._servos = DAMPED
         self._steps = 0
         self._reading: BodyState | None = None
         self._episode = 0
@@ -94,14 +94,14 @@ class SimBody:
                 joint_velocity=seen.joint_velocity,
                 quaternion_w=seen.quaternion_w,
                 angular_velocity=seen.angular_velocity,
-                remote=Remote.asking_for(self._robot.velocity_wish, self.pressed).to_bytes(),
+                remote=Remote.asking_for(self._robot.operator_velocity, self.pressed).to_bytes(),
                 motors=MotorReadings(seen.torque),
             )
         return self._reading
 
     def write(self, command: MotorCommand) -> None:
         """From the next step on."""
-        self._servos = Servos(command.position, command.stiffness, command.damping)
+        self._servos = ServoCommand(command.position, command.stiffness, command.damping)
 
     def close(self) -> None:
         """Nothing is held."""
@@ -117,7 +117,7 @@ class SimEye:
 
     def read(self) -> Picture:
         """The newest picture that has come out of the camera."""
-        taken, depth = self._body.robot.picture
+        taken, depth = self._body.robot.depth_image
         if self._newest is None or (self._body.episode, taken) != self._shown:
             self._shown = (self._body.episode, taken)
             self._newest = Picture(self._body.time_ns, depth)

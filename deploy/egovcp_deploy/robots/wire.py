@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log.tick import MotorReadings
-from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
+from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS
 from egovcp_deploy.robots.body import BodyState, MotorCommand
 from egovcp_deploy.robots.motor_fields import decode_motor_fields, encode_motor_fields

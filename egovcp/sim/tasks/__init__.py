@@ -14,5 +14,5 @@ _TASKS: Final[dict[str, type[Task]]] = {**SINGLE, SEQUENCE: SequenceTask}
 
 
 def make_task(config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> Task:
-    """The task of ``scenario``; draws its geometry and writes it into the robot's model."""
+    """The task of ``scenario``; samples its geometry and writes it into the robot's model."""
     return _TASKS[scenario.task](config, scenario, robot)

@@ -1,8 +1,8 @@
 """Traverse the arch: duck under a lintel that an upright robot would hit.
 
-With ``motion="walk"`` the arch stands and the robot walks; whoever commands the velocity also
-keeps it on course, as an operator would. On the ``rail`` the robot stands and the arch comes to
-it at the commanded speed: the same relative motion. A kinematic arch cannot be pushed away.
+With ``motion="walk"`` the robot walks to a fixed arch, and the velocity command steers it onto the
+middle of the arch. With ``rail`` the robot stands and the arch moves towards it at the commanded
+speed. The arch is kinematic: contacts do not move it.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from egovcp.sim.config import EnvConfig
-from egovcp.sim.robot import SimulatedRobot, Touch
+from egovcp.sim.config import ArchConfig, EnvConfig
+from egovcp.sim.robot import Contact, SimulatedRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import ARCH, ARCH_GEOMS, HEAD, PARTS
 from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
@@ -23,7 +23,7 @@ from egovcp.spec import ACTION_HANDS, PHYSICS_DT
 _OTHERS: Final = [part for part in range(len(PARTS)) if part != HEAD]
 _POST_HALF_WIDTH: Final = 0.06  # m
 _BEHIND: Final = 0.25  # m, an arch this far behind the pelvis has been passed
-# How whoever commands the velocity keeps a walking robot on course.
+# Steering of a walking robot.
 _SIDE_GAIN: Final = 0.5  # 1/s
 _MOST_SIDEWAYS: Final = 0.1  # m/s
 _TURN_GAIN: Final = 1.0  # 1/s
@@ -33,6 +33,7 @@ _MOST_TURNING: Final = 0.3  # rad/s
 class ArchTask(Task):
     """One arch, which starts to move at the event."""
 
+    config: ArchConfig
     terms: ClassVar = ("progress", "pass", "head", "contact", "crouch", "pose", "fall")
 
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
@@ -55,7 +56,6 @@ class ArchTask(Task):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Arch and speed."""
         return {
             "clearance": self.clearance,
             "width": 2 * self._half_width,
@@ -81,7 +81,6 @@ class ArchTask(Task):
             self.robot.shape_geom(self.robot.model.geom(name).id, size, centre)
 
     def place(self) -> None:
-        """Stand the arch across the robot's way."""
         pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
         self._direction, self._start = heading[:, 0].copy(), pelvis.copy()
         self._origin = pelvis + heading @ np.array([0.0, self._lateral, 0.0])
@@ -95,17 +94,16 @@ class ArchTask(Task):
         self.robot.data.mocap_pos[self._mocap] = self._origin + self._ahead * self._direction
 
     def park(self) -> None:
-        """Stand the arch where the model has it, far away."""
         self.robot.data.mocap_pos[self._mocap] = self._body.pos
 
     @property
     def moving(self) -> bool:
-        """Whether the robot is told to walk, or the arch comes nearer."""
+        """Whether the robot is commanded to walk, or the arch moves."""
         return self.since_event >= 0.0
 
     @property
     def velocity_command(self) -> Array:
-        """(3,) forward at the arch's speed once it moves."""
+        """(3,) see `Task`; forward, and back onto the course, from the event to the passage."""
         if not self.moving or (self._walks and self._passed):
             return np.zeros(3)
         if not self._walks:
@@ -120,19 +118,18 @@ class ArchTask(Task):
         return self.config.motion == "walk"
 
     def _off_course(self) -> tuple[float, float]:
-        """How far the pelvis is left of the straight way (m), and turned off it (rad)."""
+        """Pelvis left of the course (m), and its heading relative to the course (rad)."""
         ahead, left = self._direction, np.array([-self._direction[1], self._direction[0], 0.0])
         aside = float((self.robot.data.qpos[:3] - self._start) @ left)
         forward = self.robot.heading[:, 0]
         return aside, math.atan2(float(forward @ left), float(forward @ ahead))
 
     def begin_tick(self) -> None:
-        """Forget what the last planner tick saw."""
         super().begin_tick()
         self._progress = 0.0
 
-    def act(self) -> None:
-        """Move the arch along the rail, or see how far the robot has walked."""
+    def before_step(self) -> None:
+        """Move the arch along the rail, or measure how far the robot has walked."""
         before = self._ahead
         if self._walks:
             arch = self.robot.data.mocap_pos[self._mocap]
@@ -143,12 +140,10 @@ class ArchTask(Task):
         if self.moving:
             self._progress += before - self._ahead
 
-    def observe(self, touches: Sequence[Touch]) -> None:
-        """Remember any contact."""
-        self._touched = self._touched or bool(touches)
+    def process_contacts(self, contacts: Sequence[Contact]) -> None:
+        self._touched = self._touched or bool(contacts)
 
     def rewards(self, action: Array) -> dict[str, float]:
-        """Progress, once the passage, and the costs of contact, crouch and pose."""
         c = self.config
         passes = not self._passed and self._ahead + self._half_depth < -_BEHIND
         under_way = self.moving and not self._passed
@@ -165,28 +160,20 @@ class ArchTask(Task):
         }
 
     @property
-    def fall_cost(self) -> float:
-        """Cost of a fall."""
-        return self.config.fall_cost
-
-    @property
     def achieved(self) -> bool:
-        """Passed untouched; in an empty episode the arch never comes."""
+        """Passed without contact; in an empty episode, no contact."""
         return not self._touched and (self.event_tick is None or self._passed)
 
     @property
-    def settled(self) -> bool:
-        """Whether the arch lies behind."""
+    def finished(self) -> bool:
         return self._passed
 
     def state(self) -> ObjectState:
-        """Arch centre on the ground; active until it has been passed."""
         velocity = -self.speed * (self.moving and not self._walks) * self._direction
         position = self.robot.data.mocap_pos[self._mocap].copy()
         return ObjectState(position, velocity, self.clearance, self.moving and not self._passed)
 
     def solids(self) -> tuple[Solid, ...]:
-        """Both posts and the lintel."""
         model, data = self.robot.model, self.robot.data
         found = []
         for name in ARCH_GEOMS:

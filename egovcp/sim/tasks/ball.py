@@ -13,8 +13,8 @@ from typing import ClassVar, Final
 import mujoco
 import numpy as np
 
-from egovcp.sim.config import EnvConfig
-from egovcp.sim.robot import SimulatedRobot, Touch
+from egovcp.sim.config import BallConfig, EnvConfig
+from egovcp.sim.robot import Contact, SimulatedRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import BALL, HANDS, HEAD, LEG, TORSO
 from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
@@ -29,6 +29,7 @@ _TUMBLE: Final = 6.0  # rad/s, the most that a box turns about each axis
 class BallTask(Task):
     """One throw at the upper body, at the event."""
 
+    config: BallConfig
     terms: ClassVar = ("block", "hit", "pose", "fall")
 
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
@@ -47,7 +48,7 @@ class BallTask(Task):
         )
         self._turned, self._turning = self._attitude(scenario)
         self._thrown = False
-        self._dead = False  # has met the floor: can neither be blocked nor hit any more
+        self._grounded = False  # on the floor: contacts no longer count
         self._blocked_at: float | None = None
         self._hit = False
         self._new_block = False
@@ -56,7 +57,6 @@ class BallTask(Task):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Ball, release and aim."""
         return {
             "radius": self.radius,
             "mass": self._mass,
@@ -69,7 +69,7 @@ class BallTask(Task):
         }
 
     def _attitude(self, scenario: Scenario) -> tuple[Array, Array]:
-        """Quaternion and angular velocity (rad/s) at the release; a ball looks the same anyhow."""
+        """Quaternion and angular velocity (rad/s) at the release; constant for a ball."""
         if not self._is_box:
             return np.array([1.0, 0.0, 0.0, 0.0]), np.zeros(3)
         rng = scenario.rng("attitude")
@@ -98,18 +98,16 @@ class BallTask(Task):
         model.body_inertia[body] = share * self._mass * size[0] ** 2
 
     def place(self) -> None:
-        """Park the ball: nothing is to be seen of it before the throw."""
         self.park()
 
     def park(self) -> None:
-        """Hold the ball behind the robot, far away."""
         self._set_ball(_PARKED, _AT_REST)
 
     def _set_ball(self, pose: Array, velocity: Array) -> None:
         self.robot.data.qpos[-7:] = pose
         self.robot.data.qvel[-6:] = velocity
 
-    def act(self) -> None:
+    def before_step(self) -> None:
         """Keep the ball parked until the event, then throw it."""
         if self._thrown:
             return
@@ -129,25 +127,24 @@ class BallTask(Task):
         start[2] = self._release_height
         return start, (aim - start) / self.flight - 0.5 * _GRAVITY * self.flight
 
-    def observe(self, touches: Sequence[Touch]) -> None:
-        """Tell blocks from hits."""
-        if not self._thrown or self._dead:
+    def process_contacts(self, contacts: Sequence[Contact]) -> None:
+        """Detect the first block and the first hit."""
+        if not self._thrown or self._grounded:
             return
-        parts = {touch.part for touch in touches}
+        parts = {contact.part for contact in contacts}
         if self._blocked_at is None and not self._hit and parts & set(HANDS):
             self._blocked_at = self.time
             self._new_block = True
         elif not self._in_grace and not self._hit and parts & {TORSO, HEAD, LEG}:
             self._hit = self._new_hit = True
-        self._dead = bool(self.robot.data.qpos[-5] < self.radius + 0.01)
+        self._grounded = bool(self.robot.data.qpos[-5] < self.radius + 0.01)
 
     @property
     def _in_grace(self) -> bool:
-        """Shortly after a block, when further contacts do not count."""
+        """Whether contacts do not count, shortly after a block."""
         return self._blocked_at is not None and self.time - self._blocked_at < self.config.grace
 
     def rewards(self, action: Array) -> dict[str, float]:
-        """``block`` and ``hit`` once each, ``pose`` in every tick."""
         block, self._new_block = self._new_block, False
         hit, self._new_hit = self._new_hit, False
         return {
@@ -157,34 +154,17 @@ class BallTask(Task):
         }
 
     @property
-    def fall_cost(self) -> float:
-        """Cost of a fall."""
-        return self.config.fall_cost
-
-    @property
     def achieved(self) -> bool:
         """Blocked by a hand and not hit elsewhere; in an empty episode, always."""
         return not self._hit and (self.event_tick is None or self._blocked_at is not None)
 
     @property
-    def blocked(self) -> bool:
-        """Whether a hand or wrist was the first to meet the ball."""
-        return self._blocked_at is not None
-
-    @property
-    def hit(self) -> bool:
-        """Whether the ball met torso, head or leg."""
-        return self._hit
-
-    @property
-    def settled(self) -> bool:
-        """Whether the ball has met the floor."""
-        return self._dead
+    def finished(self) -> bool:
+        return self._grounded
 
     def state(self) -> ObjectState:
-        """Ball centre and velocity; active from the throw to the first contact or floor."""
         data = self.robot.data
-        over = self._dead or self._hit or self.blocked
+        over = self._grounded or self._hit or self._blocked_at is not None
         if not self._thrown:
             nothing = np.full(3, np.nan)
             return ObjectState(nothing, nothing.copy(), self.radius, active=False)
@@ -193,7 +173,6 @@ class BallTask(Task):
         )
 
     def solids(self) -> tuple[Solid, ...]:
-        """The ball once thrown."""
         if not self._thrown:
             return ()
         pose = self.robot.data.qpos[-7:].copy()

@@ -1,4 +1,4 @@
-"""What every task has: an event, contacts, named reward terms and an outcome."""
+"""Base class of the tasks: an event, contacts, named reward terms and success."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from typing import ClassVar, Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.sim.config import EnvConfig
-from egovcp.sim.robot import SimulatedRobot, Touch
+from egovcp.sim.config import ArchConfig, BallConfig, EnvConfig, WallConfig
+from egovcp.sim.robot import Contact, SimulatedRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import PARTS
 from egovcp.spec import CONTROLLER_TICKS_PER_PLAN, PHYSICS_DT, PHYSICS_STEPS_PER_CONTROLLER_TICK
@@ -25,12 +25,10 @@ FALL_TILT: Final = 1.0  # rad, pelvis; the deepest squat pitches it by 0.5
 
 @dataclass(frozen=True)
 class Solid:
-    """A thing in the scene, for pictures of it."""
+    """An object in the scene, for visualisation."""
 
     name: str
-    """What it is."""
     shape: Literal["sphere", "box"]
-    """Kind of geometry."""
     size: tuple[float, float, float]
     """Half sizes of a box, or the radius three times, m."""
     position_w: Array
@@ -41,7 +39,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class ObjectState:
-    """The truth about the task's object; quantities that a task lacks are NaN."""
+    """State of the task's object; quantities that a task lacks are NaN."""
 
     position_w: Array
     """(3,) ball centre, wall surface before the robot, or arch centre on the ground, m."""
@@ -56,6 +54,7 @@ class ObjectState:
 class Task(ABC):
     """One episode of a task. Called once per physics step and once per planner tick."""
 
+    config: BallConfig | WallConfig | ArchConfig
     terms: ClassVar[tuple[str, ...]]
     """Names of the reward terms."""
 
@@ -91,8 +90,8 @@ class Task(ABC):
         return (self.physics_steps - self.event_tick * PHYSICS_STEPS_PER_TICK) * PHYSICS_DT
 
     @property
-    def present(self) -> str:
-        """Name of the task that is played now, of which `state` tells the truth."""
+    def current_name(self) -> str:
+        """Name of the current task, whose object `state` describes."""
         return self.name
 
     @property
@@ -101,20 +100,20 @@ class Task(ABC):
         return np.zeros(3)
 
     def begin_tick(self) -> None:
-        """Forget what the last planner tick saw."""
+        """Reset the quantities of a planner tick."""
         self.forces[:] = 0.0
 
     def step(self) -> None:
-        """Act on the scene, do one physics step and look at its contacts."""
-        self.act()
-        self.see(self.robot.step())
+        """Act on the scene, do one physics step and process its contacts."""
+        self.before_step()
+        self.after_step(self.robot.step())
 
-    def see(self, touches: Sequence[Touch]) -> None:
-        """Count a physics step that has been done, and look at its contacts."""
+    def after_step(self, contacts: Sequence[Contact]) -> None:
+        """Count a physics step and process its contacts."""
         self.physics_steps += 1
-        for touch in touches:
-            self.forces[touch.part] = max(self.forces[touch.part], touch.force)
-        self.observe(touches)
+        for contact in contacts:
+            self.forces[contact.part] = max(self.forces[contact.part], contact.force)
+        self.process_contacts(contacts)
 
     def end_tick(self, action: Array) -> dict[str, float]:
         """Reward terms of the planner tick in which ``action`` (7,) was sent."""
@@ -124,7 +123,7 @@ class Task(ABC):
         return terms
 
     def has_fallen(self) -> bool:
-        """Whether the robot lies or is past saving."""
+        """Whether the robot lies, or is too low or too tilted to recover."""
         robot = self.robot
         return robot.pelvis_height < FALL_HEIGHT or robot.tilt > FALL_TILT or robot.on_floor
 
@@ -135,54 +134,53 @@ class Task(ABC):
 
     @property
     def parts(self) -> dict[str, bool]:
-        """Of several tasks in one episode, the success of each; of a single task, nothing."""
+        """Success of each part of a sequence; empty for a single task."""
         return {}
 
     @property
-    def settled(self) -> bool:
-        """Whether nothing that happens to the object from now on is likely to matter."""
+    def finished(self) -> bool:
+        """Whether the object no longer matters: ball on the floor, arch passed."""
         return False
 
     @property
-    @abstractmethod
     def fall_cost(self) -> float:
         """Cost of a fall."""
+        return self.config.fall_cost
 
     @property
     @abstractmethod
     def achieved(self) -> bool:
-        """`success`, falls aside."""
+        """`success`, regardless of falls."""
 
     @property
     @abstractmethod
     def parameters(self) -> dict[str, float]:
-        """What was drawn for this episode, for the record; SI units."""
+        """Sampled parameters of this episode, SI units."""
 
     @abstractmethod
     def place(self) -> None:
-        """Put the objects where the episode starts; the robot already stands."""
+        """Place the objects for the start of the episode, around the standing robot."""
 
     @abstractmethod
     def park(self) -> None:
-        """Take the objects out of the robot's sight and reach; they stay there if this is called
-        before every physics step."""
+        """Move the objects out of sight and reach; call it before every physics step."""
 
     @abstractmethod
-    def act(self) -> None:
+    def before_step(self) -> None:
         """Move objects and push the robot, before a physics step."""
 
     @abstractmethod
-    def observe(self, touches: Sequence[Touch]) -> None:
-        """Look at the contacts between robot and object after a physics step."""
+    def process_contacts(self, contacts: Sequence[Contact]) -> None:
+        """Process the contacts between robot and object of a physics step."""
 
     @abstractmethod
     def rewards(self, action: Array) -> dict[str, float]:
-        """Reward terms of the tick, the fall aside."""
+        """Reward terms of the tick but for ``fall``."""
 
     @abstractmethod
     def state(self) -> ObjectState:
-        """The truth about the object."""
+        """State of the object."""
 
     @abstractmethod
     def solids(self) -> tuple[Solid, ...]:
-        """What stands in the scene beside robot and floor."""
+        """Objects in the scene besides robot and floor."""

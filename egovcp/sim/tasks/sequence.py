@@ -1,9 +1,8 @@
 """Several tasks in one episode: an arch to duck under, then something thrown (figure 4a).
 
-A part draws what its task draws alone: the arch and the throw of sequence i are those of the arch
-and ball scenarios i of the same seed. It lasts until a pause after the moment that decides it, or
-as long as its own episodes. Then its object is taken away, and the next part begins around the
-robot as it stands: at any time one object at most is in sight and reach, and contacts are its.
+The parameters of a part are those of its task's scenario with the same seed and episode. A part
+lasts until a pause after it has finished, at most as long as its task's episodes. Then its object
+is parked, and the next part begins around the robot at its current pose.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from dataclasses import replace
 from typing import ClassVar, Final
 
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.robot import SimulatedRobot, Touch
+from egovcp.sim.robot import Contact, SimulatedRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.tasks.arch import ArchTask
 from egovcp.sim.tasks.ball import BallTask
@@ -24,7 +23,7 @@ SINGLE: Final[dict[str, type[Task]]] = {"ball": BallTask, "wall": WallTask, "arc
 
 
 class SequenceTask(Task):
-    """Plays its parts one after the other; each tick is rewarded as the present part's."""
+    """Plays its parts in turn; the rewards are those of the current part."""
 
     terms: ClassVar = tuple(dict.fromkeys(term for kind in SINGLE.values() for term in kind.terms))
 
@@ -33,27 +32,24 @@ class SequenceTask(Task):
         made = {
             name: kind(config, replace(scenario, task=name), robot) for name, kind in SINGLE.items()
         }
-        self._all = tuple(made.values())  # what is not played stays parked
+        self._all = tuple(made.values())  # the others stay parked
         self._parts = tuple(made[name] for name in config.sequence.parts)
         self._pause = config.sequence.pause_ticks
         self._at = 0
-        self._settled_ticks = 0
+        self._finished_ticks = 0
         self.event_tick = self._parts[0].event_tick
 
     @property
     def _part(self) -> Task:
-        """The part that is played now."""
         return self._parts[self._at]
 
     @property
-    def present(self) -> str:
-        """Name of the part that is played now."""
+    def current_name(self) -> str:
         return self._part.name
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Those of every part under its name; events are counted from the beginning of the part,
-        -1 where there is none."""
+        """Those of every part, prefixed by its name; event ticks count from its begin, -1: none."""
         drawn: dict[str, float] = {}
         for part in self._parts:
             drawn |= {f"{part.name}.{name}": value for name, value in part.parameters.items()}
@@ -63,63 +59,55 @@ class SequenceTask(Task):
 
     @property
     def since_event(self) -> float:
-        """Seconds since the event of the present part."""
         return self._part.since_event
 
     @property
     def velocity_command(self) -> Array:
-        """(3,) what the present part commands."""
         return self._part.velocity_command
 
     def place(self) -> None:
-        """Put the first part's object where it starts, and no other."""
         self.park()
         self._part.place()
 
     def begin_tick(self) -> None:
-        """Go on to the next part if the present one is over."""
+        """Begin the next part if the current one is over."""
         super().begin_tick()
-        self._settled_ticks += self._part.settled
-        if self._part is not self._parts[-1] and self._is_decided(self._settled_ticks):
+        self._finished_ticks += self._part.finished
+        if self._part is not self._parts[-1] and self._part_is_over(self._finished_ticks):
             self._part.park()
-            self._at, self._settled_ticks = self._at + 1, 0
+            self._at, self._finished_ticks = self._at + 1, 0
             self._part.place()
         self._part.begin_tick()
 
-    def _is_decided(self, settled_ticks: int) -> bool:
-        """Whether the present part has been decided for a while, or its time is up."""
-        return settled_ticks > self._pause or self._part.is_over
+    def _part_is_over(self, finished_ticks: int) -> bool:
+        """Whether the current part finished a pause ago, or reached its time limit."""
+        return finished_ticks > self._pause or self._part.is_over
 
     @property
     def is_over(self) -> bool:
-        """Whether that is so of the last part: an oracle that has braced on a wall for as long as
-        wall episodes last lets go of it afterwards, and falls."""
+        """Whether the last part is over."""
         last = self._part is self._parts[-1]
-        return last and self._is_decided(self._settled_ticks + self._part.settled)
+        return last and self._part_is_over(self._finished_ticks + self._part.finished)
 
     def park(self) -> None:
-        """Take all objects away."""
         for task in self._all:
             task.park()
 
-    def act(self) -> None:
-        """Move the present part's object, and keep the others away."""
+    def before_step(self) -> None:
+        """Move the current part's object, and keep the others parked."""
         for task in self._all:
             if task is not self._part:
                 task.park()
-        self._part.act()
+        self._part.before_step()
 
-    def observe(self, touches: Sequence[Touch]) -> None:
-        """Let the present part look."""
-        self._part.see(touches)
+    def process_contacts(self, contacts: Sequence[Contact]) -> None:
+        self._part.after_step(contacts)
 
     def rewards(self, action: Array) -> dict[str, float]:
-        """Those of the present part; zero for the terms of the others."""
         return dict.fromkeys(self.terms, 0.0) | self._part.rewards(action)
 
     @property
     def fall_cost(self) -> float:
-        """That of the present part."""
         return self._part.fall_cost
 
     @property
@@ -136,9 +124,7 @@ class SequenceTask(Task):
         }
 
     def state(self) -> ObjectState:
-        """The truth about the present part's object."""
         return self._part.state()
 
     def solids(self) -> tuple[Solid, ...]:
-        """The present part's object."""
         return self._part.solids()

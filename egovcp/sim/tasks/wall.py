@@ -1,4 +1,4 @@
-"""Brace against the wall: pushed at a wall, stay up and touch it with the hands only."""
+"""Brace against the wall: pushed at a wall, stay up and contact it with the hands only."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import ClassVar, Final
 
 import numpy as np
 
-from egovcp.sim.config import EnvConfig
-from egovcp.sim.robot import SimulatedRobot, Touch
+from egovcp.sim.config import EnvConfig, WallConfig
+from egovcp.sim.robot import Contact, SimulatedRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import HANDS, PARTS, WALL, WALL_HALF_SIZE
 from egovcp.sim.tasks.base import Array, ObjectState, Solid, Task
@@ -23,6 +23,7 @@ _BRACE_FORCE: Final = 5.0  # N, a hand that presses less only brushes the wall
 class WallTask(Task):
     """One push, towards the wall or (sometimes) away from it, at the event."""
 
+    config: WallConfig
     terms: ClassVar = ("brace", "upright", "contact", "impact", "pose", "guard", "fall")
 
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
@@ -37,8 +38,8 @@ class WallTask(Task):
         self.away = bool(push.random() < c.away_probability)
         self._bearing = float(push.uniform(*c.push_bearing_range)) + math.pi * self.away
         towards, disturbed = c.push_speed_range, c.disturbed_time
-        assert towards is not None, "decided by `EnvConfig.for_controller`"
-        assert disturbed is not None, "likewise"
+        assert towards is not None, "call `EnvConfig.for_controller` first"
+        assert disturbed is not None, "call `EnvConfig.for_controller` first"
         self._disturbed_time = disturbed
         speed = c.away_speed_range if self.away else towards
         self.push_speed = float(push.uniform(*speed))
@@ -49,7 +50,6 @@ class WallTask(Task):
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Wall and push."""
         return {
             "distance": self.distance,
             "yaw": self._yaw,
@@ -59,7 +59,6 @@ class WallTask(Task):
         }
 
     def place(self) -> None:
-        """Stand the wall before the pelvis."""
         pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
         self._surface = pelvis + heading @ np.array([self.distance, 0.0, 0.0])
         self._surface[2] = 0.0
@@ -69,10 +68,9 @@ class WallTask(Task):
         self._normal = np.array([math.cos(turn), math.sin(turn), 0.0])
 
     def park(self) -> None:
-        """Stand the wall where the model has it, far away."""
         self.robot.data.mocap_pos[self._mocap] = self._body.pos
 
-    def act(self) -> None:
+    def before_step(self) -> None:
         """Push: the base gains ``push_speed`` in equal parts over ``push_time``."""
         # half a step of slack keeps rounding from adding or losing one part
         since = self.since_event + PHYSICS_DT / 2
@@ -81,19 +79,17 @@ class WallTask(Task):
             direction = np.array([math.cos(self._bearing), math.sin(self._bearing), 0.0])
             self.robot.data.qvel[:3] += part * (self.robot.heading @ direction)
 
-    def observe(self, touches: Sequence[Touch]) -> None:
-        """Remember any touch that was not a hand's."""
-        if any(touch.part not in HANDS for touch in touches):
+    def process_contacts(self, contacts: Sequence[Contact]) -> None:
+        """Remember any contact that was not a hand's."""
+        if any(contact.part not in HANDS for contact in contacts):
             self._touched_otherwise = True
 
     @property
     def disturbed(self) -> bool:
-        """Whether a push is being felt or has just been."""
+        """Whether the last push is recent enough for bracing to be rewarded."""
         return 0.0 <= self.since_event <= self._disturbed_time
 
     def rewards(self, action: Array) -> dict[str, float]:
-        """``brace`` and ``upright`` while disturbed; contact, impact and pose in every tick,
-        ``guard`` before the push."""
         c = self.config
         hand_force = float(self.forces[_HANDS].max())
         upright = math.cos(self.robot.tilt) if self.disturbed else 0.0
@@ -110,11 +106,6 @@ class WallTask(Task):
         }
 
     @property
-    def fall_cost(self) -> float:
-        """Cost of a fall."""
-        return self.config.fall_cost
-
-    @property
     def achieved(self) -> bool:
         """Nothing but hands has touched the wall."""
         return not self._touched_otherwise
@@ -127,7 +118,6 @@ class WallTask(Task):
         return ObjectState(point, np.zeros(3), math.nan, self.disturbed and not self.away)
 
     def solids(self) -> tuple[Solid, ...]:
-        """The wall."""
         centre = self._surface + WALL_HALF_SIZE[0] * self._normal
         centre[2] = WALL_HALF_SIZE[2]
         quaternion = self.robot.data.mocap_quat[self._mocap].copy()

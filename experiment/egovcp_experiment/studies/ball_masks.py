@@ -8,11 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.pose import rotation_matrix
-from egovcp.sim.camera import DepthCamera, pixel_rays
+from egovcp.robot.geometry import focal_length, pixel_rays, rotation_matrix
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import VectorEnv
-from egovcp.sim.truth import Truth
+from egovcp.sim.env import PrivilegedState, VectorEnv
 from egovcp.spec import CONTROLLER_HZ, CONTROLLER_TICKS_PER_PLAN, DEPTH_COLS, DEPTH_ROWS
 
 _TOLERANCE_M: Final = 0.15  # of a pixel's depth: several standard deviations of the noise at 3 m
@@ -31,10 +29,10 @@ class BallMasks:
     """
 
     def __init__(self, config: EnvConfig) -> None:
-        rays = pixel_rays(DepthCamera(config.camera).focal)
+        rays = pixel_rays(focal_length(config.camera.vertical_fov))
         self._rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         oldest = round(config.delay.image_age[1] * CONTROLLER_HZ)
-        self._truths: deque[Truth] = deque(maxlen=2 + oldest // CONTROLLER_TICKS_PER_PLAN)
+        self._truths: deque[PrivilegedState] = deque(maxlen=2 + oldest // CONTROLLER_TICKS_PER_PLAN)
 
     def begin(self) -> None:
         """Start a new group of episodes."""
@@ -42,7 +40,7 @@ class BallMasks:
 
     def update(self, env: VectorEnv) -> None:
         """Store the poses at a planner tick; to be called once per tick, before `mask`."""
-        self._truths.append(env.snapshot())
+        self._truths.append(env.privileged_state())
 
     def mask(self, env: VectorEnv, row: int, depth: NDArray[np.uint16]) -> NDArray[np.bool_]:
         """(48, 64) pixels of the image ``depth`` (48, 64) mm of one robot that show the ball,

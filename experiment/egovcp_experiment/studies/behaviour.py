@@ -20,7 +20,7 @@ from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.intervals import bootstrap, wilson
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import StepResult, decided
+from egovcp.sim.env import StepResult, resolve_config
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import PLANNER_HZ, TASKS
 from egovcp_experiment.studies.study import finish
@@ -78,7 +78,7 @@ class _Tracks(Watcher):
         self.tracks += self._group
 
     def before(self, moment: Moment) -> None:
-        truth = moment.env.snapshot()
+        truth = moment.env.privileged_state()
         for row in np.flatnonzero(moment.live).tolist():
             track = self._group[row]
             track.since.append(float(truth.since_event[row]))
@@ -89,7 +89,7 @@ class _Tracks(Watcher):
             track.away = abs(moment.env.parameters[row].get("push_bearing", 0.0)) > np.pi / 2
 
     def after(self, moment: Moment, result: StepResult) -> None:
-        force = moment.env.snapshot().contact_force
+        force = moment.env.privileged_state().contact_force
         for row in np.flatnonzero(moment.live).tolist():
             track = self._group[row]
             track.action.append(result.sent_action[row].copy())
@@ -131,7 +131,7 @@ def _wall(config: BehaviourConfig, eventful: list[Track], empty: list[Track]) ->
     pushed = [track for track in eventful if not track.away]
     return {
         "undisturbed_without_contact": _share(untouched),
-        "braced_for_s": decided(config.env).wall.disturbed_time,
+        "braced_for_s": resolve_config(config.env).wall.disturbed_time,
         "hands_back": _share(back),
         "pushed": len(pushed),
         "recovered": len(back),

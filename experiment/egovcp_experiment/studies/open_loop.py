@@ -65,7 +65,7 @@ class _Films(Watcher):
     def before(self, moment: Moment) -> None:
         if self._balls is not None:
             self._balls.update(moment.env)
-        since = moment.env.snapshot().since_event
+        since = moment.env.privileged_state().since_event
         for row in np.flatnonzero(moment.live).tolist():
             episode = self._episodes[row]
             due = self._seen - 1e-6 <= since[row] < self._seen + PLANNER_DT - 1e-6

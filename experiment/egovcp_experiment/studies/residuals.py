@@ -184,17 +184,17 @@ def _branches(
     """(STEPS, branches) returns over ``steps`` ticks, and to the end of the episode, from each step
     of the plan on; each of (STEPS * branches) ``rngs`` makes one branch."""
     rows = len(rngs)
-    env = VectorEnv(env_config, rows, pictures=False)
+    env = VectorEnv(env_config, rows, render_depth=False)
     env.reset([point.scenario] * rows)
     for action in point.sent:
         env.step(np.tile(action, (rows, 1)))
     own = np.repeat(np.arange(STEPS), rows // STEPS)  # the step of the plan that a row is about
     short, whole = np.zeros(rows), np.zeros(rows)
-    walk.stand(np.zeros((rows, ACTION_DIM)), rngs)
+    walk.start_at(np.zeros((rows, ACTION_DIM)), rngs)
     age = 0
     while not env.done.all():
         over = np.flatnonzero(own == age - 1)
-        walk.stand_rows(over.tolist(), env.sent_action[over])
+        walk.start_rows_at(over.tolist(), env.sent_action[over])
         action = walk.act(env)
         planned = own >= age
         action[planned] = plan[min(age, STEPS - 1)]

@@ -62,7 +62,7 @@ class _Maps(Watcher):
         self._taken: list[set[str]] = [set() for _ in scenarios]
 
     def before(self, moment: Moment) -> None:
-        truth = moment.env.snapshot()
+        truth = moment.env.privileged_state()
         for row in np.flatnonzero(moment.live).tolist():
             facts = moment.env.parameters[row]
             self.aims[self._episodes[row]] = (facts["aim_lateral"], facts["aim_height"])

@@ -16,7 +16,7 @@ from egovcp.errors import UsageError
 from egovcp.plan import Policy, PolicyStep
 from egovcp.policy_options import PlannerOptions
 from egovcp.robot.controllers import make_controller
-from egovcp.sim.config import EnvConfig, eventful
+from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.sim.env import Observation, StepResult, VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp_experiment.studies.study import StudyConfig
@@ -37,7 +37,7 @@ class WatchConfig(StudyConfig):
     """Which scenarios."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     """Changes to the artifact's planner."""
-    env: EnvConfig = field(default_factory=eventful)
+    env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation."""
 
     def artifact(self) -> Artifact:

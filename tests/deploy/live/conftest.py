@@ -14,7 +14,7 @@ from egovcp.plan import PolicyStep
 from egovcp.rate import LockstepClock
 from egovcp.robot.stance import StanceController
 from egovcp.sim.config import EnvConfig, EpisodeConfig
-from egovcp.sim.live import LiveRobot, Servos
+from egovcp.sim.live import LiveRobot, ServoCommand
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM, JOINT_NAMES
 from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
@@ -99,7 +99,7 @@ class SimBody:
         self.commands.append(command)
         works = (np.arange(29) != KNEE) if self._faults.dropped else np.ones(29)
         self._robot.drive(
-            Servos(command.position, works * command.stiffness, works * command.damping)
+            ServoCommand(command.position, works * command.stiffness, works * command.damping)
         )
 
     def _temperature(self) -> NDArray[np.float64] | None:
@@ -120,7 +120,7 @@ class SimEye:
 
     def read(self) -> Picture | None:
         if not self._faults.blind or self._last is None:
-            _, depth = self._robot.picture
+            _, depth = self._robot.depth_image
             self._last = Picture(self._clock.now_ns(), depth)
         return self._last
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
+from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import ACTION_BOX, COMMAND_SLICE, STATE_SLICES
 from egovcp_deploy.pilot.states import Request, State
 from egovcp_deploy.robots.body import MotorCommand

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER
-from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
+from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER, TARGET_HIGH, TARGET_LOW
 from egovcp_deploy.live import motors
 from egovcp_deploy.robots.body import MotorCommand
 from egovcp_deploy.robots.wire import decode_command, encode_command

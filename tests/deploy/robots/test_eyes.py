@@ -13,7 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.sim.camera import pixel_rays
+from egovcp.robot.geometry import pixel_rays
 from egovcp.sim.config import CameraConfig
 from egovcp.spec import DEPTH_COLS, DEPTH_ROWS
 from egovcp_deploy.robots.body import Picture
@@ -74,7 +74,7 @@ def test_an_eye_sees_what_the_robot_sees(eye: ZmqEye, running: Running) -> None:
     assert second is not None
     assert first.time_ns < second.time_ns <= time.monotonic_ns()
     running.stop()
-    seen = running.fake.robot.picture[1]
+    seen = running.fake.robot.depth_image[1]
     assert eventually(lambda: bool((eye.read().depth == seen).all()))
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from egovcp.rate import FixedRate
 from egovcp.robot.controllers import make_controller
-from egovcp.sim.live import LiveRobot, Outcome
+from egovcp.sim.live import EpisodeOutcome, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX
 from egovcp_deploy.robots.body import MotorCommand
@@ -17,7 +17,7 @@ from egovcp_deploy.robots.sim_body import SimBody, SimClock
 NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
 
 
-def play(live: LiveRobot) -> tuple[list[Outcome], list[np.ndarray]]:
+def play(live: LiveRobot) -> tuple[list[EpisodeOutcome], list[np.ndarray]]:
     """One ball, under a controller at 50 Hz."""
     live.start(Scenario("ball", 4, 0))
     body = SimBody(live)

@@ -15,7 +15,7 @@ from lerobot.robots.unitree_g1.g1_utils import G1_29_JointIndex
 from lerobot.robots.unitree_g1.unitree_sdk2_socket import LowStateMsg
 
 from egovcp.log.tick import MotorReadings
-from egovcp.robot.targets import TARGET_HIGH, TARGET_LOW
+from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import JOINT_NAMES
 from egovcp_deploy.robots.body import BodyState, MotorCommand
 from egovcp_deploy.robots.remote import Remote

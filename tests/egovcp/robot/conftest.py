@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from egovcp.robot.controller import LowLevelController
+from egovcp.robot.controllers import LowLevelController
 from egovcp.robot.mjcf import FootModel, robot_spec
 from egovcp.robot.stance import StanceController
 from egovcp.robot.stance_table import standing_pose

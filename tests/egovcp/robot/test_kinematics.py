@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from egovcp.robot import arms, kinematics
+from egovcp.robot import arms, geometry, kinematics
 from egovcp.robot.g1 import ARMS
 from egovcp.robot.generate import kinematic_table
 from egovcp.robot.mjcf import robot_spec
@@ -38,11 +38,13 @@ def test_shipped_table_is_the_models(model: mujoco.MjModel) -> None:
     assert json.loads(json.dumps(kinematic_table(model))) == kinematics._TABLE
 
 
-def test_link_poses_agree_with_mujoco(model: mujoco.MjModel) -> None:
+def test_link_transforms_agree_with_mujoco(model: mujoco.MjModel) -> None:
     joints = _joints(8)
-    positions, quaternions = kinematics.link_poses(joints)
+    positions, rotations = kinematics.link_transforms(joints)
     links = [model.body(name).id for name in kinematics.LINK_NAMES]
-    for q, position, quaternion in zip(joints, positions, quaternions, strict=True):
+    for q, position, quaternion in zip(
+        joints, positions, geometry.quaternion(rotations), strict=True
+    ):
         data = _placed(model, q, np.array([1.0, 0, 0, 0]))
         np.testing.assert_allclose(position, data.xpos[links] - data.xpos[1], atol=1e-6)
         alike = np.abs(np.sum(quaternion * data.xquat[links], axis=1))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from egovcp.robot import arms, reach
-from egovcp.robot.kinematics import Array
-from egovcp.robot.reach import DT, ReachConfig
+from egovcp.robot import arms
+from egovcp.robot.arms import DT, ReachConfig
+from egovcp.robot.geometry import Array
 
 UPRIGHT = np.eye(3)[None]
 
@@ -15,7 +15,7 @@ UPRIGHT = np.eye(3)[None]
 def _solve(target: Array, iterations: int = 60) -> Array:
     q = np.tile(arms.REST, (len(target), 1, 1))
     for _ in range(iterations):
-        q = arms.improve(q, arms.reachable(target))
+        q = arms.ik_step(q, arms.reachable(target))
     return q
 
 
@@ -37,7 +37,7 @@ def test_reachable_targets_are_reached(left: tuple[float, float, float]) -> None
 
 def test_rest_is_a_fixed_point() -> None:
     rest = arms.REST[None]
-    moved = arms.improve(rest, arms.forward(rest).palm)
+    moved = arms.ik_step(rest, arms.forward(rest).palm)
     np.testing.assert_allclose(moved, rest, atol=1e-12)
 
 
@@ -65,11 +65,11 @@ def test_targets_are_pushed_out_of_the_trunk_and_into_reach() -> None:
 
 def test_references_respect_speed_and_acceleration() -> None:
     config = ReachConfig(speed=3.0, acceleration=40.0)
-    memory = reach.start(arms.REST.reshape(1, 14))
+    memory = arms.ArmReference.at_rest(arms.REST.reshape(1, 14))
     rates = [memory.rate]
     for tick in range(40):
         side = 0.4 if tick < 20 else 0.0
-        reach.follow(memory, np.array([[[side, 0.2, 0.4], [side, -0.2, 0.4]]]), UPRIGHT, config)
+        arms.track_hands(memory, np.array([[[side, 0.2, 0.4], [side, -0.2, 0.4]]]), UPRIGHT, config)
         rates.append(memory.rate)
     rate = np.array(rates)
     assert np.abs(rate).max() <= 3.0 + 1e-12
@@ -77,10 +77,10 @@ def test_references_respect_speed_and_acceleration() -> None:
 
 
 def test_momentum_is_the_time_derivative_of_the_first_moment() -> None:
-    memory = reach.start(arms.REST.reshape(1, 14))
+    memory = arms.ArmReference.at_rest(arms.REST.reshape(1, 14))
     before = memory.moment
     hands = np.array([[[0.4, 0.2, 0.4], [0.2, -0.3, 0.1]]])
-    reach.follow(memory, hands, UPRIGHT, ReachConfig())
+    arms.track_hands(memory, hands, UPRIGHT, ReachConfig())
     np.testing.assert_allclose(memory.linear, (memory.moment - before) / DT, atol=1e-9)
     assert np.abs(memory.linear).max() > 0.1
 
@@ -88,12 +88,12 @@ def test_momentum_is_the_time_derivative_of_the_first_moment() -> None:
 @pytest.mark.parametrize("frequency", [5.0, 20.0, 25.0])
 def test_a_critically_damped_reference_arrives_without_overshoot(frequency: float) -> None:
     config = ReachConfig(speed=100.0, acceleration=1e4, frequency=frequency)
-    memory = reach.start(arms.REST.reshape(1, 14))
+    memory = arms.ArmReference.at_rest(arms.REST.reshape(1, 14))
     goal = arms.REST[None] + 0.3
     memory.goal = goal
     positions = []
     for _ in range(150):
-        reach._smooth(memory, config)
+        arms._smooth(memory, config)
         positions.append(memory.joints[0, 0, 0])
     assert np.all(np.diff(positions) >= -1e-12)
     assert positions[-1] == pytest.approx(goal[0, 0, 0], abs=1e-3)

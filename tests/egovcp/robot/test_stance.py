@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from egovcp.robot import kinematics
+from egovcp.robot.arms import ReachConfig
 from egovcp.robot.g1 import DAMPING, STIFFNESS
-from egovcp.robot.reach import ReachConfig
 from egovcp.robot.stance import StanceConfig, StanceController
 from egovcp.robot.stance_table import standing_pose
 from egovcp.spec import ACTION_BOX, ACTION_ETA, NUM_JOINTS, STATE_DIM, STATE_SLICES

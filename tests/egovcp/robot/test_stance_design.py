@@ -14,9 +14,9 @@ from egovcp.robot.stance_design import (
     Pose,
     StanceModel,
     balanced_pose,
+    compensator,
     linearise,
 )
-from egovcp.robot.stance_gains import compensator
 from egovcp.robot.stance_table import NF, NU, NX, stance_table
 from egovcp.spec import JOINT_NAMES
 

@@ -10,8 +10,7 @@ import pytest
 from egovcp.errors import ArtifactError
 from egovcp.robot.controllers import make_controller
 from egovcp.robot.g1 import STIFFNESS
-from egovcp.robot.walk_onnx import OBSERVATION_NAMES, OnnxPolicy, export_onnx
-from egovcp.robot.walk_policy import WalkPolicy
+from egovcp.robot.walk_policy import OBSERVATION_NAMES, OnnxPolicy, WalkPolicy, export_onnx
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
 from egovcp.spec import JOINT_NAMES
 

@@ -4,9 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from egovcp.sim.camera import DepthCamera, DepthNoise, discontinuity, pixel_rays
+from egovcp.robot.geometry import pixel_rays
+from egovcp.sim.camera import DepthNoise, RayCastCamera, RayCaster, discontinuity
 from egovcp.sim.config import CameraConfig
-from egovcp.sim.rays import View
 from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_MIN_M, DEPTH_ROWS
 
 NOISELESS = CameraConfig(
@@ -25,7 +25,7 @@ def picture(xml: str, pitch: float = 0.0) -> np.ndarray:
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    return DepthCamera(NOISELESS).render(View(model, model.body("eye").id), data, pitch)
+    return RayCastCamera(NOISELESS).render(RayCaster(model, model.body("eye").id), data, pitch)
 
 
 def plate(x: float) -> str:
@@ -55,7 +55,7 @@ def test_pitching_down_raises_what_lies_ahead() -> None:
 
 
 def test_the_vertical_field_of_view_is_that_of_the_config() -> None:
-    rays = pixel_rays(DepthCamera(CameraConfig()).focal).reshape(DEPTH_ROWS, DEPTH_COLS, 3)
+    rays = pixel_rays(RayCastCamera(CameraConfig()).focal).reshape(DEPTH_ROWS, DEPTH_COLS, 3)
     pixel = rays[0, 0, 2] - rays[1, 0, 2]
     top = rays[0, 0, 2] + pixel / 2
     assert 2 * np.arctan(top) == pytest.approx(CameraConfig().vertical_fov)

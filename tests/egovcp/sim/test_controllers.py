@@ -15,8 +15,7 @@ from egovcp.sim.config import (
     WallConfig,
 )
 from egovcp.sim.env import VectorEnv
-from egovcp.sim.oracles import Oracle
-from egovcp.sim.policies import Hold, Policy
+from egovcp.sim.policies import EnvPolicy, Hold, Oracle
 from egovcp.sim.scenario import Scenario
 
 
@@ -54,7 +53,9 @@ def test_a_robot_that_walks_is_not_put_before_an_arch_on_a_rail():
         VectorEnv(EnvConfig(arch=ArchConfig(motion="rail")), 1)
 
 
-def _play(config: EnvConfig, task: str, policy: Policy, rows: int) -> tuple[list[bool], list[bool]]:
+def _play(
+    config: EnvConfig, task: str, policy: EnvPolicy, rows: int
+) -> tuple[list[bool], list[bool]]:
     env = VectorEnv(config, rows)
     scenarios = [Scenario(task, 5, i) for i in range(rows)]
     env.reset(scenarios)
@@ -94,7 +95,7 @@ def test_hands_brace_what_stepping_does_not(soon: EnvConfig):
 def test_nobody_falls_of_commands_from_one_end_of_the_box_to_the_other(controller: str):
     """A new corner of the box every 2 to 7 ticks; squats of 0.45 m/s made 6 of 32 robots fall."""
     nothing = EpisodeConfig(ticks=150, empty_probability=1.0)
-    env = VectorEnv(EnvConfig(controller=controller, ball_episode=nothing), 32, pictures=False)
+    env = VectorEnv(EnvConfig(controller=controller, ball_episode=nothing), 32, render_depth=False)
     env.reset([Scenario("ball", 0, i) for i in range(32)])
     rng = np.random.default_rng(0)
     corner, left = np.zeros((32, 7)), np.zeros(32, int)

@@ -45,7 +45,7 @@ def test_error_names_scenario_and_what_diverged(
     monkeypatch.chdir(tmp_path)
     env.reset(SCENARIOS)
     env.step(NO_ACTION)
-    getattr(env.lanes[1].robot.data, array)[index] = value
+    getattr(env.instances[1].robot.data, array)[index] = value
     with pytest.raises(SimulationDiverged, match=found) as caught:
         env.step(NO_ACTION)
     assert "task ball, seed 7, episode 1, after 0.0" in str(caught.value)
@@ -58,12 +58,12 @@ def test_error_names_scenario_and_what_diverged(
 def test_targets_that_are_not_finite_are_named(env: VectorEnv) -> None:
     env.reset(SCENARIOS)
     with pytest.raises(SimulationDiverged, match="a joint target is not finite"):
-        env.lanes[0].advance(np.full(29, np.nan))
+        env.instances[0].advance(np.full(29, np.nan))
 
 
 def test_next_episode_of_the_same_robot_is_valid_again(env: VectorEnv) -> None:
     env.reset(SCENARIOS)
-    env.lanes[1].robot.data.qvel[10] = np.nan
+    env.instances[1].robot.data.qvel[10] = np.nan
     with pytest.raises(SimulationDiverged):
         env.step(NO_ACTION)
     env.reset(SCENARIOS)
@@ -74,7 +74,7 @@ def test_scene_that_cannot_be_simulated_diverges(config: EnvConfig) -> None:
     heavy = replace(
         config.ball, radius_range=(0.01, 0.01), mass_range=(10, 10), flight_range=(0.2, 0.2)
     )
-    env = VectorEnv(replace(config, ball=heavy), 4, pictures=False)
+    env = VectorEnv(replace(config, ball=heavy), 4, render_depth=False)
     env.reset([Scenario("ball", 0, number) for number in range(4)])
     with pytest.raises(SimulationDiverged) as caught:
         roll(env, 45)

@@ -172,7 +172,7 @@ def test_a_picture_is_as_old_as_its_age(config: EnvConfig, age: float, ticks: in
     before = env.reset(scenarios("ball", 1)).depth[0].astype(int)
     seen = []
     for _ in range(14):
-        event = env.lanes[0].task.since_event
+        event = env.instances[0].task.since_event
         now = env.step(np.zeros((1, ACTION_DIM))).observation.depth[0].astype(int)
         if np.any((now > 1500) & (now < 3600) & (np.abs(now - before) > 400)):
             seen.append(event)
@@ -193,7 +193,7 @@ def test_time_limit_truncates_and_then_the_row_stands_still(config: EnvConfig) -
 
 def test_a_toppled_robot_terminates(env: VectorEnv) -> None:
     env.reset(scenarios("ball", 4))
-    env.lanes[0].robot.data.qvel[0] = 4.0
+    env.instances[0].robot.data.qvel[0] = 4.0
     for _ in range(30):
         result = env.step(np.zeros((4, ACTION_DIM)))
     assert result.terminated.tolist() == [True, False, False, False]
@@ -219,5 +219,5 @@ def test_wrong_number_of_scenarios_is_refused(env: VectorEnv) -> None:
 def test_physics_differs_between_episodes_and_is_recorded(env: VectorEnv) -> None:
     env.reset(scenarios("ball", 4))
     assert len({p["friction"] for p in env.parameters}) == 4
-    mass = [lane.robot.model.body_subtreemass[1] for lane in env.lanes]
+    mass = [lane.robot.model.body_subtreemass[1] for lane in env.instances]
     assert len(set(mass)) == 4

@@ -7,12 +7,11 @@ import pytest
 from numpy.typing import NDArray
 
 from egovcp.robot.controllers import make_controller
-from egovcp.robot.kinematics import rotate
+from egovcp.robot.geometry import rotate, rotation_matrix
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
-from egovcp.sim.live import LiveRobot, Measurement, Phase, Servos
+from egovcp.sim.live import LiveRobot, Measurement, Phase, ServoCommand
 from egovcp.sim.scenario import Scenario
-from egovcp.sim.sensors import base_rotation
 from egovcp.spec import ACTION_BOX, COMMAND_SLICE, STATE_DIM, STATE_SLICES
 
 NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
@@ -35,7 +34,9 @@ class Loop:
     def state(self, seen: Measurement) -> NDArray[np.float64]:
         state = np.empty(STATE_DIM)
         state[STATE_SLICES["angular_velocity"]] = seen.angular_velocity
-        state[STATE_SLICES["projected_gravity"]] = rotate(base_rotation(seen.quaternion_w).T, DOWN)
+        state[STATE_SLICES["projected_gravity"]] = rotate(
+            rotation_matrix(seen.quaternion_w).T, DOWN
+        )
         state[STATE_SLICES["joint_position"]] = seen.joint_position
         state[STATE_SLICES["joint_velocity"]] = seen.joint_velocity
         state[COMMAND_SLICE] = NEUTRAL
@@ -45,7 +46,7 @@ class Loop:
         for _ in range(round(seconds * 50)):
             target = self.controller.step(self.state(self.live.measure())[None])[0]
             c = self.controller
-            self.live.drive(Servos(target, c.stiffness, c.damping))
+            self.live.drive(ServoCommand(target, c.stiffness, c.damping))
             self.live.advance(4)
 
 
@@ -54,7 +55,7 @@ def test_it_is_the_episode_of_the_environment(
     live: LiveRobot, config: EnvConfig, task: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scenario = Scenario(task, 3, 1)
-    env = VectorEnv(config, 1, pictures=False)
+    env = VectorEnv(config, 1, render_depth=False)
     env.reset([scenario])
     live.start(scenario)
     live.begin()
@@ -62,7 +63,7 @@ def test_it_is_the_episode_of_the_environment(
 
     def follow(state: NDArray[np.floating]) -> NDArray[np.float64]:
         target = step(state)
-        live.drive(Servos(target[0], env.controller.stiffness, env.controller.damping))
+        live.drive(ServoCommand(target[0], env.controller.stiffness, env.controller.damping))
         live.advance(4)
         return target
 
@@ -76,7 +77,7 @@ def test_it_is_the_episode_of_the_environment(
         total += sum(terms.values())
         names |= set(terms)
         np.testing.assert_allclose(
-            live.robot.data.qpos, env.lanes[0].robot.data.qpos, atol=1e-6, rtol=0
+            live.robot.data.qpos, env.instances[0].robot.data.qpos, atol=1e-6, rtol=0
         )
     assert live.phase is Phase.OVER
     assert live.outcome.ticks == env.tick[0]
@@ -120,7 +121,7 @@ def test_the_same_commands_give_the_same_bits(live: LiveRobot) -> None:
         live.begin()
         loop.run(0.4)
         seen = live.measure()
-        return [*vars(seen).values(), live.picture[1], live.robot.data.qpos.copy()]
+        return [*vars(seen).values(), live.depth_image[1], live.robot.data.qpos.copy()]
 
     for a, b in zip(play(), play(), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -133,7 +134,7 @@ def test_the_quaternion_carries_the_noise_of_gravity(live: LiveRobot) -> None:
     off = []
     for _ in range(500):
         seen = live.measure()
-        gravity = base_rotation(seen.quaternion_w).T @ DOWN
+        gravity = rotation_matrix(seen.quaternion_w).T @ DOWN
         np.testing.assert_allclose(-seen.acceleration / 9.81, gravity, atol=20 * std**2)
         off.append(gravity - true)
     assert 0.8 * std < np.std(off, axis=0)[:2].mean() < 1.2 * std
@@ -142,10 +143,10 @@ def test_the_quaternion_carries_the_noise_of_gravity(live: LiveRobot) -> None:
 def test_motors_apply_what_they_are_told_up_to_their_limit(live: LiveRobot) -> None:
     live.start(Scenario("ball", 0, 0))
     zero = np.zeros(29)
-    live.drive(Servos(zero, zero, zero, torque=np.linspace(-4.0, 4.0, 29)))
+    live.drive(ServoCommand(zero, zero, zero, torque=np.linspace(-4.0, 4.0, 29)))
     live.advance()
     np.testing.assert_allclose(live.measure().torque, np.linspace(-4.0, 4.0, 29))
-    live.drive(Servos(zero, zero, zero, torque=np.full(29, 900.0)))
+    live.drive(ServoCommand(zero, zero, zero, torque=np.full(29, 900.0)))
     live.advance()
     limit = live.robot.model.actuator_forcerange[:, 1]
     np.testing.assert_array_equal(live.measure().torque, limit)
@@ -157,7 +158,7 @@ def test_pictures_come_late(live: LiveRobot) -> None:
     taken = []
     for _ in range(60):
         live.advance()
-        taken.append(live.steps - live.picture[0])
-    late = 4 * max(0, live.lane.image_age - 1)
+        taken.append(live.steps - live.depth_image[0])
+    late = 4 * max(0, live.instance.image_age - 1)
     assert min(taken[20:]) == late
     assert max(taken[20:]) == late + 5

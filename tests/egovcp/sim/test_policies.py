@@ -5,8 +5,7 @@ import pytest
 
 from egovcp.errors import UsageError
 from egovcp.sim.env import VectorEnv
-from egovcp.sim.oracles import Oracle
-from egovcp.sim.policies import Constant, Hold, Policy, RandomWalk, reflect
+from egovcp.sim.policies import Constant, EnvPolicy, Hold, Oracle, RandomWalk, reflect
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM, ACTION_ETA
 
@@ -42,16 +41,16 @@ def test_a_walk_steps_as_often_as_it_is_told(env: VectorEnv) -> None:
     assert np.abs(actions).max() <= 1.0
 
 
-def test_who_is_looked_at_by_chance_is_likelier_in_a_long_rest(env: VectorEnv) -> None:
+def test_long_waits_are_seen_more_often_at_a_random_time(env: VectorEnv) -> None:
     """Rests of 1 and 2 ticks, equally many: a tick is the only one of a rest, the first of two or
     the last of two with the same probability, and a step follows at once in two cases of three."""
     policy, rows = RandomWalk(step_ticks=(1, 2)), 3000
     stood = np.full((rows, ACTION_DIM), 0.2)
-    policy.stand(stood, np.random.default_rng(0).spawn(rows))
+    policy.start_at(stood, np.random.default_rng(0).spawn(rows))
     waits = np.isclose(policy.act(env), stood).all(-1)
     assert waits.mean() == pytest.approx(1 / 3, abs=0.03)
     assert not np.isclose(policy.act(env), stood)[waits].all(-1).any()
-    policy.stand_rows([1], np.full((1, ACTION_DIM), -0.2))
+    policy.start_rows_at([1], np.full((1, ACTION_DIM), -0.2))
     np.testing.assert_allclose(policy.act(env)[1], -0.2, atol=ACTION_ETA)
 
 
@@ -70,7 +69,7 @@ def test_constants_need_seven_numbers() -> None:
         Constant([0.0] * 3)
 
 
-def outcome(env: VectorEnv, policy: Policy, task: str) -> tuple[float, float]:
+def outcome(env: VectorEnv, policy: EnvPolicy, task: str) -> tuple[float, float]:
     """Success rate and mean return of one episode per row."""
     scenarios = [Scenario(task, 0, i) for i in range(env.num_envs)]
     env.reset(scenarios)

@@ -4,10 +4,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from egovcp.sim import rays
-from egovcp.sim.camera import DepthCamera
+from egovcp.sim import camera as camera_module
+from egovcp.sim.camera import RayCastCamera, RayCaster
 from egovcp.sim.config import CameraConfig
-from egovcp.sim.rays import View
 from egovcp.spec import DEPTH_MAX_M
 
 FLOOR = "<geom type='plane' size='0 0 1'/>"
@@ -23,14 +22,14 @@ def picture(xml: str, position: tuple[float, float, float] = (0.0, 0.0, 1.0)) ->
     )
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    camera = DepthCamera(CameraConfig(position=(0.0, 0.0, 0.0)))
-    return camera.render(View(model, model.body("eye").id), data, 0.05)
+    camera = RayCastCamera(CameraConfig(position=(0.0, 0.0, 0.0)))
+    return camera.render(RayCaster(model, model.body("eye").id), data, 0.05)
 
 
 @pytest.fixture
 def without_shortcuts(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """Undone, all rays go to MuJoCo."""
-    monkeypatch.setattr(rays, "_level_floor", lambda model, planes: None)
+    monkeypatch.setattr(camera_module, "_level_floor", lambda model, planes: None)
     return monkeypatch
 
 
@@ -82,6 +81,8 @@ def test_a_camera_under_the_floor_does_not_see_it() -> None:
 
 
 def test_an_empty_picture_needs_no_ray_of_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rays.mujoco, "mj_multiRay", lambda *_: pytest.fail("rays were cast"))
+    monkeypatch.setattr(
+        camera_module.mujoco, "mj_multiRay", lambda *_: pytest.fail("rays were cast")
+    )
     depth = picture(FLOOR + "<geom size='.1' pos='-3 0 1'/>")
     assert 0 < depth.max() <= DEPTH_MAX_M

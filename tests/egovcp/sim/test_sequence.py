@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from egovcp.errors import UsageError
 from egovcp.sim.config import BallConfig, EnvConfig, EpisodeConfig, SequenceConfig
 from egovcp.sim.env import StepResult, VectorEnv
-from egovcp.sim.oracles import Oracle
-from egovcp.sim.policies import Hold, Policy
+from egovcp.sim.policies import EnvPolicy, Hold, Oracle
 from egovcp.sim.scenario import SEQUENCE, Scenario
 from egovcp.sim.scene import HEAD
 from egovcp.sim.tasks.arch import ArchTask
@@ -30,15 +29,15 @@ def sequences(config: EnvConfig) -> EnvConfig:
 
 
 def begun(config: EnvConfig) -> tuple[VectorEnv, SequenceTask]:
-    env = VectorEnv(config, 1, pictures=False)
+    env = VectorEnv(config, 1, render_depth=False)
     env.reset([Scenario(SEQUENCE, 0, 0)])
-    task = env.lanes[0].task
+    task = env.instances[0].task
     assert isinstance(task, SequenceTask)
     return env, task
 
 
-def play(config: EnvConfig, policy: Policy, rows: int = 4) -> StepResult:
-    env = VectorEnv(config, rows, pictures=False)
+def play(config: EnvConfig, policy: EnvPolicy, rows: int = 4) -> StepResult:
+    env = VectorEnv(config, rows, render_depth=False)
     scenarios = [Scenario(SEQUENCE, 0, i) for i in range(rows)]
     env.reset(scenarios)
     policy.reset(env, scenarios)
@@ -70,7 +69,7 @@ def test_a_throw_comes_after_the_pause_that_follows_the_arch(sequences: EnvConfi
     while not env.done[0]:
         action = oracle.act(env)
         terms = env.step(action).reward_terms
-        seen.append((task.present, terms["pass"][0], env.snapshot().solids[0]))
+        seen.append((task.current_name, terms["pass"][0], env.privileged_state().solids[0]))
     passed = [t for t, (_, passes, _) in enumerate(seen) if passes]
     first = next(t for t, (name, _, _) in enumerate(seen) if name == "ball")
     assert first == passed[0] + 12 + 1
@@ -85,7 +84,7 @@ def test_only_the_present_object_is_near(sequences: EnvConfig) -> None:
     env, task = begun(sequences)
 
     def away() -> dict[str, bool]:
-        data, model = env.lanes[0].robot.data, env.lanes[0].robot.model
+        data, model = env.instances[0].robot.data, env.instances[0].robot.model
         return {
             name: bool(np.linalg.norm(data.xpos[model.body(name).id]) > 10)
             for name in ("arch", "wall", "ball")
@@ -94,7 +93,7 @@ def test_only_the_present_object_is_near(sequences: EnvConfig) -> None:
     env.step(HOLD)
     assert away() == {"arch": False, "wall": True, "ball": True}
     oracle = Oracle()
-    while task.present == "arch" or task.since_event < 0.2:
+    while task.current_name == "arch" or task.since_event < 0.2:
         env.step(oracle.act(env))
     assert away() == {"arch": True, "wall": True, "ball": False}
 
@@ -103,9 +102,11 @@ def test_a_part_draws_what_its_task_draws_alone(sequences: EnvConfig) -> None:
     env, _ = begun(sequences)
     drawn = env.parameters[0]
     for task in ("arch", "ball"):
-        alone = VectorEnv(sequences, 1, pictures=False)
+        alone = VectorEnv(sequences, 1, render_depth=False)
         alone.reset([Scenario(task, 0, 0)])
-        own = alone.lanes[0].task.parameters | {"event_tick": alone.lanes[0].task.event_tick}
+        own = alone.instances[0].task.parameters | {
+            "event_tick": alone.instances[0].task.event_tick
+        }
         assert {f"{task}.{name}": value for name, value in own.items()}.items() <= drawn.items()
 
 
@@ -113,9 +114,9 @@ def test_the_throw_is_aimed_at_the_robot_wherever_it_stands_by_then(sequences: E
     middle = BallConfig(aim_lateral_range=(0.0, 0.0), aim_height_range=(0.3, 0.3))
     env, task = begun(replace(sequences, ball=middle))
     oracle = Oracle()
-    while task.present == "arch":
+    while task.current_name == "arch":
         env.step(oracle.act(env))
-    env.lanes[0].robot.data.qpos[0] += 1.5
+    env.instances[0].robot.data.qpos[0] += 1.5
     hits = 0.0
     for _ in range(40):
         hits += env.step(HOLD).reward_terms["hit"][0]
@@ -130,7 +131,7 @@ def test_a_part_that_is_never_decided_has_the_time_of_its_own_episodes(
     names = []
     for _ in range(11):
         env.step(HOLD)
-        names.append(task.present)
+        names.append(task.current_name)
     assert names == ["arch"] * 9 + ["ball"] * 2
     assert task.parts == {"arch": True, "ball": False}
     assert task.ticks_limit == 9 + sequences.ball_episode.ticks
@@ -142,9 +143,9 @@ def test_the_last_part_ends_as_the_others_do(sequences: EnvConfig) -> None:
     oracle, present, settled = Oracle(), [], []
     while not env.done[0]:
         env.step(oracle.act(env))
-        present.append(task.present)
-        settled.append(task._part.settled)
-    assert env.lanes[0].truncated
+        present.append(task.current_name)
+        settled.append(task._part.finished)
+    assert env.instances[0].truncated
     assert sum(settled[present.index("ball") :]) == 12 + 1
     assert len(present) < task.ticks_limit
 
@@ -153,7 +154,7 @@ def test_the_last_part_ends_as_the_others_do(sequences: EnvConfig) -> None:
     names = []
     while not env.done[0]:
         env.step(HOLD)
-        names.append(task.present)
+        names.append(task.current_name)
     assert names.count("wall") == 9
 
 
@@ -168,13 +169,13 @@ def test_what_has_not_begun_is_not_won(sequences: EnvConfig) -> None:
 def test_a_fall_is_held_against_the_part_it_ends(sequences: EnvConfig) -> None:
     env, task = begun(replace(sequences, sequence=SequenceConfig(pause_ticks=0)))
     oracle = Oracle()
-    while task.present == "arch":
+    while task.current_name == "arch":
         env.step(oracle.act(env))
     ball = task._part
     assert isinstance(ball, BallTask)
     ball._blocked_at = 0.0
     assert task.parts == {"arch": True, "ball": True}
-    env.lanes[0].robot.data.qvel[0] = 4.0
+    env.instances[0].robot.data.qvel[0] = 4.0
     while not env.done[0]:
         result = env.step(HOLD)
     assert result.terminated[0]
@@ -189,7 +190,7 @@ def test_contacts_are_those_of_the_present_part(sequences: EnvConfig) -> None:
     while not head.any():
         result = env.step(HOLD)
         head = result.reward_terms["head"]
-    assert env.snapshot().contact_force[0, HEAD] > 0
+    assert env.privileged_state().contact_force[0, HEAD] > 0
     arch = task._part
     assert isinstance(arch, ArchTask)
     assert not arch.achieved
@@ -203,7 +204,7 @@ def test_the_robot_is_told_to_walk_before_the_throw_only(sequences: EnvConfig) -
     commands: dict[str, list[NDArray[np.float64]]] = {"arch": [], "ball": []}
     while not env.done[0]:
         env.step(oracle.act(env))
-        commands[task.present].append(task.velocity_command)
+        commands[task.current_name].append(task.velocity_command)
     assert np.max(commands["arch"]) == env.parameters[0]["arch.speed"]
     assert not np.any(commands["ball"])
 

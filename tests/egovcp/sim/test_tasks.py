@@ -9,7 +9,7 @@ from egovcp.errors import UsageError
 from egovcp.robot.stance import StanceController
 from egovcp.sim.config import ArchConfig, BallConfig, EnvConfig, EpisodeConfig, WallConfig
 from egovcp.sim.env import VectorEnv
-from egovcp.sim.robot import Touch
+from egovcp.sim.robot import Contact
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import HEAD, PARTS, TORSO, build_scene
 from egovcp.sim.tasks.arch import ArchTask
@@ -32,7 +32,7 @@ def test_the_ball_flies_through_its_aim_after_its_flight_time(config: EnvConfig)
     nearest = np.full(4, np.inf)
     for _ in range(35):
         env.step(HOLD)
-        truth = env.snapshot()
+        truth = env.privileged_state()
         left = flight - truth.since_event
         path = truth.object_w + truth.object_velocity_w * left[:, None]
         path[:, 2] -= 0.5 * 9.81 * left**2
@@ -45,7 +45,7 @@ def test_the_ball_flies_through_its_aim_after_its_flight_time(config: EnvConfig)
 
 def test_the_ball_is_out_of_sight_and_of_truth_before_the_throw(env: VectorEnv) -> None:
     begin(env, "ball")
-    truth = env.snapshot()
+    truth = env.privileged_state()
     assert np.isnan(truth.object_w).all()
     assert truth.solids == ((),) * 4
     assert not truth.object_active.any()
@@ -61,7 +61,7 @@ def test_a_box_flies_as_the_ball_of_its_volume_would(config: EnvConfig) -> None:
     assert ball.parameters == box.parameters
     for _ in range(14):
         seen = ball.step(HOLD).observation.depth, box.step(HOLD).observation.depth
-    balls, boxes = ball.snapshot(), box.snapshot()
+    balls, boxes = ball.privileged_state(), box.privileged_state()
     assert balls.object_active.all()
     np.testing.assert_allclose(balls.object_w, boxes.object_w, atol=0.002)
     sizes = [(a.size, b.size) for (a,), (b,) in zip(balls.solids, boxes.solids, strict=True)]
@@ -82,14 +82,14 @@ def test_a_box_hits_and_falls(config: EnvConfig) -> None:
     begin(env, "ball")
     hits = sum(env.step(HOLD).reward_terms["hit"] for _ in range(40))
     assert (hits < 0).any()
-    assert (env.snapshot().object_w[:, 2] < 1.0).all()
+    assert (env.privileged_state().object_w[:, 2] < 1.0).all()
 
 
 def thrown(env: VectorEnv) -> BallTask:
     begin(env, "ball")
     for _ in range(8):
         env.step(HOLD)
-    task = env.lanes[0].task
+    task = env.instances[0].task
     assert isinstance(task, BallTask)
     return task
 
@@ -108,7 +108,7 @@ def test_first_contacts_are_judged_by_part(
     env: VectorEnv, parts: list[int], blocked: bool, hit: bool
 ) -> None:
     task = thrown(env)
-    task.observe([Touch(part, 10.0) for part in parts])
+    task.process_contacts([Contact(part, 10.0) for part in parts])
     assert (task.blocked, task.hit) == (blocked, hit)
     terms = task.rewards(np.zeros(ACTION_DIM))
     assert (terms["block"] > 0, terms["hit"] < 0) == (blocked, hit)
@@ -118,17 +118,17 @@ def test_first_contacts_are_judged_by_part(
 @pytest.mark.parametrize(("steps", "hit"), [(20, False), (80, True)])
 def test_contacts_soon_after_a_block_do_not_count(env: VectorEnv, steps: int, hit: bool) -> None:
     task = thrown(env)
-    task.observe([Touch(HAND, 10.0)])
+    task.process_contacts([Contact(HAND, 10.0)])
     task.physics_steps += steps
-    task.observe([Touch(TORSO, 10.0)])
+    task.process_contacts([Contact(TORSO, 10.0)])
     assert task.hit is hit
     assert task.success is not hit
 
 
 def test_a_hand_after_a_hit_blocks_nothing(env: VectorEnv) -> None:
     task = thrown(env)
-    task.observe([Touch(TORSO, 10.0)])
-    task.observe([Touch(HAND, 10.0)])
+    task.process_contacts([Contact(TORSO, 10.0)])
+    task.process_contacts([Contact(HAND, 10.0)])
     assert task.hit
     assert not task.blocked
 
@@ -163,7 +163,7 @@ def test_a_push_gives_the_base_its_speed(config: EnvConfig) -> None:
     fastest = np.zeros(4)
     for _ in range(10):
         env.step(HOLD)
-        fastest = np.maximum(fastest, env.snapshot().pelvis_velocity_w[:, 0])
+        fastest = np.maximum(fastest, env.privileged_state().pelvis_velocity_w[:, 0])
     assert np.all((fastest > 0.2) & (fastest < 0.6))
 
 
@@ -172,7 +172,7 @@ def test_an_unbraced_push_ends_at_the_wall_and_a_touch_is_remembered(config: Env
     env = VectorEnv(replace(config, wall=push), 4)
     begin(env, "wall")
     distance = [p["distance"] for p in env.parameters]
-    gap = env.snapshot().object_b[:, 0]
+    gap = env.privileged_state().object_b[:, 0]
     np.testing.assert_allclose(gap, distance, atol=0.02)
     for _ in range(45):
         result = env.step(HOLD)
@@ -183,9 +183,9 @@ def test_the_arch_moves_at_the_commanded_speed(env: VectorEnv) -> None:
     begin(env, "arch")
     for _ in range(8):
         env.step(HOLD)
-    before = env.snapshot().object_w
+    before = env.privileged_state().object_w
     env.step(HOLD)
-    moved = env.snapshot().object_w - before
+    moved = env.privileged_state().object_w - before
     speed = np.array([p["speed"] for p in env.parameters])
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), speed * 0.04, rtol=1e-3)
 
@@ -228,7 +228,7 @@ def walked(config: EnvConfig) -> tuple[VectorEnv, ArchTask]:
     standing = replace(config, arch=ArchConfig(motion="walk"))
     env = VectorEnv(standing, 1, _SaysItWalks())
     begin(env, "arch")
-    task = env.lanes[0].task
+    task = env.instances[0].task
     assert isinstance(task, ArchTask)
     while not task.moving:
         env.step(HOLD[:1])

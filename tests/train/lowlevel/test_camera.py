@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from egovcp.sim.camera import DepthCamera
+from egovcp.robot.geometry import rotation_vector
+from egovcp.sim.camera import RayCastCamera
 from egovcp.sim.config import CameraConfig
 from egovcp_train.lowlevel import camera, events
 from egovcp_train.lowlevel.camera import TorsoMotion
@@ -15,7 +16,7 @@ from egovcp_train.lowlevel.task import DisturbanceConfig
 
 
 def test_the_focal_length_is_that_of_the_depth_image():
-    assert pytest.approx(DepthCamera(CameraConfig()).focal) == camera.FOCAL
+    assert pytest.approx(RayCastCamera(CameraConfig()).focal) == camera.FOCAL
     assert pytest.approx(43.3, abs=0.01) == camera.FOCAL
 
 
@@ -24,7 +25,7 @@ def test_a_rotation_vector_is_axis_times_angle(angle: float):
     before = Rotation.from_rotvec([0.2, -0.4, 0.7])
     vector = angle * np.array([2.0, -1.0, 2.0]) / 3
     after = before * Rotation.from_rotvec(vector)
-    found = camera.rotation_vector(before.as_matrix()[None], after.as_matrix()[None])
+    found = rotation_vector(before.as_matrix()[None], after.as_matrix()[None])
     np.testing.assert_allclose(found[0], vector, atol=1e-9)
 
 

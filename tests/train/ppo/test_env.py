@@ -30,22 +30,22 @@ class _Fake:
     controller = SimpleNamespace(id="fake")
 
     def __init__(self, config: EnvConfig, robots: int) -> None:
-        self.lanes: list[Any] = []
+        self.instances: list[Any] = []
         self._ticks = np.zeros(robots, dtype=np.int64)
 
     def reset(self, scenarios: Sequence[Scenario]) -> Observation:
-        self.lanes = [SimpleNamespace(scenario=s) for s in scenarios]
+        self.instances = [SimpleNamespace(scenario=s) for s in scenarios]
         return self._observe()
 
     def reset_rows(self, rows: Sequence[int], scenarios: Sequence[Scenario]) -> Observation:
         for row, scenario in zip(rows, scenarios, strict=True):
-            self.lanes[row] = SimpleNamespace(scenario=scenario)
+            self.instances[row] = SimpleNamespace(scenario=scenario)
             self._ticks[row] = 0
         return self._observe()
 
     def step(self, action: NDArray[np.floating]) -> StepResult:
         self._ticks += 1
-        falls = np.array([lane.scenario.episode == 1 for lane in self.lanes])
+        falls = np.array([lane.scenario.episode == 1 for lane in self.instances])
         fallen = falls & (self._ticks == 2)
         late = self._ticks == LIMIT
         reward = action[:, 0].astype(np.float64)
@@ -77,7 +77,7 @@ def build() -> Build:
 
 
 def _playing(env: ContactEnv) -> list[tuple[str, int, int]]:
-    found = [lane.scenario for lane in env.env.lanes]
+    found = [lane.scenario for lane in env.env.instances]
     return [(s.task, s.seed, s.episode) for s in found]
 
 

@@ -7,21 +7,20 @@ edges, 32 pixels from the middle, by 32 times the angle.
 
 from __future__ import annotations
 
-import math
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.g1 import WAIST
+from egovcp.robot.geometry import focal_length, rotation_matrix, rotation_vector
 from egovcp.robot.kinematics import torso_rotation
 from egovcp.sim.config import CameraConfig
-from egovcp.spec import CONTROLLER_HZ, CONTROLLER_TICKS_PER_PLAN, DEPTH_COLS, DEPTH_ROWS
-from egovcp_train.lowlevel.geometry import rotation
+from egovcp.spec import CONTROLLER_HZ, CONTROLLER_TICKS_PER_PLAN, DEPTH_COLS
 from egovcp_train.lowlevel.physics import Snapshot
 
 Array = NDArray[np.float64]
-FOCAL: Final = DEPTH_ROWS / 2 / math.tan(CameraConfig().vertical_fov / 2)
+FOCAL: Final = focal_length(CameraConfig().vertical_fov)
 """Pixels per rad in the middle of the depth image."""
 _ROLL: Final = DEPTH_COLS / 2  # pixels from the middle to the left or right edge
 _FASTEST: Final = 20.0  # rad/s, bound of the angular velocities of a robot that diverges
@@ -29,24 +28,7 @@ _FASTEST: Final = 20.0  # rad/s, bound of the angular velocities of a robot that
 
 def torso(x: Snapshot) -> Array:
     """(N, 3, 3) rotation from the torso, which carries the camera, to the world."""
-    return torso_rotation(rotation(x.quaternion), x.joints[:, WAIST])
-
-
-def rotation_vector(before: Array, after: Array) -> Array:
-    """Rotation from one attitude (..., 3, 3) to another: (..., 3) rad, in the first one's frame."""
-    turn = np.swapaxes(before, -1, -2) @ after
-    skew = 0.5 * np.stack(
-        [
-            turn[..., 2, 1] - turn[..., 1, 2],
-            turn[..., 0, 2] - turn[..., 2, 0],
-            turn[..., 1, 0] - turn[..., 0, 1],
-        ],
-        axis=-1,
-    )
-    sine = np.linalg.norm(skew, axis=-1, keepdims=True)
-    cosine = 0.5 * (np.trace(turn, axis1=-2, axis2=-1)[..., None] - 1.0)
-    angle = np.arctan2(sine, cosine)
-    return np.asarray(skew * np.where(sine > 1e-9, angle / np.maximum(sine, 1e-9), 1.0))
+    return torso_rotation(rotation_matrix(x.quaternion), x.joints[:, WAIST])
 
 
 def pixels(vector: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Rotations and headings of many robots."""
+"""Headings of many robots."""
 
 from __future__ import annotations
 
@@ -6,17 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
-
-def rotation(quaternion: Array) -> Array:
-    """(N, 4) wxyz -> (N, 3, 3) from the pelvis to the world."""
-    w, x, y, z = quaternion.T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
 def heading(turn: Array) -> Array:

@@ -16,11 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 
-from egovcp.robot.controller import LowLevelController
+from egovcp.robot.controllers import LowLevelController
 from egovcp.robot.g1 import EFFORT_LIMIT
 from egovcp.robot.mjcf import FootModel
 from egovcp.sim.config import SensorConfig
-from egovcp.sim.sensors import noise_std
+from egovcp.sim.robot import noise_std
 from egovcp.spec import CONTROLLER_HZ, JOINT_NAMES
 from egovcp_train.lowlevel import events
 from egovcp_train.lowlevel.physics import Physics, compile_model

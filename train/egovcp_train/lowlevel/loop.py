@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
 from egovcp.sim.config import SensorConfig
-from egovcp.sim.sensors import noise_std
+from egovcp.sim.robot import noise_std
 from egovcp.spec import CONTROLLER_HZ
 from egovcp_train.lowlevel import rewards, sensing
 from egovcp_train.lowlevel.camera import TorsoMotion

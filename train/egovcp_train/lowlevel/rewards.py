@@ -7,11 +7,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.robot.arms import DT
 from egovcp.robot.g1 import EFFORT_LIMIT
-from egovcp.robot.reach import DT
+from egovcp.robot.geometry import rotation_matrix
 from egovcp.robot.stance_table import NU
 from egovcp_train.lowlevel.camera import TorsoMotion
-from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
+from egovcp_train.lowlevel.geometry import heading, in_heading
 from egovcp_train.lowlevel.physics import Snapshot
 
 Array = NDArray[np.float64]
@@ -37,7 +38,7 @@ class Motion:
 
     def add(self, x: Snapshot) -> None:
         """One tick of 20 ms."""
-        forward = heading(rotation(x.quaternion))
+        forward = heading(rotation_matrix(x.quaternion))
         now = np.concatenate([in_heading(x.velocity, forward), x.angular_velocity[:, 2:]], axis=1)
         self.average += DT / _AVERAGED * (np.nan_to_num(now) - self.average)
 
@@ -76,7 +77,7 @@ def terms(
         torso: its angular velocity, up to this tick.
         pushed: (N,) whether a push was so recent that steps are needed.
     """
-    turn = rotation(x.quaternion)
+    turn = rotation_matrix(x.quaternion)
     forward = heading(turn)
     up = turn[:, 2]  # the world's vertical in the pelvis frame
     off = np.stack([up[:, 0] + np.sin(pitch), up[:, 1], up[:, 2] - np.cos(pitch)], axis=1)
@@ -107,7 +108,7 @@ def terms(
 
 def fallen(x: Snapshot, height: Array, pitch: Array) -> NDArray[np.bool_]:
     """(N,) tilted or sunk far off the reference, or the simulation diverged."""
-    up = rotation(x.quaternion)[:, 2]
+    up = rotation_matrix(x.quaternion)[:, 2]
     cosine = up[:, 2] * np.cos(pitch) - up[:, 0] * np.sin(pitch)
     low = x.position[:, 2] < height - _FALLEN_HEIGHT
     out: NDArray[np.bool_] = (cosine < np.cos(_FALLEN_TILT)) | low | x.broken

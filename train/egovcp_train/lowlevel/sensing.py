@@ -1,4 +1,4 @@
-"""What many robots measure at once (`egovcp.sim.sensors` is for one), and what a critic sees."""
+"""What many robots measure at once (`egovcp.sim.robot` is for one), and what a critic sees."""
 
 from __future__ import annotations
 
@@ -7,8 +7,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.robot.geometry import rotation_matrix
 from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES
-from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
+from egovcp_train.lowlevel.geometry import heading, in_heading
 from egovcp_train.lowlevel.physics import Snapshot
 from egovcp_train.lowlevel.rewards import standing_feet
 
@@ -20,7 +21,7 @@ def measure(x: Snapshot, command: Array, std: Array, rng: np.random.Generator) -
     """Noisy proprioception and the command (N, 10) -> observations (N, 74); always finite."""
     out = np.zeros((len(command), STATE_DIM))
     out[:, STATE_SLICES["angular_velocity"]] = x.angular_velocity
-    out[:, STATE_SLICES["projected_gravity"]] = -rotation(x.quaternion)[:, 2]
+    out[:, STATE_SLICES["projected_gravity"]] = -rotation_matrix(x.quaternion)[:, 2]
     out[:, STATE_SLICES["joint_position"]] = x.joints
     out[:, STATE_SLICES["joint_velocity"]] = x.joint_rates
     out += std * rng.standard_normal(out.shape)
@@ -36,7 +37,7 @@ def privileged(x: Snapshot, motion: Array, height: Array, friction: Array) -> ND
     True velocity 2, its average and that of the turning 3, upward velocity 1, height error 1, feet
     on the floor 2, their heights 2, their places along and across 4, friction 1.
     """
-    turn = rotation(x.quaternion)
+    turn = rotation_matrix(x.quaternion)
     forward = heading(turn)
     velocity = in_heading(x.velocity, forward)
     feet = in_heading(x.feet - x.position[:, None], forward)

@@ -18,10 +18,9 @@ from egovcp.cli import run_command, save_config
 from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import load_walk_policy
-from egovcp.robot.walk_onnx import export_onnx
+from egovcp.robot.walk_policy import export_onnx
 from egovcp.robot.walking import WalkConfig
-from egovcp.sim.capacity import require_robots
-from egovcp.sim.config import SensorConfig
+from egovcp.sim.config import SensorConfig, require_memory_for_robots
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import (
     checkpoint_dir,
@@ -113,7 +112,7 @@ def train(config: LowLevelTrainConfig) -> None:
         ArtifactError: the file of --init cannot be used.
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
-    require_robots("--robots", config.robots)
+    require_memory_for_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)
     threads = config.threads or available_cores()
     torch.set_num_threads(threads)

@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.errors import SimulationDiverged
-from egovcp.robot.controller import LowLevelController
+from egovcp.robot.arms import nearest_reachable
+from egovcp.robot.controllers import LowLevelController
 from egovcp.robot.g1 import WAIST
+from egovcp.robot.geometry import rotation_matrix, rotation_vector
 from egovcp.robot.kinematics import torso_rotation
 from egovcp.robot.mjcf import FootModel
-from egovcp.robot.reach import nearest_reachable
 from egovcp.sim.config import SensorConfig
-from egovcp.sim.robot import MAX_SPEED
-from egovcp.sim.sensors import noise_std
+from egovcp.sim.robot import MAX_SPEED, noise_std
 from egovcp.spec import CONTROLLER_HZ, CONTROLLER_TICKS_PER_PLAN
 from egovcp_train.lowlevel import camera, events
-from egovcp_train.lowlevel.geometry import heading, in_heading, rotation
+from egovcp_train.lowlevel.geometry import heading, in_heading
 from egovcp_train.lowlevel.heat import relative_rms
 from egovcp_train.lowlevel.physics import Physics, PhysicsOptions, Snapshot
 from egovcp_train.lowlevel.sensing import measure
@@ -68,7 +68,7 @@ class _Record:
         self.torque: list[Array] = []
 
     def add(self, x: Snapshot, command: Array, stepping: NDArray[np.bool_]) -> None:
-        turn = rotation(x.quaternion)
+        turn = rotation_matrix(x.quaternion)
         forward = heading(turn)
         to_heading = _heading_from_world(forward)
         palms = (to_heading[:, None] @ (x.palms - x.position[:, None])[..., None])[..., 0]
@@ -147,7 +147,7 @@ def _require_valid(physics: Physics, alive: NDArray[np.bool_], where: str) -> No
 
 
 def _fallen(x: Snapshot) -> NDArray[np.bool_]:
-    upright = rotation(x.quaternion)[:, 2, 2]
+    upright = rotation_matrix(x.quaternion)[:, 2, 2]
     out: NDArray[np.bool_] = (upright < np.cos(_FALLEN_TILT)) | x.broken
     return out | (x.position[:, 2] < _FALLEN_HEIGHT)
 
@@ -208,7 +208,7 @@ def _rotation(torso: Array, counted: NDArray[np.bool_], apart: int) -> Array:
     """Attitudes (P, N, 3, 3) at planner ticks -> (N, 3) px, mean rotation over ``apart`` ticks."""
     if len(torso) <= apart:
         return np.full((counted.shape[1], 3), np.nan)
-    turned = np.abs(camera.pixels(camera.rotation_vector(torso[:-apart], torso[apart:])))
+    turned = np.abs(camera.pixels(rotation_vector(torso[:-apart], torso[apart:])))
     both = counted[:-apart] & counted[apart:]
     return np.stack([_mean(turned[..., axis], both) for axis in range(3)], axis=-1)
 

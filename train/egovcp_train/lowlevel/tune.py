@@ -26,8 +26,7 @@ from egovcp.outputs import require_writable
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.gait import GaitConfig
 from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
-from egovcp.sim.capacity import require_robots
-from egovcp.sim.config import SensorConfig
+from egovcp.sim.config import SensorConfig, require_memory_for_robots
 from egovcp.spec import ACTION_BOX, CONTROLLER_HZ
 from egovcp.terminal import echo
 from egovcp_train.lowlevel import events
@@ -82,7 +81,7 @@ def tune(config: TuneConfig) -> None:
         UsageError: an option makes no sense.
         EnvironmentFailure: the package cma is missing, or the folder cannot be written.
     """
-    require_robots("--population", config.population, config.population * len(_SPEEDS))
+    require_memory_for_robots("--population", config.population, config.population * len(_SPEEDS))
     require_packages("egovcp-train", PROG, "cma", *SIMULATOR_MODULES)
     output = Path(config.output_dir)
     require_writable(output)
@@ -140,7 +139,7 @@ _MOST: Final = 3.0  # of the score below, per second
 def walk(gaits: Sequence[GaitConfig], config: TuneConfig, generation: int) -> Array:
     """(len(gaits),) score of each, the mean over its robots, at most 3 per second."""
     # They need the simulator, which `tune` asks for together with the other packages.
-    from egovcp.sim.sensors import noise_std
+    from egovcp.sim.robot import noise_std
     from egovcp_train.lowlevel import rewards
     from egovcp_train.lowlevel.physics import Physics
     from egovcp_train.lowlevel.sensing import measure

@@ -105,7 +105,7 @@ class ContactEnv(VecEnv):  # type: ignore[misc]
         """TASK/return, TASK/success and TASK/ticks of the episodes that have ended."""
         log: dict[str, list[float]] = defaultdict(list)
         for row in np.flatnonzero(done):
-            task = self.env.lanes[row].scenario.task
+            task = self.env.instances[row].scenario.task
             log[f"{task}/return"].append(float(self._returns[row]))
             log[f"{task}/success"].append(float(success[row]))
             log[f"{task}/ticks"].append(float(self.episode_length_buf[row]))

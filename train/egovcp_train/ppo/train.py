@@ -16,7 +16,7 @@ from egovcp.cli import run_command, save_config
 from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import absolute_controller, make_controller
-from egovcp.sim.capacity import require_robots
+from egovcp.sim.config import require_memory_for_robots
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import (
     checkpoint_dir,
@@ -47,7 +47,7 @@ def train(config: PpoTrainConfig) -> None:
     Raises:
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
-    require_robots("--robots", config.robots)
+    require_memory_for_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)
     make_controller(config.env.controller)  # raises before the simulator is imported
     controller = absolute_controller(config.env.controller)  # resumed from any working directory

@@ -20,7 +20,7 @@ from egovcp.bounds import bounded
 from egovcp.errors import EnvironmentFailure
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import DAMPING, STIFFNESS
-from egovcp.sim.live import LIMP, LiveRobot, Phase, Servos
+from egovcp.sim.live import DAMPED, LiveRobot, Phase, ServoCommand
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS, PHYSICS_DT
 from egovcp_deploy.robots.body import BodyState
 from egovcp_deploy.robots.depth_wire import WirePicture, encode_picture
@@ -113,7 +113,7 @@ class FakeBridge:
         self._senders: dict[int, float] = {}
         self._time = 0.0  # s of simulated time since the start
         self._last_command = -np.inf
-        self._servos = LIMP
+        self._servos = DAMPED
         self._last_state = b""
         self._sequence = 0
         self._shown: tuple[int, int] | None = None
@@ -151,7 +151,7 @@ class FakeBridge:
     @property
     def commanded(self) -> bool:
         """Whether the motors are told to hold anything."""
-        return self._servos is not LIMP and bool(self._servos.stiffness.any())
+        return self._servos is not DAMPED and bool(self._servos.stiffness.any())
 
     @property
     def time(self) -> float:
@@ -188,7 +188,7 @@ class FakeBridge:
                 self.counts.commands += len(waiting)
                 break
         if self._time - self._last_command > WATCHDOG_S:
-            self._servos = LIMP
+            self._servos = DAMPED
 
     def _take(self, payload: bytes) -> bool:
         """Whether the command is obeyed."""
@@ -219,7 +219,7 @@ class FakeBridge:
             self.robot.release()
             faults.release = False
 
-    def _obeyed(self) -> Servos:
+    def _obeyed(self) -> ServoCommand:
         """What the motors do: what they are told, or what a fault makes them do."""
         servos = self._intruder() if self.faults.intruder else self._servos
         if self.faults.dropped_motor is None:
@@ -250,10 +250,10 @@ class FakeBridge:
             lost[faults.dropped_motor] = self.robot.steps
         return replace(readings, faults=status, lost=lost, enabled=status == 0)
 
-    def _intruder(self) -> Servos:
+    def _intruder(self) -> ServoCommand:
         """Another program, which holds every joint where it is, a little askew."""
         joints = self.robot.robot.data.qpos[self.robot.robot.index.joint_qpos]
-        return Servos(joints + 0.1, STIFFNESS, DAMPING)
+        return ServoCommand(joints + 0.1, STIFFNESS, DAMPING)
 
     def _publish_state(self) -> None:
         faults = self.faults
@@ -287,7 +287,7 @@ class FakeBridge:
             quaternion_w=seen.quaternion_w,
             angular_velocity=rate,
             mode=self._mode,
-            remote=Remote.asking_for(self.robot.velocity_wish, self.pressed).to_bytes(),
+            remote=Remote.asking_for(self.robot.operator_velocity, self.pressed).to_bytes(),
             motors=self._motors(seen.torque),
         )
         return encode_state(LowState(body, self._sources()), seen.acceleration)
@@ -300,7 +300,7 @@ class FakeBridge:
         return recent + self.faults.announce
 
     def _publish_picture(self) -> None:
-        taken, depth = self.robot.picture
+        taken, depth = self.robot.depth_image
         if self.faults.mute_camera or (self._episode, taken) == self._shown:
             return
         self._shown = (self._episode, taken)
@@ -328,11 +328,11 @@ def _port(end: zmq.Socket[bytes]) -> int:
     return int(end.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
 
 
-def _servos(command: LowCommand) -> Servos:
+def _servos(command: LowCommand) -> ServoCommand:
     """What the motors do; one that is not enabled does nothing at all."""
     on = command.enabled.astype(np.float64)
     motors = command.motors
-    return Servos(
+    return ServoCommand(
         motors.position,
         on * motors.stiffness,
         on * motors.damping,

@@ -15,8 +15,8 @@ from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.outputs import output_file, write_report
 from egovcp.rate import NS_PER_S, Clock, MonotonicClock
-from egovcp.sim.config import EnvConfig, eventful
-from egovcp.sim.live import LiveRobot, Outcome
+from egovcp.sim.config import EnvConfig, evaluation_config
+from egovcp.sim.live import EpisodeOutcome, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import PHYSICS_DT
 from egovcp.terminal import echo
@@ -68,7 +68,7 @@ class FakeConfig:
     LeRobot's bridge sends one temperature and no status."""
     json: str = output_file()
     """File for the outcomes, rewritten after each episode."""
-    env: EnvConfig = field(default_factory=eventful)
+    env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation. The controller only says in which pose to stand
     and whether the arch comes to the robot; the delay of actions is that of the wire."""
 
@@ -178,7 +178,7 @@ class Console:
         return True
 
 
-def record(outcome: Outcome) -> dict[str, Any]:
+def record(outcome: EpisodeOutcome) -> dict[str, Any]:
     """An outcome for a JSON file."""
     return {
         "task": outcome.scenario.task,
@@ -192,7 +192,7 @@ def record(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _sum_up(outcomes: Sequence[Outcome]) -> None:
+def _sum_up(outcomes: Sequence[EpisodeOutcome]) -> None:
     if outcomes:
         won = sum(outcome.success for outcome in outcomes)
         _say(f"{len(outcomes)} episodes, {won} successes")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final, Protocol
 
-from egovcp.sim.live import LiveRobot, Outcome, Phase
+from egovcp.sim.live import EpisodeOutcome, LiveRobot, Phase
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import PHYSICS_DT
 
@@ -86,7 +86,7 @@ class Stage:
         self._scenarios = scenarios
         self._schedule = schedule or Schedule()
         self._tell = tell
-        self.outcomes: list[Outcome] = []
+        self.outcomes: list[EpisodeOutcome] = []
         """Of the episodes that are over."""
         self.finished = False
         """Whether there are no more episodes."""
@@ -141,7 +141,7 @@ class Stage:
             self._tell(spoken(outcome))
 
 
-def spoken(outcome: Outcome) -> str:
+def spoken(outcome: EpisodeOutcome) -> str:
     """An outcome in one paragraph."""
     verdict = "fell" if outcome.fallen else "success" if outcome.success else "failure"
     terms = ", ".join(f"{k} {v:+.3f}" for k, v in outcome.reward_terms.items() if v)
