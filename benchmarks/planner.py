@@ -24,9 +24,9 @@ from torch import Tensor, nn
 from egovcp import spec
 from egovcp.model import Carry, WorldModel, WorldModelConfig
 from egovcp.plan import PlanEvaluator, PlannerConfig, Policy, make_plan, optimiser_of
-from egovcp.plan.action_parameterization import reflect
 from egovcp.plan.backends import make_evaluator
 from egovcp.plan.config import PAPER_PLANNER, BackendName
+from egovcp.plan.search import reflect_once
 
 SIDE = 1024  # of the matrices of the plain product
 
@@ -47,14 +47,14 @@ def plain_plan(
         action = executed.repeat(m, 1)
         values, alive = [], torch.ones(m)
         for k in range(n):
-            action = reflect(action + config.eta * deltas[:, k])
+            action = reflect_once(action + config.eta * deltas[:, k])
             values.append(alive * (model.value(state, action) - model.min_return))
             if k > 0:
                 alive = alive * (model.termination(state) <= config.termination_threshold)
             state = model.imagine(state, action)
         elites = deltas[torch.stack(values).mean(0).topk(config.elites).indices]
         mean, std = elites.mean(0), elites.std(0, correction=0).clamp_min(config.min_std)
-    return reflect(executed[0] + config.eta * mean[0])
+    return reflect_once(executed[0] + config.eta * mean[0])
 
 
 def needed_gflop(model: WorldModel, config: PlannerConfig) -> float:

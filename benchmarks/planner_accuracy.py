@@ -22,9 +22,9 @@ from egovcp.artifact import load_artifact
 from egovcp.data.arrays import open_dataset
 from egovcp.model import Carry, WorldModel
 from egovcp.plan import PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
-from egovcp.plan.action_parameterization import random_walk
 from egovcp.plan.backends import make_evaluator
 from egovcp.plan.config import BackendName
+from egovcp.plan.search import random_walk
 
 BACKENDS: tuple[BackendName, ...] = ("float32", "int8")
 BATCH = 8  # robots planned together

@@ -39,8 +39,8 @@ from egovcp.manifest import (
 )
 from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.model.weights import load_model, size_limit, tensor_shapes
-from egovcp.plan import PlannerConfig, Policy, require_answers
-from egovcp.plan.cost import require_affordable
+from egovcp.plan import PlannerConfig, Policy, require_compatible
+from egovcp.plan.config import require_affordable
 from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
 from egovcp.safe_files import JSON_LIMIT_BYTES, UnsafeFileError, read_bytes, sha256
 
@@ -223,7 +223,7 @@ def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
             raise DecodeError(f'type is {shown(config.get("type"))}, expected "egovcp"')
         model = decode(WorldModelConfig, world_model, "world_model")
         planner = decode(PlannerConfig, config.get("planner"), "planner")
-        require_answers(model, planner)
+        require_compatible(model, planner)
     except (DecodeError, UsageError) as error:
         raise ArtifactError(
             f"{folder / CONFIG}: {error}; a policy of another version of egovcp has to be trained "

@@ -7,16 +7,16 @@ from dataclasses import asdict, dataclass, replace
 from egovcp.artifact import Artifact, load_artifact
 from egovcp.bounds import OutOfBounds, bounded
 from egovcp.errors import UsageError
-from egovcp.plan import PlannerConfig, require_answers
-from egovcp.plan.choices import Latent
+from egovcp.plan import PlannerConfig, require_compatible
 from egovcp.plan.config import (
     ActionParameterization,
     BackendName,
+    Latent,
     Objective,
     OptimiserName,
     TerminationRule,
+    require_affordable,
 )
-from egovcp.plan.cost import require_affordable
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,6 @@ def load_policy(policy: PolicyOptions, planner: PlannerOptions) -> Artifact:
     """
     artifact = load_artifact(policy.path, policy.revision)
     changed = planner.apply(artifact.planner)
-    require_answers(artifact.world_model.config, changed)
+    require_compatible(artifact.world_model.config, changed)
     require_affordable(artifact.world_model.config, changed)
     return replace(artifact, planner=changed)

@@ -1,7 +1,6 @@
 """Sampling-based planning in a learned model, and the policy that uses it."""
 
-from egovcp.plan.choices import require_answers
-from egovcp.plan.config import PlannerConfig
+from egovcp.plan.config import PlannerConfig, require_affordable, require_compatible
 from egovcp.plan.objective import PlanEvaluator, ReferenceEvaluator
 from egovcp.plan.optimisers import optimiser_of
 from egovcp.plan.policy import Policy, PolicyStep, blank_observation
@@ -21,7 +20,8 @@ __all__ = [
     "hand_grid",
     "make_plan",
     "optimiser_of",
-    "require_answers",
+    "require_affordable",
+    "require_compatible",
     "until",
     "value_map",
 ]

@@ -1,20 +1,33 @@
-"""What can be chosen about a planner."""
+"""Configuration of the planner, and the checks of what it needs of a world model and a machine."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Final, Literal, NamedTuple
 
 from egovcp import spec
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import UsageError
-from egovcp.plan.choices import Latent
+from egovcp.model import WorldModelConfig
+from egovcp.model.value import width
 
+Latent = Literal["mean", "sample"]
 Objective = Literal["value", "reward", "td"]
 ActionParameterization = Literal["random_walk", "target"]
 TerminationRule = Literal["paper", "shift", "survival"]
 OptimiserName = Literal["cem", "icem", "mppi", "shooting"]
 BackendName = Literal["auto", "eager", "float32", "int8"]
+
+MAX_SECONDS: Final = 10.0
+"""Largest estimate of the time of a plan for one robot."""
+MAX_BYTES: Final = 256 << 20
+"""Largest estimate of the memory of a plan for one robot."""
+
+_PRODUCTS_PER_S: Final = 4e10  # multiply-adds of one processor core, float32
+_FLOATS_PER_S: Final = 2e9  # element-wise operations
+_CALL_S: Final = 5e-4  # overhead of the operations of one step
+_ACTION_COPIES: Final = 8  # noise, deltas, actions, and copies in the optimisers
+_BYTES: Final = 4
 
 
 @dataclass(frozen=True)
@@ -76,7 +89,7 @@ class PlannerConfig:
 
     @property
     def actions(self) -> int:
-        """Actions of a candidate: N, and under ``objective=td`` that which Q is asked about."""
+        """Actions of a candidate: N, and under ``objective=td`` one more, for Q at the end."""
         return self.horizon + (self.objective == "td")
 
 
@@ -89,3 +102,66 @@ PAPER_PLANNER = PlannerConfig(
     action_parameterization="random_walk",
     termination_rule="paper",
 )
+
+
+def require_compatible(model: WorldModelConfig, planner: PlannerConfig) -> None:
+    """Raise `UsageError` if the planner needs predictions that the world model does not make."""
+    if planner.objective != "value" and model.loss.reward <= 0:
+        raise UsageError(
+            f"planner.objective={planner.objective} adds up predicted rewards, and this world "
+            "model predicts none: train it with --policy.loss.reward=1, or plan with "
+            "objective=value"
+        )
+    if planner.latent == "sample" and model.dynamics == "autoregressive":
+        raise UsageError(
+            "planner.latent=sample draws from the prior, and dynamics=autoregressive trains only "
+            "its mean: plan with latent=mean"
+        )
+
+
+class PlanCost(NamedTuple):
+    """Estimated cost of a plan for one robot."""
+
+    seconds: float
+    """On one processor core."""
+    memory_bytes: int
+
+
+def plan_cost(model: WorldModelConfig, planner: PlannerConfig) -> PlanCost:
+    """Estimate time and memory of a plan for one robot, on one core without a GPU."""
+    samples, iterations, actions = planner.samples, planner.iterations, planner.actions
+    steps = samples * actions * iterations
+    floats = _floats_per_step(model)
+    per_step = _products_per_step(model) / _PRODUCTS_PER_S + floats / _FLOATS_PER_S
+    seconds = steps * per_step + actions * iterations * _CALL_S
+    memory = _BYTES * samples * (actions * spec.ACTION_DIM * _ACTION_COPIES + floats)
+    return PlanCost(seconds, memory)
+
+
+def require_affordable(model: WorldModelConfig, planner: PlannerConfig) -> None:
+    """Raise `UsageError` if a plan for one robot takes too long or too much memory."""
+    cost = plan_cost(model, planner)
+    if cost.seconds > MAX_SECONDS or cost.memory_bytes > MAX_BYTES:
+        raise UsageError(
+            f"planner.samples={planner.samples}, "
+            f"planner.horizon={planner.horizon} and "
+            f"planner.iterations={planner.iterations} take about {cost.seconds:,.1f} s on "
+            f"one core and {cost.memory_bytes / 1e6:,.0f} MB for each plan of one robot with these "
+            f"networks; expected at most {MAX_SECONDS:.0f} s and {MAX_BYTES / 1e6:.0f} MB: lower "
+            "them"
+        )
+
+
+def _products_per_step(c: WorldModelConfig) -> int:
+    """Multiply-adds of one step of one candidate."""
+    state = c.hidden + c.latent
+    transition = (c.latent + spec.ACTION_DIM) * c.units + (c.units + c.hidden) * 3 * c.hidden
+    prior = c.hidden * c.units + c.units * 2 * c.latent
+    value = (state + spec.ACTION_DIM + c.units + width(c.value_loss)) * c.units
+    termination = (state + 1) * c.units
+    return transition + prior + value + termination
+
+
+def _floats_per_step(c: WorldModelConfig) -> int:
+    """Intermediate results of one step of one candidate."""
+    return 8 * c.hidden + 9 * c.units + 4 * c.latent + width(c.value_loss)

@@ -1,43 +1,43 @@
-"""What a plan is worth (equation 15), and who says so.
+"""Objectives J of plans (equation 15), and their reference evaluation with a world model.
 
 value     J = 1/N sum_{k<N} Q(h_{t+k}, z^_{t+k}, a_{t+k})                       the paper's
 reward    J = sum_{k<N} gamma^k r(h_{t+k}, z^_{t+k}, a_{t+k})                   Rew-MPC
 td        J = the same + gamma^N Q(h_{t+N}, z^_{t+N}, a_{t+N})                  TD-MPC
 
-TD-MPC asks Q_N about what its policy would do, which is trained to say the best action; here there
-is none, and Q_N is asked about one action more of the candidate's own walk, which the search looks
-for.
+TD-MPC evaluates Q_N at the action of a trained policy. There is none here, so the candidate has one
+more action, which the search optimises.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple, Protocol
+from functools import partial
+from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from egovcp.plan.choices import reward_model, step_of
-from egovcp.plan.config import PlannerConfig
+from egovcp.errors import UsageError
+from egovcp.plan.config import Latent, PlannerConfig
 
 PlanValue = Callable[[Tensor, torch.Generator | None], Tensor]
-"""J (E, M) of plans (E, M, N, 7); the generator is for the noise under ``latent=sample``."""
+"""J (E, M) of plans (E, M, N, 7); the generator samples the noise under ``latent=sample``."""
 
 
 class PlanEvaluator[C](Protocol):
-    """Says what plans from a state are worth; several may compute the same in different ways."""
+    """Evaluates plans from a state; all implementations compute the same up to rounding."""
 
     def at(self, carry: C) -> PlanValue:
-        """What all plans from the robots' states (E, ...) share is computed here, once."""
+        """The evaluation of plans from the robots' states (E, ...)."""
         ...
 
 
 class Dynamics[L](Protocol):
-    """What is needed of a world model; leading dimensions broadcast (E robots, M plans)."""
+    """The part of a world model that planning uses; leading dimensions (E, M) broadcast."""
 
     @property
     def min_return(self) -> Tensor:
-        """The worst return of the data: what a failed plan is worth under rule ``shift``."""
+        """Lowest return of the data: the value of a failed plan under rule ``shift``."""
         ...
 
     def expand_candidates(self, carry: L) -> L:
@@ -57,8 +57,61 @@ class Dynamics[L](Protocol):
         ...
 
 
+@runtime_checkable
+class StochasticModel(Protocol):
+    """A model that can sample the next state."""
+
+    def imagine_sample(
+        self, carry: Any, action: Tensor, generator: torch.Generator | None = None
+    ) -> Any:
+        """Advance by one tick under action (E, M, 7), with the same noise for all of them."""
+        ...
+
+
+class RewardModel(Protocol):
+    """A model that predicts rewards."""
+
+    @property
+    def discount(self) -> Tensor:
+        """gamma of its returns, per tick."""
+        ...
+
+    def reward(self, carry: Any, action: Tensor) -> Tensor:
+        """Immediate reward (E, M) of action (E, M, 7)."""
+        ...
+
+
+def require_reward_model(model: object) -> RewardModel:
+    """``model``; raises `UsageError` if it does not predict rewards."""
+    if not (hasattr(model, "reward") and hasattr(model, "discount")):
+        raise UsageError(
+            f"{type(model).__name__} has no reward and discount; plan with objective=value"
+        )
+    return cast("RewardModel", model)  # buffers are not seen by isinstance
+
+
+def _transition[L](
+    model: object,
+    imagine: Callable[[L, Tensor], L],
+    latent: Latent,
+    generator: torch.Generator | None,
+) -> Callable[[L, Tensor], L]:
+    """The transition function: ``imagine``, or under ``latent=sample`` the model's sampling one.
+
+    Raises:
+        UsageError: the model cannot sample.
+    """
+    if latent == "mean":
+        return imagine
+    if not isinstance(model, StochasticModel):
+        raise UsageError(
+            f"latent=sample: {type(model).__name__} has no imagine_sample; plan with latent=mean"
+        )
+    return partial(model.imagine_sample, generator=generator)
+
+
 class ReferenceEvaluator[L](NamedTuple):
-    """The evaluator that asks a world model about every step: slow, and right by definition."""
+    """Evaluates plans with the world model step by step: slow, the reference of all backends."""
 
     model: Dynamics[L]
     config: PlannerConfig
@@ -73,67 +126,66 @@ class ReferenceEvaluator[L](NamedTuple):
 
 
 class ReturnAccumulator:
-    """J of plans, step by step: which head a step is asked for, and what it adds.
+    """Accumulates J of plans step by step, and selects the head that each step needs.
 
-    A plan that has failed is worth the floor, or earns (1 - gamma) floor at each tick: for ever,
-    that is the floor. So a failure at tick j is worth gamma^j floor, however many of the later
-    ticks are looked at.
+    A failed plan has the value ``floor``, or the reward (1 - gamma) floor at each tick, whose
+    discounted sum is the floor. So a failure at tick j contributes gamma^j floor for any horizon.
 
     Args:
-        config: the objective, and the rule of what follows a failure.
-        model: a `Dynamics`; under ``reward`` and ``td`` it must foresee rewards.
+        config: objective and termination rule.
+        model: a `Dynamics`; under ``reward`` and ``td`` a `RewardModel`.
         steps: of a plan, `PlannerConfig.actions`.
 
     Raises:
-        UsageError: the model does not know what is asked of it.
+        UsageError: the model lacks a head that the objective needs.
     """
 
     def __init__(self, config: PlannerConfig, model: Dynamics[Any], steps: int) -> None:
         self._config, self._steps = config, steps
-        self._means = config.objective == "value"
-        self._discount = 1.0 if self._means else reward_model(model).discount
+        self._is_mean = config.objective == "value"
+        self._discount = 1.0 if self._is_mean else require_reward_model(model).discount
         self._floor = 0.0 if config.termination_rule == "paper" else model.min_return
         self._weight: Tensor | float = 1.0
-        self._share: Tensor | float = 1.0
+        self._survival: Tensor | float = 1.0
         self._above: Tensor | float = 0.0
         self._below: Tensor | float = 0.0
 
-    def asks_value(self, k: int) -> bool:
-        """Whether step k is asked for Q, else for its reward."""
+    def needs_value(self, k: int) -> bool:
+        """Whether step k contributes Q, rather than its reward."""
         at_the_end = self._config.objective == "td" and k == self._steps - 1
-        return self._means or at_the_end
+        return self._is_mean or at_the_end
 
-    def asks_risk(self, k: int) -> bool:
-        """Whether it matters if step k is a failure: o_t was seen alive, and nothing follows the
-        last step."""
+    def needs_termination(self, k: int) -> bool:
+        """Whether the termination probability of step k affects J: not in the first (observed) and
+        the last one."""
         return 0 < k < self._steps - 1
 
-    def value(self, q: Tensor) -> None:
-        """The step is worth ``q``, or all that comes from it on."""
+    def add_value(self, q: Tensor) -> None:
+        """Add Q of the step."""
         self._add(q, self._floor)
 
-    def reward(self, r: Tensor) -> None:
-        """The step earns ``r``."""
+    def add_reward(self, r: Tensor) -> None:
+        """Add the reward of the step."""
         self._add(r, (1.0 - self._discount) * self._floor)
         self._weight = self._weight * self._discount
 
-    def risk(self, dead: Tensor) -> None:
-        """The state of the step is a failure with probability ``dead``."""
+    def add_termination(self, probability: Tensor) -> None:
+        """Apply the termination probability of the step's state."""
         if self._config.termination_rule == "survival":
-            self._share = self._share * (1.0 - dead)
+            self._survival = self._survival * (1.0 - probability)
         else:
-            self._share = self._share * (dead <= self._config.termination_threshold)
+            self._survival = self._survival * (probability <= self._config.termination_threshold)
 
     def plan_value(self) -> Tensor:
         """J, (...)."""
         j = self._above + self._below
-        if self._means:
+        if self._is_mean:
             j = j / self._steps
         assert isinstance(j, Tensor)
         return j
 
     def _add(self, value: Tensor, floor: Tensor | float) -> None:
-        self._above = self._above + self._weight * self._share * (value - floor)
+        self._above = self._above + self._weight * self._survival * (value - floor)
         self._below = self._below + self._weight * floor
 
 
@@ -150,17 +202,17 @@ def evaluate[L](
         generator: of the noise under ``latent=sample``; None: torch's own.
 
     Raises:
-        UsageError: the model does not know what is asked of it.
+        UsageError: the model lacks a head that the objective needs.
     """
     accumulator = ReturnAccumulator(config, model, actions.shape[-2])
     states = _states(model, carry, actions, config, generator)
     for k, (state, action) in enumerate(zip(states, actions.unbind(-2), strict=True)):
-        if accumulator.asks_value(k):
-            accumulator.value(model.value(state, action))
+        if accumulator.needs_value(k):
+            accumulator.add_value(model.value(state, action))
         else:
-            accumulator.reward(reward_model(model).reward(state, action))
-        if accumulator.asks_risk(k):
-            accumulator.risk(model.termination(state))
+            accumulator.add_reward(require_reward_model(model).reward(state, action))
+        if accumulator.needs_termination(k):
+            accumulator.add_termination(model.termination(state))
     return accumulator.plan_value()
 
 
@@ -171,8 +223,8 @@ def _states[L](
     config: PlannerConfig,
     generator: torch.Generator | None,
 ) -> Iterator[L]:
-    """At which each of the actions is taken: the robots' own, then the imagined ones."""
-    imagine = step_of(model, model.imagine, config.latent, generator)
+    """The states in which the actions are taken: the robots' present ones, then imagined ones."""
+    imagine = _transition(model, model.imagine, config.latent, generator)
     carry = model.expand_candidates(carry)
     yield carry
     for action in actions.unbind(-2)[:-1]:

@@ -1,4 +1,4 @@
-"""The world model as a policy: filter an observation, plan, report what was imagined."""
+"""The world model as a policy: filter an observation, plan, and imagine."""
 
 from __future__ import annotations
 
@@ -13,17 +13,16 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
-from egovcp.plan.action_parameterization import shift
 from egovcp.plan.backends import make_evaluator
 from egovcp.plan.config import PlannerConfig
 from egovcp.plan.objective import PlanEvaluator
 from egovcp.plan.optimisers import optimiser_of
-from egovcp.plan.search import make_plan
+from egovcp.plan.search import make_plan, shift
 
 type Array = NDArray[np.float32]
 
 LARGEST_STATE: Final = 1e3
-"""No quantity of the proprioception reaches this, in the units of `spec.STATE_SLICES`."""
+"""Bound of all quantities of the proprioception, in the units of `spec.STATE_SLICES`."""
 _WARM_UP_PLANS: Final = 2
 
 
@@ -31,7 +30,7 @@ _NONE: Final[Array] = np.zeros(0, np.float32)
 
 
 class PolicyStep(NamedTuple):
-    """What the policy decided for E robots, as numpy arrays; empty where it decided nothing."""
+    """Result of a planner tick for E robots; fields that a policy does not compute are empty."""
 
     action: Array  # (E, 7) in [-1, 1]
     plan: Array = _NONE  # (E, N, 7)
@@ -44,15 +43,13 @@ class PolicyStep(NamedTuple):
 
 
 class Policy:
-    """Filters and plans for E robots in step; call `act`, then `advance`, once a tick.
+    """Filters observations and plans for E robots; call `act`, then `advance`, once per tick.
 
-    An observation of a robot is skipped if its state is not finite or exceeds `LARGEST_STATE`:
-    the prior predicts the state of this tick, and the next observation is used as always. Depth
-    that is not finite counts as invalid (0).
+    If a robot's state is not finite or exceeds `LARGEST_STATE`, its observation is skipped and the
+    prior predicts this tick. Depth that is not finite counts as invalid (0).
 
-    The recurrence advances with the action that was actually sent, so `advance` must be
-    told what the safety layer made of the planned one. The planner packs the model's weights
-    when they are first needed; later changes of them are not seen.
+    The recurrence advances with the action that was sent, after the safety layer: pass it to
+    `advance`. The model's weights are packed at the first plan; later changes are not seen.
     """
 
     def __init__(
@@ -62,14 +59,14 @@ class Policy:
         self.config = config
         self.num_envs = num_envs
         self._seed = seed
-        self._judge: PlanEvaluator[Carry] | None = None
+        self._evaluator: PlanEvaluator[Carry] | None = None
         self.skipped: NDArray[np.bool_] = np.zeros(num_envs, np.bool_)
         """(E,) whether the last observation of each robot was skipped."""
         self.reset()
 
     @torch.inference_mode()
     def reset(self, rows: NDArray[np.intp] | None = None) -> None:
-        """Forget the past of ``rows`` (None: of all, and restart the random stream)."""
+        """Reset ``rows`` (None: all, and the random generator)."""
         if rows is None:
             device, envs = self._device, self.num_envs
             self._carry = self.model.initial(envs)
@@ -93,8 +90,7 @@ class Policy:
         self._check_shapes(depth, state)
         if np.issubdtype(depth.dtype, np.floating):
             depth = np.nan_to_num(depth, nan=0.0, posinf=0.0, neginf=0.0)
-        # NaN compares as false: a state that is not a number is no valid one.
-        valid = (np.abs(state) <= LARGEST_STATE).all(1)
+        valid = (np.abs(state) <= LARGEST_STATE).all(1)  # false for NaN
         before, first = self._carry, self._first
         observed = self.model.observe(
             before,
@@ -111,7 +107,7 @@ class Policy:
         else:
             predicted = self._predicted(before, first)
             self._carry = _choose_rows(usable, observed, predicted)
-            self._first = first & ~usable  # the recurrence begins at the first usable one
+            self._first = first & ~usable  # it starts at the first usable observation
         self.skipped = ~usable.cpu().numpy()
 
     def _predicted(self, carry: Carry, first: Tensor) -> Carry:
@@ -137,14 +133,13 @@ class Policy:
         state: NDArray[np.floating],
         remaining: Callable[[], float] | None = None,
     ) -> PolicyStep:
-        """Depth (E, 48, 64) mm and state (E, 74) -> the plan from here.
+        """Observe depth (E, 48, 64) mm and state (E, 74), and plan.
 
         Args:
-            depth: as sensed.
-            state: as sensed.
-            remaining: seconds until the answer is due (`egovcp.plan.until`); the planner runs
-                as many iterations as fit, at least one. None: all of them, the same on every
-                machine that computes the same.
+            depth: as in `observe`.
+            state: as in `observe`.
+            remaining: seconds until the result is due (`egovcp.plan.until`); the planner does as
+                many iterations as fit, at least one. None: all of them.
         """
         self.observe(depth, state)
         plan = make_plan(
@@ -170,7 +165,7 @@ class Policy:
         )
 
     def warm_up(self) -> None:
-        """Plan for nothing and `reset`: the first plans compile, pack and allocate.
+        """Make unused plans and `reset`: the first plans compile, pack and allocate.
 
         Raises:
             UsageError, EnvironmentFailure: as `prepare`.
@@ -180,18 +175,18 @@ class Policy:
         self.reset()
 
     def prepare(self) -> PlanEvaluator[Carry]:
-        """Pack the planner now and not at the first observation: it may have to be compiled.
+        """Pack the planner, and compile it if necessary.
 
         Raises:
-            UsageError: the backend does not go with the model.
-            EnvironmentFailure: the backend cannot be built here.
+            UsageError: the backend does not support the model.
+            EnvironmentFailure: the backend cannot be built on this machine.
         """
-        if self._judge is None:
-            self._judge = make_evaluator(self.model, self.config)
-        return self._judge
+        if self._evaluator is None:
+            self._evaluator = make_evaluator(self.model, self.config)
+        return self._evaluator
 
     def advance(self, sent: NDArray[np.floating]) -> None:
-        """Tell the recurrence which action (E, 7) was really sent.
+        """Set the action (E, 7) that was sent, for the recurrence.
 
         Raises:
             UsageError: it is not finite.
@@ -202,17 +197,17 @@ class Policy:
 
     @property
     def _device(self) -> torch.device:
-        """Where the model lies; noise differs between devices, and so do plans."""
+        """Device of the model. Random numbers, and so plans, differ between devices."""
         return self.model.state_mean.device
 
     @property
     def carry(self) -> Carry:
-        """The filtered state, for probes and logs; of inference mode: no gradient passes it."""
+        """The filtered state, for probes and logs; without gradients."""
         return self._carry
 
     @torch.inference_mode()
     def reconstruct(self) -> Array:
-        """Depth (E, 48, 64) in metres decoded from the filtered state; 0 = nothing there."""
+        """Depth (E, 48, 64) in metres decoded from the filtered state; 0 = invalid."""
         return _numpy(self.model.decode(self._carry)[0])
 
     @torch.inference_mode()
@@ -226,10 +221,9 @@ class Policy:
         for k in range(horizon):
             carry = self.model.imagine(carry, actions[:, min(k, actions.shape[1] - 1)])
             path.append(carry)
-        # one decoder call for all of them: a quarter of the time of one call each
         states = Carry.join(path, lambda parts: torch.stack(parts, 1).flatten(0, 1))
-        film = _numpy(self.model.decode(states)[0])
-        return film.reshape(-1, horizon, *film.shape[1:])
+        depth = _numpy(self.model.decode(states)[0])
+        return depth.reshape(-1, horizon, *depth.shape[1:])
 
 
 def blank_observation(num_envs: int) -> tuple[NDArray[np.uint16], Array]:

@@ -11,7 +11,7 @@ from egovcp import spec
 from egovcp.cuda_graphs import MOST_RECORDINGS, Recorded
 from egovcp.model import PRESETS, Carry
 from egovcp.plan import PlannerConfig, ReferenceEvaluator
-from egovcp.plan.backends.evaluators import FloatEvaluator
+from egovcp.plan.backends import FloatEvaluator
 from egovcp.testing import toy_model
 from tests.support.cuda_graphs import RecomputingRecorder
 

@@ -12,9 +12,8 @@ from egovcp.errors import UsageError
 from egovcp.hub import RetryPolicy, is_repo_id
 from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
-from egovcp.plan import PlannerConfig, require_answers
-from egovcp.plan.config import PAPER_PLANNER
-from egovcp.plan.cost import require_affordable
+from egovcp.plan import PlannerConfig, require_compatible
+from egovcp.plan.config import PAPER_PLANNER, require_affordable
 from egovcp_train.wandb_records import WandbConfig
 
 
@@ -160,7 +159,7 @@ class TrainConfig:
     """Weights & Biases."""
 
     def __post_init__(self) -> None:
-        require_answers(self.policy, self.planner)
+        require_compatible(self.policy, self.planner)
         require_affordable(self.policy, self.planner)
         loss = self.policy.loss
         if loss.q_target == "td" and self.returns.scale == "per_task":

@@ -1,8 +1,7 @@
-"""The layers that a planning network is made of, taken out of a world model.
+"""The layers of a planning network, extracted from a world model.
 
-A layer's inputs are of two kinds. *Wide* ones (h, and what a hidden layer gives to the next) carry
-nearly all of the arithmetic. *Narrow* ones (z and the action) are few.
-What all candidates share is computed once (`egovcp.plan.backends.shared_prefix`).
+*Wide* inputs of a layer (h, and the outputs of a hidden layer) need nearly all of the arithmetic;
+*narrow* ones (z and the action) are few.
 """
 
 from __future__ import annotations

@@ -38,8 +38,8 @@ WITHOUT_TILES: Final = "-DWITHOUT_TILES"
 OTHERWISE: Final = "plan with --planner.backend=float32"
 
 
-class Wide(ctypes.Structure):
-    """``Wide`` of the kernel; so are the structures below."""
+class CWide(ctypes.Structure):
+    """``Wide`` of the kernel; the structures below mirror those of the same name without C."""
 
     _fields_ = (
         ("inputs", ctypes.c_int32),
@@ -50,23 +50,23 @@ class Wide(ctypes.Structure):
     )
 
 
-class Narrow(ctypes.Structure):
+class CNarrow(ctypes.Structure):
     _fields_ = (("inputs", ctypes.c_int32), ("weight", ctypes.c_void_p))
 
 
-class Layer(ctypes.Structure):
+class CLayer(ctypes.Structure):
     _fields_ = (
         ("outputs", ctypes.c_int32),
-        ("wide", Wide),
-        ("beside", Wide),
-        ("few", Narrow),
+        ("wide", CWide),
+        ("second", CWide),
+        ("narrow", CNarrow),
         ("gamma", ctypes.c_void_p),
         ("beta", ctypes.c_void_p),
         ("epsilon", ctypes.c_float),
     )
 
 
-class Dot(ctypes.Structure):
+class CDot(ctypes.Structure):
     _fields_ = (
         ("inputs", ctypes.c_int32),
         ("weight", ctypes.c_void_p),
@@ -74,15 +74,15 @@ class Dot(ctypes.Structure):
     )
 
 
-class Top(ctypes.Structure):
-    _fields_ = (("outputs", ctypes.c_int32), ("wide", Wide), ("bias", ctypes.c_void_p))
+class CTop(ctypes.Structure):
+    _fields_ = (("outputs", ctypes.c_int32), ("wide", CWide), ("bias", ctypes.c_void_p))
 
 
-class Head(ctypes.Structure):
-    _fields_ = (("first", Layer), ("second", Layer), ("one", Dot), ("many", Top))
+class CHead(ctypes.Structure):
+    _fields_ = (("first", CLayer), ("second", CLayer), ("one", CDot), ("many", CTop))
 
 
-class Reading(ctypes.Structure):
+class CReadout(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int32) for name in ("objective", "rule", "bins")),
         ("each", ctypes.c_void_p),
@@ -90,85 +90,84 @@ class Reading(ctypes.Structure):
     )
 
 
-class Network(ctypes.Structure):
+class CNetwork(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int32) for name in ("hidden", "latent", "actions")),
-        *((name, Layer) for name in ("mix", "gru", "prior", "termination")),
-        ("prior_top", Top),
-        ("termination_top", Dot),
+        *((name, CLayer) for name in ("mix", "gru", "prior", "termination")),
+        ("prior_top", CTop),
+        ("termination_top", CDot),
         ("min_std", ctypes.c_float),
-        *((name, Head) for name in ("value", "reward")),
+        *((name, CHead) for name in ("value", "reward")),
         ("silu", ctypes.c_void_p),
         ("tanh", ctypes.c_void_p),
-        ("reading", Reading),
+        ("readout", CReadout),
     )
 
 
-class SharedPrefix(ctypes.Structure):
+class CSharedPrefix(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_void_p) for name in ("h", "mix", "gates", "value", "reward")),
-        ("nothing", ctypes.c_float),
+        ("nan_or_zero", ctypes.c_float),
     )
 
 
-class Start(ctypes.Structure):
+class CStart(ctypes.Structure):
     _fields_ = (
         *((name, ctypes.c_int32) for name in ("hidden", "latent", "gates", "heads", "mix")),
         *((name, ctypes.c_void_p) for name in ("of_h", "of_z")),
     )
 
 
-class Crew(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_int32) for name in ("next", "turn", "inside", "present"))
+class CThreadPool(ctypes.Structure):
+    _fields_ = tuple((name, ctypes.c_int32) for name in ("next", "turn", "active", "workers"))
 
 
-class Job(ctypes.Structure):
+class CJob(ctypes.Structure):
     _fields_ = (
         ("network", ctypes.c_void_p),
-        ("root", ctypes.c_void_p),
+        ("prefix", ctypes.c_void_p),
         *((name, ctypes.c_int32) for name in ("rows", "steps")),
-        *((name, ctypes.c_void_p) for name in ("actions", "noise", "worth")),
-        ("crew", Crew),
+        *((name, ctypes.c_void_p) for name in ("actions", "noise", "values")),
+        ("pool", CThreadPool),
     )
 
 
 class Threads:
-    """Judges the plans of a job on several threads at once, the caller's among them.
+    """Evaluates the plans of a job on several threads, among them the caller's.
 
-    The others are asked to come at the start of a plan, and leave when nothing has come for a
-    millisecond. One job is judged at a time.
+    The workers are woken at the start of a plan, and return after a millisecond without a job. One
+    job is evaluated at a time.
     """
 
     def __init__(self, kernel: ctypes.CDLL, count: int) -> None:
         self._kernel = kernel
-        self._others = count - 1
+        self._workers = count - 1
         self._pool = ThreadPoolExecutor(count - 1, "planner") if count > 1 else None
-        self._job = Job()
+        self._job = CJob()
         self._address = ctypes.byref(self._job)
         self._lock = Lock()
 
-    def call(self) -> None:
-        """Ask them to come: there is going to be a job soon."""
+    def wake(self) -> None:
+        """Wake the workers, before a job."""
         if self._pool is not None:
-            for _ in range(self._kernel.lacking(self._address, self._others)):
-                self._pool.submit(self._kernel.help, self._address)
+            for _ in range(self._kernel.missing_workers(self._address, self._workers)):
+                self._pool.submit(self._kernel.work, self._address)
 
     def evaluate(self, **job: int | None) -> None:
-        """Returns when all have ended.
+        """Evaluate a job; returns when all threads have finished it.
 
         Args:
-            job: numbers and addresses, as `Job` has them.
+            job: numbers and addresses, the fields of `CJob`.
         """
         with self._lock:
             for name, value in job.items():
                 setattr(self._job, name, value)
-            self.call()
+            self.wake()
             self._kernel.evaluate(self._address)
 
 
 def processor_is_fast() -> bool:
-    """Whether this processor has the vectors that the kernel is written for: of 512 bits with
-    products of bytes (AVX-512 VNNI), or of 256 (AVX2)."""
+    """Whether this processor has AVX-512 VNNI, or AVX2 and FMA, for which the kernel is written."""
     return processor_has("avx512_vnni") or (processor_has("avx2") and processor_has("fma"))
 
 
@@ -204,41 +203,41 @@ def library() -> ctypes.CDLL:
             f"the int8 planner cannot be compiled or loaded ({error}); {OTHERWISE}"
         ) from error
     p, i = ctypes.c_void_p, ctypes.c_int32
-    for function in (kernel.evaluate, kernel.help):
+    for function in (kernel.evaluate, kernel.work):
         function.argtypes = [p]
         function.restype = None
     f = ctypes.c_float
     kernel.draw.argtypes = [i, i, i, p, p, p, p]
     kernel.walk.argtypes = [i, i, i, i, f, p, p, p]
-    kernel.learn.argtypes = [i, i, i, i, f, p, p, p, p, p, p, p]
-    for function in (kernel.draw, kernel.walk, kernel.learn):
+    kernel.update.argtypes = [i, i, i, i, f, p, p, p, p, p, p, p]
+    for function in (kernel.draw, kernel.walk, kernel.update):
         function.restype = None
     kernel.start.argtypes = [p, p, p, p, p]
     kernel.start.restype = f
-    kernel.lacking.argtypes = [p, i]
-    kernel.lacking.restype = i
+    kernel.missing_workers.argtypes = [p, i]
+    kernel.missing_workers.restype = i
     kernel.layout.argtypes = [p, p, p]
     kernel.layout.restype = None
     return kernel
 
 
 class Layout(NamedTuple):
-    """How the kernel on this processor wants the weights of wide products."""
+    """Memory layout of the weights of wide products for this processor."""
 
-    depth: int  # their inputs are filled up with zeros to a multiple of
-    lanes: int  # outputs of a vector
-    group: int  # inputs that lie together
+    depth: int  # inputs are padded with zeros to a multiple of it
+    lanes: int  # outputs per vector
+    group: int  # adjacent inputs
 
 
 def layout(kernel: ctypes.CDLL) -> Layout:
-    """That of a kernel."""
+    """The layout of a kernel."""
     found = [ctypes.c_int32() for _ in Layout._fields]
     kernel.layout(*map(ctypes.byref, found))
     return Layout(*(x.value for x in found))
 
 
 def tiles_are_refused() -> bool:
-    """Whether the processor has AMX and Linux does not let this process use it."""
+    """Whether the processor has AMX but Linux does not permit it to this process."""
     if not processor_has("amx_int8"):
         return False
     arch_prctl, ask_for, tile_data = 158, 0x1023, 18  # <asm/prctl.h>: ARCH_REQ_XCOMP_PERM
@@ -258,17 +257,17 @@ def library_if_possible() -> ctypes.CDLL | None:
 
 @cache
 def warn_float32(reason: str) -> None:
-    """Say once, on stderr, why ``--planner.backend=auto`` computes in float32."""
+    """Warn once, on stderr, that ``--planner.backend=auto`` computes in float32."""
     _warn(f"{reason}. Planning in float32, which is slower")
 
 
 def _warn(text: str) -> None:
-    if multiprocessing.parent_process() is None:  # else every worker would repeat it
+    if multiprocessing.parent_process() is None:  # not in every worker
         echo(f"egovcp: warning: {text}", error=True)
 
 
 def _cached(name: str, flags: Sequence[str]) -> bytes:
-    """The compiled kernel; without a cache folder it is compiled for this process alone."""
+    """The compiled kernel; not cached if there is no cache folder."""
     folder = user_cache_folder()
     if folder is None:
         _warn_uncached("the user has no home folder")
@@ -297,7 +296,7 @@ def _warn_uncached(reason: str) -> None:
 
 
 def _identity(flags: Sequence[str]) -> str:
-    """Changes with the source, the flags and the processor that ``-march=native`` means."""
+    """Hash of the source, the flags and the processor (``-march=native``)."""
     digest = hashlib.sha256()
     for path in sorted(SOURCE.parent.glob("*.[ch]")):
         digest.update(path.read_bytes())
@@ -308,12 +307,12 @@ def _identity(flags: Sequence[str]) -> str:
         if line.startswith(("model name", "flags", "Features")):
             digest.update(line.encode())
         if not line:
-            break  # the first processor tells of all
+            break  # the first processor is enough
     return digest.hexdigest()[:16]
 
 
 def _compile(flags: Sequence[str]) -> bytes:
-    """The shared library that the compiler makes of the kernel.
+    """Compile the kernel to a shared library.
 
     Raises:
         EnvironmentFailure: there is no compiler, or it fails.

@@ -50,7 +50,7 @@ class BallTask(Task):
         self._thrown = False
         self._grounded = False  # on the floor: contacts no longer count
         self._blocked_at: float | None = None
-        self._hit = False
+        self.hit = False
         self._new_block = False
         self._new_hit = False
         self._shape_ball()
@@ -132,12 +132,17 @@ class BallTask(Task):
         if not self._thrown or self._grounded:
             return
         parts = {contact.part for contact in contacts}
-        if self._blocked_at is None and not self._hit and parts & set(HANDS):
+        if not self.blocked and not self.hit and parts & set(HANDS):
             self._blocked_at = self.time
             self._new_block = True
-        elif not self._in_grace and not self._hit and parts & {TORSO, HEAD, LEG}:
-            self._hit = self._new_hit = True
+        elif not self._in_grace and not self.hit and parts & {TORSO, HEAD, LEG}:
+            self.hit = self._new_hit = True
         self._grounded = bool(self.robot.data.qpos[-5] < self.radius + 0.01)
+
+    @property
+    def blocked(self) -> bool:
+        """Whether a hand or wrist was the first to touch the ball."""
+        return self._blocked_at is not None
 
     @property
     def _in_grace(self) -> bool:
@@ -156,7 +161,7 @@ class BallTask(Task):
     @property
     def achieved(self) -> bool:
         """Blocked by a hand and not hit elsewhere; in an empty episode, always."""
-        return not self._hit and (self.event_tick is None or self._blocked_at is not None)
+        return not self.hit and (self.event_tick is None or self.blocked)
 
     @property
     def finished(self) -> bool:
@@ -164,7 +169,7 @@ class BallTask(Task):
 
     def state(self) -> ObjectState:
         data = self.robot.data
-        over = self._grounded or self._hit or self._blocked_at is not None
+        over = self._grounded or self.hit or self.blocked
         if not self._thrown:
             nothing = np.full(3, np.nan)
             return ObjectState(nothing, nothing.copy(), self.radius, active=False)

@@ -27,7 +27,7 @@ from egovcp.artifact import Artifact
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
-from egovcp.plan.action_parameterization import random_walk
+from egovcp.plan.search import random_walk
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import StepResult, VectorEnv
 from egovcp.sim.policies import RandomWalk

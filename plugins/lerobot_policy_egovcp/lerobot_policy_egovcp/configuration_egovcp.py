@@ -12,8 +12,8 @@ from egovcp.data import ReturnConfig
 from egovcp.errors import DataError, UsageError
 from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
-from egovcp.plan import PlannerConfig, require_answers
-from egovcp.plan.cost import require_affordable
+from egovcp.plan import PlannerConfig, require_compatible
+from egovcp.plan.config import require_affordable
 
 FEATURE_SHAPES = {
     spec.DEPTH_KEY: (1, spec.DEPTH_ROWS, spec.DEPTH_COLS),
@@ -75,7 +75,7 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
                 "--policy.returns.scale=per_task is an ablation of egovcp-train; choose dataset or "
                 "none"
             )
-        require_answers(self.world_model, self.planner)
+        require_compatible(self.world_model, self.planner)
         require_affordable(self.world_model, self.planner)
         self._check_losses()
         if any(mode is not NormalizationMode.IDENTITY for mode in self._modes()):

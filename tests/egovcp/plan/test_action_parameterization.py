@@ -8,8 +8,8 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
-from egovcp.plan.action_parameterization import random_walk, reflect, target_steps
 from egovcp.plan.config import OptimiserName
+from egovcp.plan.search import random_walk, reflect_once, target_steps
 from tests.support.worlds import PointWorld
 
 ETA = spec.ACTION_ETA
@@ -36,7 +36,7 @@ def test_the_walk_far_from_the_walls_is_a_sum() -> None:
 
 @pytest.mark.parametrize(("x", "inside"), [(1.2, 0.8), (-1.3, -0.7), (0.4, 0.4), (1.0, 1.0)])
 def test_reflection_folds_at_the_walls(x: float, inside: float) -> None:
-    assert reflect(torch.tensor(x)).item() == pytest.approx(inside)
+    assert reflect_once(torch.tensor(x)).item() == pytest.approx(inside)
 
 
 # --- ramps --------------------------------------------------------------------------------
@@ -46,7 +46,7 @@ def test_a_ramp_goes_straight_to_one_place_and_rests_there(eta: float) -> None:
     steps = target_steps(start, deltas, eta)
     actions = random_walk(start, steps, eta)
     assert actions.abs().max() <= 1 + 1e-6
-    place = reflect((start + eta * deltas.sum(1)).clamp(-3, 3))
+    place = reflect_once((start + eta * deltas.sum(1)).clamp(-3, 3))
     left = torch.cat([(place - start)[:, None], place[:, None] - actions], 1)  # (500, 7, 7)
     torch.testing.assert_close(
         left[:, 1:].abs(), (left[:, :-1].abs() - eta).clamp_min(0.0), atol=1e-5, rtol=0

@@ -14,10 +14,9 @@ from egovcp.errors import UsageError
 from egovcp.model import PRESETS, Carry, WorldModel
 from egovcp.model.config import LossConfig
 from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
-from egovcp.plan.action_parameterization import random_walk
-from egovcp.plan.backends import library, make_evaluator
-from egovcp.plan.backends.evaluators import FloatEvaluator, Int8Evaluator
+from egovcp.plan.backends import FloatEvaluator, Int8Evaluator, library, make_evaluator
 from egovcp.plan.config import BackendName
+from egovcp.plan.search import random_walk
 from egovcp.testing import toy_model
 from tests.support.models import CountingModel
 

@@ -11,9 +11,9 @@ from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.model import Carry
 from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
-from egovcp.plan.action_parameterization import random_walk, shift
 from egovcp.plan.config import ActionParameterization, TerminationRule
 from egovcp.plan.objective import Dynamics, evaluate
+from egovcp.plan.search import random_walk, shift
 from egovcp.testing import toy_model
 from tests.support.worlds import Point, PointWorld, plain_planner
 

@@ -87,7 +87,7 @@ def test_a_search_cut_short_answers_as_a_shorter_one() -> None:
 
 def test_without_a_deadline_it_goes_on() -> None:
     pace = Deadline(None)
-    assert all(pace.goes_on() for _ in range(100))
+    assert all(pace.allows_iteration() for _ in range(100))
 
 
 def test_a_policy_hands_its_deadline_on_and_reports_what_was_done() -> None:

@@ -10,8 +10,7 @@ import pytest
 
 from egovcp.errors import EnvironmentFailure
 from egovcp.plan import PlannerConfig
-from egovcp.plan.backends import library, make_evaluator
-from egovcp.plan.backends.evaluators import FloatEvaluator, Int8Evaluator
+from egovcp.plan.backends import FloatEvaluator, Int8Evaluator, library, make_evaluator
 from egovcp.plan.config import BackendName
 from egovcp.testing import toy_model
 from tests.support.limited import run_limited

@@ -13,7 +13,7 @@ from egovcp.errors import UsageError
 from egovcp.model import PRESETS, Carry, WorldModel
 from egovcp.plan import PlannerConfig, Policy, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.plan.backends import make_evaluator
-from egovcp.plan.choices import require_answers
+from egovcp.plan.config import require_compatible
 from egovcp.plan.objective import evaluate
 from egovcp.testing import toy_model
 from tests.support.worlds import Point, PointWorld, ScriptedWorld, plain_planner
@@ -209,6 +209,6 @@ def test_a_model_that_foresees_no_rewards_is_refused(objective: Any) -> None:
 def test_draws_from_a_prior_that_was_only_trained_in_its_mean_are_refused() -> None:
     autoregressive = dataclasses.replace(DEBUG, dynamics="autoregressive")
     with pytest.raises(UsageError, match="plan with latent=mean"):
-        require_answers(autoregressive, plain_planner(latent="sample"))
-    require_answers(autoregressive, plain_planner())
-    require_answers(DEBUG, plain_planner(latent="sample"))
+        require_compatible(autoregressive, plain_planner(latent="sample"))
+    require_compatible(autoregressive, plain_planner())
+    require_compatible(DEBUG, plain_planner(latent="sample"))

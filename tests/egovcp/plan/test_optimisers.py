@@ -12,10 +12,8 @@ from egovcp import spec
 from egovcp.errors import UsageError
 from egovcp.plan import Plan, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.plan.config import OptimiserName
-from egovcp.plan.icem import coloured
-from egovcp.plan.mppi import weights
 from egovcp.plan.objective import evaluate
-from egovcp.plan.optimisers import OPTIMISERS
+from egovcp.plan.optimisers import OPTIMISERS, coloured, weights
 from egovcp.plan.search import SearchState
 from tests.support.worlds import Point, PointWorld, plain_planner
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.model import Carry, WorldModel
 from egovcp.plan import Optimiser, Plan, PlanEvaluator, PlannerConfig, Policy, PolicyStep, make_plan
-from egovcp.plan.action_parameterization import shift
+from egovcp.plan.search import shift
 from egovcp.testing import toy_model
 from tests.support.models import CountingModel
 from tests.support.worlds import plain_planner

@@ -6,11 +6,9 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.plan import PlannerConfig, optimiser_of
-from egovcp.plan.action_parameterization import random_walk
 from egovcp.plan.backends import library
-from egovcp.plan.backends.sampling import KernelCrossEntropy
-from egovcp.plan.cem import CrossEntropy
-from egovcp.plan.search import SearchState
+from egovcp.plan.optimisers import CrossEntropy, KernelCrossEntropy
+from egovcp.plan.search import SearchState, random_walk
 
 pytestmark = pytest.mark.skipif(library.compiler() is None, reason="no C compiler")
 CONFIG = PlannerConfig(samples=60, horizon=3, elites=7)
@@ -31,8 +29,8 @@ def _learned(values: Tensor) -> tuple[SearchState, SearchState]:
     deltas = 2 * torch.rand(len(values), CONFIG.samples, *SHAPE, generator=rng) - 1
     state = _belief(len(values))
     return (
-        KernelCrossEntropy(CONFIG).learn(state, deltas, values),
-        CrossEntropy(CONFIG).learn(state, deltas, values),
+        KernelCrossEntropy(CONFIG).update(state, deltas, values),
+        CrossEntropy(CONFIG).update(state, deltas, values),
     )
 
 

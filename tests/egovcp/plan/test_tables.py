@@ -6,7 +6,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from egovcp.plan.backends.tables import LEAST_SILU, NODES, ONE, UNIT, silu_table, tanh_table
+from egovcp.plan.backends.integer_network import (
+    LEAST_SILU,
+    NODES,
+    ONE,
+    UNIT,
+    silu_table,
+    tanh_table,
+)
 
 
 def _on_lines(table: Tensor, reach: float, unit: int, a: Tensor) -> Tensor:

@@ -242,7 +242,7 @@ def carry(task: ArchTask, forward: float, left: float = 0.0, turn: float = 0.0) 
     data.qpos[:3] += forward * direction + left * aside
     yaw = turn / 2
     data.qpos[3:7] = [np.cos(yaw), 0.0, 0.0, np.sin(yaw)]
-    task.act()
+    task.before_step()
 
 
 def test_a_standing_arch_is_approached_by_walking_only(config: EnvConfig) -> None:

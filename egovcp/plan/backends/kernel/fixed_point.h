@@ -1,8 +1,7 @@
-/* Activations in words: 16-bit fixed point, 32 numbers a vector.
+/* Activations in 16-bit fixed point (words).
  *
- * A word of a hidden layer is x * UNIT; one of the state h, or of tanh, x * 2^15. Functions are
- * pieces of straight lines between NODES places (`tables.py`), of which a word picks one: within 8e-4
- * of their values for SiLU, 2e-4 for tanh. A byte tells no more than 4e-3. */
+ * Hidden layers have the unit UNIT, h and tanh 2^15. Functions are piecewise linear between NODES nodes
+ * (`integer_network.py`), with errors below 8e-4 for SiLU and 2e-4 for tanh; a byte resolves 4e-3. */
 #pragma once
 #include "vectors.h"
 
@@ -11,7 +10,7 @@ enum { UNIT = 2048, NODES = 64, LEAST_SILU = 571 }; /* in words, negative */
 /* NODES words. */
 typedef struct {
 #if defined(HALF_VECTORS)
-    __m256i bytes[4]; /* of 16 nodes each: their low ones, then their high ones */
+    __m256i bytes[4]; /* of 16 nodes each: low bytes, then high bytes */
 #else
     Words node[NODES / WORDS];
 #endif
@@ -36,10 +35,10 @@ INLINE Table table_of(const int16_t *node) {
     return t;
 }
 
-/* From [2][NODES]: the values at the nodes, and half of what a piece rises. */
+/* From [2][NODES]: values at the nodes, and half the rise of each piece. */
 INLINE Lines lines_of(const int16_t *table) { return (Lines){table_of(table), table_of(table + NODES)}; }
 
-/* The entries at `index`, of which the last six bits count. */
+/* The entries at the last six bits of `index`. */
 INLINE Words entries(const Table *t, Words index) {
 #if defined(WIDE_VECTORS)
     return (Words)_mm512_permutex2var_epi16((__m512i)t->node[0], (__m512i)index, (__m512i)t->node[1]);
@@ -66,9 +65,9 @@ INLINE Words entries(const Table *t, Words index) {
 #endif
 }
 
-/* The function of |a|, whose nodes are 2^bits apart; beyond the last one it is as there. */
+/* The function of |a| with nodes 2^bits apart; constant beyond the last one. */
 INLINE Words on_lines(Lines l, Words far, const int bits) {
-    const int below = 65536 - (NODES << bits); /* so that far places saturate */
+    const int below = 65536 - (NODES << bits); /* saturates beyond the last node */
     const Words node = right(sum_of_unsigned(far, all(below + (1 << (bits - 1)))), bits);
     return entries(&l.value, node) + product(entries(&l.slope, node), left(far, 16 - bits));
 }
@@ -83,7 +82,7 @@ INLINE Words tanh_of(Lines l, Words x) {
     const __mmask32 negative = _mm512_movepi16_mask((__m512i)x);
     return (Words)_mm512_mask_sub_epi16((__m512i)v, negative, _mm512_setzero_si512(), (__m512i)v);
 #elif defined(HALF_VECTORS)
-    return (Words)_mm256_sign_epi16((__m256i)v, (__m256i)x); /* that of 0 is 0 */
+    return (Words)_mm256_sign_epi16((__m256i)v, (__m256i)x); /* 0 for 0 */
 #else
     const Words negative = x < 0;
     return (v ^ negative) - negative;

@@ -1,12 +1,11 @@
-/* The steps of a search between two calls of its evaluator: `draw`, `walk`, `best_of` and `refit` of
- * `egovcp.plan`. */
+/* The steps of the cross-entropy method between two evaluations, as in `egovcp.plan.optimisers`. */
 #pragma once
 #include "vectors.h"
 
 INLINE float clamped(float x) { return x < -1.0f ? -1.0f : x > 1.0f ? 1.0f : x; }
 
 /* deltas [robots][plans][size] around mean and std [robots][size], from noise [plans][size]; the first
- * candidate is the mean itself, the second stands still. */
+ * candidate is the mean itself, the second is zero. */
 void draw(int32_t robots, int32_t plans, int32_t size, const float *mean, const float *std,
           const float *noise, float *deltas) {
     for (int e = 0; e < robots; e++, mean += size, std += size) {
@@ -30,7 +29,7 @@ void walk(int32_t robots, int32_t plans, int32_t steps, int32_t size, float eta,
                 __m512 x = _mm512_maskz_loadu_ps(lanes, start);
                 for (int k = 0; k < steps; k++, deltas += size, actions += size) {
                     x = _mm512_add_ps(x, _mm512_mul_ps(rate, _mm512_maskz_loadu_ps(lanes, deltas)));
-                    /* what is not a number is the second of two, and comes out */
+                    /* NaN is the second operand, which min and max return */
                     const __m512 inside = _mm512_max_ps(-wall, _mm512_min_ps(wall, x));
                     x = _mm512_sub_ps(_mm512_add_ps(inside, inside), x);
                     _mm512_mask_storeu_ps(actions, lanes, x);
@@ -46,7 +45,7 @@ void walk(int32_t robots, int32_t plans, int32_t steps, int32_t size, float eta,
         }
 }
 
-/* Places of the `count` largest of values [plans], best first, and of equals the earlier. */
+/* Indices of the `count` largest of values [plans], best first; of equal ones, the earlier. */
 static void best(const float *values, int32_t plans, int32_t count, int32_t *place) {
     int known = 0;
     for (int i = 0; i < plans; i++) {
@@ -76,11 +75,10 @@ static void moments(const float *elites, int32_t count, int32_t size, float leas
     }
 }
 
-/* What the cross-entropy method learns of deltas [robots][plans][size] that are worth `values`
- * [robots][plans], not a number or infinite ones -inf: the elites, best first, their values `top`, the
- * mean of these, and mean and deviation of the elites that are worth anything; without any, the ones of
- * before are left as they are. */
-void learn(int32_t robots, int32_t plans, int32_t size, int32_t count, float least, const float *deltas,
+/* Update from deltas [robots][plans][size] and `values` [robots][plans] (-inf if not finite): the elites, best
+ * first, their values `top`, the mean of these, and mean and deviation of the elites with finite values; if
+ * there are none, both stay unchanged. */
+void update(int32_t robots, int32_t plans, int32_t size, int32_t count, float least, const float *deltas,
            const float *values, float *elites, float *top, float *value, float *mean, float *std) {
     for (int e = 0; e < robots; e++) {
         int32_t place[count];

@@ -1,18 +1,18 @@
-/* Threads that share the blocks of a job. Helpers wait for the next job of a search where they are: to
- * wake a thread that sleeps takes longer than to draw a round's candidates. */
+/* Threads that share the blocks of a job. Workers spin between the jobs of a search: to wake a sleeping
+ * thread takes longer than to sample the candidates of an iteration. */
 #pragma once
 #include <sched.h>
 #include <stdint.h>
 #include <time.h>
 
-enum { PATIENCE_NS = 1000000, LOOKS = 32 };
+enum { TIMEOUT_NS = 1000000, SPINS = 32 };
 
 typedef struct {
-    int32_t next;    /* row of the job that is given out next */
+    int32_t next;    /* next row of the job */
     int32_t turn;    /* odd while there is a job */
-    int32_t inside;  /* helpers that may be reading the job */
-    int32_t present; /* helpers that have come, or been asked to */
-} Crew;
+    int32_t active;  /* workers that may be reading the job */
+    int32_t workers; /* workers that run, or are being started */
+} ThreadPool;
 
 static inline void rest(void) {
 #if defined(__x86_64__)
@@ -30,33 +30,33 @@ static inline int32_t look(const int32_t *x) { return __atomic_load_n(x, __ATOMI
 
 static inline void change(int32_t *x, int32_t by) { __atomic_fetch_add(x, by, __ATOMIC_SEQ_CST); }
 
-/* A helper's wait for a job other than the one of turn `seen`: its turn, or 0 if none came in time. Who
- * gets one is inside. */
-static int32_t wait_for_job(Crew *crew, int32_t seen) {
-    const int64_t until = clock_ns() + PATIENCE_NS;
+/* A worker waits for a job other than the one of turn `seen`; returns its turn, or 0 after TIMEOUT_NS. With a
+ * job, the worker is counted as active. */
+static int32_t wait_for_job(ThreadPool *pool, int32_t seen) {
+    const int64_t until = clock_ns() + TIMEOUT_NS;
     for (;;) {
-        for (int i = 0; i < LOOKS; i++, rest()) {
-            const int32_t turn = look(&crew->turn);
+        for (int i = 0; i < SPINS; i++, rest()) {
+            const int32_t turn = look(&pool->turn);
             if (!(turn & 1) || turn == seen) continue;
-            change(&crew->inside, 1);
-            if (look(&crew->turn) == turn) return turn;
-            change(&crew->inside, -1); /* it has ended */
+            change(&pool->active, 1);
+            if (look(&pool->turn) == turn) return turn;
+            change(&pool->active, -1); /* it has ended */
         }
         if (clock_ns() > until) return 0;
-        sched_yield(); /* whoever else wants this core is to have it */
+        sched_yield(); /* yield the core to other threads */
     }
 }
 
-static void open_job(Crew *crew) {
-    __atomic_store_n(&crew->next, 0, __ATOMIC_RELAXED);
-    change(&crew->turn, 1);
+static void open_job(ThreadPool *pool) {
+    __atomic_store_n(&pool->next, 0, __ATOMIC_RELAXED);
+    change(&pool->turn, 1);
 }
 
-/* No helper reads the job any more once this returns. */
-static void close_job(Crew *crew) {
-    change(&crew->turn, 1);
-    while (look(&crew->inside)) {
-        for (int i = 0; i < LOOKS && look(&crew->inside); i++) rest();
-        sched_yield(); /* a helper may be waiting for this very core */
+/* After this returns, no worker reads the job. */
+static void close_job(ThreadPool *pool) {
+    change(&pool->turn, 1);
+    while (look(&pool->active)) {
+        for (int i = 0; i < SPINS && look(&pool->active); i++) rest();
+        sched_yield(); /* a worker may need this core */
     }
 }

@@ -1,4 +1,4 @@
-/* Vectors of LANES floats and of twice as many fixed-point numbers: of AVX-512, of AVX2, or of neither. */
+/* Vectors of LANES floats or twice as many 16-bit numbers (words): AVX-512, AVX2, or portable. */
 #pragma once
 #include <math.h>
 #include <stdint.h>
@@ -119,12 +119,12 @@ INLINE Floats first_floats(Floats v, int count) {
 #endif
 }
 
-/* exp(x) of x <= 0, to 1e-7; what is below exp(-80) counts as that. */
+/* exp(x) of x <= 0, to 1e-7; x is limited to -80. */
 INLINE Floats exponential(Floats x) {
     const Ints far = x < -80.0f;
     x = (Floats)((far & (Ints)all_floats(-80.0f)) | (~far & (Ints)x));
     const Floats power = x * 1.44269504f; /* of two */
-    const Ints whole = __builtin_convertvector(power - 0.5f, Ints); /* to the nearest: none is positive */
+    const Ints whole = __builtin_convertvector(power - 0.5f, Ints); /* rounded; none is positive */
     const Floats f = (power - __builtin_convertvector(whole, Floats)) * 0.69314718f;
     static const float SERIES[] = {1.0f, 1.0f, 1.0f / 2, 1.0f / 6, 1.0f / 24, 1.0f / 120, 1.0f / 720};
     Floats sum = all_floats(SERIES[6]);
@@ -132,7 +132,7 @@ INLINE Floats exponential(Floats x) {
     return sum * (Floats)((whole + 127) << 23);
 }
 
-/* Rounded to whole numbers, to the nearest word where there is none. */
+/* Rounded to words, with saturation. */
 INLINE Words words_of(Floats a, Floats b) {
 #if defined(WIDE_VECTORS)
     const __m512i each =
@@ -171,7 +171,7 @@ INLINE Words larger(Words a, Words b) {
 #endif
 }
 
-/* Of -32768: itself, which is 32768 to whom words have no sign. */
+/* -32768 stays; as an unsigned word it is 32768. */
 INLINE Words absolute(Words a) {
 #if defined(SIMD)
     return (Words)SIMD(abs_epi16)((Integers)a);
@@ -181,7 +181,7 @@ INLINE Words absolute(Words a) {
 #endif
 }
 
-/* a + b, at most the largest word and at least the least. */
+/* a + b with saturation. */
 INLINE Words sum(Words a, Words b) {
 #if defined(SIMD)
     return (Words)SIMD(adds_epi16)((Integers)a, (Integers)b);
@@ -194,7 +194,7 @@ INLINE Words sum(Words a, Words b) {
 #endif
 }
 
-/* The same of words without a sign. */
+/* The same of unsigned words. */
 INLINE Words sum_of_unsigned(Words a, Words b) {
 #if defined(SIMD)
     return (Words)SIMD(adds_epu16)((Integers)a, (Integers)b);
@@ -217,7 +217,7 @@ INLINE Words product(Words a, Words b) {
 #endif
 }
 
-/* a b / 2^16 of words without a sign, rounded down. */
+/* a b / 2^16 of unsigned words, rounded down. */
 INLINE Words product_of_unsigned(Words a, Words b) {
 #if defined(SIMD)
     return (Words)SIMD(mulhi_epu16)((Integers)a, (Integers)b);
@@ -240,8 +240,8 @@ INLINE Ints pairs(Ints sum, Words a, Words b) {
 #endif
 }
 
-/* Two words, again and again. */
-INLINE Words again(const int16_t *x) {
+/* Two words, repeated. */
+INLINE Words repeated(const int16_t *x) {
     int32_t both;
     memcpy(&both, x, sizeof both);
     return (Words)((Ints){0} + both);
@@ -255,7 +255,7 @@ INLINE Words halved(Words a, int times) {
 #endif
 }
 
-/* Shifted as words without a sign. */
+/* Shift of unsigned words. */
 INLINE Words left(Words a, int bits) {
     typedef uint16_t Unsigned __attribute__((vector_size(2 * WORDS)));
     return (Words)((Unsigned)a << bits);
@@ -268,7 +268,7 @@ INLINE Words right(Words a, int bits) {
 
 INLINE Words all(int x) { return (Words){0} + (int16_t)x; }
 
-/* The largest, if none is below zero. */
+/* The largest; none is negative. */
 INLINE int highest(Words v) {
 #if defined(WIDE_VECTORS)
     const __m256i half = _mm256_max_epi16(_mm512_castsi512_si256((__m512i)v),
@@ -288,14 +288,14 @@ INLINE int highest(Words v) {
 #endif
 }
 
-/* A number of eight bits without a sign, as `dots` reads it: AVX2 multiplies words. */
+/* An unsigned 8-bit number, as `dots` reads it: AVX2 multiplies words. */
 #if defined(HALF_VECTORS)
 typedef int16_t Byte;
 #else
 typedef uint8_t Byte;
 #endif
 
-/* Two vectors of words as bytes, to the nearest byte where there is none. */
+/* Two vectors of words as bytes, with saturation. */
 INLINE void store_bytes(Byte *u, Words a, Words b) {
 #if defined(WIDE_VECTORS)
     const __m512i each = _mm512_packus_epi16((__m512i)a, (__m512i)b);
