@@ -18,15 +18,15 @@ from egovcp.artifact import load_artifact
 from egovcp.errors import ArtifactError, UsageError
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.gym import EgovcpEnv
-from lerobot_env_egovcp import EgovcpEnvConfig, LeRobotView
+from lerobot_env_egovcp import EgovcpEnvConfig, LeRobotEgovcpEnv
 
 TICKS = 8
 SIMULATION = EnvConfig(controller="stance", ball_episode=EpisodeConfig(TICKS, (2, 3)))
 
 
 @pytest.fixture(scope="module")
-def view() -> Iterator[LeRobotView]:
-    env = LeRobotView("ball", SIMULATION)
+def view() -> Iterator[LeRobotEgovcpEnv]:
+    env = LeRobotEgovcpEnv("ball", SIMULATION)
     yield env
     env.close()
 
@@ -39,11 +39,11 @@ def plain() -> Iterator[EgovcpEnv]:
 
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space.*")
-def test_it_passes_gymnasiums_own_check(view: LeRobotView) -> None:
+def test_it_passes_gymnasiums_own_check(view: LeRobotEgovcpEnv) -> None:
     check_env(view, skip_render_check=True)
 
 
-def test_it_is_the_same_episode_under_other_names(view: LeRobotView, plain: EgovcpEnv) -> None:
+def test_it_is_the_same_episode_under_other_names(view: LeRobotEgovcpEnv, plain: EgovcpEnv) -> None:
     action = np.full(spec.ACTION_DIM, 0.2, dtype=np.float32)
     (seen, _), (expected, _) = view.reset(seed=3), plain.reset(seed=3)
     for tick in range(TICKS):
@@ -58,7 +58,7 @@ def test_it_is_the_same_episode_under_other_names(view: LeRobotView, plain: Egov
 
 
 def test_a_success_counts_at_the_end_alone(
-    view: LeRobotView, monkeypatch: pytest.MonkeyPatch
+    view: LeRobotEgovcpEnv, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     step = EgovcpEnv.step
 
@@ -73,7 +73,7 @@ def test_a_success_counts_at_the_end_alone(
     assert found == [False] * (TICKS - 1) + [True]
 
 
-def test_the_picture_is_bright_where_something_is_near(view: LeRobotView) -> None:
+def test_the_picture_is_bright_where_something_is_near(view: LeRobotEgovcpEnv) -> None:
     seen, _ = view.reset(seed=0)
     depth, picture = seen["images.ego_depth"][0], view.render()
     assert picture.shape == (4 * spec.DEPTH_ROWS, 4 * spec.DEPTH_COLS, 3)

@@ -17,7 +17,7 @@ from torch import Tensor
 from egovcp import spec
 from egovcp.errors import ArtifactError, DataError
 from lerobot_policy_egovcp import EgovcpPolicy
-from lerobot_policy_egovcp.observations import read_observation
+from lerobot_policy_egovcp.batches import read_observation
 
 ROBOTS = 2
 Batch = dict[str, Any]

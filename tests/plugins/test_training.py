@@ -27,7 +27,7 @@ from lerobot_policy_egovcp import (
     make_egovcp_pre_post_processors,
     modeling_egovcp,
 )
-from lerobot_policy_egovcp.training_rows import Targets, mirrored, open_reader, to_batch
+from lerobot_policy_egovcp.batches import RowTargets, mirrored, open_reader, to_batch
 
 ROWS = [0, 1, 5, 11, 12, 26, 32, 33, 92]  # first, middle and last rows; 24 to 32 end in a fall
 
@@ -68,7 +68,7 @@ def test_a_window_of_lerobot_is_a_window_of_the_stream(
     ends = store.start + store.length
     episode = np.searchsorted(ends, ROWS, side="right")
     expected = gather(store, np.array(ROWS), episode, config.sequence_length)
-    found = to_batch(_windows(config, meta, ROWS), Targets.of(_reader(meta), config.returns))
+    found = to_batch(_windows(config, meta, ROWS), RowTargets.of(_reader(meta), config.returns))
     valid = expected["valid"]
     for name in Batch._fields:
         value = getattr(found, name).numpy()
@@ -88,7 +88,7 @@ def test_a_mirrored_window_of_lerobot_is_a_mirrored_window_of_the_stream(
     expected = gather(store, np.array(ROWS), episode, config.sequence_length)
     which = np.arange(len(ROWS)) % 2 == 0
     mirror_rows(expected, np.flatnonzero(which))
-    plain = to_batch(_windows(config, meta, ROWS), Targets.of(_reader(meta), config.returns))
+    plain = to_batch(_windows(config, meta, ROWS), RowTargets.of(_reader(meta), config.returns))
     found = mirrored(plain, torch.from_numpy(which))
     valid = expected["valid"]
     for name in Batch._fields:

@@ -5,6 +5,6 @@ importing this one registers the environment type ``egovcp``.
 """
 
 from lerobot_env_egovcp.configuration_egovcp import EgovcpEnvConfig
-from lerobot_env_egovcp.environment_egovcp import LeRobotView
+from lerobot_env_egovcp.environment_egovcp import LeRobotEgovcpEnv
 
-__all__ = ["EgovcpEnvConfig", "LeRobotView"]
+__all__ = ["EgovcpEnvConfig", "LeRobotEgovcpEnv"]

@@ -1,4 +1,4 @@
-"""``--env.type=egovcp``: the simulation's options, and how LeRobot makes environments of them."""
+"""``--env.type=egovcp``: options of the simulation, and the creation of environments."""
 
 from __future__ import annotations
 
@@ -7,17 +7,16 @@ from functools import partial
 from typing import Any
 
 import gymnasium
-from lerobot.configs import FeatureType, PolicyFeature
+from lerobot.configs import FeatureType, PipelineFeatureType, PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.processor import PolicyProcessorPipeline
+from lerobot.processor import InfoProcessorStep, PolicyProcessorPipeline
 
 from egovcp import spec
 from egovcp.bounds import check_cores
 from egovcp.errors import UsageError, suggest
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig as SimulationConfig
-from lerobot_env_egovcp.environment_egovcp import LeRobotView
-from lerobot_env_egovcp.processor_egovcp import ControllerIdProcessorStep
+from lerobot_env_egovcp.environment_egovcp import LeRobotEgovcpEnv
 
 
 def _features() -> dict[str, PolicyFeature]:
@@ -30,13 +29,35 @@ def _features() -> dict[str, PolicyFeature]:
     }
 
 
-def _names() -> dict[str, str]:
-    """The environment's names -> LeRobot's."""
-    return {
-        "images.ego_depth": spec.DEPTH_KEY,
-        "agent_pos": spec.STATE_KEY,
-        "action": spec.ACTION_KEY,
-    }
+#: The environment's names -> LeRobot's.
+_NAMES = {
+    "images.ego_depth": spec.DEPTH_KEY,
+    "agent_pos": spec.STATE_KEY,
+    "action": spec.ACTION_KEY,
+}
+
+
+@dataclass
+class ControllerIdProcessorStep(InfoProcessorStep):  # type: ignore[misc]
+    """Adds the id of the low-level controller to ``info``, for policies to check.
+
+    LeRobot passes a policy neither the environment nor its config.
+    """
+
+    controller_id: str
+    """`LowLevelController.id` of the simulated robots."""
+
+    def info(self, info: dict[str, Any]) -> dict[str, Any]:
+        return {**info, spec.CONTROLLER_ID_KEY: self.controller_id}
+
+    def get_config(self) -> dict[str, Any]:
+        return {"controller_id": self.controller_id}
+
+    def transform_features(
+        self, features: dict[PipelineFeatureType, dict[str, PolicyFeature]]
+    ) -> dict[PipelineFeatureType, dict[str, PolicyFeature]]:
+        """Unchanged."""
+        return features
 
 
 @EnvConfig.register_subclass("egovcp")
@@ -51,9 +72,9 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
     simulation: SimulationConfig = field(default_factory=SimulationConfig)
     """Scene, sensors, randomisation and low-level controller."""
     features: dict[str, PolicyFeature] = field(default_factory=_features)
-    """What the environment shows and takes."""
-    features_map: dict[str, str] = field(default_factory=_names)
-    """LeRobot's names for it."""
+    """Observations and actions."""
+    features_map: dict[str, str] = field(default_factory=_NAMES.copy)
+    """LeRobot's names of the features."""
 
     def __post_init__(self) -> None:
         if self.task not in spec.TASKS:
@@ -63,15 +84,15 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `LeRobotView`."""
+        """Arguments of `LeRobotEgovcpEnv`."""
         return {"task": self.task, "config": self.simulation}
 
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gymnasium.vector.VectorEnv[Any, Any, Any]]]:
-        """``n_envs`` robots side by side, in one process or in one each."""
+        """``n_envs`` robots, in one process or in one process each."""
         check_cores(self.simulation, "--env.simulation.")
-        make = [partial(LeRobotView, **self.gym_kwargs)] * n_envs
+        make = [partial(LeRobotEgovcpEnv, **self.gym_kwargs)] * n_envs
         mode = gymnasium.vector.AutoresetMode.SAME_STEP
         envs: gymnasium.vector.VectorEnv[Any, Any, Any] = (
             gymnasium.vector.AsyncVectorEnv(make, context="forkserver", autoreset_mode=mode)
@@ -81,10 +102,10 @@ class EgovcpEnvConfig(EnvConfig):  # type: ignore[misc]
         return {self.type: {0: envs}}
 
     def get_env_processors(self) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-        """What LeRobot applies to observations and to actions of these environments.
+        """Pre- and postprocessors of these environments.
 
         Raises:
-            UsageError, ArtifactError: as `make_controller`, for ``simulation.controller``.
+            UsageError, ArtifactError: see `make_controller`; for ``simulation.controller``.
         """
         step = ControllerIdProcessorStep(make_controller(self.simulation.controller).id)
         return PolicyProcessorPipeline(steps=[step]), PolicyProcessorPipeline(steps=[])

@@ -1,4 +1,4 @@
-"""One simulated robot with LeRobot's names for what it sees."""
+"""One simulated robot with LeRobot's names of observations."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from egovcp.sim.config import EnvConfig
 from egovcp.sim.gym import EgovcpEnv, GymObservation
 
 _GREY_PER_MM = 255 / (spec.DEPTH_MAX_M * 1e3)
-_MAGNIFY = 4  # video encoders want more than 64 columns
+_MAGNIFY = 4  # video encoders need more than 64 columns
 
 
-class LeRobotView(gymnasium.Env[GymObservation, NDArray[np.float32]]):
-    """`EgovcpEnv` as LeRobot's rollouts read it.
+class LeRobotEgovcpEnv(gymnasium.Env[GymObservation, NDArray[np.float32]]):
+    """`EgovcpEnv` for LeRobot's rollouts.
 
     Observation: ``images.ego_depth`` (1, 48, 64) float32 mm, 0 = invalid, and ``agent_pos`` (74,),
-    which LeRobot calls ``observation.state``. ``info["is_success"]`` is the episode's outcome: it
-    is set at the end alone, because LeRobot counts an episode that was ever successful.
+    which LeRobot calls ``observation.state``. ``info["is_success"]`` is true only at the end of a
+    successful episode: LeRobot counts episodes in which it is ever true.
     """
 
     observation_space: gymnasium.Space[Any]
@@ -48,19 +48,19 @@ class LeRobotView(gymnasium.Env[GymObservation, NDArray[np.float32]]):
     ) -> tuple[GymObservation, dict[str, Any]]:
         """Start the next episode, or episode 0 of ``seed``."""
         super().reset(seed=seed)
-        seen, info = self._env.reset(seed=seed, options=options)
-        return self._renamed(seen), info | {"is_success": False}
+        observed, info = self._env.reset(seed=seed, options=options)
+        return self._renamed(observed), info | {"is_success": False}
 
     def step(
         self, action: NDArray[np.float32]
     ) -> tuple[GymObservation, float, bool, bool, dict[str, Any]]:
         """One planner tick of 40 ms."""
-        seen, reward, terminated, truncated, info = self._env.step(action)
+        observed, reward, terminated, truncated, info = self._env.step(action)
         success = bool(info["success"]) and (terminated or truncated)
-        return self._renamed(seen), reward, terminated, truncated, {"is_success": success}
+        return self._renamed(observed), reward, terminated, truncated, {"is_success": success}
 
     def render(self) -> NDArray[np.uint8]:
-        """What the robot sees, (192, 256, 3): the nearer, the brighter; black: nothing."""
+        """The depth image as (192, 256, 3): near is bright, black is invalid."""
         near = np.where(self._depth == 0, 0.0, 255.0 - self._depth * _GREY_PER_MM)
         grey = near.clip(0, 255).astype(np.uint8).repeat(_MAGNIFY, 0).repeat(_MAGNIFY, 1)
         return np.stack([grey] * 3, -1)
@@ -69,9 +69,9 @@ class LeRobotView(gymnasium.Env[GymObservation, NDArray[np.float32]]):
         """End the threads of the simulation."""
         self._env.close()
 
-    def _renamed(self, seen: GymObservation) -> GymObservation:
-        self._depth = seen["depth"]
+    def _renamed(self, observed: GymObservation) -> GymObservation:
+        self._depth = observed["depth"]
         return {
-            "images.ego_depth": seen["depth"][None].astype(np.float32),
-            "agent_pos": seen["state"],
+            "images.ego_depth": observed["depth"][None].astype(np.float32),
+            "agent_pos": observed["state"],
         }

@@ -1,4 +1,4 @@
-"""``--policy.type=egovcp``: what LeRobot must know of the world model before it exists."""
+"""``--policy.type=egovcp``: configuration of the policy and its training."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from egovcp.data import ReturnConfig
 from egovcp.errors import DataError, UsageError
 from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
-from egovcp.plan import PlannerConfig, require_compatible
-from egovcp.plan.config import require_affordable
+from egovcp.plan import PlannerConfig, require_affordable, require_compatible
 
 FEATURE_SHAPES = {
     spec.DEPTH_KEY: (1, spec.DEPTH_ROWS, spec.DEPTH_COLS),
@@ -31,8 +30,7 @@ def _no_normalisation() -> dict[str, NormalizationMode]:
 class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
     """World model, planner and training of an egovcp policy; the first two are the artifact's.
 
-    ``lerobot-train`` saves the last weights, not averaged ones as ``egovcp-train`` does: its
-    training loop has no place for a second model.
+    ``lerobot-train`` saves the last weights, not averaged ones as ``egovcp-train``.
     """
 
     world_model: WorldModelConfig = field(default_factory=WorldModelConfig)
@@ -48,9 +46,9 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
     mirror: bool = True
     """Left-right mirror half of the windows (the robot is symmetric)."""
     drop_n_last_frames: int = 0
-    """Rows at the end of an episode at which no window begins; windows past the end are padded."""
+    """Rows at the end of an episode at which no window begins. Windows are padded at the end."""
     normalization_mapping: dict[str, NormalizationMode] = field(default_factory=_no_normalisation)
-    """None: the statistics are in the weights, as on the robot."""
+    """Identity: the world model normalises, with statistics among its weights."""
     optimizer_lr: float = 1e-3
     """Peak learning rate."""
     optimizer_weight_decay: float = 1e-3
@@ -87,7 +85,7 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
         loss = self.world_model.loss
         if loss.q_target == "td" and loss.td_decay > 0:
             raise UsageError(
-                "lerobot-train has no place for a slow copy of Q; give "
+                "lerobot-train keeps no slow copy of Q; give "
                 "--policy.world_model.loss.td_decay=0, or train with egovcp-train"
             )
         if self.world_model.dynamics == "autoregressive":
@@ -109,7 +107,7 @@ class EgovcpConfig(PreTrainedConfig):  # type: ignore[misc]
 
     @property
     def reward_delta_indices(self) -> None:
-        """None: returns reach past the window and come from the whole reward column."""
+        """None: returns need rows beyond the window, see `RowTargets`."""
         return
 
     def get_optimizer_preset(self) -> AdamWConfig:

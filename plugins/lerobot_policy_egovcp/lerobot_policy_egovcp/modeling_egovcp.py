@@ -24,9 +24,14 @@ from egovcp.errors import ArtifactError, UsageError
 from egovcp.manifest import SEAL
 from egovcp.model import WorldModel, world_model_loss
 from egovcp.plan import Policy
+from lerobot_policy_egovcp.batches import (
+    RowTargets,
+    mirrored,
+    open_reader,
+    read_observation,
+    to_batch,
+)
 from lerobot_policy_egovcp.configuration_egovcp import EgovcpConfig
-from lerobot_policy_egovcp.observations import read_observation
-from lerobot_policy_egovcp.training_rows import Targets, mirrored, open_reader, to_batch
 
 type Stats = Mapping[str, Mapping[str, Any]]
 
@@ -36,9 +41,9 @@ _OWN_KEYS = ("schema_version", "egovcp_version", "features", "files", SEAL)  # o
 
 
 class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
-    """Filters every observation into the world model's memory, then plans.
+    """Filters every observation into the state of the world model, then plans.
 
-    What it saves is an artifact as ``egovcp-train`` writes it (see `egovcp.artifact`).
+    It saves an artifact as ``egovcp-train`` writes it (see `egovcp.artifact`).
     """
 
     config_class = EgovcpConfig
@@ -64,7 +69,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         config.validate_features()
         self.world_model = WorldModel(config.world_model)
         self._reader = _reader(dataset_meta)
-        self._targets: Targets | None = None
+        self._targets: RowTargets | None = None
         self._provenance = _provenance(self._reader)
         self._planner: Policy | None = None
         if self._reader is not None and dataset_stats is not None:
@@ -92,7 +97,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
 
         Args:
             config: replaces the artifact's own, for another planner or other loss weights.
-            dataset_stats: not used: the artifact has its own.
+            dataset_stats: unused; the artifact has its own.
             dataset_meta: a dataset to train on further.
 
         Raises:
@@ -112,7 +117,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         return policy
 
     def _take(self, artifact: Artifact) -> None:
-        """The weights and, for want of a dataset of its own, the provenance of an artifact."""
+        """Take the weights and, without a dataset, the provenance of an artifact."""
         try:
             self.world_model.load_state_dict(artifact.world_model.state_dict())
         except RuntimeError as error:
@@ -124,23 +129,22 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         older = {k: v for k, v in artifact.manifest.items() if k not in _OWN_KEYS}
         self._provenance = self._provenance or older
 
-    # --- acting --------------------------------------------------------------------------
     def reset(self) -> None:
-        """Forget the past of all robots; the next batch may have another size."""
+        """Reset all robots; the next batch may have another size."""
         self._planner = None
 
     @torch.no_grad()
     def select_action(self, batch: dict[str, Any]) -> Tensor:
         """Filter one observation of E robots and plan: the action (E, 7) in [-1, 1] to execute.
 
-        The memory advances with this action, as if it were sent unchanged. See
+        The state advances with this action, as if it were sent unchanged. See
         `predict_action_chunk` for the arguments and the errors.
         """
         return self.predict_action_chunk(batch)[:, 0]
 
     @torch.no_grad()
     def predict_action_chunk(self, batch: dict[str, Any]) -> Tensor:
-        """The same, but the whole plan (E, N, 7). One call is one planner step of 40 ms.
+        """Filter and plan as `select_action`, once per planner step of 40 ms: the plan (E, N, 7).
 
         An observation whose state is not finite is skipped with a warning, see
         `egovcp.plan.Policy`.
@@ -153,7 +157,7 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         Raises:
             DataError: a part of the observation is missing, or of another type, shape or unit.
             UsageError: E changed without a `reset`.
-            ArtifactError: the policy was trained for another low-level controller.
+            ArtifactError: the policy is for another low-level controller.
         """
         self._require_controller(batch.get("info"))
         depth, state = read_observation(batch)
@@ -190,7 +194,6 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
             )
         return self._planner
 
-    # --- training ------------------------------------------------------------------------
     def forward(self, batch: dict[str, Tensor]) -> tuple[Tensor, dict[str, float]]:
         """Loss of the world model on windows (see `to_batch`), and its terms.
 
@@ -208,24 +211,23 @@ class EgovcpPolicy(PreTrainedPolicy):  # type: ignore[misc]
         """All parameters, one group."""
         return self.world_model.parameters()
 
-    def _dataset_targets(self) -> Targets:
+    def _dataset_targets(self) -> RowTargets:
         if self._targets is None:
             if self._reader is None:
                 raise UsageError(
                     "an egovcp policy learns from the rewards of a whole dataset: make it with "
                     "dataset_meta, as lerobot-train does"
                 )
-            self._targets = Targets.of(self._reader, self.config.returns)
+            self._targets = RowTargets.of(self._reader, self.config.returns)
         return self._targets
 
-    # --- saving --------------------------------------------------------------------------
     def _save_pretrained(
         self, save_directory: Path, state_dict: dict[str, Tensor] | None = None
     ) -> None:
         """Write the artifact; LeRobot adds its processors, and so the manifest is without them.
 
         Raises:
-            ArtifactError: it is not known which low-level controller the policy drives.
+            ArtifactError: the low-level controller of the policy is unknown.
         """
         weights = {
             name.removeprefix(_PREFIX): value
@@ -249,7 +251,7 @@ def _reader(meta: LeRobotDatasetMetadata | None) -> DatasetReader | None:
 
 
 def _provenance(reader: DatasetReader | None) -> dict[str, Any]:
-    """What the manifest says about where the policy comes from; empty without a dataset."""
+    """Provenance for the manifest; empty without a dataset."""
     if reader is None:
         return {}
     source = reader.source

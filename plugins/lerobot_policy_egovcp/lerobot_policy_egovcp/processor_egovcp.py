@@ -1,4 +1,4 @@
-"""The steps that LeRobot takes before and after the policy: none that changes a number."""
+"""Pre- and postprocessors of the policy, which change no values."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from lerobot_policy_egovcp.configuration_egovcp import EgovcpConfig
 def make_egovcp_pre_post_processors(
     config: EgovcpConfig, dataset_stats: dict[str, dict[str, Tensor]] | None = None
 ) -> tuple[PolicyProcessorPipeline, PolicyProcessorPipeline]:
-    """LeRobot's usual pipelines: rename, add a batch dimension, move to the device and back.
+    """LeRobot's default pipelines: rename, add a batch dimension, move to the device and back.
 
     Args:
-        dataset_stats: kept beside the steps as LeRobot does, and applied to nothing: the
-            statistics that count are in the world model.
+        dataset_stats: stored as LeRobot does, but unused; the world model has its own.
     """
     pipelines: tuple[Any, Any] = make_default_pre_post_processors(
         config, dataset_stats, normalizer_device=config.device

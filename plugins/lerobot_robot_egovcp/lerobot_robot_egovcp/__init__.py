@@ -4,7 +4,6 @@ LeRobot imports every installed distribution whose name begins with ``lerobot_ro
 importing this one registers the robot type ``egovcp_g1``.
 """
 
-from lerobot_robot_egovcp.configuration_egovcp import EgovcpG1Config
-from lerobot_robot_egovcp.robot_egovcp import EgovcpG1
+from lerobot_robot_egovcp.robot_egovcp import EgovcpG1, EgovcpG1Config
 
 __all__ = ["EgovcpG1", "EgovcpG1Config"]

@@ -1,27 +1,55 @@
-"""The robot as LeRobot's recording, replaying and teleoperating tools see it."""
+"""A Unitree G1 as a LeRobot robot, ``--robot.type=egovcp_g1``."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from lerobot.robots import Robot
+from lerobot.robots import Robot, RobotConfig
 from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnectedError
 
 from egovcp import spec
 from egovcp.errors import UsageError
+from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions
 from egovcp_deploy.live.puppet import Puppet
-from lerobot_robot_egovcp.configuration_egovcp import EgovcpG1Config
+from egovcp_deploy.live.run import LiveSetup
+from egovcp_deploy.pilot.states import Limits
+from egovcp_deploy.robots.bridge import BridgeConfig
 
 _DEPTH = spec.DEPTH_KEY.removeprefix("observation.images.")
 
 
-class EgovcpG1(Robot):  # type: ignore[misc]
-    """Takes the seven numbers of an egovcp action at 25 Hz and shows what its datasets hold.
+@RobotConfig.register_subclass("egovcp_g1")
+@dataclass(kw_only=True)
+class EgovcpG1Config(RobotConfig):  # type: ignore[misc]
+    """A G1 behind LeRobot's bridge, or egovcp-fake-g1."""
 
-    The robot balances, holds when actions stop coming, and is damped when it falls, whatever
-    LeRobot does. Untested on hardware.
+    bridge: BridgeConfig = field(default_factory=BridgeConfig)
+    """Where the bridge is."""
+    camera: CameraOptions = field(default_factory=CameraOptions)
+    """The depth camera."""
+    controller: str = "walk"
+    """Low-level controller: walk, stance, or the file of a trained one."""
+    limits: Limits = field(default_factory=Limits)
+    """When the robot is held, and when its motors are damped."""
+    by_itself: bool = False
+    """Whether `connect` makes the robot stand up, arm and run, for egovcp-fake-g1. Else use its
+    remote control: Y, A, start."""
+
+    @property
+    def setup(self) -> LiveSetup:
+        """Configuration of the control process."""
+        hardware = HardwareOptions(self.bridge, self.camera)
+        return LiveSetup(hardware, self.controller, self.limits, stays=False)
+
+
+class EgovcpG1(Robot):  # type: ignore[misc]
+    """Takes egovcp actions at 25 Hz; its observations have the features of egovcp datasets.
+
+    The robot balances, holds its pose if actions stop, and is damped if it falls. Untested on
+    hardware.
     """
 
     config_class = EgovcpG1Config
@@ -34,9 +62,9 @@ class EgovcpG1(Robot):  # type: ignore[misc]
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
-        """Proprioception by name, and the depth picture."""
-        picture = (spec.DEPTH_ROWS, spec.DEPTH_COLS, 1)
-        return {**dict.fromkeys(spec.STATE_NAMES, float), _DEPTH: picture}
+        """Proprioception by name, and the depth image."""
+        image = (spec.DEPTH_ROWS, spec.DEPTH_COLS, 1)
+        return {**dict.fromkeys(spec.STATE_NAMES, float), _DEPTH: image}
 
     @cached_property
     def action_features(self) -> dict[str, Any]:
@@ -45,17 +73,15 @@ class EgovcpG1(Robot):  # type: ignore[misc]
 
     @property
     def cameras(self) -> dict[str, Any]:
-        """None that LeRobot would have to run: the picture comes with the observation."""
+        """Empty: the depth image is part of the observation."""
         return {}
 
     @property
     def is_connected(self) -> bool:
-        """Whether the robot runs."""
         return self._puppet is not None
 
     @property
     def is_calibrated(self) -> bool:
-        """Always: the robot knows its joints."""
         return True
 
     def connect(self, calibrate: bool = True) -> None:
@@ -80,7 +106,7 @@ class EgovcpG1(Robot):  # type: ignore[misc]
         return {**state, _DEPTH: report.depth[..., None].copy()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
-        """Send `spec.ACTION_NAMES`, each in [-1, 1]; what the robot takes, rate limited.
+        """Send `spec.ACTION_NAMES`, each in [-1, 1]; returns the rate-limited action.
 
         Raises:
             UsageError: one is missing, or no number.
@@ -93,7 +119,7 @@ class EgovcpG1(Robot):  # type: ignore[misc]
         return dict(zip(spec.ACTION_NAMES, taken.tolist(), strict=True))
 
     def disconnect(self) -> None:
-        """Hold, then damp: hang the robot up first."""
+        """Hold, then damp. Suspend the robot first."""
         puppet, self._puppet = self._running, None
         puppet.close()
 

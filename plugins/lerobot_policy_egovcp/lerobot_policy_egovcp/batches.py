@@ -1,0 +1,232 @@
+"""Conversion of LeRobot's observations and training batches to those of egovcp."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final, Self
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from egovcp import spec
+from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid, mirror
+from egovcp.data.source import recorded
+from egovcp.errors import DataError
+from egovcp.model import Batch
+
+_COLUMNS = (spec.REWARD_KEY, spec.DONE_KEY, spec.TRUNCATED_KEY)
+_IMAGE: Final = (1, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+_CHANNEL_LAST: Final = (spec.DEPTH_ROWS, spec.DEPTH_COLS, 1)
+_INTEGERS: Final = (torch.uint16, torch.int16, torch.int32, torch.uint32, torch.int64)
+_FLOATS: Final = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
+_SHAPES: Final = {spec.DEPTH_KEY: _IMAGE, spec.STATE_KEY: (spec.STATE_DIM,)}
+
+
+def read_observation(
+    batch: Mapping[str, Any],
+) -> tuple[NDArray[np.uint16], NDArray[np.float32]]:
+    """Depth (E, 48, 64) in mm, 0 = invalid, and state (E, 74) of one step of E robots.
+
+    Args:
+        batch: ``observation.images.ego_depth`` (E, 1, 48, 64) or (E, 48, 64, 1), in millimetres
+            of any integer or float type but uint8, and ``observation.state`` (E, 74). Without E
+            it is the observation of one robot, as `LeRobotDataset` returns it.
+
+    Raises:
+        DataError: one is missing, or of another type, shape or unit.
+    """
+    depth, state = (_tensor(batch, key) for key in (spec.DEPTH_KEY, spec.STATE_KEY))
+    if tuple(depth.shape[-3:]) == _CHANNEL_LAST:
+        depth = depth.movedim(-1, -3)
+    depth, state = _batched(depth, spec.DEPTH_KEY), _batched(state, spec.STATE_KEY)
+    if len(depth) != len(state) or len(state) == 0:
+        raise DataError(
+            f"{spec.DEPTH_KEY} is of {len(depth)} robots and {spec.STATE_KEY} of {len(state)}; "
+            "expected one observation of each of at least one robot"
+        )
+    return (
+        to_millimetres(depth).cpu().numpy().astype(np.uint16),
+        state.to("cpu", torch.float32).numpy(),
+    )
+
+
+def to_millimetres(depth: Tensor) -> Tensor:
+    """LeRobot's depth (..., 1, 48, 64), millimetres -> (..., 48, 64) whole ones, int32.
+
+    Negative and non-finite values become 0, invalid.
+
+    Raises:
+        DataError: another type or shape, or not in millimetres.
+    """
+    if depth.dtype not in (*_INTEGERS, *_FLOATS):
+        raise DataError(
+            f"{spec.DEPTH_KEY} has type {_name(depth)}; expected millimetres as uint16, int32 or "
+            "float32"
+        )
+    if tuple(depth.shape[-3:]) != _IMAGE:
+        raise _wrong_shape(spec.DEPTH_KEY, depth, f"(..., {_listed(_IMAGE)})")
+    # torch has no arithmetic for uint16
+    finite = depth.squeeze(-3).float().nan_to_num(0.0, 0.0, 0.0)
+    farthest = float(finite.max()) if finite.numel() else 0.0
+    if 0 < farthest < spec.DEPTH_MIN_M * 1e3:
+        raise DataError(
+            f"{spec.DEPTH_KEY} is at most {farthest:g}, less than the camera's nearest "
+            f"{spec.DEPTH_MIN_M * 1e3:g} mm: the policy reads millimetres, not metres"
+        )
+    return finite.round().clamp(0, torch.iinfo(torch.uint16).max).to(torch.int32)
+
+
+def _tensor(batch: Mapping[str, Any], key: str) -> Tensor:
+    if key not in batch:
+        given = ", ".join(sorted(name for name in batch if name.startswith("observation")))
+        raise DataError(
+            f"the observation has no {key!r}, only {given or 'other keys'}; a camera or state of "
+            "another name is renamed with --rename_map"
+        )
+    value = batch[key]
+    if not isinstance(value, Tensor):
+        raise DataError(
+            f"{key} is a {type(value).__name__}; expected a torch.Tensor (torch.from_numpy)"
+        )
+    if key == spec.STATE_KEY and value.dtype not in (*_INTEGERS, *_FLOATS):
+        raise DataError(f"{key} has type {_name(value)}; expected numbers, such as float32")
+    return value
+
+
+def _batched(value: Tensor, key: str) -> Tensor:
+    """``value`` with the leading dimension E of the robots."""
+    shape = _SHAPES[key]
+    missing = len(shape) + 1 - value.ndim
+    if tuple(value.shape[-len(shape) :]) != shape or missing not in (0, 1):
+        expected = f"(E, {_listed(shape)}) for E robots, or ({_listed(shape)}) for one"
+        raise _wrong_shape(key, value, expected)
+    return value[None] if missing else value
+
+
+def _wrong_shape(key: str, value: Tensor, expected: str) -> DataError:
+    return DataError(f"{key} has shape {tuple(value.shape)}; expected {expected}")
+
+
+def _listed(shape: tuple[int, ...]) -> str:
+    return ", ".join(map(str, shape))
+
+
+def _name(value: Tensor) -> str:
+    return str(value.dtype).removeprefix("torch.")
+
+
+@dataclass(frozen=True)
+class RowTargets:
+    """Reward, return and termination of every row of a dataset, by LeRobot's row ``index``.
+
+    They are computed once, from whole columns: LeRobot reads no windows of scalar columns, and a
+    return needs rows beyond a window.
+    """
+
+    mc_return: Tensor  # (N,)
+    mc_valid: Tensor  # (N,) bool
+    terminal_next: Tensor  # (N,) bool
+    reward: Tensor  # (N,)
+
+    @classmethod
+    def of(cls, reader: DatasetReader, config: ReturnConfig) -> Self:
+        """Compute the targets of a dataset.
+
+        Raises:
+            DataError: the dataset is damaged, or its episodes are too short for any return.
+        """
+        parts = [_episode_targets(reader, i, config) for i in range(len(reader))]
+        found = cls(*(torch.from_numpy(np.concatenate(c)) for c in zip(*parts, strict=True)))
+        if not found.mc_valid.any():
+            raise DataError(
+                f"{reader.root}: no row has a complete Monte Carlo return: the episodes (at most "
+                f"{int(reader.lengths.max())} ticks) are not longer than --policy.returns.steps; "
+                "lower it, or collect longer episodes"
+            )
+        return found
+
+    @property
+    def usable(self) -> Tensor:
+        """The complete returns, (n,)."""
+        return self.mc_return[self.mc_valid]
+
+    def window(self, index: Tensor, length: int) -> dict[str, Tensor]:
+        """Targets (B, length) of the windows that begin at rows ``index`` (B,).
+
+        Past the dataset's end the last row is repeated.
+        """
+        rows = index.reshape(-1, 1).cpu() + torch.arange(length)
+        rows = rows.clamp_max(len(self.mc_return) - 1)
+        return {name: values[rows].to(index.device) for name, values in vars(self).items()}
+
+
+def _episode_targets(reader: DatasetReader, index: int, config: ReturnConfig) -> tuple[Any, ...]:
+    columns = reader.read_episode_columns(index, _COLUMNS)
+    reward, done, truncated = (columns[name] for name in _COLUMNS)
+    if not np.isfinite(reward).all():
+        raise DataError.at(reader.data_path(index), "a reward is not a number", index)
+    limit = reader.time_limit(index)
+    return (
+        mc_return(reward, config.gamma, config.steps),
+        mc_valid(len(reward), limit, config.steps, config.keep_truncated),
+        is_terminal(done, truncated),
+        reward,
+    )
+
+
+def open_reader(root: Path, repo_id: str) -> DatasetReader:
+    """A reader of the dataset that LeRobot has loaded from ``root``.
+
+    Raises:
+        DataError: it was not written by egovcp, or is damaged.
+    """
+    return DatasetReader(recorded(Path(root), repo_id))
+
+
+def to_batch(batch: Mapping[str, Tensor], targets: RowTargets) -> Batch:
+    """Convert a batch of LeRobot's windows to the `Batch` of the losses.
+
+    Args:
+        batch: observations (B, T, ...) of rows t .. t + T - 1 and actions (B, T + 1, 7) from
+            row t - 1 on, with LeRobot's ``_is_pad`` masks and the ``index`` (B,) of row t.
+
+    Raises:
+        DataError: the depth is not in millimetres, or of another shape.
+    """
+    state, action = batch[spec.STATE_KEY], batch[spec.ACTION_KEY]
+    valid = ~batch[f"{spec.STATE_KEY}_is_pad"]
+    is_first = torch.zeros_like(valid)
+    is_first[:, 0] = batch[f"{spec.ACTION_KEY}_is_pad"][:, 0]
+    rows = targets.window(batch["index"], state.shape[1])
+    return Batch(
+        depth=to_millimetres(batch[spec.DEPTH_KEY]),
+        state=state,
+        action=action[:, 1:],
+        prev_action=action[:, :-1].masked_fill(is_first[..., None], 0.0),
+        is_first=is_first,
+        valid=valid,
+        mc_return=rows["mc_return"],
+        mc_valid=rows["mc_valid"] & valid,
+        terminal_next=rows["terminal_next"] & valid,
+        reward=rows["reward"],
+    )
+
+
+def mirrored(rows: Batch, which: Tensor) -> Batch:
+    """The batch with the windows ``which`` (B,) bool mirrored left to right."""
+
+    def swap(value: Tensor, source: NDArray[np.intp], sign: NDArray[np.float32]) -> Tensor:
+        other = value[..., torch.from_numpy(source).to(value.device)]
+        other = other * torch.from_numpy(sign).to(value)
+        return torch.where(which[:, None, None], other, value)
+
+    return rows._replace(
+        depth=torch.where(which[:, None, None, None], rows.depth.flip(-1), rows.depth),
+        state=swap(rows.state, mirror.STATE_SOURCE, mirror.STATE_SIGN),
+        action=swap(rows.action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),
+        prev_action=swap(rows.prev_action, mirror.ACTION_SOURCE, mirror.ACTION_SIGN),
+    )
