@@ -22,7 +22,8 @@ from egovcp.log.tick import (
     Tick,
     ValueMap,
 )
-from egovcp.robot.kinematics import LINK_NAMES, quaternion
+from egovcp.robot.geometry import quaternion
+from egovcp.robot.kinematics import LINK_NAMES
 from egovcp.spec import ACTION_NAMES, DEPTH_COLS, JOINT_NAMES, STATE_NAMES, STATE_SLICES
 
 CAMERA_FRAME: Final = "head_camera_optical"

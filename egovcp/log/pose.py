@@ -14,13 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log.tick import CameraView, Tick
-from egovcp.robot.kinematics import (
-    LINK_NAMES,
-    PALM_OFFSET,
-    heading_rotation,
-    link_transforms,
-    quaternion,
-)
+from egovcp.robot.geometry import heading_rotation, quaternion, rotation_matrix
+from egovcp.robot.kinematics import LINK_NAMES, PALM_OFFSET, link_transforms
 from egovcp.spec import STATE_SLICES
 
 Array = NDArray[np.float64]
@@ -87,14 +82,6 @@ def _place(tick: Tick, height: float, tilt: Array, positions: Array, rotations: 
     rotations_w = pelvis @ rotations
     palms = np.stack([rotations_w[i] @ PALM_OFFSET[k] for k, i in enumerate(WRISTS)])
     return RobotPose(positions_w, rotations_w, _yaw_only(pelvis), positions_w[WRISTS] + palms)
-
-
-def rotation_matrix(quaternion_wxyz: NDArray[np.floating]) -> Array:
-    """(4,) unit quaternion (w, x, y, z) -> (3, 3): R = 1 + 2 w [v] + 2 [v]^2."""
-    w, x, y, z = np.asarray(quaternion_wxyz, np.float64)
-    v = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    out: Array = np.eye(3) + 2.0 * w * v + 2.0 * v @ v
-    return out
 
 
 def _yaw_only(rotation: Array) -> Array:

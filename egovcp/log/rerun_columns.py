@@ -17,7 +17,8 @@ from egovcp.log.meshes import SPHERE, value_colours
 from egovcp.log.messages import to_millimetres
 from egovcp.log.pose import WRISTS, RobotPose
 from egovcp.log.tick import CameraView, Hand, SceneObject, Tick, ValueMap
-from egovcp.robot.kinematics import LINK_NAMES, PARENT, quaternion
+from egovcp.robot.geometry import quaternion
+from egovcp.robot.kinematics import LINK_NAMES, PARENT
 from egovcp.spec import ACTION_BOX, ACTION_HANDS, STATE_SLICES
 
 Array = NDArray[np.floating]

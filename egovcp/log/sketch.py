@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log.meshes import OBSTACLE, SPHERE, LinkMesh
-from egovcp.log.pose import RobotPose, rotation_matrix
+from egovcp.log.pose import RobotPose
 from egovcp.log.tick import SceneObject
+from egovcp.robot.geometry import rotation_matrix
 from egovcp.robot.kinematics import LINK_NAMES, PARENT
 
 Array = NDArray[np.float64]

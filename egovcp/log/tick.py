@@ -11,6 +11,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.robot.geometry import focal_length
 from egovcp.spec import DEPTH_COLS, DEPTH_ROWS, FEATURES, PLANNER_HZ, SPEC_VERSION
 
 Array = NDArray[np.floating]
@@ -160,8 +161,8 @@ class CameraView:
 
     @property
     def focal_px(self) -> float:
-        """Focal length in pixels, f = (H / 2) / tan(fov / 2); pixels are square."""
-        return DEPTH_ROWS / 2 / math.tan(self.vertical_fov / 2)
+        """Focal length, pixels."""
+        return focal_length(self.vertical_fov)
 
     @property
     def centre_px(self) -> tuple[float, float]:

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egovcp.log.pose import robot_pose, robot_poses, rotation_matrix
+from egovcp.log.pose import robot_pose, robot_poses
 from egovcp.log.tick import BasePose, CameraView, RunInfo
+from egovcp.robot.geometry import rotation_matrix
 from egovcp.robot.kinematics import palm_positions
 from egovcp.spec import STATE_SLICES
 
