@@ -10,12 +10,13 @@ export PATH
 # Threads that spin at barriers for long slow each other down tenfold beside any other program.
 export GOMP_SPINCOUNT := 20000
 
-.PHONY: help install quickstart test check bench build cards clean
+.PHONY: help install quickstart test check docs bench build cards clean
 
 help:
 	@echo "make quickstart   install, then collect, train, evaluate and record the ball task (10 to 20 min)"
 	@echo "make test         the test suite"
-	@echo "make check        linter, formatter, type checker, lock file"
+	@echo "make check        linter, formatter, type checker, lock file, docs"
+	@echo "make docs         the documentation site, in site/"
 	@echo "make bench        benchmarks, ratios measured side by side"
 	@echo "make cards        dataset_cards/ from a dataset of 1000 episodes of each task (collected if need be)"
 	@echo "make build        wheels and source distributions of every package into dist/"
@@ -56,11 +57,15 @@ quickstart: install
 	@echo "          $(OUT)/rollout.png"
 	@echo "next      train longer with more data (README), or another task: egovcp-collect --task=wall --help"
 
-check: install
+check: install docs
 	ruff check .
 	ruff format --check .
 	mypy
 	uv lock --check
+
+# The plugins print advertisements of other tools.
+docs: install
+	NO_MKDOCS_2_WARNING=1 DISABLE_MKDOCS_2_WARNING=true mkdocs build --quiet
 
 bench: install
 	@mkdir -p outputs/benchmarks
