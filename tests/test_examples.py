@@ -1,0 +1,23 @@
+"""The scripts in examples/ run, at a reduced size."""
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+_SMALL = ["--preset=debug", "--steps=2", "--batch_size=2", "--eval_freq=0", "--threads=1"]
+
+
+def test_examples_train_a_policy_and_imagine_with_it(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    quickstart = runpy.run_path(str(EXAMPLES / "quickstart.py"))
+    rate = quickstart["run"](tmp_path, episodes=2, minutes=0, scenarios=1, options=_SMALL)
+    assert 0.0 <= rate <= 1.0
+    capsys.readouterr()
+
+    imagine = runpy.run_path(str(EXAMPLES / "imagine.py"))
+    policy = tmp_path / "policy/checkpoints/last/pretrained_model"
+    imagine["main"](str(policy), str(tmp_path / "dataset"))
+    assert capsys.readouterr().out.count("Q = ") == 2
