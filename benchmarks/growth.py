@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 from writer import make_episode
 from writer import writer as write
 
-from egovcp.data import BoundedStream, EpisodeIndex, ShuffleConfig, StreamConfig, open_dataset
+from egovcp.data import EpisodeIndex, SamplerConfig, ShuffleConfig, StreamingSampler, open_dataset
 from egovcp.data.schema import COLLECTION_PATH, EPISODES_PATH, INFO_PATH, SHARD_EPISODES
 
 
@@ -73,10 +73,12 @@ def _copy_facts(shard: Path, root: Path, copies: int) -> None:
 
 
 def streamed(
-    root: Path, config: StreamConfig, shuffle: ShuffleConfig, seconds: float
+    root: Path, config: SamplerConfig, shuffle: ShuffleConfig, seconds: float
 ) -> list[float]:
     """Windows per second of processor time, and resident MB at the most."""
-    stream = BoundedStream(EpisodeIndex.of([open_dataset(root)], "train"), config, shuffle=shuffle)
+    stream = StreamingSampler(
+        EpisodeIndex.of([open_dataset(root)], "train"), config, shuffle=shuffle
+    )
     rates = []
     for _ in range(5):
         count, start = 0, time.process_time()
@@ -94,7 +96,7 @@ def _peak_mb() -> float:
 
 
 def growth(
-    folder: Path, sizes: list[int], config: StreamConfig, shuffle: ShuffleConfig, seconds: float
+    folder: Path, sizes: list[int], config: SamplerConfig, shuffle: ShuffleConfig, seconds: float
 ) -> dict[str, object]:
     """Rate and memory at each size, and those of the largest by those of the smallest."""
     shard = folder / "shard"

@@ -14,12 +14,12 @@ from writer import PROVENANCE, make_episode
 
 from egovcp.cli import DatasetConfig
 from egovcp.data import (
-    BoundedStream,
     DatasetReader,
     DatasetWriter,
     EpisodeIndex,
+    SamplerConfig,
     ShuffleConfig,
-    StreamConfig,
+    StreamingSampler,
 )
 from egovcp.hub import Content, Publication, RetryPolicy, publish
 
@@ -45,7 +45,7 @@ def serving(folder: Path) -> Iterator[str]:
 
 
 def epoch_rates(
-    folder: Path, episodes: int, config: StreamConfig, shuffle: ShuffleConfig, rounds: int
+    folder: Path, episodes: int, config: SamplerConfig, shuffle: ShuffleConfig, rounds: int
 ) -> list[dict[str, float]]:
     """Windows per second of wall clock of an epoch from the disk and from the Hub, in turns.
 
@@ -65,7 +65,7 @@ def epoch_rates(
 
 
 def _round(
-    root: Path, endpoint: str, config: StreamConfig, shuffle: ShuffleConfig
+    root: Path, endpoint: str, config: SamplerConfig, shuffle: ShuffleConfig
 ) -> dict[str, float]:
     disk = _epoch(DatasetReader.open(DatasetConfig(root=str(root))), config, shuffle)
     with tempfile.TemporaryDirectory() as home, in_this_process(endpoint, Path(home)):
@@ -73,9 +73,9 @@ def _round(
     return {"disk": disk, "hub": hub}
 
 
-def _epoch(reader: DatasetReader, config: StreamConfig, shuffle: ShuffleConfig) -> float:
+def _epoch(reader: DatasetReader, config: SamplerConfig, shuffle: ShuffleConfig) -> float:
     index = EpisodeIndex.of([reader])
-    stream = BoundedStream(index, config, shuffle=shuffle, checked=not reader.is_remote)
+    stream = StreamingSampler(index, config, shuffle=shuffle, checked=not reader.is_remote)
     batches = int(index.num_frames * shuffle.reuse / config.length / config.batch_size)
     start = time.perf_counter()
     for _ in range(batches):

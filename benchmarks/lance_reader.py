@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from egovcp.data import EpisodeIndex
-from egovcp.data.columns import EPISODE_FEATURES
+from egovcp.data.parquet import EPISODE_FEATURES
 
 CASES = ("lance", "lance_jpeg")
 

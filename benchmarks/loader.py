@@ -4,8 +4,8 @@ The same dataset and windows of the same length, batch by batch, one process eac
 
 * ``lerobot``: `LeRobotDataset` with `delta_timestamps` for every feature that a window needs, items
   at random places, collated by torch;
-* ``ram``: `egovcp.data.SequenceStream`, all episodes in memory;
-* ``bounded``: `egovcp.data.BoundedStream`, episodes read from the disk through a shuffle window;
+* ``ram``: `egovcp.data.InMemorySampler`, all episodes in memory;
+* ``bounded``: `egovcp.data.StreamingSampler`, episodes read from the disk through a shuffle window;
 * ``lance``, ``lance_jpeg`` (with --lance_python): stable-worldmodel's reader, see
   `lance_windows.py`; ratios of ours to it are to the faster of its two ways.
 
@@ -44,12 +44,12 @@ from writer import writer as write
 
 from egovcp import spec
 from egovcp.data import (
-    BoundedStream,
     EpisodeIndex,
     EpisodeStore,
-    SequenceStream,
+    InMemorySampler,
+    SamplerConfig,
     ShuffleConfig,
-    StreamConfig,
+    StreamingSampler,
     open_dataset,
 )
 
@@ -85,12 +85,12 @@ def compare(
     lance: LanceReader | None,
 ) -> dict[str, object]:
     """The rates, and the ratios of ours to the others'."""
-    config = StreamConfig(batch_size=BATCH, length=length)
+    config = SamplerConfig(batch_size=BATCH, length=length)
     (reader,) = index.readers
     cases: dict[str, Callable[[], Iterator[object]]] = {
         "lerobot": lambda: lerobot(reader.root, length),
-        "ram": lambda: SequenceStream(EpisodeStore.read(index), config),
-        "bounded": lambda: BoundedStream(index, config, shuffle=shuffle),
+        "ram": lambda: InMemorySampler(EpisodeStore.read(index), config),
+        "bounded": lambda: StreamingSampler(index, config, shuffle=shuffle),
     }
     streams = {name: make() for name, make in cases.items()}
     for stream in streams.values():
@@ -121,7 +121,7 @@ def compare(
 
 def from_hub(folder: Path, episodes: int, length: int, rounds: int) -> dict[str, object]:
     """An epoch from the Hub against one from the disk."""
-    config, shuffle = StreamConfig(batch_size=BATCH, length=length), ShuffleConfig(32)
+    config, shuffle = SamplerConfig(batch_size=BATCH, length=length), ShuffleConfig(32)
     rows = epoch_rates(folder, episodes, config, shuffle, rounds)
     rates = {
         f"{name}_epoch_windows_per_s": statistics.median(r[name] for r in rows) for name in rows[0]
@@ -163,7 +163,7 @@ def main() -> None:
             )
         figures |= compare(index, args.length, args.rounds, shuffle, lance)
         if args.growth:
-            config = StreamConfig(batch_size=BATCH, length=args.length)
+            config = SamplerConfig(batch_size=BATCH, length=args.length)
             figures |= growth(home / "growth", args.growth, config, shuffle, seconds=5.0)
         publish(figures, args.json)
 

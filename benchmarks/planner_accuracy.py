@@ -19,7 +19,7 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.artifact import load_artifact
-from egovcp.data.arrays import open_dataset
+from egovcp.data.reader import open_dataset
 from egovcp.model import Carry, WorldModel
 from egovcp.plan import PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.plan.backends import make_evaluator

@@ -31,10 +31,9 @@ from egovcp import spec
 from egovcp.artifact import Artifact, load_artifact
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
-from egovcp.data.index import EpisodeIndex, require_mixable
-from egovcp.data.split import in_split
-from egovcp.data.targets import mc_return, mc_valid
-from egovcp.data.windows import gather
+from egovcp.data.index import EpisodeIndex, in_split, require_mixable
+from egovcp.data.returns import mc_return, mc_valid
+from egovcp.data.store import gather
 from egovcp.errors import DataError, UsageError
 from egovcp.model.losses import filter_sequence
 from egovcp.policy_options import PolicyOptions
@@ -186,7 +185,7 @@ class _Tasks:
     def _task(self, task: str, train: EpisodeIndex, heldout: EpisodeIndex) -> _Task:
         config = self._config
         if config.episodes:
-            train = train.spread(config.episodes)
+            train = train.subsample(config.episodes)
         folder = Path(config.output_dir)
         learning, judging = (episodes_of(index, folder) for index in (train, heldout))
         return _Task(task, learning, judging, heldout, config.probe)

@@ -38,9 +38,9 @@ from writer import writer as write
 from egovcp.data import (
     EpisodeIndex,
     EpisodeStore,
+    InMemorySampler,
     ReturnConfig,
-    SequenceStream,
-    StreamConfig,
+    SamplerConfig,
     open_dataset,
 )
 from egovcp.model import Batch, WorldModel, WorldModelConfig
@@ -70,12 +70,12 @@ class Learners:
             keep_freed_memory()
         torch.set_num_threads(threads)
         torch.manual_seed(0)
-        index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
+        index = EpisodeIndex.of([open_dataset(root)], "train").subsample(EPISODES)
         store = EpisodeStore.read(index, returns)
         self._model = WorldModel(WorldModelConfig())
         set_normalisation(self._model, store)
         self._config = OptimizerConfig(warmup_steps=0)
-        self._stream = SequenceStream(store, StreamConfig(batch_size=size, length=LENGTH))
+        self._stream = InMemorySampler(store, SamplerConfig(batch_size=size, length=LENGTH))
         self._batch = self._next()
 
     def _next(self) -> Batch:

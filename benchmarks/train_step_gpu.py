@@ -28,9 +28,9 @@ from writer import writer as write
 from egovcp.data import (
     EpisodeIndex,
     EpisodeStore,
+    InMemorySampler,
     ReturnConfig,
-    SequenceStream,
-    StreamConfig,
+    SamplerConfig,
     open_dataset,
 )
 from egovcp.model import Batch, WorldModel, WorldModelConfig
@@ -50,7 +50,7 @@ def cases(store: EpisodeStore, size: int, on_cpu: bool) -> dict[str, Callable[[]
     model = WorldModel(WorldModelConfig())
     set_normalisation(model, store)
     config = OptimizerConfig(warmup_steps=0)
-    stream = SequenceStream(store, StreamConfig(batch_size=size, length=LENGTH))
+    stream = InMemorySampler(store, SamplerConfig(batch_size=size, length=LENGTH))
 
     def learner(device: torch.device, bf16: bool) -> Learner:
         return Learner(copy.deepcopy(model).to(device), config, seed=0, bf16=bf16)
@@ -105,7 +105,7 @@ def main() -> None:
         root = args.root or Path(folder) / "dataset"
         if args.root is None:
             write(root, [make_episode(i, 150) for i in range(EPISODES)])
-        index = EpisodeIndex.of([open_dataset(root)], "train").spread(EPISODES)
+        index = EpisodeIndex.of([open_dataset(root)], "train").subsample(EPISODES)
         store = EpisodeStore.read(index, ReturnConfig(steps=args.return_steps))
         for size in args.batches:
             seconds = interleaved(cases(store, size, size in args.cpu_batches), args.rounds)

@@ -26,9 +26,8 @@ from report import parser, publish
 
 from egovcp import spec
 from egovcp.data import DatasetWriter, Episode, Provenance
-from egovcp.data.committer import committing
-from egovcp.data.encoded import encode
-from egovcp.data.spool import SealedEpisode
+from egovcp.data.committer import open_committer
+from egovcp.data.staging import StagedEpisode, encode
 from egovcp.testing import random_episode
 
 PROVENANCE = Provenance("benchmark")
@@ -76,10 +75,10 @@ def writer(root: Path, episodes: Sequence[Episode]) -> None:
 
 def service(root: Path, episodes: Sequence[Episode]) -> None:
     """Sealed one by one, committed together."""
-    with committing(root, PROVENANCE) as committer:
+    with open_committer(root, PROVENANCE) as committer:
         for number, episode in enumerate(episodes):
-            committer.spool.put(SealedEpisode.of(number, encode(episode)))
-            committer.note(number)
+            committer.staging.put(StagedEpisode.of(number, encode(episode)))
+            committer.mark_staged(number)
         committer.commit()
 
 

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from egovcp.data import Episode
-from egovcp.data.encoded import EncodedEpisode, encode
-from egovcp.data.spool import SealedEpisode
+from egovcp.data.staging import EncodedEpisode, StagedEpisode, encode
 from egovcp.errors import DataError
 from egovcp.sim.scenario import Scenario
 
@@ -32,7 +31,7 @@ class Brief:
     @classmethod
     def of(cls, number: int, encoded: EncodedEpisode) -> Brief:
         """Summarise an episode."""
-        metadata = encoded.facts["metadata"]
+        metadata = encoded.record["metadata"]
         return cls(
             number,
             len(encoded),
@@ -50,7 +49,7 @@ class Report:
     """Planner ticks since its last report."""
     done: tuple[Brief, ...] = ()
     """Episodes that it has finished since."""
-    sealed: tuple[SealedEpisode, ...] = ()
+    sealed: tuple[StagedEpisode, ...] = ()
     """Those of them that it could not put into the spool itself."""
     failure: Exception | None = None
     """Why it has ended; nothing follows."""

@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from egovcp.cluster import connect, ray_package
-from egovcp.data.spool import SealedEpisode
+from egovcp.data.staging import StagedEpisode
 from egovcp.sim.scenario import Scenario
 from egovcp_collect.backend import Brief, Report, encode_numbered, portable
 from egovcp_collect.config import CollectConfig
@@ -41,7 +41,7 @@ class RemoteSimulation:
         except Exception as error:  # noqa: BLE001 - whatever it is, the collection must hear of it
             return Report(0, failure=portable(error))
         briefs = tuple(Brief.of(number, episode) for number, episode in encoded)
-        sealed = tuple(SealedEpisode.of(number, episode) for number, episode in encoded)
+        sealed = tuple(StagedEpisode.of(number, episode) for number, episode in encoded)
         return Report(progress.steps, briefs, sealed)
 
 

@@ -13,7 +13,7 @@ import draccus
 
 from egovcp.cli import run_command
 from egovcp.data import Provenance
-from egovcp.data.committer import Committer, committing
+from egovcp.data.committer import Committer, open_committer
 from egovcp.data.source import local_root
 from egovcp.packages import require_packages
 from egovcp.robot.controllers import make_controller
@@ -66,10 +66,10 @@ def collect(config: CollectConfig, command: str = "") -> None:
     provenance = _provenance(config, command)
     agree = partial(require_same, provenance) if config.resume else None
     root = local_root(config.dataset)
-    with committing(root, provenance, config.shard_episodes, agree) as committer:
+    with open_committer(root, provenance, config.shard_episodes, agree) as committer:
         missing = _missing(config, committer)
         require_room(committer.root.parent, missing, config.env, config.shard_episodes)
-        already = committer.committed + committer.sealed
+        already = committer.committed + committer.staged
         with Progress(config.episodes, already, lambda: _disk_bytes(committer)) as progress:
             try:
                 _collect(config, missing, committer, progress)
@@ -114,13 +114,13 @@ def _collect(
         while not crew.over and not stopped:
             for report in crew.poll():
                 for sealed in report.sealed:
-                    sealed.require_whole()
-                    committer.spool.put(sealed)
+                    sealed.verify()
+                    committer.staging.put(sealed)
                 for brief in report.done:
-                    committer.note(brief.number)
+                    committer.mark_staged(brief.number)
                 progress.add(report)
             progress.show()
-            if committer.shard_is_ready:
+            if committer.next_shard_is_complete:
                 committer.commit()
 
 
@@ -131,17 +131,17 @@ def _backend(config: CollectConfig, committer: Committer) -> Backend:
         return RayBackend(config)
     from egovcp_collect.local import LocalBackend
 
-    return LocalBackend(config, committer.spool.folder)
+    return LocalBackend(config, committer.staging.folder)
 
 
 def _disk_bytes(committer: Committer) -> int:
     files = committer.root.glob("data/*/*.parquet")
-    return committer.spool.size() + sum(file.stat().st_size for file in files)
+    return committer.staging.size() + sum(file.stat().st_size for file in files)
 
 
 def _summary(committer: Committer, progress: Progress) -> str:
     """The last line of the command."""
-    waiting = f", {committer.sealed} more sealed for --resume" if committer.sealed else ""
+    waiting = f", {committer.staged} more sealed for --resume" if committer.staged else ""
     return (
         f"{committer.committed} episodes, {committer.frames} steps, {progress.rate:.0f} steps/s"
         f"{waiting}"

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from egovcp.data import Episode
-from egovcp.data.spool import SealedEpisode, Spool
+from egovcp.data.staging import StagedEpisode, StagingDir
 from egovcp.hardware import available_cores
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
@@ -99,7 +99,7 @@ class LocalBackend:
 def _serve(pipe: Connection, config: CollectConfig, spool: Path, parent: int) -> None:
     """Runs in the process, until the pipe or the parent is gone."""
     try:
-        simulation, sealer = Simulation(config), _Sealer(Spool(spool))
+        simulation, sealer = Simulation(config), _Sealer(StagingDir(spool))
         while os.getppid() == parent:
             _receive(pipe, simulation)
             progress = simulation.advance(_REPORT_EVERY)
@@ -122,7 +122,7 @@ def _receive(pipe: Connection, simulation: Simulation) -> None:
 class _Sealer:
     """Seals episodes on a thread: the simulation goes on while the disk flushes."""
 
-    def __init__(self, spool: Spool) -> None:
+    def __init__(self, spool: StagingDir) -> None:
         self._spool = spool
         self._pool = ThreadPoolExecutor(1)
         self._pending: deque[Future[Brief]] = deque()
@@ -133,7 +133,7 @@ class _Sealer:
 
     def _put(self, number: int, episode: Episode) -> Brief:
         encoded = encode_numbered(number, episode)
-        self._spool.put(SealedEpisode.of(number, encoded))
+        self._spool.put(StagedEpisode.of(number, encoded))
         return Brief.of(number, encoded)
 
     def finished(self, wait: bool) -> tuple[Brief, ...]:

@@ -48,7 +48,7 @@ def dataset_problems(root: Path, progress: Progress | None = None) -> Iterator[D
     from egovcp.checks.duplicates import DuplicateEpisodes
     from egovcp.checks.layout import file_problems, table_problems
     from egovcp.checks.statistics import EpisodeStatistics, StatisticsCheck
-    from egovcp.data.hashes import hash_problems
+    from egovcp.data.metadata import hash_problems
 
     yield from _raised(hash_problems(root))
     reader = yield from _open(root)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from egovcp.data import DatasetReader, schema
-from egovcp.data.duplicates import DuplicateFinder
+from egovcp.data.provenance import DuplicateFinder
 from egovcp.errors import DataError
 
 

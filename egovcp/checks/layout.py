@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from egovcp.data import DatasetReader, metadata, schema
-from egovcp.data.parquet import damaged, open_parquet
+from egovcp.data.parquet import data_errors, open_parquet
 from egovcp.data.paths import files_below, require_file
 from egovcp.errors import DataError
 
@@ -34,7 +34,7 @@ def file_problems(reader: DatasetReader) -> Iterator[DataError]:
 
 def _content_problems(reader: DatasetReader, path: Path, frames: int) -> Iterator[DataError]:
     require_file(reader.root, path)
-    with damaged(path):
+    with data_errors(path):
         file = open_parquet(path)
         rows, columns = file.metadata.num_rows, set(file.schema_arrow.names)
     if rows != frames:
@@ -54,7 +54,7 @@ def table_problems(reader: DatasetReader) -> Iterator[DataError]:
     yield from (DataError.at(path, text) for text in _split_problems(info, len(reader)))
     index = 0
     for file in metadata.episode_files(reader.root):
-        with damaged(file):
+        with data_errors(file):
             listed = open_parquet(file).read(columns=["tasks"])["tasks"].to_pylist()
         for tasks in listed:
             if tasks != [reader.task(index)]:

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.data import DatasetReader, Episode, metadata, schema, stats
-from egovcp.data.columns import EPISODE_FEATURES
-from egovcp.data.parquet import damaged, open_parquet
+from egovcp.data.parquet import EPISODE_FEATURES, data_errors, open_parquet
 from egovcp.errors import DataError
 
 _RELATIVE = 1e-4  # of the column's range: statistics may have been gathered in float32
@@ -88,7 +87,7 @@ class EpisodeStatistics:
 
     def _all_rows(self) -> Iterator[tuple[Any, Mapping[str, Any]]]:
         for path in metadata.episode_files(self._reader.root):
-            with damaged(path):
+            with data_errors(path):
                 file = open_parquet(path)
                 names = [n for n in file.schema_arrow.names if n.startswith("stats/")]
                 for group in range(file.num_row_groups):

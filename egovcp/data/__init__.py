@@ -6,48 +6,44 @@ In one line, a dataset as padded arrays [Batch, Time, Data]::
 """
 
 from egovcp.cli import DatasetConfig
-from egovcp.data.arrays import load_arrays, open_dataset
-from egovcp.data.bounded import BoundedStream, ShuffleConfig
 from egovcp.data.episode import Episode
-from egovcp.data.heldout import describe_heldout
-from egovcp.data.index import EpisodeIndex
-from egovcp.data.mix import Mix
-from egovcp.data.order import Shard
+from egovcp.data.index import EpisodeIndex, describe_heldout, sample_files
+from egovcp.data.order import Mix
 from egovcp.data.provenance import Provenance
-from egovcp.data.reader import DatasetReader
-from egovcp.data.returns import ReturnConfig
-from egovcp.data.sample import sample_files
-from egovcp.data.store import EpisodeStore
-from egovcp.data.stream import SequenceStream, StreamConfig
-from egovcp.data.survey import Survey, survey, survey_sample
-from egovcp.data.targets import is_terminal, mc_return, mc_valid
-from egovcp.data.windows import Batch
+from egovcp.data.reader import DatasetReader, load_arrays, open_dataset
+from egovcp.data.returns import ReturnConfig, is_terminal, mc_return, mc_valid
+from egovcp.data.samplers import InMemorySampler, SamplerConfig, ShuffleConfig, StreamingSampler
+from egovcp.data.store import Batch, EpisodeStore
+from egovcp.data.training_stats import (
+    TrainingStats,
+    compute_training_stats,
+    estimate_training_stats,
+)
 from egovcp.data.writer import DatasetWriter
 
 __all__ = [
     "Batch",
-    "BoundedStream",
     "DatasetConfig",
     "DatasetReader",
     "DatasetWriter",
     "Episode",
     "EpisodeIndex",
     "EpisodeStore",
+    "InMemorySampler",
     "Mix",
     "Provenance",
     "ReturnConfig",
-    "SequenceStream",
-    "Shard",
+    "SamplerConfig",
     "ShuffleConfig",
-    "StreamConfig",
-    "Survey",
+    "StreamingSampler",
+    "TrainingStats",
+    "compute_training_stats",
     "describe_heldout",
+    "estimate_training_stats",
     "is_terminal",
     "load_arrays",
     "mc_return",
     "mc_valid",
     "open_dataset",
     "sample_files",
-    "survey",
-    "survey_sample",
 ]

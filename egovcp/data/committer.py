@@ -1,125 +1,131 @@
-"""Turns sealed episodes into a dataset, shard by shard, and never into anything less.
+"""Turns staged episodes into a dataset, shard by shard, safe against crashes.
 
 At every moment ``root`` either does not exist or is a complete dataset of episodes 0..n-1 of the
-run (after a removal of episodes: without those). What is sealed but not committed, and the lock,
-lie in a hidden folder beside it::
+collection (without those that were removed from it). Staged episodes and the lock are in a hidden
+folder beside it::
 
     .NAME.collect/
         lock           held while a collector runs
-        run.json       what the run is, until a dataset says so
-        sealed/        episodes that wait for the shard before them to be complete
-        next/          the version that is being built
+        run.json       provenance of the collection, until the dataset has it
+        sealed/        staged episodes, which wait until the shards before theirs are complete
+        next/          the version that is being written
 """
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any, Final
+
+import pyarrow as pa
 
 from egovcp.atomic import removed_on_error
-from egovcp.data import files, metadata, schema
-from egovcp.data.continued import read_version
-from egovcp.data.destination import is_vacant, make_parent, require_replaceable, resolve_root
-from egovcp.data.encoded import EncodedEpisode
-from egovcp.data.lock import only_writer
-from egovcp.data.provenance import Provenance, parse_provenance
-from egovcp.data.spool import Spool
-from egovcp.data.version import Contents, Version, publish, recover
+from egovcp.data import files, metadata, schema, stats
+from egovcp.data.destination import (
+    is_vacant,
+    make_parent,
+    require_replaceable,
+    resolve_root,
+    writer_lock,
+)
+from egovcp.data.metadata import load_hashes, verify_hashes
+from egovcp.data.parquet import data_errors, open_parquet
+from egovcp.data.provenance import SOURCES, Provenance, parse_provenance
+from egovcp.data.staging import EncodedEpisode, StagingDir
+from egovcp.data.version import VersionContents, VersionWriter, publish, recover, shard_paths
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
 
-type Agree = Callable[[Provenance], None]
+_STAGING: Final = "sealed"  # name on disk, which unfinished collections of older versions have
+
+type CheckProvenance = Callable[[Provenance], None]
 
 
 def work_folder(root: Path) -> Path:
-    """Where a collection keeps what is not in the dataset yet; beside the real folder if ``root``
-    is a symbolic link."""
+    """Folder of a collection's lock and staged episodes; if ``root`` is a symbolic link, beside its
+    target."""
     real = resolve_root(root)
     return real.with_name(f".{real.name}.collect")
 
 
 class Committer:
-    """Knows which episodes of a run are safe, and commits them. Made by `committing`."""
+    """Tracks and commits the staged episodes of a collection. Created by `open_committer`."""
 
     def __init__(self, root: Path, provenance: Provenance, shard_episodes: int) -> None:
         self.root = root
         self.provenance = provenance
-        self.spool = Spool(work_folder(root) / "sealed")
+        self.staging = StagingDir(work_folder(root) / _STAGING)
         self.committed = 0
         """Episodes in the dataset."""
         self.frames = 0
         """Frames in the dataset."""
         self.next_number = 0
-        """Number, in the run, of the next episode to commit. It is `committed`, unless episodes
-        were removed from the dataset: those are not collected again."""
-        self._contents = Contents(shard_episodes)
+        """Number, in the collection, of the next episode to commit. It is more than `committed` if
+        episodes were removed from the dataset: those are not collected again."""
+        self._contents = VersionContents(shard_episodes)
         self._tail: list[EncodedEpisode] = []
-        self._sealed: set[int] = set()
+        self._staged: set[int] = set()
 
     @property
-    def sealed(self) -> int:
+    def staged(self) -> int:
         """Episodes that wait to be committed."""
-        return len(self._sealed)
+        return len(self._staged)
 
     def missing(self, episodes: int) -> list[int]:
-        """Numbers that are not sealed yet of a dataset of so many episodes in all."""
+        """Numbers of the episodes that are still to be staged for a dataset of ``episodes``."""
         last = self.next_number + episodes - self.committed
-        return [n for n in range(self.next_number, last) if n not in self._sealed]
+        return [n for n in range(self.next_number, last) if n not in self._staged]
 
-    def note(self, number: int) -> None:
-        """An episode has been put into the spool."""
-        self._sealed.add(number)
+    def mark_staged(self, number: int) -> None:
+        """Register an episode that was put into `staging`."""
+        self._staged.add(number)
 
     def ready(self) -> int:
-        """How many sealed episodes follow the committed ones without a gap."""
+        """Number of staged episodes that follow the committed ones without a gap."""
         count = 0
-        while self.next_number + count in self._sealed:
+        while self.next_number + count in self._staged:
             count += 1
         return count
 
     @property
-    def shard_is_ready(self) -> bool:
-        """Whether the sealed episodes complete the shard that comes next."""
-        size = self._contents.shard_episodes
-        return self.ready() >= size - len(self._tail)
+    def next_shard_is_complete(self) -> bool:
+        """Whether the staged episodes complete the next shard."""
+        return self.ready() + len(self._tail) >= self._contents.shard_episodes
 
     def commit(self) -> list[int]:
-        """Commit every sealed episode that follows without a gap; their numbers.
+        """Commit every staged episode that follows without a gap; returns their numbers.
 
-        When it returns they are in the dataset, flushed to the disk. If it fails the dataset is as
-        it was, and nothing sealed is lost.
+        On return they are in the dataset, flushed to the disk. On failure the dataset is unchanged
+        and no staged episode is lost.
 
         Raises:
             OSError: the disk is full or broken.
-            DataError: the dataset is not the one that was committed.
+            DataError: the dataset has been removed or changed.
         """
         numbers = list(range(self.next_number, self.next_number + self.ready()))
-        episodes = self._take(numbers)
-        if episodes:
-            self._publish(episodes)
-            self.next_number += len(episodes)
-            self._sealed.difference_update(numbers)
-            self.spool.drop_before(self.next_number)
-        return numbers[: len(episodes)]
-
-    def _take(self, numbers: list[int]) -> list[EncodedEpisode]:
-        """The episodes up to the first that is not whole any more, which becomes missing."""
-        out = []
+        episodes: list[EncodedEpisode] = []
         for number in numbers:
-            encoded = self.spool.get(number)
-            if encoded is None:
-                self._sealed.discard(number)
+            encoded = self.staging.get(number)
+            if encoded is None:  # damaged
+                self._staged.discard(number)
                 break
-            out.append(encoded)
-        return out
+            episodes.append(encoded)
+        committed = numbers[: len(episodes)]
+        if committed:
+            self._publish(episodes)
+            self.next_number += len(committed)
+            self._staged.difference_update(committed)
+            self.staging.drop_before(self.next_number)
+        return committed
 
     def _publish(self, episodes: list[EncodedEpisode]) -> None:
         previous = self.root if self.committed else None
         if previous is not None and not (self.root / schema.INFO_PATH).is_file():
             raise DataError(f"{self.root} has been removed or changed during the collection")
-        version = Version(self._next, self.provenance, self._contents, previous)
+        version = VersionWriter(self._next, self.provenance, self._contents, previous)
         try:
             for encoded in (*self._tail, *episodes):
                 version.add(encoded)
@@ -127,31 +133,33 @@ class Committer:
             publish(self._next, self.root, replace=previous is not None)
         finally:
             version.discard()
-        self.committed, self.frames = len(contents.records), contents.frames
-        self._contents, self._tail = contents.split([*self._tail, *episodes])
+        self.committed, self.frames = version.episodes, version.frames
+        tail = [*self._tail, *episodes]
+        self._tail = tail[len(tail) - (self.committed - len(contents.records)) :]
+        self._contents = contents
 
     @property
     def _next(self) -> Path:
         return work_folder(self.root) / "next"
 
-    def _load(self, agree: Agree) -> None:
-        """Take up what an earlier run left."""
+    def _load(self, check: CheckProvenance) -> None:
+        """Load the dataset and the staged episodes of an earlier run."""
         recover(self._next, self.root)
         shutil.rmtree(self._next, ignore_errors=True)
         run = work_folder(self.root) / "run.json"
         if not is_vacant(self.root):
-            existing = read_version(self.root)
-            agree(existing.provenance)
-            self._contents, self._tail = existing.contents, existing.tail
-            self.next_number = existing.next_number
+            state = load_append_state(self.root)
+            check(state.provenance)
+            self._contents, self._tail = state.contents, state.tail
+            self.next_number = state.next_number
         elif run.is_file():
-            agree(parse_provenance(metadata.load_object(run), run))
+            check(parse_provenance(metadata.load_json_object(run), run))
         self.committed = len(self._contents.records) + len(self._tail)
         self.frames = self._contents.frames + sum(map(len, self._tail))
-        self.spool.folder.mkdir(exist_ok=True)
-        self.spool.sweep()
-        self.spool.drop_before(self.next_number)
-        self._sealed = self.spool.numbers()
+        self.staging.folder.mkdir(exist_ok=True)
+        self.staging.remove_invalid()
+        self.staging.drop_before(self.next_number)
+        self._staged = self.staging.numbers()
         with removed_on_error(run.with_suffix(".partial")) as partial:
             partial.unlink(missing_ok=True)
             files.write_json(partial, asdict(self.provenance))
@@ -160,60 +168,148 @@ class Committer:
 
 
 @contextmanager
-def committing(
+def open_committer(
     root: Path,
     provenance: Provenance,
     shard_episodes: int = schema.SHARD_EPISODES,
-    resume: Agree | None = None,
+    resume: CheckProvenance | None = None,
 ) -> Iterator[Committer]:
-    """A committer that alone may write the dataset at ``root``.
+    """Lock the dataset at ``root`` and yield its committer.
 
     Args:
-        root: the dataset; a symbolic link stands for the folder that it leads to.
-        provenance: what its ``meta/collection.json`` will say.
-        shard_episodes: episodes per shard of a new dataset; an old one keeps its own.
-        resume: take up a dataset or an unfinished collection that is there; called with its
-            provenance, it raises if the two cannot be one. None: there must be none.
+        root: the dataset; a symbolic link is followed.
+        provenance: how it is collected.
+        shard_episodes: episodes per shard of a new dataset; an existing one keeps its value.
+        resume: called with the provenance of an existing dataset or unfinished collection; it
+            raises if that cannot be continued. None: there must be none.
 
     Raises:
-        UsageError: something is there and ``resume`` is None, or ``root`` cannot exist.
-        EnvironmentFailure: another process writes it, nothing can be written there, or it is a
-            mount point.
-        DataError: what is there is damaged.
+        UsageError: ``root`` exists and ``resume`` is None, or ``root`` cannot exist.
+        EnvironmentFailure: another process holds the lock, or ``root`` is not writable or a mount
+            point.
+        DataError: the existing dataset is damaged.
     """
     root = resolve_root(root)
     make_parent(root)
     work = work_folder(root)
     if resume is None:
-        _require_nothing(root, work)
+        _require_unused(root, work)
     require_replaceable(root)
     try:
         work.mkdir(exist_ok=True)
     except OSError as error:
         raise EnvironmentFailure(f"cannot write beside {root}: {error.strerror}") from error
-    with only_writer(root, work):
+    with writer_lock(root, work):
         committer = Committer(root, provenance, shard_episodes)
         try:
-            committer._load(resume or _nothing_to_agree)
+            committer._load(resume or (lambda _: None))
             yield committer
         finally:
-            # asked of the disk: a run that was refused has not looked at what is sealed
-            if not any((work / "sealed").glob("*.arrow")):
+            # On the disk: a run that was refused has not loaded the staged episodes.
+            if not any((work / _STAGING).glob("*.arrow")):
                 with suppress(OSError):
                     shutil.rmtree(work)
 
 
-def _nothing_to_agree(provenance: Provenance) -> None:
-    """A new collection has no predecessor."""
-
-
-def _require_nothing(root: Path, work: Path) -> None:
+def _require_unused(root: Path, work: Path) -> None:
     if not is_vacant(root):
         raise UsageError(
             f"{root} exists already; continue it with --resume, or choose another --dataset.root"
         )
-    if any((work / "sealed").glob("*.arrow")):
+    if any((work / _STAGING).glob("*.arrow")):
         raise UsageError(
-            f"an unfinished collection of {root} lies in {work}; continue it with --resume, or "
+            f"an unfinished collection of {root} is in {work}; continue it with --resume, or "
             "remove that folder"
         )
+
+
+@dataclass(frozen=True)
+class AppendState:
+    """What is needed to append to a dataset."""
+
+    contents: VersionContents
+    """Content of the complete shards."""
+    tail: list[EncodedEpisode]
+    """Episodes of the last shard if it is not complete."""
+    provenance: Provenance
+    next_number: int
+    """Number, in the collection, of the next episode; more than the number of episodes if some
+    were removed."""
+
+
+def load_append_state(root: Path) -> AppendState:
+    """Verify a dataset and read what is needed to append to it."""
+    verify_hashes(root)
+    info = metadata.load_info(root)
+    table = metadata.load_episode_table(root, info)
+    episodes = len(table.length)
+    collection = metadata.load_collection(root, table.length)
+    size, hashes = collection.get("shard_episodes"), load_hashes(root)
+    if not isinstance(size, int) or size < 1 or not hashes:
+        raise DataError(
+            f"{root} was not written in shards by egovcp and cannot be extended; "
+            "`egovcp-dataset repair` writes a copy that can"
+        )
+    shards = [_episodes_table(root, number) for number in range(-(-episodes // size))]
+    matrices = [stats.from_arrow(shard) for shard in shards]
+    lengths = [shard["length"].to_pylist() for shard in shards]
+    records = collection["episodes"]
+    full = episodes // size
+    kept = full * size
+    present = {record["task"] for record in records[:kept]}
+    contents = VersionContents(
+        size,
+        [json.dumps(record) for record in records[:kept]],
+        {t: index for index, t in sorted(metadata.load_tasks(root).items()) if t in present},
+        [(stats.aggregate(matrices[n], lengths[n]), sum(lengths[n])) for n in range(full)],
+        {name: hashes[name] for number in range(full) for name in shard_paths(number)},
+    )
+    tail = _read_tail(root, full, records[kept:], matrices[full]) if kept < episodes else []
+    provenance = parse_provenance(collection, root / schema.COLLECTION_PATH)
+    return AppendState(contents, tail, provenance, _next_number(root, provenance, records))
+
+
+def _next_number(root: Path, provenance: Provenance, records: list[dict[str, Any]]) -> int:
+    """The highest number plus one, so that no episode is collected twice."""
+    path = root / schema.COLLECTION_PATH
+    elsewhere = (
+        f"{root} holds episodes of several collections and cannot be extended; collect into "
+        "another folder, then join the two with `egovcp-dataset merge`"
+    )
+    if SOURCES in provenance.config:
+        raise UsageError(elsewhere)
+    first: dict[int, int] = {}  # episode number -> index in the dataset
+    for index, record in enumerate(records):
+        facts = record.get("metadata", {})
+        number = facts.get("episode", index)
+        if not isinstance(number, int) or isinstance(number, bool) or number < 0:
+            raise DataError.at(path, f"its number is {number!r}, expected an integer", index)
+        if facts.get("seed", provenance.seed) != provenance.seed:
+            raise UsageError(elsewhere)
+        if first.setdefault(number, index) != index:
+            problem = f"is number {number} of the collection, as episode {first[number]}"
+            raise DataError.at(path, f"{problem}; `egovcp-dataset repair` keeps one", index)
+    return max(first, default=-1) + 1
+
+
+def _episodes_table(root: Path, number: int) -> pa.Table:
+    path = root / shard_paths(number)[1]
+    with data_errors(path):
+        return open_parquet(path).read()
+
+
+def _read_tail(
+    root: Path, number: int, records: list[dict[str, Any]], matrices: list[stats.Matrix]
+) -> list[EncodedEpisode]:
+    path = root / shard_paths(number)[0]
+    ordered = schema.episode_schema()
+    with data_errors(path):
+        file = open_parquet(path)
+        tables = [
+            file.read_row_group(i, columns=ordered.names).select(ordered.names).cast(ordered)
+            for i in range(len(records))
+        ]
+    return [
+        EncodedEpisode(table, record, matrix[:, stats.DATA_COLUMNS])
+        for table, record, matrix in zip(tables, records, matrices, strict=True)
+    ]

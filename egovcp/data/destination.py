@@ -1,15 +1,20 @@
-"""Where a dataset may be written.
+"""Checks of the folder to which a dataset is written, and its lock.
 
-A dataset folder is replaced as a whole, by renaming folders beside it. The checks here find out
-before any work starts whether that is possible.
+A dataset folder is replaced as a whole, by renaming folders beside it. The checks show before any
+work starts whether that is possible.
 """
 
 from __future__ import annotations
 
 import os
 import re
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Final
+
+from filelock import FileLock, Timeout
 
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.outputs import nearest_existing, require_writable
@@ -22,7 +27,7 @@ def resolve_root(root: str | Path) -> Path:
     """The absolute path of a dataset folder without symbolic links; it need not exist.
 
     Locks, staging folders and renames must use this path: through a link they would replace the
-    link, and two writers that use different names would not see each other.
+    link, and two writers that use different names would have different locks.
 
     Raises:
         UsageError: the links form a loop.
@@ -42,14 +47,11 @@ def is_vacant(root: Path) -> bool:
 
 
 def require_new(root: Path) -> None:
-    """Raise if there is something at ``root``, or it cannot be created; nothing is overwritten.
-
-    Args:
-        root: as `resolve_root` returns it.
+    """Raise unless ``root`` is absent or an empty folder, and can be created.
 
     Raises:
-        UsageError: ``root`` is a file, lies below a file, or is a folder that is not empty.
-        EnvironmentFailure: no permission, a file system that takes no files, or a mount point.
+        UsageError: ``root`` is a file, is below a file, or is a folder that is not empty.
+        EnvironmentFailure: no permission, a read-only file system, or a mount point.
     """
     if not is_vacant(root):
         raise UsageError(
@@ -62,7 +64,7 @@ def require_new(root: Path) -> None:
 
 
 def require_replaceable(root: Path) -> None:
-    """Raise `EnvironmentFailure` if ``root`` is a mount point: it cannot be renamed."""
+    """Raise `EnvironmentFailure` if ``root`` is a mount point, which cannot be renamed."""
     if is_mount_point(root):
         raise EnvironmentFailure(
             f"{root} is a mount point; a dataset is replaced as a whole folder, which a mount "
@@ -71,7 +73,7 @@ def require_replaceable(root: Path) -> None:
 
 
 def is_mount_point(folder: Path) -> bool:
-    """Whether a file system is mounted at ``folder``, a bind mount of the same one included."""
+    """Whether a file system is mounted at ``folder``, bind mounts included."""
     return os.path.ismount(folder) or str(folder) in _mount_points()
 
 
@@ -85,11 +87,7 @@ def _mount_points() -> set[str]:
 
 
 def make_parent(root: Path) -> None:
-    """Make the folder that will hold ``root``.
-
-    Raises:
-        UsageError: it would lie below a file.
-    """
+    """Create the parent of ``root``; raises `UsageError` if that would be below a file."""
     try:
         root.parent.mkdir(parents=True, exist_ok=True)
     except (FileExistsError, NotADirectoryError) as error:
@@ -97,4 +95,31 @@ def make_parent(root: Path) -> None:
 
 
 def _below_file(root: Path) -> UsageError:
-    return UsageError(f"output folder {root} would lie below a file; choose another")
+    return UsageError(f"output folder {root} would be below a file; choose another")
+
+
+@contextmanager
+def writer_lock(root: Path, folder: Path) -> Iterator[None]:
+    """Hold the lock of the dataset at ``root``, a file in ``folder``, within the block.
+
+    The system releases it when the process ends.
+
+    Raises:
+        EnvironmentFailure: immediately, if another process holds it.
+    """
+    lock, owner, holder = FileLock(folder / "lock"), folder / "owner", "another process"
+    try:
+        lock.acquire(timeout=0)
+    except Timeout as error:
+        with suppress(OSError):
+            holder = owner.read_text(encoding="utf-8") or holder
+        raise EnvironmentFailure(
+            f"{root} is being written by {holder}; wait for it, or choose another folder"
+        ) from error
+    try:
+        owner.write_text(f"process {os.getpid()} on {socket.gethostname()}", encoding="utf-8")
+        yield
+    finally:
+        with suppress(OSError):
+            owner.unlink(missing_ok=True)
+        lock.release()

@@ -1,4 +1,4 @@
-"""One episode as arrays, and what makes it valid."""
+"""One episode as arrays, and its validation."""
 
 from __future__ import annotations
 
@@ -13,13 +13,23 @@ from numpy.typing import NDArray
 from egovcp import spec
 from egovcp.errors import DataError, suggest
 
-_ACTION_SLACK = 1e-6  # float32 rounding of an action on the wall of its box
+_ACTION_SLACK = 1e-6  # float32 rounding of an action on the boundary of its box
 
-#: Longest episode, frames (33 minutes); an episode is read as a whole.
+#: Longest episode, frames (33 minutes), because an episode is read as a whole.
 EPISODE_FRAMES: Final = 50_000
 
-#: The arrays of an episode, in the order in which its digest takes them.
-ARRAYS: Final = ("depth", "state", "action", "reward", "done", "success", "truncated")
+type FrameLayout = tuple[tuple[int, ...], type[np.generic]]
+
+#: Array of an episode -> shape and dtype of a frame, in the order of the digest.
+FRAME_LAYOUT: Final[Mapping[str, FrameLayout]] = {
+    "depth": ((spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16),
+    "state": ((spec.STATE_DIM,), np.float32),
+    "action": ((spec.ACTION_DIM,), np.float32),
+    "reward": ((), np.float32),
+    "done": ((), np.bool_),
+    "success": ((), np.bool_),
+    "truncated": ((), np.bool_),
+}
 
 
 @dataclass(frozen=True)
@@ -42,7 +52,7 @@ class Episode:
     success: NDArray[np.bool_]
     """(T,) the task's success after the action; never ends an episode."""
     truncated: NDArray[np.bool_]
-    """(T,) the episode ended with this row because its time was up."""
+    """(T,) the episode ended with this row because of the time limit."""
     task: str
     """One of ``spec.TASKS``."""
     time_limit: int
@@ -55,26 +65,25 @@ class Episode:
 
     @property
     def terminated(self) -> bool:
-        """The episode ended in failure (a fall), not because its time was up."""
+        """The episode ended in failure (a fall), not because of the time limit."""
         return bool(self.done[-1] and not self.truncated[-1])
 
     def digest(self) -> str:
-        """SHA-256 of the arrays' little-endian bytes, hexadecimal: the same wherever and by
-        whatever tool the episode is stored."""
+        """Hexadecimal SHA-256 of the arrays' little-endian bytes, independent of the storage."""
         out = hashlib.sha256()
-        for name in ARRAYS:
+        for name in FRAME_LAYOUT:
             array = np.ascontiguousarray(getattr(self, name))
             out.update(array.astype(array.dtype.newbyteorder("<"), copy=False).data)
         return out.hexdigest()
 
     def validate(self, where: str = "episode") -> None:
-        """Raise `DataError` saying what is wrong, and at which frame of ``where``."""
+        """Raise `DataError` with the first problem; ``where`` names the episode."""
         for frame, problem in self.problems():
             place = where if frame is None else f"{where}, frame {frame}"
             raise DataError(f"{place}: {problem}")
 
     def problems(self) -> Iterator[tuple[int | None, str]]:
-        """Everything that is wrong: (first frame at fault, or None; what is wrong)."""
+        """All problems: (first frame at fault, or None; the problem)."""
         layout = list(_layout_problems(self))
         yield from layout
         if not layout:
@@ -90,17 +99,8 @@ def _layout_problems(episode: Episode) -> Iterator[tuple[int | None, str]]:
         yield None, "no frames, expected at least one"
     if length > EPISODE_FRAMES:
         yield None, f"{length} frames, expected at most {EPISODE_FRAMES}"
-    layout: dict[str, tuple[tuple[int, ...], type[np.generic]]] = {
-        "depth": ((length, spec.DEPTH_ROWS, spec.DEPTH_COLS), np.uint16),
-        "state": ((length, spec.STATE_DIM), np.float32),
-        "action": ((length, spec.ACTION_DIM), np.float32),
-        "reward": ((length,), np.float32),
-        "done": ((length,), np.bool_),
-        "success": ((length,), np.bool_),
-        "truncated": ((length,), np.bool_),
-    }
-    for name, (shape, dtype) in layout.items():
-        array = getattr(episode, name)
+    for name, (frame, dtype) in FRAME_LAYOUT.items():
+        array, shape = getattr(episode, name), (length, *frame)
         if array.shape != shape or array.dtype != dtype:
             found, expected = f"{array.dtype} {array.shape}", f"{np.dtype(dtype)} {shape}"
             yield None, f"{name} is {found}, expected {expected}"
@@ -110,7 +110,7 @@ def _value_problems(episode: Episode) -> Iterator[tuple[int, str]]:
     for name in ("state", "action", "reward"):
         finite = np.isfinite(getattr(episode, name)).reshape(len(episode), -1).all(axis=1)
         yield from _where_not(finite, f"{name} is not finite")
-    inside = ~(np.abs(episode.action).max(axis=1) > 1 + _ACTION_SLACK)  # NaN is told above
+    inside = ~(np.abs(episode.action).max(axis=1) > 1 + _ACTION_SLACK)  # NaN is reported above
     yield from _where_not(inside, "action lies outside [-1, 1]")
     farthest = round(spec.DEPTH_MAX_M * 1000)
     deepest = episode.depth.reshape(len(episode), -1).max(axis=1)

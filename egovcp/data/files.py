@@ -1,7 +1,6 @@
-"""Every change that a dataset makes to the disk, and its flushing.
+"""All changes of a dataset on the disk, and their flushing.
 
-All writers go through this module: it is the one place where a disk can fail, and where the tests
-make it fail.
+All writers use this module, so that tests can simulate disk failures in one place.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ _NO_LINK: Final = (errno.EPERM, errno.ENOTSUP, errno.EMLINK, errno.ENOSYS, errno
 
 
 def create(path: Path) -> IO[bytes]:
-    """Open a new file for writing; its folder is made if need be."""
+    """Open a new file for writing; its folder is created if it does not exist."""
     path.parent.mkdir(parents=True, exist_ok=True)
     return path.open("xb")
 
@@ -33,12 +32,12 @@ def write_bytes(path: Path, content: bytes | memoryview) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write ``content`` as JSON, strictly: NaN and infinities raise `ValueError`."""
+    """Write ``content`` as strict JSON: NaN and infinities raise `ValueError`."""
     write_bytes(path, (json.dumps(content, indent=1, allow_nan=False) + "\n").encode())
 
 
 def sync_tree(folder: Path) -> None:
-    """Flush every file and folder below ``folder``, and itself, to the disk."""
+    """Flush ``folder`` and everything in it to the disk."""
     for path in folder.rglob("*"):
         sync(path)
     sync(folder)
@@ -59,7 +58,7 @@ def rename(source: Path, target: Path) -> None:
 
 
 def link(source: Path, target: Path) -> None:
-    """The same file under a second name; a copy where the file system has no hard links."""
+    """Hard-link ``source`` to ``target``; copies if the file system has no hard links."""
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
         os.link(source, target)
@@ -71,10 +70,10 @@ def link(source: Path, target: Path) -> None:
 
 
 def exchange(one: Path, other: Path) -> None:
-    """Swap two folders in one step: whoever looks sees both as they were, or both swapped.
+    """Swap two folders atomically.
 
     Raises:
-        OSError: EINVAL or ENOSYS where the system or the file system cannot.
+        OSError: EINVAL or ENOSYS if the system or the file system does not support it.
     """
     if not sys.platform.startswith("linux"):
         raise OSError(errno.ENOSYS, "exchanging folders needs Linux", str(one))

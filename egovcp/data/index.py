@@ -1,4 +1,9 @@
-"""Which episodes of one or several datasets a split consists of; their content stays on disk."""
+"""The episodes of a split of one or several datasets; their arrays stay on disk.
+
+Held-out episodes are chosen by a hash of what an episode *is*. The choice depends on neither
+order nor number of episodes, so a dataset that is extended, merged or read in part keeps the
+same episodes out of training.
+"""
 
 from __future__ import annotations
 
@@ -8,18 +13,54 @@ from dataclasses import dataclass
 from functools import cached_property
 from itertools import compress
 from pathlib import Path
-from typing import Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from egovcp.data.columns import EPISODE_FEATURES
-from egovcp.data.digests import Digests
 from egovcp.data.episode import Episode
+from egovcp.data.parquet import EPISODE_FEATURES
 from egovcp.data.reader import DatasetReader
-from egovcp.data.split import HELDOUT_FRACTION, in_split
-from egovcp.errors import DataError
+from egovcp.errors import DataError, UsageError, suggest
+
+SPLITS: Final = ("train", "heldout", "all")
+HELDOUT_FRACTION: Final = 0.05
+#: `describe_heldout` lists at most this many episode numbers.
+LISTED: Final = 5000
+RULE: Final = (
+    "the first 8 bytes of the SHA-256 of task/seed/episode, as a share of 2**64, are below the "
+    "fraction; if none is, the episode with the lowest share"
+)
+
+
+def in_split(
+    identities: Sequence[str], split: str, fraction: float = HELDOUT_FRACTION
+) -> list[bool]:
+    """Whether each of the episodes with these identities belongs to ``split``.
+
+    An episode is held out if its hash, as a share of all hashes, is below ``fraction``. If
+    none of at least two episodes is, the one with the lowest hash is held out, so that a
+    small dataset can be trained on, too.
+
+    Raises:
+        UsageError: no such split.
+    """
+    if split not in SPLITS:
+        raise UsageError(f"unknown split {split!r}{suggest(split, SPLITS)}")
+    if split == "all":
+        return [True] * len(identities)
+    shares = [_share(identity) for identity in identities]
+    bound = fraction
+    if min(shares) >= fraction > 0:
+        bound = min((share for share in shares if share > min(shares)), default=fraction)
+    return [(share < bound) == (split == "heldout") for share in shares]
+
+
+def _share(identity: str) -> float:
+    """The identity's hash as a number in [0, 1)."""
+    digest = hashlib.sha256(identity.encode()).digest()
+    return int.from_bytes(digest[:8], "big") / 2**64
 
 
 @dataclass(frozen=True)
@@ -29,9 +70,9 @@ class EpisodeIndex:
     readers: tuple[DatasetReader, ...]
     """The datasets."""
     dataset: NDArray[np.int64]
-    """(E,) which of the datasets holds each episode."""
+    """(E,) dataset of each episode, an index into `readers`."""
     number: NDArray[np.int64]
-    """(E,) the number of each episode there."""
+    """(E,) number of each episode in its dataset."""
 
     @classmethod
     def of(
@@ -40,20 +81,20 @@ class EpisodeIndex:
         split: str = "all",
         heldout_fraction: float = HELDOUT_FRACTION,
     ) -> Self:
-        """The episodes of a split, of those that are asked for.
+        """The selected episodes of the datasets that belong to a split.
 
         Raises:
             DataError: the datasets cannot be mixed, or the split is empty.
             UsageError: there is no such split.
         """
         require_mixable(readers)
-        places = [(d, i) for d, reader in enumerate(readers) for i in reader.chosen.tolist()]
+        places = [(d, i) for d, reader in enumerate(readers) for i in reader.selected.tolist()]
         identities = [readers[d].identity(i) for d, i in places]
         chosen = list(compress(places, in_split(identities, split, heldout_fraction)))
         if not chosen:
             raise DataError(
                 f"none of the {len(places)} episodes falls into split {split!r}: collect more, or "
-                "name other datasets beside them"
+                "add other datasets"
             )
         dataset, number = np.array(chosen, dtype=np.int64).T
         return cls(tuple(readers), dataset, number)
@@ -61,10 +102,10 @@ class EpisodeIndex:
     def __len__(self) -> int:
         return len(self.number)
 
-    def spread(self, per_task: int) -> EpisodeIndex:
-        """At most ``per_task`` episodes of each task, evenly spread, in their order."""
+    def subsample(self, per_task: int) -> EpisodeIndex:
+        """At most ``per_task`` episodes of each task, evenly spaced, in order."""
         tasks = np.array(self.tasks)
-        kept = [spread(np.flatnonzero(tasks == task), per_task) for task in sorted(set(tasks))]
+        kept = [evenly_spaced(np.flatnonzero(tasks == t), per_task) for t in sorted(set(tasks))]
         return self.select(np.sort(np.concatenate(kept)))
 
     def select(self, episodes: NDArray[np.int64]) -> EpisodeIndex:
@@ -89,7 +130,7 @@ class EpisodeIndex:
 
     @property
     def identities(self) -> tuple[str, ...]:
-        """(E,) what each episode is (see `DatasetReader.identity`)."""
+        """(E,) `DatasetReader.identity` of each episode."""
         return tuple(self.readers[d].identity(i) for d, i in self._places)
 
     @property
@@ -99,56 +140,38 @@ class EpisodeIndex:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hash of which episodes these are, in order."""
+        """Hash of the episodes' identities and lengths, in order."""
         return fingerprint(self.identities, self.length)
 
     @property
     def is_remote(self) -> bool:
-        """Whether some of the episodes come from the Hub as they are read."""
+        """Whether some data files are downloaded from the Hub when they are read."""
         return any(reader.is_remote for reader in self.readers)
 
-    def bring(self) -> None:
-        """Have the files of all its episodes here.
-
-        Raises:
-            DataError: a dataset on the Hub is incomplete.
-            EnvironmentFailure: the Hub cannot be reached, or refuses.
-        """
-        one_of_each = dict(zip(self.files, range(len(self)), strict=True)).values()
-        for episode in tqdm(one_of_each, unit="file", desc="fetch", leave=False):
+    def download(self) -> None:
+        """Download the files of all its episodes that are not on disk."""
+        one_per_file = dict(zip(self.files, range(len(self)), strict=True)).values()
+        for episode in tqdm(one_per_file, unit="file", desc="fetch", leave=False):
             reader, number = self._place(episode)
-            reader.bring(number)
+            reader.download(number)
 
-    def expect(self, episodes: Sequence[int]) -> None:
-        """Say which episodes are read next, so that their files come meanwhile."""
+    def prefetch(self, episodes: Sequence[int]) -> None:
+        """Start to download the files of the episodes that are read next."""
         for reader in self.readers:
             if reader.is_remote:
                 places = map(self._place, episodes)
-                reader.expect([number for other, number in places if other is reader])
+                reader.prefetch([number for other, number in places if other is reader])
 
-    def read(self, episode: int, digests: Digests | None = None) -> Episode:
-        """Read one episode and validate it (see `DatasetReader.read`).
-
-        Raises:
-            DataError: the file is damaged or its content violates the specification.
-        """
+    def read(self, episode: int) -> Episode:
+        """Read one episode and validate it (see `DatasetReader.read`)."""
         reader, number = self._place(episode)
-        return reader.read(number, digests)
+        return reader.read(number)
 
-    def read_again(self, episode: int) -> Episode:
-        """Read one episode that has been validated before.
-
-        Raises:
-            DataError: the file is damaged.
-        """
+    def read_unchecked(self, episode: int) -> Episode:
+        """Read one episode that was validated before."""
         reader, number = self._place(episode)
         columns = reader.read_episode_columns(number, tuple(EPISODE_FEATURES.values()))
-        return Episode(
-            **{name: columns[key] for name, key in EPISODE_FEATURES.items()},
-            task=reader.task(number),
-            time_limit=reader.time_limit(number),
-            metadata=reader.metadata(number),
-        )
+        return reader.to_episode(number, columns)
 
     def _place(self, episode: int) -> tuple[DatasetReader, int]:
         return self.readers[int(self.dataset[episode])], int(self.number[episode])
@@ -158,15 +181,15 @@ class EpisodeIndex:
         return list(zip(self.dataset.tolist(), self.number.tolist(), strict=True))
 
 
-def spread(places: NDArray[np.intp], limit: int | None) -> NDArray[np.intp]:
-    """At most ``limit`` of the places, evenly spread over them."""
-    if limit is None or limit >= len(places):
-        return places
-    return places[np.linspace(0, len(places) - 1, limit).round().astype(np.intp)]
+def evenly_spaced[T: np.generic](values: NDArray[T], limit: int | None) -> NDArray[T]:
+    """At most ``limit`` of the values, evenly spaced in their order; None: all."""
+    if limit is None or limit >= len(values):
+        return values
+    return values[np.linspace(0, len(values) - 1, limit).round().astype(np.intp)]
 
 
 def fingerprint(identities: Sequence[str], length: NDArray[np.int64]) -> str:
-    """Hash of which episodes these are, in order."""
+    """Hash of the episodes' identities and lengths, in order."""
     text = "\n".join(f"{i} {n}" for i, n in zip(identities, length, strict=True))
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -184,3 +207,57 @@ def require_mixable(readers: Sequence[DatasetReader]) -> None:
                     f"{other.root} has {what} {have}, {first.root} has {want}; such datasets do "
                     "not mix"
                 )
+
+
+def describe_heldout(
+    readers: Sequence[DatasetReader], fraction: float = HELDOUT_FRACTION
+) -> dict[str, Any]:
+    """JSON-compatible description of the held-out episodes of these datasets.
+
+    ``rule`` and ``fraction`` say how they are chosen, ``count`` is their number, ``fingerprint``
+    the hash of their identities and lengths, ``numbers`` lists them for each dataset (null if
+    they are more than `LISTED`).
+
+    Raises:
+        DataError: none is held out.
+    """
+    heldout = EpisodeIndex.of(readers, "heldout", fraction)
+    numbers = [heldout.number[heldout.dataset == d].tolist() for d in range(len(readers))]
+    return {
+        "rule": RULE,
+        "fraction": fraction,
+        "count": len(heldout),
+        "fingerprint": heldout.fingerprint,
+        "numbers": numbers if len(heldout) <= LISTED else None,
+    }
+
+
+def sample_files(
+    learning: EpisodeIndex, heldout: EpisodeIndex, files: int
+) -> tuple[EpisodeIndex, EpisodeIndex]:
+    """Training and held-out episodes in a few files, the same files for both if possible.
+
+    All episodes of a dataset on disk are kept; of one on the Hub those in at most ``files``
+    files of each task, evenly spaced.
+    """
+    return _sample_files(learning, heldout, files), _sample_files(heldout, learning, files)
+
+
+def _sample_files(index: EpisodeIndex, other: EpisodeIndex, files: int) -> EpisodeIndex:
+    shared = set(_file_keys(other))
+    own = _file_keys(index)
+    kept = np.zeros(len(index), dtype=np.bool_)
+    for task, dataset in sorted({(task, dataset) for task, dataset, _ in own}):
+        names = sorted({f for t, d, f in own if (t, d) == (task, dataset)})
+        if index.readers[dataset].is_remote:
+            common = [f for f in names if (task, dataset, f) in shared]
+            names = evenly_spaced(np.array(common or names), files).tolist()
+        wanted = {(task, dataset, f) for f in names}
+        kept |= np.array([key in wanted for key in own])
+    return index.select(np.flatnonzero(kept))
+
+
+def _file_keys(index: EpisodeIndex) -> list[tuple[str, int, str]]:
+    """Task, dataset and file of each episode."""
+    files = (path.as_posix() for path in index.files)
+    return list(zip(index.tasks, index.dataset.tolist(), files, strict=True))

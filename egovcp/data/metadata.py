@@ -1,8 +1,9 @@
-"""Reads and checks a dataset's `meta` folder against the specification."""
+"""Reads a dataset's `meta` folder, checked against the specification and the list of hashes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -14,11 +15,10 @@ from numpy.typing import NDArray
 from egovcp import spec
 from egovcp.data import schema
 from egovcp.data.episode import EPISODE_FRAMES
-from egovcp.data.parquet import damaged, open_parquet
+from egovcp.data.parquet import data_errors, open_parquet
 from egovcp.data.paths import check_template, files_below, require_file
-from egovcp.data.records import record_problems
 from egovcp.errors import DataError
-from egovcp.safe_files import JSON_LIMIT_BYTES, read_json
+from egovcp.safe_files import JSON_LIMIT_BYTES, read_json, sha256
 
 _EPISODE_COLUMNS = (
     "episode_index",
@@ -29,15 +29,21 @@ _EPISODE_COLUMNS = (
     "dataset_to_index",
 )
 
-
 _EPISODES: Final = 10_000_000
 _TASKS: Final = 10_000
 _RECORD_BYTES: Final = 32_768  # 20 times the record of an episode
+_LARGEST_LIMIT: Final = 2**31 - 1
+_DIGEST: Final = re.compile(r"[0-9a-f]{64}")
+#: Folders in which every file must be listed in ``meta/sha256.json``, but for `_UNLISTED`.
+_HASHED = ("data", "meta")
+_UNLISTED = (schema.HASHES_PATH, schema.SOURCE_PATH)
+_LIST_BYTES: Final = 256 << 20  # 10^6 shards
+_OTHER_BYTES: Final = 1 << 30
 
 
 @dataclass(frozen=True)
 class EpisodeTable:
-    """Where each of the E episodes lies; all arrays are (E,) int64."""
+    """Position of each of the E episodes; all arrays are (E,) int64."""
 
     length: NDArray[np.int64]
     chunk_index: NDArray[np.int64]
@@ -47,13 +53,9 @@ class EpisodeTable:
 
 
 def load_info(root: Path) -> dict[str, Any]:
-    """``meta/info.json``, checked against the specification.
-
-    Raises:
-        DataError: missing, damaged, or of another format, rate or feature set.
-    """
+    """``meta/info.json``, checked against format, rate and features of the specification."""
     path = root / schema.INFO_PATH
-    info = load_object(path, root)
+    info = load_json_object(path, root)
     missing = {"codebase_version", "fps", "features", "total_episodes", "data_path"} - info.keys()
     if missing:
         raise DataError.at(path, f"lacks {', '.join(sorted(missing))}")
@@ -65,19 +67,19 @@ def load_info(root: Path) -> dict[str, Any]:
         )
     if info["fps"] != spec.PLANNER_HZ:
         raise DataError.at(path, f"{info['fps']} fps, expected {spec.PLANNER_HZ}")
-    with damaged(path):
+    with data_errors(path):
         _check_features(dict(info["features"]), path)
     check_template(info["data_path"], path)
     return info
 
 
-def load_object(
+def load_json_object(
     path: Path, root: Path | None = None, limit_bytes: int = JSON_LIMIT_BYTES
 ) -> dict[str, Any]:
-    """A JSON file that holds an object; with ``root``, one that lies inside this folder."""
+    """Read a JSON file that holds an object; with ``root``, the file must be inside that folder."""
     if root is not None:
         require_file(root, path)
-    with damaged(path):
+    with data_errors(path):
         content = read_json(path, limit_bytes)
     if not isinstance(content, dict):
         raise DataError.at(path, f"holds a {type(content).__name__}, expected an object")
@@ -96,7 +98,7 @@ def _check_features(features: Mapping[str, Any], path: Path) -> None:
     info = dict(features[spec.DEPTH_KEY].get("info") or {})
     unit = info.get("depth_unit", schema.DEPTH_UNIT)
     if not info.get("is_depth_map") or unit != schema.DEPTH_UNIT:
-        problem = f"{spec.DEPTH_KEY} is no depth map in {schema.DEPTH_UNIT}: {info}"
+        problem = f"{spec.DEPTH_KEY} is not a depth map in {schema.DEPTH_UNIT}: {info}"
         raise DataError.at(path, problem)
 
 
@@ -111,20 +113,12 @@ def load_episode_table(root: Path, info: Mapping[str, Any]) -> EpisodeTable:
     column = {name: np.concatenate([part[name] for part in parts]) for name in _EPISODE_COLUMNS}
     rows = np.cumsum([len(part["length"]) for part in parts])
     _check_episodes(column, info, root, lambda row: paths[int(np.searchsorted(rows, row, "right"))])
-    return EpisodeTable(
-        length=column["length"],
-        chunk_index=column["data/chunk_index"],
-        file_index=column["data/file_index"],
-        start=column["dataset_from_index"],
-    )
+    names = ("length", "data/chunk_index", "data/file_index", "dataset_from_index")
+    return EpisodeTable(*(column[name] for name in names))
 
 
 def episode_files(root: Path) -> list[Path]:
-    """The files of the table of episodes, in order.
-
-    Raises:
-        DataError: there is none.
-    """
+    """The files of the episodes table, in order; raises `DataError` if there is none."""
     folder = root / "meta" / "episodes"
     paths = [path for path in files_below(folder) if path.suffix == ".parquet"]
     if not paths:
@@ -134,7 +128,7 @@ def episode_files(root: Path) -> list[Path]:
 
 def _episode_columns(root: Path, path: Path) -> dict[str, NDArray[np.int64]]:
     require_file(root, path)
-    with damaged(path):
+    with data_errors(path):
         table = open_parquet(path, _EPISODES).read(columns=list(_EPISODE_COLUMNS))
         for name in _EPISODE_COLUMNS:
             column = table[name]
@@ -181,15 +175,11 @@ def _check_episodes(
 def load_episode_stats(
     root: Path, feature: str, count: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Mean and deviation of a feature in each of ``count`` episodes, (E, n) each.
-
-    Raises:
-        DataError: the table of episodes does not have them, or not for all.
-    """
+    """Mean and standard deviation of a feature in each of ``count`` episodes, (E, n) each."""
     folder = root / "meta" / "episodes"
     names = [f"stats/{feature}/{statistic}" for statistic in ("mean", "std")]
     paths = episode_files(root)
-    with damaged(folder):
+    with data_errors(folder):
         tables = [open_parquet(path, _EPISODES).read(columns=names) for path in paths]
         table = pa.concat_tables(tables)
         mean, std = (np.array(table[name].to_pylist(), dtype=np.float64) for name in names)
@@ -202,7 +192,7 @@ def load_tasks(root: Path) -> dict[int, str]:
     """``meta/tasks.parquet``: task index -> task name."""
     path = root / schema.TASKS_PATH
     require_file(root, path)
-    with damaged(path):
+    with data_errors(path):
         table = open_parquet(path, _TASKS).read(columns=["task_index", "task"])
         numbers, names = table["task_index"].to_pylist(), table["task"].to_pylist()
     if not all(type(number) is int for number in numbers):
@@ -216,27 +206,107 @@ def load_tasks(root: Path) -> dict[int, str]:
 
 def load_stats(root: Path) -> dict[str, Any]:
     """``meta/stats.json``: feature -> statistic -> values."""
-    return load_object(root / schema.STATS_PATH, root)
+    return load_json_object(root / schema.STATS_PATH, root)
 
 
 def load_collection(root: Path, lengths: NDArray[np.int64]) -> dict[str, Any]:
-    """``meta/collection.json``: provenance, and the record of each episode.
-
-    Args:
-        lengths: (E,) frames of each episode, as the table of episodes has them.
-    """
+    """``meta/collection.json``: provenance and episode records; ``lengths`` (E,) are in frames."""
     path = root / schema.COLLECTION_PATH
     if not path.exists() and not path.is_symlink():
         raise DataError.at(
             path,
             "missing: the low-level controller and the planned episode lengths are unknown. "
-            "If LeRobot's tools made this dataset out of others, take the facts from those: "
+            "If LeRobot's tools made this dataset from others, copy the records from those: "
             f"egovcp-dataset repair {root} --records=ORIGINAL --output_dir=NEW",
         )
-    collection = load_object(path, root, JSON_LIMIT_BYTES + _RECORD_BYTES * len(lengths))
+    collection = load_json_object(path, root, JSON_LIMIT_BYTES + _RECORD_BYTES * len(lengths))
     if collection.get("spec_version") != spec.SPEC_VERSION:
         found = collection.get("spec_version")
         raise DataError.at(path, f"specification {found}, expected {spec.SPEC_VERSION}")
-    for episode, problem in record_problems(collection.get("episodes"), lengths):
-        raise DataError.at(path, problem, episode)
+    records = collection.get("episodes")
+    if not isinstance(records, list):
+        kind = type(records).__name__
+        raise DataError.at(path, f"episodes is a {kind}, expected a list")
+    if len(records) != len(lengths):
+        problem = f"records {len(records)} episodes, but meta/episodes lists {len(lengths)}"
+        raise DataError.at(path, problem)
+    for index, record in enumerate(records):
+        for problem in record_problems(record, int(lengths[index])):
+            raise DataError.at(path, problem, index)
     return collection
+
+
+def record_problems(record: object, length: int | None = None) -> Iterator[str]:
+    """Problems of the record of an episode with ``length`` frames; None: any number."""
+    if not isinstance(record, Mapping):
+        yield f"its record is a {type(record).__name__}, expected an object"
+        return
+    task, limit, digest = record.get("task"), record.get("time_limit"), record.get("sha256", "")
+    if task not in spec.TASKS:
+        yield f"its task is {task!r}, expected one of {', '.join(spec.TASKS)}"
+    if not isinstance(limit, int) or isinstance(limit, bool) or not 0 < limit <= _LARGEST_LIMIT:
+        yield f"its time_limit is {limit!r}, expected 1 to {_LARGEST_LIMIT} ticks"
+    if not isinstance(digest, str) or (digest and not _DIGEST.fullmatch(digest)):
+        yield f"its sha256 is {digest!r}, expected 64 hexadecimal digits"
+    if not isinstance(record.get("metadata", {}), Mapping):
+        yield "its metadata is not an object"
+    if length is not None and record.get("length", length) != length:
+        yield f"its record says {record['length']} frames, but meta/episodes says {length}"
+
+
+def load_hashes(root: Path) -> Mapping[str, str]:
+    """Relative path -> SHA-256; empty for a dataset written by other tools."""
+    path = root / schema.HASHES_PATH
+    if not path.exists():
+        return {}
+    require_file(root, path)
+    hashes = load_json_object(path, limit_bytes=_LIST_BYTES)
+    if not hashes or not all(isinstance(value, str) for value in hashes.values()):
+        raise DataError.at(path, "expected the SHA-256 of each file")
+    return hashes
+
+
+def hashed_files(root: Path) -> list[str]:
+    """Relative paths of the files that must be listed, sorted."""
+    found = (
+        path.relative_to(root).as_posix()
+        for folder in _HASHED
+        for path in files_below(root / folder)
+    )
+    return sorted(set(found) - set(_UNLISTED))
+
+
+def verify_hashes(root: Path) -> None:
+    """Raise the first of `hash_problems`."""
+    for error in hash_problems(root):
+        raise error
+
+
+def hash_problems(root: Path) -> Iterator[DataError]:
+    """Every file that is missing, not listed, or different; empty without a list."""
+    hashes = load_hashes(root)
+    present = set(hashed_files(root)) if hashes else set()
+    for name in sorted({*hashes, *present}):
+        if name not in hashes:
+            yield DataError.at(root / name, f"not listed in {schema.HASHES_PATH}; remove it")
+        elif name not in present:
+            yield DataError.at(root / name, "missing; the dataset is incomplete")
+        else:
+            yield from _difference(root, name, hashes[name])
+
+
+def _difference(root: Path, name: str, expected: str) -> Iterator[DataError]:
+    path = root / name
+    try:
+        require_file(root, path)
+        if path.suffix == ".parquet":
+            open_parquet(path)  # rejects huge sparse files, which would take hours to hash
+        with data_errors(path):
+            found = sha256(path, None if path.suffix == ".parquet" else _OTHER_BYTES)
+    except DataError as error:
+        yield error
+        return
+    if found != expected:
+        yield DataError.at(
+            root / name, f"damaged: its SHA-256 is not the one in {schema.HASHES_PATH}"
+        )

@@ -1,8 +1,8 @@
-"""Left-right reflection of a row: what the robot would have seen and done in a mirror.
+"""Left-right reflection of depth images, states and actions.
 
 The reflection maps y to -y. Vectors change the sign of y; axial vectors (angular
-velocity) that of x and z; the limbs trade places; a joint keeps the sign of its angle if it
-turns about y (pitch, knee, elbow) and changes it if it turns about x or z (roll, yaw).
+velocity) that of x and z; left and right limbs are exchanged; a joint angle keeps its sign if
+the axis is y (pitch, knee, elbow) and changes it if the axis is x or z (roll, yaw).
 """
 
 from __future__ import annotations
@@ -53,15 +53,15 @@ ACTION_SIGN: Final = np.array([*_POLAR, *_POLAR, 1.0], dtype=np.float32)
 
 
 def mirror_depth(depth: NDArray[np.uint16]) -> NDArray[np.uint16]:
-    """Depth ``(..., H, W)`` seen in the mirror (a view); the camera sits in the middle."""
+    """Reflected depth ``(..., H, W)``, a view; the camera is in the plane of symmetry."""
     return depth[..., ::-1]
 
 
 def mirror_state[F: np.floating](state: NDArray[F]) -> NDArray[F]:
-    """Proprioception ``(..., 74)`` in the mirror."""
+    """Reflected proprioception ``(..., 74)``."""
     return np.asarray(state[..., STATE_SOURCE] * STATE_SIGN.astype(state.dtype))
 
 
 def mirror_action[F: np.floating](action: NDArray[F]) -> NDArray[F]:
-    """Normalised action ``(..., 7)`` in the mirror; the action box is its own mirror image."""
+    """Reflected normalised action ``(..., 7)``; the action box is symmetric."""
     return np.asarray(action[..., ACTION_SOURCE] * ACTION_SIGN.astype(action.dtype))

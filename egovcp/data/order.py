@@ -1,84 +1,125 @@
-"""In which order a bounded stream reads the episodes: endless, by shards, exactly resumable."""
+"""How often and in which order episodes are drawn: weights of datasets and tasks, and epochs."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from itertools import chain, groupby
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp import spec
 from egovcp.data.index import EpisodeIndex
-from egovcp.data.mix import Groups
-from egovcp.errors import UsageError
+from egovcp.errors import UsageError, suggest
 
-#: Files whose episodes are shuffled with each other: few enough that they stay open.
+#: Files whose episodes are shuffled with each other; few, because they stay open.
 FILES_AT_ONCE: Final = 4
+#: Episodes ahead of the current one whose files are prefetched.
+LOOKAHEAD: Final = 256
 
 type Numbers = NDArray[np.int64]
 
 
 @dataclass(frozen=True)
-class Shard:
-    """Which part of the data a worker of a rank reads; every part has its own episodes."""
+class Mix:
+    """Weights of datasets and tasks; without any, all rows are equally likely."""
 
-    rank: int = 0
-    """This process."""
-    ranks: int = 1
-    """Processes that train together."""
-    worker: int = 0
-    """This worker of the process."""
-    workers: int = 1
-    """Workers of each process."""
+    datasets: tuple[float, ...] = ()
+    """Share of each dataset, independent of its size; empty: in proportion to its frames."""
+    tasks: Mapping[str, float] = field(default_factory=dict)
+    """Task -> factor on its share; 1 for other tasks."""
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether there are no weights."""
+        return not self.datasets and not self.tasks
 
     def check(self) -> None:
-        """Raise `UsageError` unless rank and worker lie within their numbers."""
-        if not (0 <= self.rank < self.ranks and 0 <= self.worker < self.workers):
-            raise UsageError(
-                f"rank {self.rank} of {self.ranks}, worker {self.worker} of {self.workers}: "
-                "expected to count from 0"
-            )
+        """Raise `UsageError` for invalid weights."""
+        for task in self.tasks:
+            if task not in spec.TASKS:
+                raise UsageError(f"a weight for unknown task {task!r}{suggest(task, spec.TASKS)}")
+        weights = [*self.datasets, *self.tasks.values()]
+        wrong = [weight for weight in weights if not (weight >= 0 and math.isfinite(weight))]
+        if wrong:
+            raise UsageError(f"a weight of {wrong[0]}: expected a finite number of at least 0")
 
-    @property
-    def index(self) -> int:
-        """Number of the shard."""
-        return self.rank * self.workers + self.worker
-
-    @property
-    def count(self) -> int:
-        """Number of shards."""
-        return self.ranks * self.workers
+    def as_dict(self) -> dict[str, Any]:
+        """JSON-compatible."""
+        return {"datasets": list(self.datasets), "tasks": dict(sorted(self.tasks.items()))}
 
 
-class _Epoch(NamedTuple):
-    """All episodes of a group once, block by block of files."""
+class EpisodeGroups(NamedTuple):
+    """G groups: the episodes of one task in one dataset form a group."""
 
-    episodes: Numbers
-    ends: Numbers
-    """(blocks,) where each block ends."""
-    files: list[list[int]]
-    """For each block, an episode of each of its files."""
+    of: NDArray[np.int64]  # (E,) group of each episode
+    share: NDArray[np.float64]  # (G,) share of the windows; sums to 1
+
+
+def group_episodes(
+    mix: Mix, dataset: NDArray[np.int64], tasks: Sequence[str], length: NDArray[np.int64]
+) -> EpisodeGroups:
+    """Group episodes by ``dataset`` (E,) and ``tasks`` (E,), and compute the share of each group.
+
+    Raises:
+        UsageError: the weights are not valid, or all shares are zero.
+    """
+    mix.check()
+    if mix.datasets and len(mix.datasets) <= dataset.max():
+        raise UsageError(f"{len(mix.datasets)} weights for {dataset.max() + 1} datasets")
+    if mix.is_plain:
+        return EpisodeGroups(np.zeros(len(dataset), dtype=np.int64), np.ones(1))
+    keys = sorted(set(zip(dataset.tolist(), tasks, strict=True)))
+    number = {key: i for i, key in enumerate(keys)}
+    of = np.array([number[key] for key in zip(dataset.tolist(), tasks, strict=True)])
+    share = np.bincount(of, weights=length).astype(np.float64)
+    if mix.datasets:
+        frames = np.bincount(dataset, weights=length)
+        share *= np.array([mix.datasets[d] / frames[d] for d, _ in keys])
+    share *= np.array([mix.tasks.get(task, 1.0) for _, task in keys])
+    if not share.sum() > 0:
+        raise UsageError("the weights of datasets and tasks leave no episode to draw")
+    return EpisodeGroups(of, share / share.sum())
+
+
+class GroupedRows:
+    """Rows sorted by group."""
+
+    def __init__(self, group_of_rows: NDArray[np.int64], groups: int) -> None:
+        self._rows = np.argsort(group_of_rows, kind="stable")
+        self._count = np.bincount(group_of_rows, minlength=groups)
+        self._first = self._count.cumsum() - self._count
+
+    def pick(self, rng: np.random.Generator, group: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Draw a row of each of these groups uniformly; no group may be empty."""
+        place = (rng.random(len(group)) * self._count[group]).astype(np.int64)
+        at = np.minimum(self._first[group] + place, len(self._rows) - 1)
+        return np.asarray(self._rows[at])
 
 
 class EpisodeOrder:
-    """Endless epochs over the episodes of each group in one shard."""
+    """Endless epochs over the episodes of each group in the shard of one process."""
 
-    def __init__(self, index: EpisodeIndex, groups: Groups, shard: Shard, seed: int) -> None:
-        """Deal the files out.
+    def __init__(
+        self, index: EpisodeIndex, groups: EpisodeGroups, rank: int, ranks: int, seed: int
+    ) -> None:
+        """Assign the files to ``ranks`` processes, of which this is ``rank``; shards are disjoint.
 
         Raises:
-            UsageError: a group has fewer episodes than there are shards.
+            UsageError: ``rank`` is out of range, or a group has fewer episodes than processes.
         """
-        shard.check()
-        self._seed = (seed, shard.index)
+        if not 0 <= rank < ranks:
+            raise UsageError(f"rank {rank} of {ranks}: expected to count from 0")
+        self._seed = (seed, rank)
         drawn = np.flatnonzero(groups.share > 0)
-        self._files = [_dealt(_files(index, groups.of == g), shard) for g in drawn]
+        self._files = [_assign_files(_files(index, groups.of == g), rank, ranks) for g in drawn]
         self._epoch = [0] * len(drawn)
         self._cursor = [0] * len(drawn)
-        self._epochs = [self._shuffle(g) for g in range(len(drawn))]
-        # An episode yields windows in proportion to its length: groups of long ones come less often
+        self._episodes = [self._shuffle(g) for g in range(len(drawn))]
+        # An episode yields windows in proportion to its length, so groups of long ones are rarer.
         mean = np.array([index.length[np.concatenate(files)].mean() for files in self._files])
         rate = groups.share[drawn] / mean
         self._rate = rate / rate.sum()
@@ -91,65 +132,60 @@ class EpisodeOrder:
     def draw(self, rng: np.random.Generator) -> int:
         """The next episode of a group that ``rng`` chooses."""
         group = int(rng.choice(len(self._rate), p=self._rate)) if len(self._rate) > 1 else 0
-        if self._cursor[group] == len(self._epochs[group].episodes):
+        if self._cursor[group] == len(self._episodes[group]):
             self._epoch[group] += 1
             self._cursor[group] = 0
-            self._epochs[group] = self._shuffle(group)
+            self._episodes[group] = self._shuffle(group)
         self._cursor[group] += 1
-        return int(self._epochs[group].episodes[self._cursor[group] - 1])
+        return int(self._episodes[group][self._cursor[group] - 1])
 
     def upcoming(self) -> list[int]:
-        """An episode of each file that is read from now on, for a few files of each group."""
-        found: list[int] = []
-        for cursor, epoch in zip(self._cursor, self._epochs, strict=True):
-            block = int(np.searchsorted(epoch.ends, cursor, side="right"))
-            found += chain.from_iterable(epoch.files[block : block + 2])
-        return found
+        """The next episodes of each group's epoch."""
+        groups = zip(self._cursor, self._episodes, strict=True)
+        return [int(e) for cursor, part in groups for e in part[cursor : cursor + LOOKAHEAD]]
 
     def state_dict(self) -> dict[str, Any]:
         """JSON-compatible."""
         return {"epoch": list(self._epoch), "cursor": list(self._cursor)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on where another order over the same episodes stood."""
+        """Continue from the state of another order over the same episodes."""
         self._epoch, self._cursor = list(state["epoch"]), list(state["cursor"])
-        self._epochs = [self._shuffle(g) for g in range(len(self._files))]
+        self._episodes = [self._shuffle(g) for g in range(len(self._files))]
 
-    def _shuffle(self, group: int) -> _Epoch:
-        """The episodes of a group in the order of its epoch: a few files at a time."""
+    def _shuffle(self, group: int) -> Numbers:
+        """The episodes of a group in the order of its current epoch."""
         rng = np.random.default_rng((*self._seed, group, self._epoch[group]))
         files = self._files[group]
         order = rng.permutation(len(files))
         blocks = [order[i : i + FILES_AT_ONCE] for i in range(0, len(order), FILES_AT_ONCE)]
-        together = (np.concatenate([files[f] for f in block]) for block in blocks)
-        parts = [rng.permutation(episodes) for episodes in together]
-        some = [[int(files[f][0]) for f in block] for block in blocks]
-        return _Epoch(np.concatenate(parts), np.cumsum([len(part) for part in parts]), some)
+        parts = [rng.permutation(np.concatenate([files[f] for f in block])) for block in blocks]
+        return np.concatenate(parts)
 
 
 def _files(index: EpisodeIndex, chosen: NDArray[np.bool_]) -> list[Numbers]:
-    """The chosen episodes, file by file."""
+    """The chosen episodes by file."""
     files = index.files
     numbers = np.flatnonzero(chosen).tolist()
     return [np.array(list(part)) for _, part in groupby(numbers, key=lambda n: files[n])]
 
 
-def _dealt(files: list[Numbers], shard: Shard) -> list[Numbers]:
-    """The files of one shard; pieces of files where there are fewer files than shards."""
+def _assign_files(files: list[Numbers], rank: int, ranks: int) -> list[Numbers]:
+    """The files of one process; files are split if there are fewer than processes."""
     episodes = sum(map(len, files))
-    if episodes < shard.count:
+    if episodes < ranks:
         raise UsageError(
-            f"{episodes} episodes of one task and dataset for {shard.count} workers in all; use "
-            "fewer workers"
+            f"{episodes} episodes of one task and dataset for {ranks} processes; use fewer "
+            "processes"
         )
-    while len(files) < shard.count:
+    while len(files) < ranks:
         largest = max(range(len(files)), key=lambda i: len(files[i]))
         files[largest : largest + 1] = np.array_split(files[largest], 2)
-    load = [0] * shard.count
+    load = [0] * ranks
     own: list[Numbers] = []
-    for file in sorted(files, key=len, reverse=True):  # the largest first, to whoever has least
+    for file in sorted(files, key=len, reverse=True):  # largest first, to the smallest shard
         to = load.index(min(load))
         load[to] += len(file)
-        if to == shard.index:
+        if to == rank:
             own.append(file)
     return own

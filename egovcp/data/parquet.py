@@ -1,7 +1,7 @@
-"""Opens parquet files that somebody else wrote, without trusting the sizes that they claim.
+"""Reads parquet files from untrusted sources, and their columns as arrays.
 
 A few kilobytes of parquet can describe billions of rows, and a compressed page can hold gigabytes.
-What is read is therefore bounded by the footer first.
+The sizes in the footer are therefore checked before anything is read.
 """
 
 from __future__ import annotations
@@ -9,13 +9,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
+from egovcp import spec
+from egovcp.data import schema, tiff
+from egovcp.data.paths import require_file
 from egovcp.errors import DataError
-from egovcp.safe_files import UnsafeFileError, require_regular
+from egovcp.safe_files import require_regular
 
 ROW_GROUP_ROWS: Final = 65_536
 """Largest number of rows of a row group, which is read as a whole: 0.4 GB of depth."""
@@ -24,9 +30,7 @@ _ROW_VALUES: Final = 4096
 _CHUNK_BYTES: Final = 1 << 30
 _COLUMNS: Final = 4096
 _PADDING_BYTES: Final = 16 << 20  # page indexes and Bloom filters lie between the row groups
-
-
-#: What pyarrow and the code around it raise on damaged files.
+#: Errors that pyarrow and its callers raise on damaged files.
 _READ_ERRORS: Final = (
     pa.ArrowException,
     ArithmeticError,
@@ -36,44 +40,46 @@ _READ_ERRORS: Final = (
     ValueError,
 )
 
+type Columns = dict[str, NDArray[Any]]
+
+#: Array of `Episode` -> feature.
+EPISODE_FEATURES = {
+    "depth": spec.DEPTH_KEY,
+    "state": spec.STATE_KEY,
+    "action": spec.ACTION_KEY,
+    "reward": spec.REWARD_KEY,
+    "done": spec.DONE_KEY,
+    "success": spec.SUCCESS_KEY,
+    "truncated": spec.TRUNCATED_KEY,
+}
+
 
 @contextmanager
-def damaged(path: Path) -> Iterator[None]:
-    """Turn what is raised while a damaged file is read into a `DataError` that names it."""
+def data_errors(path: Path) -> Iterator[None]:
+    """Turn errors of reading a damaged file into a `DataError` that names it."""
     try:
         yield
     except FileNotFoundError as error:
         raise DataError.at(path, "missing; the dataset is incomplete") from error
-    except UnsafeFileError as error:
-        raise DataError.at(path, f"damaged: {error}") from error
-    except MemoryError as error:  # ArrowMemoryError among them
+    except MemoryError as error:  # includes ArrowMemoryError
         raise DataError.at(path, "its content does not fit into memory") from error
-    except OSError as error:
-        if error.errno is not None:
+    except (OSError, *_READ_ERRORS) as error:
+        if isinstance(error, OSError) and error.errno is not None:
             raise
-        raise _damage(path, error) from error
-    except _READ_ERRORS as error:
-        raise _damage(path, error) from error
-
-
-def _damage(path: Path, error: Exception) -> DataError:
-    reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-    return DataError.at(path, f"damaged: {reason}")
+        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+        raise DataError.at(path, f"damaged: {reason}") from error
 
 
 def open_parquet(path: Path, rows: int | None = None) -> pq.ParquetFile:
     """Open a parquet file whose row groups can be read safely.
 
-    Args:
-        path: a regular file, read piece by piece. It is not mapped: pages of a map count as this
-            process's memory as long as the file is open, and a file that somebody cuts short would
-            end it.
-        rows: the largest number of rows; None: any.
+    The file is not memory-mapped: mapped pages count as memory of this process while the file is
+    open, and truncation of the file would end the process. ``rows`` limits the number of rows.
 
     Raises:
-        DataError: it is missing, damaged, or claims sizes that no dataset has.
+        DataError: it is missing, damaged, or its footer has sizes that no dataset has.
     """
-    with damaged(path):
+    with data_errors(path):
         size = require_regular(path).st_size
         file = pq.ParquetFile(path)
         for problem in _row_problems(file.metadata, rows):
@@ -85,9 +91,9 @@ def open_parquet(path: Path, rows: int | None = None) -> pq.ParquetFile:
 
 
 def _parse_column_chunks(path: Path) -> None:
-    """Let Arrow's reader parse the footer's entry of every column chunk, and one row.
+    """Parse the footer's entries of all column chunks with Arrow's reader.
 
-    `RowGroupMetaData.column` aborts the process where an entry contradicts the schema; the reader
+    `RowGroupMetaData.column` aborts the process if an entry contradicts the schema; the reader
     raises. With `pre_buffer` it parses all entries before it reads the first row.
     """
     with pq.ParquetFile(path, pre_buffer=True) as file:
@@ -131,3 +137,34 @@ def _column_problems(content: pq.FileMetaData, size: int) -> Iterator[str]:
                 yield f"column {column.path_in_schema} {found}, expected at most {values}"
     if size > stored + _PADDING_BYTES:
         yield f"has {size} bytes, but its row groups only {stored}"
+
+
+def open_data_file(root: Path, path: Path) -> pq.ParquetFile:
+    """Open a data file of the dataset at ``root`` and check its column types."""
+    require_file(root, path)
+    file = open_parquet(path)
+    with data_errors(path):
+        for problem in schema.type_problems(file.schema_arrow):
+            raise DataError.at(path, problem)
+    return file
+
+
+def to_numpy(column: pa.ChunkedArray, name: str) -> NDArray[Any]:
+    """Convert a column to (T,), (T, n) or, for depth, (T, 48, 64); errors have `frame` set."""
+    array = column.combine_chunks()
+    if isinstance(array, pa.ChunkedArray):
+        array = pa.concat_arrays(array.chunks)
+    if array.null_count:
+        empty = array.is_null().to_numpy(zero_copy_only=False)
+        raise tiff.frame_error(int(np.argmax(empty)), f"column {name} is empty")
+    if name == spec.DEPTH_KEY:
+        return tiff.decode(array.field("bytes"), spec.DEPTH_ROWS, spec.DEPTH_COLS)
+    dtype, width = str(schema.FEATURES[name]["dtype"]), schema.width(name)
+    if width == 1:
+        return np.asarray(array.to_numpy(zero_copy_only=False), dtype=dtype)
+    sizes = pc.list_value_length(array).to_numpy()
+    if (sizes != width).any():
+        at = int(np.argmax(sizes != width))
+        raise tiff.frame_error(at, f"column {name} has {sizes[at]} values, expected {width}")
+    flat = array.flatten().to_numpy(zero_copy_only=False)
+    return np.asarray(flat.reshape(len(array), width), dtype=dtype)

@@ -1,4 +1,4 @@
-"""Which files a dataset may name: regular ones, inside its own folder."""
+"""Checks that the files of a dataset are regular files inside its folder."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ _FIELD = re.compile(r"\{(?:chunk_index|file_index)(?::0?[1-9]?d)?\}")
 
 
 def check_template(template: object, path: Path) -> None:
-    """Raise `DataError` unless ``template``, found in ``path``, names files inside the dataset.
+    """Raise `DataError` unless ``template``, read from ``path``, names files inside the dataset.
 
-    Only plain fields may stand in it: Python's format language can do far more than count.
+    Only plain fields are allowed, because Python's format language can read attributes.
     """
     if not isinstance(template, str):
-        raise DataError.at(path, f"data_path {template!r} is no file template")
+        raise DataError.at(path, f"data_path {template!r} is not a file template")
     parts = PurePosixPath(template)
     if parts.is_absolute() or ".." in parts.parts:
         raise DataError.at(path, f"data_path {template!r} leads outside of the dataset")
@@ -26,16 +26,16 @@ def check_template(template: object, path: Path) -> None:
     if not template.startswith("data/") or re.search(r"[^\w./-]", plain, re.ASCII):
         raise DataError.at(
             path,
-            f"data_path {template!r} is no file template; expected one below data/ with the "
-            "fields chunk_index and file_index",
+            f"data_path {template!r} is not a file template; expected one below data/ "
+            "with the fields chunk_index and file_index",
         )
 
 
 def require_file(root: Path, path: Path) -> None:
     """Raise `DataError` unless ``path`` is a regular file inside ``root``.
 
-    Links may lead into the folder of blobs beside a snapshot in the Hub's cache, which is how
-    huggingface_hub stores a download, and nowhere else.
+    Links may also lead to the folder of blobs beside a snapshot in the Hub's cache, where
+    huggingface_hub stores a download.
     """
     try:
         target = path.resolve(strict=True)
@@ -45,25 +45,25 @@ def require_file(root: Path, path: Path) -> None:
         raise DataError.at(path, "a loop of symbolic links") from error
     except OSError as error:
         raise DataError.at(path, f"cannot be opened: {error.strerror}") from error
-    if not any(target.is_relative_to(home) for home in _homes(root)):
+    if not any(target.is_relative_to(folder) for folder in _allowed_folders(root)):
         raise DataError.at(path, f"a link that leads outside of the dataset, to {target}")
     if not target.is_file():
-        kind = "a folder" if target.is_dir() else "no regular file"
+        kind = "a folder" if target.is_dir() else "not a regular file"
         raise DataError.at(path, f"{kind}, expected a file")
 
 
-def _homes(root: Path) -> list[Path]:
-    homes = [root.resolve()]
+def _allowed_folders(root: Path) -> list[Path]:
+    folders = [root.resolve()]
     if root.parent.name == "snapshots":
-        homes.append(root.resolve().parents[1] / "blobs")
-    return homes
+        folders.append(root.resolve().parents[1] / "blobs")
+    return folders
 
 
 def files_below(folder: Path) -> list[Path]:
-    """Everything in ``folder``, at any depth, that is no folder, sorted; links are not followed.
+    """All files and links in ``folder``, at any depth, sorted; links are not followed.
 
-    Hidden files and folders are ignored, as `datasets` does: macOS writes ``._NAME`` beside each
-    file on a foreign disk, and ``.DS_Store``.
+    Hidden files and folders are ignored, as by `datasets`: macOS writes ``.DS_Store``, and
+    ``._NAME`` beside each file on other file systems.
     """
     if folder.is_symlink():
         return [folder]

@@ -1,4 +1,16 @@
-"""Reads a dataset episode by episode, or column by column, straight from parquet."""
+"""Reads a dataset straight from parquet: by episode, by column, or as arrays [Batch, Time, Data].
+
+All episodes at once, padded to the longest::
+
+    data = load_arrays("data/ball")            # or a Hub id: load_arrays("me/egovcp-ball")
+    data["action"]                             # (B, T, 7) float32
+    data["valid"]                              # (B, T) bool, False after an episode's end
+
+or episode by episode, read on demand::
+
+    for episode in open_dataset("data/ball"):
+        episode.depth                          # (T, 48, 64) uint16, mm
+"""
 
 from __future__ import annotations
 
@@ -18,17 +30,14 @@ from numpy.typing import NDArray
 from egovcp import spec
 from egovcp.cli import DatasetConfig, SelectedDatasetConfig
 from egovcp.data import metadata, schema
-from egovcp.data.columns import EPISODE_FEATURES, Columns, open_data_file, to_numpy
-from egovcp.data.digests import Digests
 from egovcp.data.episode import Episode
-from egovcp.data.origin import ScenarioKey, ScenarioKeys
-from egovcp.data.parquet import damaged
+from egovcp.data.parquet import EPISODE_FEATURES, Columns, data_errors, open_data_file, to_numpy
 from egovcp.data.paths import require_file
-from egovcp.data.provenance import parse_provenance
+from egovcp.data.provenance import ScenarioKey, ScenarioKeys, parse_provenance
 from egovcp.data.selection import select_episodes
-from egovcp.data.source import Source, is_local, locate, shelve
+from egovcp.data.source import Source, is_local, locate, open_file_cache
 from egovcp.errors import DataError, suggest
-from egovcp.hub import RetryPolicy, Shelf
+from egovcp.hub import HubFileCache, RetryPolicy, is_local_path
 
 _OPEN_FILES = 8
 _RETRY_POLICY = RetryPolicy()
@@ -36,107 +45,96 @@ _TIMESTAMP_SLACK = 1e-3  # s; float32 timestamps
 
 
 class DatasetReader:
-    """A validated dataset; the arrays themselves are read, and checked, on demand."""
+    """A dataset with a validated `meta` folder; arrays are read, and checked, on demand."""
 
-    def __init__(self, source: Source, shelf: Shelf | None = None, episodes: str = "") -> None:
-        """Check the `meta` folder of a dataset that lies on disk; `open` looks for its files, too.
+    def __init__(
+        self, source: Source, cache: HubFileCache | None = None, episodes: str = ""
+    ) -> None:
+        """Read and check the `meta` folder. `open` also checks that the data files exist.
 
         Args:
-            source: where it lies.
-            shelf: what brings its data files when they are read; None: they are there.
-            episodes: those of them that are asked for (see `select_episodes`); empty: all.
+            source: the dataset's folder.
+            cache: downloads the data files when they are read; None: they are in the folder.
+            episodes: the selected episodes (see `select_episodes`).
 
         Raises:
-            UsageError: the episodes asked for are not there.
-            DataError: it is damaged, incomplete, or of another specification.
+            UsageError: a selected episode does not exist.
+            DataError: the dataset is damaged, incomplete, or of another specification.
         """
         self.source = source
-        self._info = metadata.load_info(source.root)
-        self._table = metadata.load_episode_table(source.root, self._info)
+        self.root = source.root
+        """Folder of the dataset."""
+        self.info: Mapping[str, Any] = metadata.load_info(source.root)
+        """``meta/info.json``."""
+        self._table = metadata.load_episode_table(source.root, self.info)
+        self.lengths = self._table.length
+        """(E,) frames of each episode."""
         self._collection = metadata.load_collection(source.root, self.lengths)
+        self._records: list[Mapping[str, Any]] = self._collection["episodes"]
         self.origin = parse_provenance(self._collection, source.root / schema.COLLECTION_PATH)
         """How the dataset was collected."""
         try:
             self._scenarios = ScenarioKeys(self.origin)
         except DataError as error:
             raise DataError.at(source.root / schema.COLLECTION_PATH, error.problem) from error
-        self._task_names = metadata.load_tasks(source.root)
+        self.task_names: Mapping[int, str] = metadata.load_tasks(source.root)
+        """``meta/tasks.parquet``: task index -> task."""
         self._file_start = _file_starts(self._table)
-        self._shelf, self._episodes = shelf, episodes
-        self.chosen = select_episodes(episodes, len(self))
-        """The numbers of the episodes that are asked for, ascending."""
+        self._cache = cache
+        self.episodes = episodes
+        """The selected episodes, in the notation of `select_episodes`; empty: all."""
+        self.selected = select_episodes(episodes, len(self))
+        """Numbers of the selected episodes, ascending."""
         self._open_file = lru_cache(maxsize=_OPEN_FILES)(self._opened)
-        # A batch is made ahead in a thread; two that read one open file find it damaged.
-        self._reading = Lock()
+        # Batches are prefetched in a thread, and a parquet file is not thread-safe.
+        self._lock = Lock()
 
     @classmethod
     def open(cls, config: DatasetConfig) -> Self:
         """Open the dataset that ``config`` names, from disk or from the Hub.
 
-        The network is never touched when a root is given or LeRobot's local folder has
-        the dataset and no revision is asked for.
+        The network is not used if a root is given, or if LeRobot's local folder has the dataset
+        and no revision is given.
 
         Raises:
             UsageError: the configuration names no dataset.
             DataError: there is none, or not one of this specification.
             EnvironmentFailure: the Hub cannot be reached.
         """
-        reader = cls(locate(config), episodes=_asked_for(config))
+        reader = cls(locate(config), episodes=_selection(config))
         for path in reader.frames_per_file:
             require_file(reader.root, path)
         return reader
 
     @classmethod
     def on_demand(cls, config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Self:
-        """Open a dataset to stream from: what is only on the Hub comes file by file, when it is
-        read, at the commit that the revision is now.
-
-        Raises:
-            UsageError: the configuration names no dataset.
-            DataError: there is none, or not one of this specification.
-            EnvironmentFailure: the Hub cannot be reached.
-        """
+        """As `open`, but files on the Hub are downloaded when they are read, at the commit to which
+        the revision resolves now."""
         if is_local(config):
             return cls.open(config)
-        shelf = shelve(config, retry)
-        source = Source(shelf.folder, shelf.repo_id, shelf.commit)
-        return cls(source, shelf, _asked_for(config))
+        cache = open_file_cache(config, retry)
+        return cls(Source(cache.folder, cache.repo_id, cache.commit), cache, _selection(config))
 
     def __len__(self) -> int:
-        return len(self._table.length)
+        return len(self.lengths)
 
     def __iter__(self) -> Iterator[Episode]:
-        """The episodes in order, each read when its turn comes (see `read`)."""
+        """The episodes in order, each read on demand (see `read`)."""
         return (self.read(index) for index in range(len(self)))
 
     @property
     def is_remote(self) -> bool:
-        """Whether its data files come from the Hub as they are read."""
-        return self._shelf is not None
-
-    @property
-    def episodes(self) -> str:
-        """Which episodes were asked for, in the words of `select_episodes`; empty: all."""
-        return self._episodes
-
-    @property
-    def root(self) -> Path:
-        """Folder of the dataset."""
-        return self.source.root
-
-    @property
-    def lengths(self) -> NDArray[np.int64]:
-        """(E,) frames of each episode."""
-        return self._table.length
+        """Whether data files are downloaded from the Hub when they are read."""
+        return self._cache is not None
 
     @property
     def num_frames(self) -> int:
         """Frames of all episodes."""
-        return int(self._table.length.sum())
+        return int(self.lengths.sum())
 
     @property
     def frames_per_file(self) -> dict[Path, int]:
-        """The data files, in order, and how many frames each holds."""
+        """The data files, in order, and the number of frames in each."""
         frames: Counter[Path] = Counter()
         for index, length in enumerate(self.lengths.tolist()):
             frames[self.data_path(index)] += length
@@ -145,26 +143,16 @@ class DatasetReader:
     @property
     def fps(self) -> int:
         """Rows per second."""
-        return int(self._info["fps"])
-
-    @property
-    def info(self) -> Mapping[str, Any]:
-        """``meta/info.json``."""
-        return self._info
-
-    @property
-    def task_names(self) -> Mapping[int, str]:
-        """``meta/tasks.parquet``: task index -> task."""
-        return self._task_names
+        return int(self.info["fps"])
 
     @property
     def controller_id(self) -> str:
-        """Low-level controller that the actions were given to."""
+        """Low-level controller that executed the actions."""
         return self.origin.controller_id
 
     @property
     def provenance(self) -> Mapping[str, Any]:
-        """`origin` as it is in ``meta/collection.json``, with entries that others added."""
+        """``meta/collection.json`` without its episodes: `origin` and entries of other tools."""
         return {key: value for key, value in self._collection.items() if key != "episodes"}
 
     @property
@@ -172,192 +160,153 @@ class DatasetReader:
         """Statistics of every feature, as in ``meta/stats.json``."""
         return metadata.load_stats(self.root)
 
+    @property
+    def content_digest(self) -> str:
+        """Hash of identity, length and digest of the selected episodes, in order: equal for
+        copies of a dataset."""
+        facts = (f"{self.identity(i)} {self.lengths[i]} {self.digest(i)}" for i in self.selected)
+        return hashlib.sha256("\n".join(facts).encode()).hexdigest()
+
     def task(self, index: int) -> str:
         """Task of an episode."""
-        return str(self._collection["episodes"][index]["task"])
+        return str(self._records[index]["task"])
 
     def metadata(self, index: int) -> Mapping[str, Any]:
         """Scenario seed and parameters of an episode."""
-        found: Mapping[str, Any] = self._collection["episodes"][index].get("metadata", {})
+        found: Mapping[str, Any] = self._records[index].get("metadata", {})
         return found
 
     def time_limit(self, index: int) -> int:
         """Planned length of an episode, ticks."""
-        return int(self._collection["episodes"][index]["time_limit"])
+        return int(self._records[index]["time_limit"])
 
     def digest(self, index: int) -> str:
-        """`Episode.digest` as it was when the episode was written; empty if not recorded."""
-        return str(self._collection["episodes"][index].get("sha256", ""))
-
-    @property
-    def content_digest(self) -> str:
-        """Hash of identity, length and recorded digest of the episodes that are asked for, in
-        order: equal for copies of a dataset, wherever they lie."""
-        facts = (f"{self.identity(i)} {self.lengths[i]} {self.digest(i)}" for i in self.chosen)
-        return hashlib.sha256("\n".join(facts).encode()).hexdigest()
+        """Recorded `Episode.digest` of an episode; empty if not recorded."""
+        return str(self._records[index].get("sha256", ""))
 
     def identity(self, index: int) -> str:
-        """What the episode is, whatever dataset holds it: task, seed and episode number."""
+        """Task, seed and episode number, the same in every dataset that holds the episode."""
         facts = self.metadata(index)
         seed, number = facts.get("seed", self._collection.get("seed")), facts.get("episode", index)
         return f"{self.task(index)}/{seed}/{number}"
 
     def scenario(self, index: int) -> ScenarioKey | None:
-        """What an episode simulates, whatever dataset holds it; None if that is not recorded.
-
-        Unlike `identity` it tells collections of different configurations apart.
-
-        Raises:
-            DataError: it names a collection that is not recorded.
-        """
+        """Key of the simulated scenario, distinct between configurations; None if not recorded."""
         try:
             return self._scenarios.key(self.task(index), self.metadata(index))
         except DataError as error:
             raise DataError.at(self.root / schema.COLLECTION_PATH, error.problem, index) from error
 
-    def read(self, index: int, digests: Digests | None = None) -> Episode:
-        """Read one episode, validate it and compare it with its recorded digest.
+    def data_path(self, index: int) -> Path:
+        """The file that holds an episode."""
+        return self.root / self._name(index)
 
-        Args:
-            index: its number.
-            digests: compares it while others are read, and raises what is wrong then; None: it is
-                compared at once.
+    def read(self, index: int) -> Episode:
+        """Read one episode, validate it and compare it with its recorded digest.
 
         Raises:
             DataError: the file is damaged or its content violates the specification.
             IndexError: there is no such episode.
         """
-        episode, problems = self._examined(index) if digests is not None else self.inspect(index)
+        episode, problems = self.inspect(index)
         for error in problems:
             raise error
         assert episode is not None
-        if digests is not None:
-            digests.compare(episode, self.digest(index), self._changed(index))
         return episode
 
     def inspect(self, index: int) -> tuple[Episode | None, list[DataError]]:
-        """Read one episode, and everything that is wrong with it; None if it cannot be read.
-
-        Raises:
-            IndexError: there is no such episode.
-        """
-        episode, problems = self._examined(index)
-        known = self.digest(index)
-        if episode is not None and not problems and known not in ("", episode.digest()):
-            problems = [self._changed(index)]
-        return episode, problems
-
-    def _examined(self, index: int) -> tuple[Episode | None, list[DataError]]:
-        """As `inspect`, but for the digest."""
+        """Read one episode, and all its problems; the episode is None if it cannot be read."""
         path = self.data_path(index)
         try:
-            columns = self._columns(index, tuple(schema.FEATURES))
+            columns = self.read_episode_columns(index, tuple(schema.FEATURES))
         except DataError as error:
             return None, [error]
-        episode = Episode(
+        episode = self.to_episode(index, columns)
+        found = [*self._index_problems(index, columns), *episode.problems()]
+        if not found and self.digest(index) not in ("", episode.digest()):
+            problem = "differs from what was collected: its sha256 is not the recorded one"
+            found = [(None, problem)]
+        return episode, [DataError.at(path, problem, index, frame) for frame, problem in found]
+
+    def to_episode(self, index: int, columns: Columns) -> Episode:
+        """The episode whose arrays are in ``columns``, not validated."""
+        return Episode(
             **{name: columns[key] for name, key in EPISODE_FEATURES.items()},
             task=self.task(index),
             time_limit=self.time_limit(index),
             metadata=self.metadata(index),
         )
-        found = [*self._index_problems(index, columns), *episode.problems()]
-        return episode, [DataError.at(path, problem, index, frame) for frame, problem in found]
-
-    def _changed(self, index: int) -> DataError:
-        return DataError.at(
-            self.data_path(index),
-            "differs from what was collected: its sha256 is not the recorded one",
-            index,
-        )
 
     def read_columns(self, names: Sequence[str]) -> Columns:
-        """Whole columns over all frames, ``(N, ...)`` each, in episode order.
-
-        Args:
-            names: LeRobot feature names, keys of ``schema.FEATURES``.
-        """
-        for name in names:
-            if name not in schema.FEATURES:
-                raise DataError(f"no column {name!r}{suggest(name, schema.FEATURES)}")
-        parts = [self._columns(i, tuple(names)) for i in range(len(self))]
+        """Whole columns over all frames, ``(N, ...)``; ``names`` are keys of `schema.FEATURES`."""
+        parts = [self.read_episode_columns(i, names) for i in range(len(self))]
         return {name: np.concatenate([part[name] for part in parts]) for name in names}
 
     def read_episode_columns(self, index: int, names: Sequence[str]) -> Columns:
         """Some columns of one episode, ``(T, ...)`` each, not validated.
 
         Raises:
-            DataError: the file is damaged.
+            DataError: there is no such column, or the file is damaged.
             IndexError: there is no such episode.
         """
-        return self._columns(index, names)
-
-    def _columns(self, index: int, names: Sequence[str]) -> Columns:
+        for name in names:
+            if name not in schema.FEATURES:
+                raise DataError(f"no column {name!r}{suggest(name, schema.FEATURES)}")
         if not 0 <= index < len(self):
             raise IndexError(f"episode {index} of {len(self)}")
         path = self.data_path(index)
         try:
-            with damaged(path):
+            with data_errors(path):
                 table = self._rows(path, index, names)
-                if table.num_rows != self._table.length[index]:
+                if table.num_rows != self.lengths[index]:
                     raise DataError("ends before the end of the episode")
                 return {name: to_numpy(table[name], name) for name in names}
         except DataError as error:
             raise DataError.at(path, error.problem or str(error), index, error.frame) from error
 
-    def bring(self, index: int) -> None:
-        """Have the file of an episode here, which may mean to wait for it.
+    def download(self, index: int) -> None:
+        """Download the file of an episode unless it is on disk; see `HubFileCache.get`."""
+        if self._cache is not None:
+            self._cache.get(self._name(index))
 
-        Raises:
-            DataError: the dataset on the Hub lacks it.
-            EnvironmentFailure: the Hub cannot be reached, or refuses.
-        """
-        if self._shelf is not None:
-            self._shelf.bring(self._name(index))
-
-    def expect(self, indices: Sequence[int]) -> None:
-        """Say which episodes are read next, so that their files come meanwhile."""
-        if self._shelf is not None:
-            self._shelf.expect(map(self._name, indices))
+    def prefetch(self, indices: Sequence[int]) -> None:
+        """Start to download the files of the episodes that are read next."""
+        if self._cache is not None:
+            self._cache.prefetch(map(self._name, indices))
 
     def episode_stats(self, feature: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Mean and deviation of a feature in each episode, (E, n) each, from `meta/episodes`.
-
-        Raises:
-            DataError: they are not there.
-        """
+        """Mean and standard deviation of a feature in each episode, (E, n) each, if recorded."""
         return metadata.load_episode_stats(self.root, feature, len(self))
 
     def _name(self, index: int) -> str:
-        return str(self._info["data_path"]).format(
+        return str(self.info["data_path"]).format(
             chunk_index=int(self._table.chunk_index[index]),
             file_index=int(self._table.file_index[index]),
         )
 
     def _opened(self, path: Path) -> tuple[pq.ParquetFile, NDArray[np.int64]]:
         """A data file, and the rows (groups + 1,) at which its row groups begin and end."""
-        if self._shelf is not None:
-            self._shelf.bring(path.relative_to(self.root).as_posix())
+        if self._cache is not None:
+            self._cache.get(path.relative_to(self.root).as_posix())
         file = open_data_file(self.root, path)
         content = file.metadata
         groups = [content.row_group(g).num_rows for g in range(content.num_row_groups)]
         return file, np.cumsum([0, *groups])
 
-    def data_path(self, index: int) -> Path:
-        """The file that holds an episode."""
-        return self.root / self._name(index)
-
     def _rows(self, path: Path, index: int, names: Sequence[str]) -> pa.Table:
         """The rows of an episode, from the row groups that hold them."""
+        # The file names of depth frames are not read.
+        columns = [f"{name}.bytes" if name == spec.DEPTH_KEY else name for name in names]
         first = int(self._table.start[index] - self._file_start[index])
-        last = first + int(self._table.length[index])
-        with self._reading:
+        last = first + int(self.lengths[index])
+        with self._lock:
             file, edges = self._open_file(path)
             touched = np.flatnonzero((edges[:-1] < last) & (edges[1:] > first))
-            table = file.read_row_groups(touched.tolist(), columns=_parts(names), use_threads=False)
+            table = file.read_row_groups(touched.tolist(), columns=columns, use_threads=False)
         offset = first - int(edges[touched[0]]) if len(touched) else 0
         return table.slice(offset, last - first)
 
-    def _index_problems(self, index: int, columns: Columns) -> Iterator[tuple[int, str]]:
+    def _index_problems(self, index: int, columns: Columns) -> Iterator[tuple[int | None, str]]:
         frames = np.arange(len(columns["index"]))
         counts = {
             "index": frames + self._table.start[index],
@@ -375,21 +324,16 @@ class DatasetReader:
             at = int(np.argmax(late))
             found = columns["timestamp"][at]
             yield at, f"timestamp {found:g} s, expected {at / self.fps:g} at {self.fps} fps"
-        own = [number for number, name in self._task_names.items() if name == self.task(index)]
+        own = [number for number, name in self.task_names.items() if name == self.task(index)]
         other = ~np.isin(columns["task_index"], own)
         if other.any():
             at = int(np.argmax(other))
-            found = self._task_names.get(int(columns["task_index"][at]), "unknown")
+            found = self.task_names.get(int(columns["task_index"][at]), "unknown")
             yield at, f"its task is {found}, but {schema.COLLECTION_PATH} says {self.task(index)}"
 
 
-def _asked_for(config: DatasetConfig) -> str:
+def _selection(config: DatasetConfig) -> str:
     return config.episodes if isinstance(config, SelectedDatasetConfig) else ""
-
-
-def _parts(names: Sequence[str]) -> list[str]:
-    """The columns as parquet names them; a depth frame's file name is of no use here."""
-    return [f"{name}.bytes" if name == spec.DEPTH_KEY else name for name in names]
 
 
 def _file_starts(table: metadata.EpisodeTable) -> NDArray[np.int64]:
@@ -397,3 +341,43 @@ def _file_starts(table: metadata.EpisodeTable) -> NDArray[np.int64]:
     files = np.stack([table.chunk_index, table.file_index], axis=1)
     _, first_episode, file_of = np.unique(files, axis=0, return_index=True, return_inverse=True)
     return np.asarray(table.start[first_episode][file_of])
+
+
+def open_dataset(where: str | Path, revision: str = "") -> DatasetReader:
+    """Open a folder, or ``user/name`` on the Hub at a branch, tag or commit SHA.
+
+    Raises:
+        UsageError: no dataset is named, or a revision of a folder.
+        DataError: there is no such folder, or it is damaged or of another specification.
+        EnvironmentFailure: the Hub cannot be reached.
+    """
+    if not isinstance(where, str) or is_local_path(where):
+        return DatasetReader.open(DatasetConfig(root=str(where), revision=revision))
+    return DatasetReader.open(DatasetConfig(repo_id=str(where), revision=revision))
+
+
+def load_arrays(
+    dataset: str | Path | DatasetReader, columns: Sequence[str] = tuple(spec.FEATURES)
+) -> dict[str, NDArray[Any]]:
+    """Whole columns of a dataset of B episodes as (B, T, ...), T the longest episode's frames.
+
+    Frames after the end of an episode are zeros, and False in the additional array ``valid``
+    (B, T). Depth takes 6 kB per frame: omit it from ``columns`` if it is not needed.
+
+    Args:
+        dataset: a folder, an id on the Hub, or an open dataset.
+        columns: LeRobot feature names, keys of ``schema.FEATURES``.
+
+    Raises:
+        DataError: there is no such column, or the dataset is damaged.
+    """
+    reader = dataset if isinstance(dataset, DatasetReader) else open_dataset(dataset)
+    longest = int(reader.lengths.max())
+    out: dict[str, NDArray[Any]] = {"valid": np.arange(longest) < reader.lengths[:, None]}
+    for index, length in enumerate(reader.lengths):
+        for name, values in reader.read_episode_columns(index, columns).items():
+            if name not in out:
+                shape = (len(reader), longest, *values.shape[1:])
+                out[name] = np.zeros(shape, dtype=values.dtype)
+            out[name][index, :length] = values
+    return out

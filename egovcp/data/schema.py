@@ -14,36 +14,33 @@ CODEBASE_VERSION: Final = "v3.0"
 ROBOT_TYPE: Final = "unitree_g1"
 DEPTH_UNIT: Final = "mm"
 CHUNK_FILES: Final = 1000  # files per chunk folder
-FILE_MB: Final = 100  # said to LeRobot's own writer, should it append
+FILE_MB: Final = 100  # for LeRobot's writer, should it append
 
 DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
 INFO_PATH: Final = "meta/info.json"
 STATS_PATH: Final = "meta/stats.json"
 TASKS_PATH: Final = "meta/tasks.parquet"
-#: What LeRobot has no place for: provenance and the scenario of each episode.
+#: Provenance and the scenario of each episode, which are not part of the LeRobot format.
 COLLECTION_PATH: Final = "meta/collection.json"
 COLLECTION_VERSION: Final = 2
 #: SHA-256 of every other file.
 HASHES_PATH: Final = "meta/sha256.json"
-#: Which commit of the Hub a downloaded folder is.
+#: Hub commit of a downloaded folder.
 SOURCE_PATH: Final = "meta/source.json"
 #: Episodes per shard: one data file and one file of the episodes table (150 ticks: 95 MB).
 SHARD_EPISODES: Final = 100
 
 #: Columns that LeRobot adds to every dataset.
 INDEX_FEATURES: Final[dict[str, dict[str, object]]] = {
-    "timestamp": {"dtype": "float32", "shape": (1,), "names": None},
-    "frame_index": {"dtype": "int64", "shape": (1,), "names": None},
-    "episode_index": {"dtype": "int64", "shape": (1,), "names": None},
-    "index": {"dtype": "int64", "shape": (1,), "names": None},
-    "task_index": {"dtype": "int64", "shape": (1,), "names": None},
+    key: {"dtype": "float32" if key == "timestamp" else "int64", "shape": (1,), "names": None}
+    for key in ("timestamp", "frame_index", "episode_index", "index", "task_index")
 }
 FEATURES: Final = {**spec.FEATURES, **INDEX_FEATURES}
 
 #: Numeric columns in the order of ``FEATURES``; every one but the depth image.
 NUMERIC_KEYS: Final = tuple(key for key in FEATURES if key != spec.DEPTH_KEY)
-#: Those that an episode itself holds; the others say where in a dataset a frame lies.
+#: Those of an `Episode`; the others give the position of a frame in the dataset.
 DATA_KEYS: Final = tuple(key for key in spec.FEATURES if key != spec.DEPTH_KEY)
 
 
@@ -55,7 +52,7 @@ def width(key: str) -> int:
 
 
 def type_problems(found: pa.Schema) -> Iterator[str]:
-    """What is wrong with the columns of a data file; a list may be of fixed size or not."""
+    """Problems of the columns of a data file; lists may be of fixed size or not."""
     expected = arrow_schema()
     for name in sorted(set(expected.names) - set(found.names)):
         yield f"column {name} is missing"
@@ -67,7 +64,7 @@ def type_problems(found: pa.Schema) -> Iterator[str]:
 
 
 def _elements(kind: pa.DataType) -> tuple[bool, pa.DataType]:
-    """Whether a type is a list, and of what."""
+    """Whether a type is a list, and its element type."""
     listed = pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind)
     return listed, kind.value_type if listed else kind
 
@@ -75,8 +72,8 @@ def _elements(kind: pa.DataType) -> tuple[bool, pa.DataType]:
 def info_features(controller_id: str) -> dict[str, dict[str, object]]:
     """The ``features`` of ``info.json``.
 
-    The controller is named inside the action's ``info``: what an action does depends on
-    it, and LeRobot's own tools keep feature descriptions and refuse to merge unequal ones.
+    The action's ``info`` names the controller, on which the effect of an action depends: LeRobot's
+    tools keep feature descriptions and refuse to merge datasets in which they differ.
     """
     features = {key: dict(value) for key, value in FEATURES.items()}
     features[spec.DEPTH_KEY]["info"] = {"is_depth_map": True, "depth_unit": DEPTH_UNIT}
@@ -93,7 +90,7 @@ def arrow_schema() -> pa.Schema:
 
 
 def episode_schema() -> pa.Schema:
-    """Arrow schema of what an episode itself holds: depth and `DATA_KEYS`."""
+    """Arrow schema of an episode: depth and `DATA_KEYS`."""
     return pa.schema([pa.field(key, _arrow_type(spec.FEATURES[key])) for key in spec.FEATURES])
 
 

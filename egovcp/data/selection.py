@@ -1,4 +1,4 @@
-"""Which episodes of a dataset are asked for: ``[0, 5, 7]``, ``0:1334``, ``[0:100, 250]``."""
+"""Parses a selection of episodes: ``[0, 5, 7]``, ``0:1334``, ``[0:100, 250]``."""
 
 from __future__ import annotations
 
@@ -14,48 +14,44 @@ _PART = re.compile(r"(\d{1,18})|(\d{0,18}):(\d{0,18})", re.ASCII)
 
 
 def select_episodes(text: str, count: int, flag: str = "--dataset.episodes") -> NDArray[np.int64]:
-    """The numbers that ``text`` names, in ascending order, each once; all of them if it is empty.
+    """The selected episode numbers, ascending and unique; all if ``text`` is empty.
 
-    A lone number needs its brackets: YAML reads the range ``1:30`` as the number 90 where it is not
-    quoted, and that must not pass for an episode.
+    A single number needs brackets: YAML reads an unquoted ``1:30`` as the number 90, which must not
+    be taken for an episode.
 
     Args:
         text: numbers and ranges ``first:end`` without the end, separated by commas; either end of
-            a range may be left out. May be in brackets or parentheses.
+            a range may be omitted. May be in brackets or parentheses.
         count: episodes of the dataset.
-        flag: names the option in messages.
+        flag: the option, for messages.
 
     Raises:
-        UsageError: it is not of this form, names nothing, or an episode that is not there.
+        UsageError: ``text`` is malformed, selects nothing, or an episode that does not exist.
     """
-    if not text.strip():
+    inner = text.strip()
+    if not inner:
         return np.arange(count)
     given = f"{flag}={as_flag_value(text)}"
-    wanted: NDArray[np.int64] = np.unique(
-        np.concatenate([_part(part, given, count) for part in _parts(text, given)])
-    )
-    if len(wanted) == 0:
-        raise UsageError(f"{given} names no episode; there are {count}")
-    return wanted
-
-
-def _parts(text: str, given: str) -> list[str]:
-    inner = text.strip()
     if inner[0] + inner[-1] in ("[]", "()"):
         inner = inner[1:-1]
     elif inner.isdigit():
+        number = as_flag_value(inner)
         raise UsageError(
-            f"{given}: for a single episode write [{as_flag_value(inner)}], for the first ones "
-            f"0:{as_flag_value(inner)}; in YAML, quote a range: '0:{as_flag_value(inner)}'"
+            f"{given}: for a single episode write [{number}], for the first ones 0:{number}; in "
+            f"YAML, quote a range: '0:{number}'"
         )
-    return [part.strip() for part in inner.split(",")]
+    parts = [_part(part.strip(), given, count) for part in inner.split(",")]
+    wanted: NDArray[np.int64] = np.unique(np.concatenate(parts))
+    if len(wanted) == 0:
+        raise UsageError(f"{given} selects no episode; there are {count}")
+    return wanted
 
 
 def _part(part: str, given: str, count: int) -> NDArray[np.int64]:
     found = _PART.fullmatch(part)
     if found is None:
         raise UsageError(
-            f"{given}: {as_flag_value(part)!r} is no episode; expected numbers, [0, 5, 7], a "
+            f"{given}: {as_flag_value(part)!r} is not an episode; expected numbers, [0, 5, 7], a "
             "range without its end, 0:1334, or both, [0:100, 250]"
         )
     number, first, end = found.groups()

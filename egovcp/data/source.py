@@ -1,4 +1,4 @@
-"""Where a dataset lies: a folder, LeRobot's local cache, or the Hub at a pinned commit."""
+"""Finds a dataset: a folder, LeRobot's local folder, or the Hub at a pinned commit."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from egovcp.cli import DatasetConfig
 from egovcp.data import schema
 from egovcp.data.files import write_json
 from egovcp.errors import DataError, UsageError, suggest_path
-from egovcp.hub import RetryPolicy, Shelf, is_repo_id, snapshot
+from egovcp.hub import HubFileCache, RetryPolicy, is_repo_id, snapshot
 from egovcp.safe_files import read_json
 
 _RETRY_POLICY = RetryPolicy()
@@ -18,7 +18,7 @@ _RETRY_POLICY = RetryPolicy()
 
 @dataclass(frozen=True)
 class Source:
-    """A dataset folder and, if it came from the Hub, the commit that it is."""
+    """A dataset folder and, if it was downloaded, its repository and commit."""
 
     root: Path
     repo_id: str
@@ -33,11 +33,7 @@ def lerobot_home() -> Path:
 
 
 def local_root(config: DatasetConfig) -> Path:
-    """The folder that ``config`` names: its root, or LeRobot's place for the repo id.
-
-    Raises:
-        UsageError: neither root nor a well-formed repo id is given.
-    """
+    """The folder that ``config`` names: its root, or LeRobot's folder for the repo id."""
     if config.root:
         return Path(os.path.expanduser(config.root)).absolute()
     _require_repo_id(config.repo_id)
@@ -47,29 +43,30 @@ def local_root(config: DatasetConfig) -> Path:
 def locate(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Source:
     """Find the dataset; download it only if no root is given and no local copy exists.
 
-    If the Hub cannot be reached, a complete earlier download serves.
+    If the Hub cannot be reached, a complete earlier download is used.
 
     Raises:
-        UsageError: bad or missing id, or a revision asked of a folder.
-        DataError: no dataset there.
+        UsageError: bad or missing id, or a revision given with a folder.
+        DataError: there is no dataset.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
     root = local_root(config)
     if config.root and config.revision:
         raise UsageError(
-            "--dataset.revision pins a dataset of the Hub and cannot be checked for a folder; "
+            "--dataset.revision selects a version on the Hub and cannot be checked for a folder; "
             "drop it, or drop --dataset.root"
         )
     if (root / schema.INFO_PATH).is_file() and not config.revision:
-        return recorded(root, config.repo_id)
+        return read_source(root, config.repo_id)
     if config.root:
         require_folder(root)
         raise DataError(f"no dataset at {root}: {schema.INFO_PATH} is missing")
-    return _download(config, retry)
+    folder = snapshot(config.repo_id, config.revision, retry, cache_dir=_hub_cache())
+    return Source(folder, config.repo_id, commit=folder.name)
 
 
 def require_folder(root: Path) -> None:
-    """Raise `DataError`, which suggests the nearest existing name, unless there is a folder."""
+    """Raise `DataError`, which suggests a similar name, unless ``root`` is a folder."""
     if not os.path.lexists(root):
         raise DataError(f"no such folder: {root}{suggest_path(root)}")
     if not root.is_dir():
@@ -77,19 +74,15 @@ def require_folder(root: Path) -> None:
 
 
 def is_local(config: DatasetConfig) -> bool:
-    """Whether the dataset is a folder: the root, or LeRobot's, unless a revision is asked for.
-
-    Raises:
-        UsageError: neither root nor a well-formed repo id is given.
-    """
+    """Whether the dataset is a folder: the root, or LeRobot's if no revision is given."""
     there = (local_root(config) / schema.INFO_PATH).is_file()
     return bool(config.root) or (there and not config.revision)
 
 
-def shelve(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Shelf:
-    """A dataset of the Hub with its `meta` folder; the other files can be brought from there.
+def open_file_cache(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> HubFileCache:
+    """Download the `meta` folder of a dataset on the Hub; the cache downloads its other files.
 
-    If the Hub cannot be reached, a complete `meta` folder of an earlier download serves.
+    If the Hub cannot be reached, a complete `meta` folder of an earlier download is used.
 
     Raises:
         UsageError: bad or missing id.
@@ -97,27 +90,23 @@ def shelve(config: DatasetConfig, retry: RetryPolicy = _RETRY_POLICY) -> Shelf:
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
     _require_repo_id(config.repo_id)
-    return Shelf.open(config.repo_id, config.revision, retry, _hub_cache(), ["meta/*"])
+    return HubFileCache(config.repo_id, config.revision, retry, _hub_cache(), ["meta/*"])
 
 
-def record(source: Source) -> None:
-    """Note in a downloaded folder which commit it is."""
+def write_source(source: Source) -> None:
+    """Write ``meta/source.json``, which identifies the commit of a downloaded folder."""
     content = {"repo_id": source.repo_id, "commit": source.commit}
     write_json(source.root / schema.SOURCE_PATH, content)
 
 
-def recorded(root: Path, repo_id: str = "") -> Source:
-    """The source of a folder: the one noted in it, unless it is of another dataset.
-
-    Raises:
-        DataError: the note is damaged.
-    """
+def read_source(root: Path, repo_id: str = "") -> Source:
+    """The source of a folder, with the commit in ``meta/source.json`` if that is of ``repo_id``."""
     path = root / schema.SOURCE_PATH
     if not path.is_file():
         return Source(root, repo_id)
     try:
-        note = read_json(path)
-        found = Source(root, str(note["repo_id"]), str(note["commit"]))
+        content = read_json(path)
+        found = Source(root, str(content["repo_id"]), str(content["commit"]))
     except (ValueError, KeyError, TypeError) as error:
         raise DataError(f"{path} is damaged; remove it, or pull the dataset again") from error
     return found if repo_id in ("", found.repo_id) else Source(root, repo_id)
@@ -125,16 +114,13 @@ def recorded(root: Path, repo_id: str = "") -> Source:
 
 def _require_repo_id(repo_id: str) -> None:
     if not repo_id:
-        raise UsageError("which dataset? give --dataset.repo_id=user/name or --dataset.root=FOLDER")
+        raise UsageError(
+            "no dataset is named; give --dataset.repo_id=user/name or --dataset.root=FOLDER"
+        )
     if not is_repo_id(repo_id):
         raise UsageError(f"--dataset.repo_id={repo_id!r} is not of the form user/name")
 
 
-def _download(config: DatasetConfig, retry: RetryPolicy) -> Source:
-    folder = snapshot(config.repo_id, config.revision, retry, cache_dir=_hub_cache())
-    return Source(folder, config.repo_id, commit=folder.name)
-
-
 def _hub_cache() -> Path:
-    """Where LeRobot, too, keeps what it has downloaded."""
+    """LeRobot's folder of downloads."""
     return lerobot_home() / "hub"

@@ -8,7 +8,7 @@ min, max, mean and std, and the count-weighted mean of the episodes' quantiles.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -39,21 +39,12 @@ DATA_COLUMNS: Final = slice(0, LAYOUT[next(iter(schema.INDEX_FEATURES))].start)
 
 
 def data_stats(depth: NDArray[np.uint16], columns: Mapping[str, NDArray[np.generic]]) -> Matrix:
-    """Statistics ``(R, D1)`` of what an episode itself holds: depth and `schema.DATA_KEYS`.
-
-    Args:
-        depth: (T, H, W) mm.
-        columns: every key of ``schema.DATA_KEYS``, (T,) or (T, n).
-    """
+    """Statistics ``(R, D1)`` of depth (T, H, W), mm, and of `schema.DATA_KEYS`, (T,) or (T, n)."""
     return np.concatenate([_depth_stats(depth), _numeric_stats(columns, schema.DATA_KEYS)], axis=1)
 
 
 def index_stats(columns: Mapping[str, NDArray[np.generic]]) -> Matrix:
-    """Statistics ``(R, D2)`` of the columns that say where in a dataset a frame lies.
-
-    Args:
-        columns: every key of ``schema.INDEX_FEATURES``, (T,).
-    """
+    """Statistics ``(R, D2)`` of `schema.INDEX_FEATURES`, (T,) each."""
     return _numeric_stats(columns, tuple(schema.INDEX_FEATURES))
 
 
@@ -65,7 +56,7 @@ def _numeric_stats(columns: Mapping[str, NDArray[np.generic]], keys: Sequence[st
 
 
 def _depth_stats(depth: NDArray[np.uint16]) -> Matrix:
-    """(R, 1) from the histogram of all pixels: exact, and one pass over them."""
+    """(R, 1) from the histogram of all pixels: exact, in one pass."""
     counts = np.bincount(depth.reshape(-1))
     present = np.flatnonzero(counts)
     weights = counts[present]
@@ -78,7 +69,7 @@ def _depth_stats(depth: NDArray[np.uint16]) -> Matrix:
 
 
 def aggregate(matrices: Sequence[Matrix], counts: Sequence[int]) -> Matrix:
-    """Statistics of the union of episodes (or of groups of them) with these frame counts."""
+    """Statistics of the union of episodes, or groups of them, with these frame counts."""
     stacked, weight = np.stack(matrices), np.asarray(counts, dtype=np.float64)[:, None]
     total = weight.sum()
     out: Matrix = np.empty_like(stacked[0])
@@ -91,18 +82,14 @@ def aggregate(matrices: Sequence[Matrix], counts: Sequence[int]) -> Matrix:
 
 
 def to_json(matrix: Matrix, count: int) -> dict[str, dict[str, object]]:
-    """The content of ``stats.json``; depth statistics are shaped (1, 1, 1) like an image's."""
+    """The content of ``stats.json``."""
     return {
         key: {
-            **{row: _nest(key, matrix[i, part].tolist()) for i, row in enumerate(ROWS)},
+            **{row: _nested(key, matrix[None, i, part])[0] for i, row in enumerate(ROWS)},
             "count": [count],
         }
         for key, part in LAYOUT.items()
     }
-
-
-def _nest(key: str, values: list[float]) -> object:
-    return [[values]] if key == spec.DEPTH_KEY else values
 
 
 def to_arrow(matrices: Sequence[Matrix], counts: Sequence[int]) -> dict[str, pa.Array]:
@@ -111,28 +98,22 @@ def to_arrow(matrices: Sequence[Matrix], counts: Sequence[int]) -> dict[str, pa.
     columns: dict[str, pa.Array] = {}
     for key, part in LAYOUT.items():
         for i, row in enumerate(ROWS):
-            column = _lists(np.ascontiguousarray(stacked[:, i, part]))
-            for _ in range(2 if key == spec.DEPTH_KEY else 0):
-                column = pa.ListArray.from_arrays(_offsets(len(stacked), 1), column)
-            columns[f"stats/{key}/{row}"] = column
-        columns[f"stats/{key}/count"] = _lists(np.asarray(counts, dtype=np.int64)[:, None])
+            columns[f"stats/{key}/{row}"] = pa.array(_nested(key, stacked[:, i, part]))
+        columns[f"stats/{key}/count"] = pa.array([[count] for count in counts])
     return columns
 
 
+def _nested(key: str, values: Matrix) -> list[Any]:
+    """Values (E, n) of a feature as lists; of depth as (1, 1, 1) like an image."""
+    nested: list[Any] = (values[..., None, None] if key == spec.DEPTH_KEY else values).tolist()
+    return nested
+
+
 def from_arrow(table: pa.Table) -> list[Matrix]:
-    """The matrices ``(R, D)`` of the episodes in a table that `to_arrow` made."""
+    """The matrices ``(R, D)`` of the episodes in a table of `to_arrow`."""
     out: list[Matrix] = [np.empty((len(ROWS), _DIM)) for _ in range(table.num_rows)]
     for key, part in LAYOUT.items():
         for i, row in enumerate(ROWS):
             for matrix, values in zip(out, table[f"stats/{key}/{row}"].to_pylist(), strict=True):
                 matrix[i, part] = np.ravel(values)
     return out
-
-
-def _lists(values: NDArray[np.generic]) -> pa.ListArray:
-    rows, size = values.shape
-    return pa.ListArray.from_arrays(_offsets(rows, size), pa.array(values.reshape(-1)))
-
-
-def _offsets(rows: int, size: int) -> pa.Int32Array:
-    return pa.array(np.arange(rows + 1, dtype=np.int32) * np.int32(size))

@@ -1,21 +1,30 @@
-"""Episodes of one or several datasets as contiguous arrays in memory, with their targets."""
+"""Episodes as contiguous arrays in memory, with their targets, and windows of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Final, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp import spec
-from egovcp.data import targets
-from egovcp.data.episode import Episode
-from egovcp.data.index import EpisodeIndex, fingerprint
+from egovcp.data.episode import FRAME_LAYOUT, Episode, FrameLayout
+from egovcp.data.index import HELDOUT_FRACTION, EpisodeIndex, fingerprint
+from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
 from egovcp.data.reader import DatasetReader
-from egovcp.data.returns import ReturnConfig
-from egovcp.data.split import HELDOUT_FRACTION
+from egovcp.data.returns import ReturnConfig, is_terminal, mc_return, mc_valid
+
+type Batch = dict[str, NDArray[Any]]
+
+_FROM_EPISODE: Final = ("depth", "state", "action", "reward", "done", "success")
+_ARRAYS: Final[Mapping[str, FrameLayout]] = {
+    **{name: FRAME_LAYOUT[name] for name in _FROM_EPISODE},
+    "prev_action": FRAME_LAYOUT["action"],
+    "terminal_next": ((), np.bool_),
+    "mc_return": ((), np.float32),
+    "mc_valid": ((), np.bool_),
+}
 
 
 @dataclass(frozen=True)
@@ -47,11 +56,11 @@ class EpisodeStore:
     length: NDArray[np.int64]
     """(E,) frames of each episode."""
     dataset: NDArray[np.int64]
-    """(E,) which dataset each episode is of."""
+    """(E,) dataset of each episode."""
     tasks: tuple[str, ...]
     """(E,) task of each episode; for sampling and reports, never for the network."""
     identities: tuple[str, ...]
-    """(E,) what each episode is (see `DatasetReader.identity`)."""
+    """(E,) `DatasetReader.identity` of each episode."""
 
     @classmethod
     def load(
@@ -62,26 +71,16 @@ class EpisodeStore:
         heldout_fraction: float = HELDOUT_FRACTION,
         per_task: int | None = None,
     ) -> Self:
-        """Read the episodes of a split into memory (6.3 kB per frame, nearly all depth).
+        """Read the episodes of a split, at most ``per_task`` of each task, into memory.
 
-        Args:
-            per_task: read at most this many episodes of each task, evenly spread over those of
-                the split; None: all.
-
-        Raises:
-            DataError: the datasets cannot be mixed, are damaged, or the split is empty.
-            UsageError: there is no such split.
+        A frame takes 6.3 kB, nearly all depth.
         """
         index = EpisodeIndex.of(readers, split, heldout_fraction)
-        return cls.read(index if per_task is None else index.spread(per_task), returns)
+        return cls.read(index if per_task is None else index.subsample(per_task), returns)
 
     @classmethod
     def read(cls, index: EpisodeIndex, returns: ReturnConfig | None = None) -> Self:
-        """Read all episodes of an index into memory, each validated.
-
-        Raises:
-            DataError: a dataset is damaged.
-        """
+        """Read and validate all episodes of an index."""
         store = cls.empty(index.length, index.dataset, index.tasks, index.identities)
         for number in range(len(index)):
             store.fill(number, index.read(number), returns or ReturnConfig())
@@ -95,8 +94,12 @@ class EpisodeStore:
         tasks: tuple[str, ...] = (),
         identities: tuple[str, ...] = (),
     ) -> Self:
-        """Room for episodes of these lengths."""
-        arrays = _allocate(int(length.sum()))
+        """Allocate arrays for episodes of these lengths."""
+        frames = int(length.sum())
+        arrays: dict[str, NDArray[Any]] = {
+            name: np.empty((frames, *shape), dtype=dtype)
+            for name, (shape, dtype) in _ARRAYS.items()
+        }
         start = length.cumsum() - length
         return cls(
             **arrays,
@@ -108,16 +111,16 @@ class EpisodeStore:
         )
 
     def fill(self, number: int, episode: Episode, config: ReturnConfig) -> None:
-        """Write an episode and its targets to where episode ``number`` starts."""
+        """Write an episode and its targets to the frames of episode ``number``."""
         first = int(self.start[number])
         rows = slice(first, first + len(episode))
-        for name in ("depth", "state", "action", "reward", "done", "success"):
+        for name in _FROM_EPISODE:
             getattr(self, name)[rows] = getattr(episode, name)
         self.prev_action[first] = 0.0
         self.prev_action[first + 1 : rows.stop] = episode.action[:-1]
-        self.terminal_next[rows] = targets.is_terminal(episode.done, episode.truncated)
-        self.mc_return[rows] = targets.mc_return(episode.reward, config.gamma, config.steps)
-        self.mc_valid[rows] = targets.mc_valid(
+        self.terminal_next[rows] = is_terminal(episode.done, episode.truncated)
+        self.mc_return[rows] = mc_return(episode.reward, config.gamma, config.steps)
+        self.mc_valid[rows] = mc_valid(
             len(episode), episode.time_limit, config.steps, config.keep_truncated
         )
 
@@ -128,21 +131,38 @@ class EpisodeStore:
 
     @property
     def fingerprint(self) -> str:
-        """Hash of which episodes these are, in order."""
+        """Hash of the episodes' identities and lengths, in order."""
         return fingerprint(self.identities, self.length)
 
 
-def _allocate(frames: int) -> dict[str, NDArray[Any]]:
-    pixels = (spec.DEPTH_ROWS, spec.DEPTH_COLS)
-    return {
-        "depth": np.empty((frames, *pixels), dtype=np.uint16),
-        "state": np.empty((frames, spec.STATE_DIM), dtype=np.float32),
-        "action": np.empty((frames, spec.ACTION_DIM), dtype=np.float32),
-        "prev_action": np.empty((frames, spec.ACTION_DIM), dtype=np.float32),
-        "reward": np.empty(frames, dtype=np.float32),
-        "done": np.empty(frames, dtype=np.bool_),
-        "success": np.empty(frames, dtype=np.bool_),
-        "terminal_next": np.empty(frames, dtype=np.bool_),
-        "mc_return": np.empty(frames, dtype=np.float32),
-        "mc_valid": np.empty(frames, dtype=np.bool_),
+def gather(
+    store: EpisodeStore, start: NDArray[np.int64], episode: NDArray[np.int64], span: int
+) -> Batch:
+    """Windows of ``span`` rows, each from one episode, as arrays ``[B, span, ...]``.
+
+    Keys: depth (uint16 mm), state, action, prev_action, reward, done, success, is_first,
+    valid, mc_return, mc_valid, terminal_next; episode [B] and t [B, span] for reports.
+    Past the episode's end the last row is repeated with ``valid``, ``mc_valid`` and the
+    flags false.
+    """
+    end = store.start[episode] + store.length[episode]
+    wanted = start[:, None] + np.arange(span)
+    valid = wanted < end[:, None]
+    rows = np.minimum(wanted, end[:, None] - 1)
+    t = rows - store.start[episode][:, None]
+    batch: Batch = {
+        name: getattr(store, name)[rows]
+        for name in ("depth", "state", "action", "prev_action", "reward", "mc_return")
     }
+    for name in ("done", "success", "terminal_next", "mc_valid"):
+        batch[name] = getattr(store, name)[rows] & valid
+    batch |= {"is_first": (t == 0) & valid, "valid": valid, "episode": episode, "t": t}
+    return batch
+
+
+def mirror_windows(batch: Batch, windows: NDArray[np.intp]) -> None:
+    """Reflect some windows of a batch left to right, in place."""
+    batch["depth"][windows] = mirror_depth(batch["depth"][windows])
+    batch["state"][windows] = mirror_state(batch["state"][windows])
+    for name in ("action", "prev_action"):
+        batch[name][windows] = mirror_action(batch[name][windows])

@@ -61,14 +61,10 @@ def encode(depth: NDArray[np.uint16]) -> pa.BinaryArray:
 
 
 def decode(blobs: pa.BinaryArray, rows: int, cols: int) -> NDArray[np.uint16]:
-    """``T`` TIFF blobs -> depth ``(T, rows, cols)`` uint16; a view where the layout is ours.
-
-    Raises:
-        DataError: a blob is missing, is no TIFF, or has another size or pixel type.
-    """
+    """``T`` TIFF blobs -> depth ``(T, rows, cols)`` uint16; fast for the layout of `encode`."""
     if blobs.null_count:
         empty = int(np.argmax(blobs.is_null().to_numpy(zero_copy_only=False)))
-        raise _at(empty, "is empty")
+        raise frame_error(empty, "its depth image is empty")
     raw = _fixed_size_bytes(blobs, len(header(rows, cols)) + 2 * rows * cols)
     if raw is not None:
         head = np.frombuffer(header(rows, cols), dtype=np.uint8)
@@ -90,7 +86,7 @@ def _fixed_size_bytes(blobs: pa.BinaryArray, size: int) -> NDArray[np.uint8] | N
 
 
 def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uint16]:
-    from PIL import Image, UnidentifiedImageError  # only for layouts that are not ours
+    from PIL import Image, UnidentifiedImageError  # needed for other layouts only
 
     try:
         with (
@@ -101,30 +97,17 @@ def _decode_any(blob: bytes, frame: int, rows: int, cols: int) -> NDArray[np.uin
             if mode.startswith("I;16") and size == (cols, rows):
                 return np.asarray(image).astype(np.uint16)
     except UnidentifiedImageError as error:
-        raise _at(frame, "is no TIFF") from error
-    except (*_PILLOW_ERRORS, Image.DecompressionBombError) as error:
+        raise frame_error(frame, "its depth image is not a TIFF") from error
+    except Exception as error:  # Pillow's parser raises many types on damaged files
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise _at(frame, f"is not a readable TIFF: {reason}") from error
-    raise _at(frame, f"is {mode} {size[1]}x{size[0]}, expected uint16 {rows}x{cols}")
+        raise frame_error(frame, f"its depth image is not a readable TIFF: {reason}") from error
+    raise frame_error(
+        frame, f"its depth image is {mode} {size[1]}x{size[0]}, expected uint16 {rows}x{cols}"
+    )
 
 
-#: What Pillow raises on a damaged TIFF: its parser trusts what it reads.
-_PILLOW_ERRORS = (
-    ArithmeticError,
-    AttributeError,
-    EOFError,
-    LookupError,
-    OSError,
-    RuntimeError,
-    SyntaxError,
-    TypeError,
-    ValueError,
-    struct.error,
-)
-
-
-def _at(frame: int, problem: str) -> DataError:
-    error = DataError(f"depth frame {frame} {problem}")
-    error.frame = frame
-    error.problem = f"its depth image {problem}"
+def frame_error(frame: int, problem: str) -> DataError:
+    """An error of one frame of an episode."""
+    error = DataError(f"frame {frame}: {problem}")
+    error.frame, error.problem = frame, problem
     return error

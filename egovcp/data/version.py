@@ -1,8 +1,8 @@
-"""A dataset folder never changes: it is replaced by its next version.
+"""Writes a dataset as a sequence of versions; a published folder never changes, it is replaced.
 
-A version shares the files of its complete shards with the one before (hard links) and brings new
-shards and a new ``meta``. Its content depends on its episodes and provenance alone, not on how many
-versions came before it.
+A version shares the files of its complete shards with the one before (hard links) and adds new
+shards and a new ``meta``. Its content depends on its episodes and provenance alone, not on the
+number of versions before it. A shard is one data file and its part of the episodes table.
 """
 
 from __future__ import annotations
@@ -11,17 +11,20 @@ import errno
 import json
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
+
+import pyarrow as pa
+import pyarrow.parquet as pq
 
 from egovcp import spec
 from egovcp.atomic import removed_on_error
 from egovcp.data import files, schema, stats
 from egovcp.data.destination import is_vacant
-from egovcp.data.encoded import EncodedEpisode
 from egovcp.data.provenance import Provenance
-from egovcp.data.shard import Shard, shard_paths
+from egovcp.data.staging import EncodedEpisode, with_index
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.safe_files import sha256
 
@@ -32,16 +35,89 @@ _NO_RENAME: Final = (errno.EBUSY, errno.EXDEV)
 _OCCUPIED: Final = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)
 
 
+def shard_paths(number: int) -> tuple[str, str]:
+    """Relative paths of a shard's data file and of its file of the episodes table."""
+    place = _place(number)
+    return schema.DATA_PATH.format(**place), schema.EPISODES_PATH.format(**place)
+
+
+def _place(number: int) -> dict[str, int]:
+    chunk, file = divmod(number, schema.CHUNK_FILES)
+    return {"chunk_index": chunk, "file_index": file}
+
+
+class ShardWriter:
+    """Writes the files of shard ``number``, one row group per episode.
+
+    Both files are complete and flushed after `close`.
+    """
+
+    def __init__(self, folder: Path, number: int) -> None:
+        self._folder = folder
+        self._place = _place(number)
+        self._data_path, self._episodes_path = shard_paths(number)
+        self._file: IO[bytes] = files.create(folder / self._data_path)
+        # A dictionary does not compress depth; snappy halves it at little cost.
+        self._writer = pq.ParquetWriter(
+            self._file, schema.arrow_schema(), compression="snappy", use_dictionary=False
+        )
+        self._rows: list[dict[str, Any]] = []
+        self._stats: list[stats.Matrix] = []
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(
+        self, encoded: EncodedEpisode, episode_index: int, first_frame: int, task_index: int
+    ) -> None:
+        """Append an episode at its position in the dataset."""
+        table, matrix = with_index(encoded, episode_index, first_frame, task_index)
+        self._writer.write_table(table, row_group_size=table.num_rows)
+        self._rows.append(
+            {
+                "episode_index": episode_index,
+                "tasks": [encoded.record["task"]],
+                "length": len(encoded),
+                **{f"data/{name}": value for name, value in self._place.items()},
+                "dataset_from_index": first_frame,
+                "dataset_to_index": first_frame + len(encoded),
+            }
+        )
+        self._stats.append(matrix)
+
+    def close(self) -> tuple[stats.Matrix, int]:
+        """Complete both files; returns the statistics and the number of all frames."""
+        self._writer.close()
+        self._file.close()
+        counts = [row["length"] for row in self._rows]
+        table = pa.Table.from_pylist(self._rows)
+        columns = stats.to_arrow(self._stats, counts)
+        for name, value in self._place.items():
+            columns[f"meta/episodes/{name}"] = pa.array([value] * len(counts))
+        for name, column in columns.items():
+            table = table.append_column(name, column)
+        with files.create(self._folder / self._episodes_path) as file:
+            pq.write_table(table, file)
+        for path in (self._data_path, self._episodes_path):
+            files.sync(self._folder / path)
+        return stats.aggregate(self._stats, counts), sum(counts)
+
+    def discard(self) -> None:
+        """Close the open files after an error."""
+        with suppress(OSError, pa.ArrowException):
+            self._writer.close()
+        with suppress(OSError):
+            self._file.close()
+
+
 @dataclass(frozen=True)
-class Contents:
-    """What a version holds, as far as the next one must know."""
+class VersionContents:
+    """Content of complete shards, from which the next version is built."""
 
     shard_episodes: int = schema.SHARD_EPISODES
-    """Episodes per shard; only the last may hold fewer."""
+    """Episodes per shard."""
     records: Sequence[str] = ()
     """The JSON record of each episode in ``meta/collection.json``."""
-    frames: int = 0
-    """Frames of all episodes."""
     tasks: Mapping[str, int] = field(default_factory=dict)
     """Task -> task index, in order of appearance."""
     totals: Sequence[tuple[stats.Matrix, int]] = ()
@@ -49,60 +125,41 @@ class Contents:
     hashes: Mapping[str, str] = field(default_factory=dict)
     """SHA-256 of each file of a shard."""
 
-    def split(self, last: Sequence[EncodedEpisode]) -> tuple[Contents, list[EncodedEpisode]]:
-        """The complete shards alone, and the episodes of the one that is not, the end of
-        ``last``."""
-        over = len(self.records) % self.shard_episodes
-        if not over:
-            return self, []
-        tail = list(last[-over:])
-        tasks = {json.loads(record)["task"] for record in self.records[:-over]}
-        full = len(self.totals) - 1
-        return Contents(
-            self.shard_episodes,
-            self.records[:-over],
-            self.frames - sum(map(len, tail)),
-            {task: index for task, index in self.tasks.items() if task in tasks},
-            self.totals[:-1],
-            {name: h for name, h in self.hashes.items() if name not in shard_paths(full)},
-        ), tail
+    @property
+    def frames(self) -> int:
+        """Frames of all episodes."""
+        return sum(count for _, count in self.totals)
 
 
-class Version:
-    """Builds the next version in a new folder: `add` episodes, then `close`."""
+class VersionWriter:
+    """Writes the next version to a new folder: `add` episodes, then `close`."""
 
     def __init__(
         self,
         folder: Path,
         provenance: Provenance,
-        contents: Contents | None = None,
+        contents: VersionContents | None = None,
         previous: Path | None = None,
     ) -> None:
-        """Begin.
-
-        Args:
-            folder: does not exist yet; on the file system of ``previous``.
-            provenance: what ``meta/collection.json`` will say.
-            contents: what ``previous`` holds, in complete shards.
-            previous: the version before.
-        """
+        """Create ``folder`` with the complete shards, ``contents``, of the previous version, which
+        is on the same file system."""
         self.folder = folder
         self.provenance = provenance
-        contents = contents or Contents()
-        self.frames = contents.frames
-        self._shard_episodes = contents.shard_episodes
-        self._records = list(contents.records)
-        self._tasks = dict(contents.tasks)
-        self._totals = list(contents.totals)
-        self._hashes = dict(contents.hashes)
-        self._shard: Shard | None = None
+        self._complete = contents or VersionContents()
+        self.frames = self._complete.frames
+        """Number of frames so far."""
+        self._records = list(self._complete.records)
+        self._tasks = dict(self._complete.tasks)
+        self._totals = list(self._complete.totals)
+        self._hashes = dict(self._complete.hashes)
+        self._shard: ShardWriter | None = None
         folder.mkdir(parents=True)
         if previous is not None:
             with removed_on_error(folder):
-                self._take_over(previous)
+                self._link_files(previous)
 
-    def _take_over(self, previous: Path) -> None:
-        """The files of the shards, and what others put beside ``data`` and ``meta``: a card."""
+    def _link_files(self, previous: Path) -> None:
+        """Link the files of the shards, and other files beside ``data`` and ``meta``: a card."""
         for name in self._hashes:
             files.link(previous / name, self.folder / name)
         for path in previous.iterdir():
@@ -118,50 +175,51 @@ class Version:
 
     def add(self, encoded: EncodedEpisode) -> None:
         """Append an episode."""
-        record = json.dumps(dict(encoded.facts), allow_nan=False)
-        task = self._tasks.setdefault(encoded.facts["task"], len(self._tasks))
+        record = json.dumps(dict(encoded.record), allow_nan=False)
+        task = self._tasks.setdefault(encoded.record["task"], len(self._tasks))
         if self._shard is None:
-            self._shard = Shard(self.folder, len(self._totals))
+            self._shard = ShardWriter(self.folder, len(self._totals))
         self._shard.add(encoded, self.episodes, self.frames, task)
         self._records.append(record)
         self.frames += len(encoded)
-        if len(self._shard) == self._shard_episodes:
-            self._close_shard()
+        if len(self._shard) == self._complete.shard_episodes:
+            self._complete = self._close_shard(self._shard)
 
-    def _close_shard(self) -> None:
-        if self._shard is not None:
-            self._totals.append(self._shard.close())
-            self._hashes.update(self._shard.hashes())
-            self._shard = None
-
-    def close(self) -> Contents:
-        """Write ``meta`` and flush everything; what the version holds."""
-        self._close_shard()
-        self._write_meta()
-        for path in (*(self.folder / "meta").glob("*.*"), *self.folder.rglob("*/"), self.folder):
-            files.sync(path)
-        return Contents(
-            self._shard_episodes,
-            self._records,
-            self.frames,
-            self._tasks,
-            self._totals,
-            self._hashes,
+    def _close_shard(self, shard: ShardWriter) -> VersionContents:
+        """Close the current shard; returns the content with it."""
+        paths = shard_paths(len(self._totals))
+        self._totals.append(shard.close())
+        self._shard = None
+        self._hashes |= {path: sha256(self.folder / path) for path in paths}
+        return replace(
+            self._complete,
+            records=tuple(self._records),
+            tasks=dict(self._tasks),
+            totals=tuple(self._totals),
+            hashes=dict(self._hashes),
         )
 
-    def _write_meta(self) -> None:
+    def close(self) -> VersionContents:
+        """Write ``meta`` and flush everything; returns the content of the complete shards."""
+        if self._shard is not None:
+            self._close_shard(self._shard)
         matrices, counts = zip(*self._totals, strict=True)
         total = stats.to_json(stats.aggregate(matrices, counts), self.frames)
         self._write_tasks()
         files.write_json(self.folder / schema.INFO_PATH, self._info())
         files.write_json(self.folder / schema.STATS_PATH, total)
         files.write_bytes(self.folder / schema.COLLECTION_PATH, self._collection())
-        files.write_json(self.folder / schema.HASHES_PATH, self._all_hashes())
+        meta = (schema.INFO_PATH, schema.STATS_PATH, schema.TASKS_PATH, schema.COLLECTION_PATH)
+        hashes = self._hashes | {path: sha256(self.folder / path) for path in meta}
+        files.write_json(self.folder / schema.HASHES_PATH, hashes)
+        for path in (*(self.folder / "meta").glob("*.*"), *self.folder.rglob("*/"), self.folder):
+            files.sync(path)
+        return self._complete
 
     def discard(self) -> None:
         """Remove the folder."""
         if self._shard is not None:
-            self._shard.abandon()
+            self._shard.discard()
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def _write_tasks(self) -> None:
@@ -195,46 +253,37 @@ class Version:
             "collection_version": schema.COLLECTION_VERSION,
             "spec_version": spec.SPEC_VERSION,
             **asdict(self.provenance),
-            "shard_episodes": self._shard_episodes,
+            "shard_episodes": self._complete.shard_episodes,
         }
         text = json.dumps(head, indent=1, allow_nan=False).removesuffix("\n}")
         records = ",\n  ".join(self._records)
         return f'{text},\n "episodes": [\n  {records}\n ]\n}}\n'.encode()
 
-    def _all_hashes(self) -> dict[str, str]:
-        """Every file of the dataset but this list itself."""
-        paths = (schema.INFO_PATH, schema.STATS_PATH, schema.TASKS_PATH, schema.COLLECTION_PATH)
-        meta = {path: sha256(self.folder / path) for path in paths}
-        return {**self._hashes, **meta}
-
 
 def publish(folder: Path, root: Path, replace: bool = False) -> None:
-    """Make the finished version ``folder`` the dataset at ``root``, in one step.
+    """Make the complete version ``folder`` the dataset at ``root``, atomically.
 
-    Args:
-        folder: the new version, on the file system of ``root``.
-        root: the dataset.
-        replace: whether ``root`` is the version before, which lies in ``folder`` afterwards, or is
-            gone. Otherwise nothing may be there but an empty folder.
+    If ``replace``, ``root`` is the previous version, which is moved to ``folder``. Otherwise
+    ``root`` must be absent or an empty folder.
 
     Raises:
-        UsageError: something is there that must not be replaced.
+        UsageError: ``root`` is occupied.
         EnvironmentFailure: ``root`` cannot be renamed.
     """
     try:
         if replace:
             _exchange(folder, root)
         else:
-            files.rename(folder, root)  # replaces an empty folder, and nothing else
+            files.rename(folder, root)  # replaces an empty folder only
     except OSError as error:
         if error.errno in _OCCUPIED:
             raise UsageError(
-                f"output folder {root} is not empty any more: another program has written there"
+                f"output folder {root} is no longer empty: another program has written to it"
             ) from error
         if error.errno in _NO_RENAME:
             raise EnvironmentFailure(
-                f"{root} cannot be renamed ({error.strerror}): it is a mount point, or comes from "
-                "a container image; copy it to a folder inside a volume and use that"
+                f"{root} cannot be renamed ({error.strerror}): it is a mount point, or part of a "
+                "container image; copy it to a folder inside a volume and use that"
             ) from error
         raise
     files.sync(root.parent)
@@ -246,19 +295,14 @@ def _exchange(folder: Path, root: Path) -> None:
     except OSError as error:
         if error.errno not in _NO_EXCHANGE:
             raise
-        _swap(folder, root)
-
-
-def _swap(folder: Path, root: Path) -> None:
-    """`files.exchange` in three steps; `recover` mends what a crash between them leaves."""
-    aside = _aside(folder)
-    files.rename(root, aside)
-    files.rename(folder, root)
-    files.rename(aside, folder)
+        aside = _aside(folder)  # `recover` completes the three renames after a crash
+        files.rename(root, aside)
+        files.rename(folder, root)
+        files.rename(aside, folder)
 
 
 def recover(folder: Path, root: Path) -> None:
-    """Put a version back that a crash within `publish` left aside."""
+    """Restore the version that a crash within `publish` left aside."""
     aside = _aside(folder)
     if aside.exists():
         if is_vacant(root):

@@ -1,38 +1,33 @@
 """Writes whole episodes as a LeRobot v3.0 dataset, straight to parquet.
 
-Everything goes to a temporary folder beside the destination, which appears under its
-own name only when it is complete: an interrupted run leaves nothing half-made. A collection that
-must survive a crash seals and commits its episodes instead (`egovcp.data.committer`).
+Files are written to a temporary folder beside the destination, which is renamed when it is
+complete: an interrupted run leaves no incomplete dataset. A collection that must survive a crash
+uses `egovcp.data.committer` instead.
 """
 
 from __future__ import annotations
 
 import secrets
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 
 from egovcp.data import schema
 from egovcp.data.destination import make_parent, require_new, resolve_root
-from egovcp.data.encoded import encode
 from egovcp.data.episode import Episode
 from egovcp.data.provenance import Provenance
-from egovcp.data.version import Contents, Version, publish
+from egovcp.data.staging import encode
+from egovcp.data.version import VersionContents, VersionWriter, publish
 from egovcp.errors import UsageError
 
 
 class DatasetWriter:
-    """Adds episodes one by one; ``finalize`` makes the dataset appear at ``root``.
+    """Adds episodes one by one; `finalize` moves the dataset to ``root``.
 
-    As a context manager it finalizes on success and discards everything on an error, one of
-    ``finalize`` included.
+    As a context manager it finalizes on success and discards everything on an error.
     """
 
     def __init__(
-        self,
-        root: str | Path,
-        provenance: Provenance,
-        shard_episodes: int = schema.SHARD_EPISODES,
+        self, root: str | Path, provenance: Provenance, shard_episodes: int = schema.SHARD_EPISODES
     ) -> None:
         """Create the temporary folder.
 
@@ -44,7 +39,7 @@ class DatasetWriter:
         require_new(self.root)
         make_parent(self.root)
         folder = self.root.with_name(f".{self.root.name}.{secrets.token_hex(4)}.partial")
-        self._version = Version(folder, provenance, Contents(shard_episodes))
+        self._version = VersionWriter(folder, provenance, VersionContents(shard_episodes))
 
     @property
     def num_episodes(self) -> int:
@@ -57,22 +52,18 @@ class DatasetWriter:
         return self._version.frames
 
     def add(self, episode: Episode) -> None:
-        """Append a complete episode.
-
-        Raises:
-            DataError: the episode is not valid (see `Episode.validate`).
-        """
+        """Validate and append a complete episode (see `Episode.validate`)."""
         self._version.add(encode(episode, f"episode {self.num_episodes}"))
 
     def finalize(self) -> Path:
         """Complete the files, move the folder to ``root`` and return it.
 
         Raises:
-            UsageError: no episode was added, or ``root`` has appeared meanwhile.
+            UsageError: no episode was added, or ``root`` was created by another program.
         """
         try:
             if self.num_episodes == 0:
-                raise UsageError(f"no episode was written to {self.root}; nothing to keep")
+                raise UsageError(f"no episode was written to {self.root}")
             self._version.close()
             publish(self._version.folder, self.root)
         except BaseException:
@@ -87,12 +78,7 @@ class DatasetWriter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if kind is None:
             self.finalize()
         else:

@@ -1,20 +1,26 @@
-"""The Hugging Face Hub over a network that fails: bounded requests, whole versions, clear errors.
+"""The Hugging Face Hub over unreliable networks, for datasets and models.
 
-`publish` puts files there in one commit, `fetch` brings a commit to a folder, `snapshot` to the
-cache, `Shelf` file by file as they are needed; `retrying` and `explained` hold every other call of
-Hugging Face's library to the same limits and errors. Datasets and models alike.
+`publish` commits files at once, `fetch` downloads a commit to a folder, `snapshot` to the cache,
+and `HubFileCache` file by file. `retrying` and `hub_errors` apply the same time limits and errors
+to other calls of `huggingface_hub`.
 """
 
-from egovcp.hub.failures import LostUpdate, RepoType, explained, token
-from egovcp.hub.fetch import fetch, resolve, snapshot
-from egovcp.hub.options import PublishConfig
-from egovcp.hub.publish import Content, Publication, Published, publish, reserve
-from egovcp.hub.repo_id import is_local_path, is_repo_id
+from egovcp.hub.errors import LostUpdate, RepoType, hub_errors, hub_token
+from egovcp.hub.fetch import fetch, is_local_path, is_repo_id, resolve, snapshot
+from egovcp.hub.file_cache import HubFileCache
+from egovcp.hub.publish import (
+    Content,
+    Publication,
+    PublishConfig,
+    Published,
+    ensure_repository,
+    publish,
+)
 from egovcp.hub.retry import HubUnreachable, RetryPolicy, retrying
-from egovcp.hub.shelf import Shelf
 
 __all__ = [
     "Content",
+    "HubFileCache",
     "HubUnreachable",
     "LostUpdate",
     "Publication",
@@ -22,15 +28,14 @@ __all__ = [
     "Published",
     "RepoType",
     "RetryPolicy",
-    "Shelf",
-    "explained",
+    "ensure_repository",
     "fetch",
+    "hub_errors",
+    "hub_token",
     "is_local_path",
     "is_repo_id",
     "publish",
-    "reserve",
     "resolve",
     "retrying",
     "snapshot",
-    "token",
 ]

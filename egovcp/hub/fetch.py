@@ -1,17 +1,19 @@
-"""A commit of the Hub to a folder: resumable, and compared with what the Hub says it holds."""
+"""Repository ids, and downloads of one commit: resumable, compared with the Hub's list of files."""
 
 from __future__ import annotations
 
-import hashlib
 import logging
+import os
+import re
 import shutil
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from egovcp.errors import DataError, EnvironmentFailure
-from egovcp.hub.failures import RepoType, explained, token
+from egovcp.hub.errors import RepoType, hub_errors, hub_token
+from egovcp.hub.publish import Content
 from egovcp.hub.retry import HubUnreachable, RetryPolicy, retrying
 
 if TYPE_CHECKING:
@@ -19,22 +21,42 @@ if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoFile
 
 _LOG = logging.getLogger(__name__)
-#: What the Hub keeps beside a dataset, and is none of it.
-_FOREIGN = (".gitattributes", ".gitignore")
-_WORKERS = 4
+_NAME: Final = r"[A-Za-z0-9_](?:[\w.-]*\w)?"
+_REPO_ID: Final = re.compile(rf"{_NAME}/{_NAME}", re.ASCII)
+_MAX_LENGTH: Final = 96
+#: Files of the repository that are not part of the dataset.
+_FOREIGN: Final = (".gitattributes", ".gitignore")
+_WORKERS: Final = 4
+
+
+def is_repo_id(text: str) -> bool:
+    """Whether ``text`` has the form of an id on the Hub, ``user/name``."""
+    return (
+        len(text) <= _MAX_LENGTH
+        and _REPO_ID.fullmatch(text) is not None
+        and ".." not in text
+        and "--" not in text
+        and not text.endswith(".git")
+    )
+
+
+def is_local_path(text: str) -> bool:
+    """Whether an argument that may be a folder or a Hub id means a folder, existing or not.
+
+    It does if something of this name exists, if it has not the form of an id, or if its parent is
+    an existing folder: ``runs/bal`` beside ``runs/ball`` is a mistyped folder.
+    """
+    if not is_repo_id(text) or os.path.lexists(text):
+        return True
+    return os.path.isdir(os.path.dirname(text))
 
 
 def resolve(repo_id: str, revision: str, retry: RetryPolicy) -> str:
-    """The commit SHA of a branch, a tag or a shortened SHA.
-
-    Raises:
-        DataError: there is no such dataset or revision.
-        EnvironmentFailure: the Hub cannot be reached, or refuses.
-    """
-    with explained(repo_id, revision), retrying(retry):
+    """The commit SHA of a branch, a tag or a shortened SHA of a dataset."""
+    with hub_errors(repo_id, revision), retrying(retry):
         from huggingface_hub import HfApi
 
-        commit = HfApi(token=token()).dataset_info(repo_id, revision=revision or None).sha
+        commit = HfApi(token=hub_token()).dataset_info(repo_id, revision=revision or None).sha
         assert commit is not None
         return commit
 
@@ -47,17 +69,10 @@ def snapshot(
     cache_dir: Path | None = None,
     patterns: Sequence[str] | None = None,
 ) -> Path:
-    """The folder, in the library's cache, of a revision's files; its name is the commit SHA.
+    """Download a revision to the library's cache; the folder's name is the commit SHA.
 
-    If the Hub cannot be reached, a complete earlier download serves.
-
-    Args:
-        repo_id: `user/name`.
-        revision: branch, tag or commit SHA; empty: the latest.
-        retry: how often and how long to try.
-        repo_type: what kind of repository it is.
-        cache_dir: the cache; None: the library's own.
-        patterns: of the files to bring; None: all.
+    If the Hub cannot be reached, a complete earlier download is used. Without ``patterns``, globs,
+    all files are downloaded.
 
     Raises:
         DataError: there is no such dataset or revision.
@@ -66,7 +81,7 @@ def snapshot(
     """
     from huggingface_hub import snapshot_download
 
-    bring = partial(
+    download = partial(
         snapshot_download,
         repo_id,
         repo_type=repo_type,
@@ -75,31 +90,35 @@ def snapshot(
         allow_patterns=None if patterns is None else list(patterns),
     )
     try:
-        with explained(repo_id, revision, repo_type=repo_type), retrying(retry):
-            return Path(bring(token=token()))
+        with hub_errors(repo_id, revision, repo_type=repo_type), retrying(retry):
+            return Path(download(token=hub_token()))
     except HubUnreachable as error:
         try:
-            found = Path(bring(local_files_only=True))
-        except OSError:  # nothing, or not all of it
+            found = Path(download(local_files_only=True))
+        except OSError:  # no earlier download, or an incomplete one
             raise error from None
-        _LOG.warning("%s; taking the earlier download of commit %s", error, found.name)
+        _LOG.warning("%s; using the earlier download of commit %s", error, found.name)
         return found
 
 
 def fetch(repo_id: str, commit: str, folder: Path, retry: RetryPolicy) -> None:
-    """Make ``folder`` hold exactly the files of a commit.
+    """Make ``folder`` hold exactly the files of a commit of a dataset.
 
-    What an interrupted call has brought is used; files that do not belong are removed.
+    Files of an interrupted call are reused; other files are removed.
 
     Raises:
-        EnvironmentFailure: the Hub cannot be reached, refuses, or sends something else than it
-            lists; the damaged file is removed, so that the next call fetches it anew.
+        EnvironmentFailure: the Hub cannot be reached, refuses, or sends a file that differs from
+            its list; that file is removed, so that the next call downloads it again.
     """
-    with explained(repo_id, commit), retrying(retry):
+    with hub_errors(repo_id, commit), retrying(retry):
         from huggingface_hub import HfApi, snapshot_download
 
-        listing = _listing(HfApi(token=token()), repo_id, commit)
-        _remove_others(folder, listing)
+        listing = _listing(HfApi(token=hub_token()), repo_id, commit)
+        for found in folder.rglob("*"):
+            relative = found.relative_to(folder)
+            foreign = relative.parts[0] != ".cache" and relative.as_posix() not in listing
+            if foreign and found.is_file():
+                found.unlink()
         snapshot_download(
             repo_id,
             repo_type="dataset",
@@ -108,8 +127,14 @@ def fetch(repo_id: str, commit: str, folder: Path, retry: RetryPolicy) -> None:
             ignore_patterns=list(_FOREIGN),
             max_workers=_WORKERS,
         )
-    for path, file in listing.items():
-        _require_same(folder / path, file)
+    for name, file in listing.items():
+        path = folder / name
+        if not path.is_file() or not Content(path).matches(file):
+            path.unlink(missing_ok=True)
+            raise EnvironmentFailure(
+                f"{name} differs from the Hub's hash of it; the file was removed and will be "
+                "downloaded again by the next attempt"
+            )
     shutil.rmtree(folder / ".cache", ignore_errors=True)  # LeRobot would download again
 
 
@@ -120,32 +145,5 @@ def _listing(api: HfApi, repo_id: str, commit: str) -> dict[str, RepoFile]:
     files = {entry.path: entry for entry in tree if isinstance(entry, RepoFile)}
     for path in files:
         if path.startswith("/") or ".." in path.split("/"):
-            raise DataError(f"{repo_id}@{commit} holds {path!r}, a place outside the dataset")
+            raise DataError(f"{repo_id}@{commit} holds {path!r}, a path outside the dataset")
     return {path: file for path, file in files.items() if path not in _FOREIGN}
-
-
-def _remove_others(folder: Path, listing: dict[str, RepoFile]) -> None:
-    for path in folder.rglob("*"):
-        name = path.relative_to(folder)
-        if path.is_file() and name.parts[0] != ".cache" and name.as_posix() not in listing:
-            path.unlink()
-
-
-def _require_same(path: Path, file: RepoFile) -> None:
-    if _digest(path, file) != (file.lfs.sha256 if file.lfs is not None else file.blob_id):
-        path.unlink(missing_ok=True)
-        raise EnvironmentFailure(
-            f"{file.path} is not what the Hub says it is: its hash differs; the file was removed "
-            "and is fetched anew by the next try"
-        )
-
-
-def _digest(path: Path, file: RepoFile) -> str:
-    if not path.is_file():
-        return ""
-    if file.lfs is None:
-        content = path.read_bytes()
-        header = b"blob %d\0" % len(content)
-        return hashlib.sha1(header + content, usedforsecurity=False).hexdigest()
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()

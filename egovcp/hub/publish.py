@@ -1,4 +1,4 @@
-"""Files to the Hub in one commit: complete at once, or not there at all."""
+"""Publishes files to the Hub in one commit: all of them or none."""
 
 from __future__ import annotations
 
@@ -7,31 +7,52 @@ import hashlib
 import time
 from collections.abc import Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.hub.failures import LostUpdate, RepoType, explained, token
+from egovcp.hub.errors import LostUpdate, RepoType, hub_errors, hub_token
 from egovcp.hub.retry import HubUnreachable, RetryPolicy, retrying
+from egovcp.outputs import output_file
 
 if TYPE_CHECKING:
-    from huggingface_hub import CommitOperationAdd, CommitOperationDelete, HfApi
+    from huggingface_hub import CommitOperationAdd, CommitOperationDelete
     from huggingface_hub.hf_api import RepoFile
 
 _MAIN = "main"
 
 
+@dataclass(frozen=True)
+class PublishConfig:
+    """Options of every command that publishes something in one commit."""
+
+    repo_id: str = ""
+    """Repository to publish to, `user/name`."""
+    private: bool = False
+    """A new repository is private."""
+    branch: str = "main"
+    """Branch; created if it does not exist."""
+    tag: str = ""
+    """Tag for this version; empty: none. It cannot be moved later."""
+    message: str = ""
+    """Title of the commit; empty: a title that names what was published."""
+    network: RetryPolicy = field(default_factory=RetryPolicy)
+    """Attempts and time limits of requests."""
+    json: str = output_file()
+    """File for {"repo_id", "branch", "tag", "commit", "new"}; empty: none."""
+
+
 class Content:
-    """One file to publish; its hashes are computed when asked for, once."""
+    """One file to publish; each hash is computed once, when it is needed."""
 
     def __init__(self, source: Path | bytes) -> None:
         self.source = source
 
     @cached_property
     def sha256(self) -> str:
-        """Name of a large file's content."""
+        """The Hub's hash of a large file."""
         if isinstance(self.source, bytes):
             return hashlib.sha256(self.source).hexdigest()
         with self.source.open("rb") as file:
@@ -39,15 +60,22 @@ class Content:
 
     @cached_property
     def git_oid(self) -> str:
-        """Git's name of a small file's content."""
+        """Git's hash of a small file."""
         content = self.source if isinstance(self.source, bytes) else self.source.read_bytes()
         header = b"blob %d\0" % len(content)
         return hashlib.sha1(header + content, usedforsecurity=False).hexdigest()
 
+    def matches(self, file: RepoFile) -> bool:
+        """Whether a file on the Hub has this content."""
+        if file.lfs is not None:
+            return self.sha256 == file.lfs.sha256
+        size = self.source.stat().st_size if isinstance(self.source, Path) else None
+        return size in (None, file.size) and self.git_oid == file.blob_id
+
 
 @dataclass(frozen=True)
 class Publication:
-    """What a repository shall hold."""
+    """The desired content of a repository."""
 
     repo_id: str
     contents: Mapping[str, Content]
@@ -55,220 +83,197 @@ class Publication:
     message: str
     """Title of the commit."""
     owned: tuple[str, ...] = ()
-    """Folders in which nothing else may remain."""
+    """Folders in which other files are deleted."""
     branch: str = _MAIN
     private: bool = False
-    """A new repository shows to its owner alone."""
+    """A new repository is visible to its owner only."""
     moving_tag: str = ""
-    """A tag that follows the branch."""
+    """Tag that follows the branch."""
     tag: str = ""
-    """A tag for this commit, for good."""
+    """Tag of this commit, which never moves."""
     repo_type: RepoType = "dataset"
-    """What kind of repository it is."""
 
     @property
-    def failures(self) -> AbstractContextManager[None]:
-        """`explained` for what is done to this repository."""
-        return explained(self.repo_id, self.branch, writing=True, repo_type=self.repo_type)
+    def errors(self) -> AbstractContextManager[None]:
+        """`hub_errors` for requests to this repository."""
+        return hub_errors(self.repo_id, self.branch, writing=True, repo_type=self.repo_type)
 
 
 @dataclass(frozen=True)
 class Published:
-    """Where it is now."""
+    """The result of `publish`."""
 
     commit: str
     new: bool
-    """False: the repository held just this already."""
-
-
-@dataclass(frozen=True)
-class _State:
-    """A branch as it was when looked at."""
-
-    head: str
-    files: Mapping[str, RepoFile]
+    """False: the repository had the same content already."""
 
 
 def publish(publication: Publication, retry: RetryPolicy) -> Published:
     """Make the branch hold the contents, then set the tags.
 
-    Repeating it completes what an interrupted one has left undone: large files that have
-    arrived stay there, and nothing is committed if nothing differs.
+    A repeated call completes an interrupted one: large files that were uploaded are reused, and
+    nothing is committed if nothing differs.
 
     Raises:
-        UsageError: a private repository was asked for and the id has a public one, or the tag
-            is another commit's.
-        LostUpdate: somebody else has changed the branch meanwhile.
+        UsageError: a private repository was requested and the id has a public one, or the tag
+            belongs to another commit.
+        LostUpdate: somebody else has changed the branch in the meantime.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
-    with publication.failures, retrying(retry):
-        from huggingface_hub import HfApi
-
-        api = HfApi(token=token())
-        _prepare(api, publication)
-        seen = _look(api, publication, publication.branch)
-        tags = _tags(api, publication)
-        _require_free(publication, tags, seen)
-        commit = seen.head
-        if _operations(publication, seen):
-            commit = _commit(api, publication, seen, retry)
+    with publication.errors, retrying(retry):
+        publisher = _Publisher(publication, hub_token())
+        publisher.prepare()
+        seen, tags = publisher.read_branch(publication.branch), publisher.tags()
+        publisher.require_free_tag(tags, seen)
+        commit = publisher.commit(seen, retry) if publisher.operations(seen) else seen.head
         for tag in filter(None, (publication.moving_tag, publication.tag)):
-            _set_tag(api, publication, tag, commit, tags.get(tag))
+            publisher.set_tag(tag, commit, tags.get(tag))
     return Published(commit, commit != seen.head)
 
 
-def reserve(publication: Publication, retry: RetryPolicy) -> None:
-    """Make the repository that a long computation is to fill, or see that one may write there.
+def ensure_repository(publication: Publication, retry: RetryPolicy) -> None:
+    """Create the repository and the branch, or check that they can be written to.
+
+    Call it before a long computation whose result is to be published.
 
     Raises:
-        UsageError: the id is none, or names a public repository and a private one is asked for.
-        EnvironmentFailure: nobody is logged in, the Hub refuses, or cannot be reached.
+        UsageError: the id is not valid, or has a public repository and a private one is requested.
+        EnvironmentFailure: not logged in, the Hub refuses, or cannot be reached.
     """
-    with publication.failures, retrying(retry):
+    with publication.errors, retrying(retry):
+        if (token := hub_token()) is None:
+            raise EnvironmentFailure(
+                f"not logged in to the Hub, so {publication.repo_id} could not be published; run "
+                "`hf auth login`, or set HF_TOKEN"
+            )
+        _Publisher(publication, token).prepare()
+
+
+class _Branch(NamedTuple):
+    """State of a branch."""
+
+    head: str
+    files: Mapping[str, RepoFile]
+
+
+class _Publisher:
+    """The requests that publish a `Publication`."""
+
+    def __init__(self, publication: Publication, token: str | None) -> None:
         from huggingface_hub import HfApi
 
-        if (known := token()) is None:
-            raise EnvironmentFailure(
-                f"nobody is logged in to the Hub, so {publication.repo_id} could not be "
-                "published; run `hf auth login`, or set HF_TOKEN"
+        self._api = HfApi(token=token)
+        self._wanted = publication
+        self._repo: dict[str, Any] = {
+            "repo_id": publication.repo_id,
+            "repo_type": publication.repo_type,
+        }
+
+    def prepare(self) -> None:
+        """Create the repository and the branch if they do not exist."""
+        private, branch = self._wanted.private, self._wanted.branch
+        self._api.create_repo(**self._repo, private=private or None, exist_ok=True)
+        if private and not self._api.repo_info(**self._repo).private:
+            raise UsageError(
+                f"{self._wanted.repo_id} exists and is public, but --private was given; nothing "
+                "was published; make it private on the Hub, or choose another id"
             )
-        _prepare(HfApi(token=known), publication)
+        if branch != _MAIN:
+            self._api.create_branch(**self._repo, branch=branch, exist_ok=True)
 
+    def read_branch(self, revision: str) -> _Branch:
+        """Head and files of a branch or a commit."""
+        from huggingface_hub.hf_api import RepoFile
 
-def _prepare(api: HfApi, publication: Publication) -> None:
-    """The repository and the branch."""
-    repo_id, repo_type, private = publication.repo_id, publication.repo_type, publication.private
-    api.create_repo(repo_id, repo_type=repo_type, private=private or None, exist_ok=True)
-    if private and not api.repo_info(repo_id, repo_type=repo_type).private:
-        raise UsageError(
-            f"{repo_id} exists and is public, --private was given; nothing was published; make "
-            "it private on the Hub, or choose another id"
-        )
-    if publication.branch != _MAIN:
-        api.create_branch(repo_id, repo_type=repo_type, branch=publication.branch, exist_ok=True)
+        head = self._api.repo_info(**self._repo, revision=revision).sha
+        assert head is not None
+        tree = self._api.list_repo_tree(**self._repo, revision=head, recursive=True)
+        return _Branch(head, {entry.path: entry for entry in tree if isinstance(entry, RepoFile)})
 
+    def tags(self) -> dict[str, str]:
+        """Tag -> commit."""
+        refs = self._api.list_repo_refs(**self._repo)
+        return {tag.name: tag.target_commit for tag in refs.tags}
 
-def _look(api: HfApi, publication: Publication, revision: str) -> _State:
-    from huggingface_hub.hf_api import RepoFile
+    def require_free_tag(self, tags: Mapping[str, str], seen: _Branch) -> None:
+        """Raise `UsageError` if the tag belongs to another commit."""
+        tag, at = self._wanted.tag, tags.get(self._wanted.tag)
+        if at is None or tag == self._wanted.moving_tag:
+            return
+        if at != seen.head or self.operations(seen):
+            raise UsageError(
+                f"tag {tag} of {self._wanted.repo_id} is commit {at} already, and tags do not "
+                "move; nothing was published; choose another --tag"
+            )
 
-    repo_id, repo_type = publication.repo_id, publication.repo_type
-    head = api.repo_info(repo_id, repo_type=repo_type, revision=revision).sha
-    assert head is not None
-    tree = api.list_repo_tree(repo_id, repo_type=repo_type, revision=head, recursive=True)
-    return _State(head, {entry.path: entry for entry in tree if isinstance(entry, RepoFile)})
+    def operations(self, state: _Branch) -> list[CommitOperationAdd | CommitOperationDelete]:
+        """Additions and deletions that lead from ``state`` to the publication."""
+        from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
-
-def _tags(api: HfApi, publication: Publication) -> dict[str, str]:
-    refs = api.list_repo_refs(publication.repo_id, repo_type=publication.repo_type)
-    return {tag.name: tag.target_commit for tag in refs.tags}
-
-
-def _require_free(publication: Publication, tags: Mapping[str, str], seen: _State) -> None:
-    """A release's tag does not move."""
-    at = tags.get(publication.tag)
-    if at is None or publication.tag == publication.moving_tag:
-        return
-    if at != seen.head or _operations(publication, seen):
-        raise UsageError(
-            f"tag {publication.tag} of {publication.repo_id} is commit {at} already, and tags "
-            "are kept; nothing was published; choose another --tag"
-        )
-
-
-def _operations(
-    publication: Publication, state: _State
-) -> list[CommitOperationAdd | CommitOperationDelete]:
-    """What a commit on top of ``state`` must add and delete."""
-    from huggingface_hub import CommitOperationAdd, CommitOperationDelete
-
-    wanted, there = publication.contents, state.files
-    stale = [
-        path
-        for path in there
-        if path not in wanted and path.startswith(tuple(f"{o}/" for o in publication.owned))
-    ]
-    return [
-        *(CommitOperationDelete(path, is_folder=False) for path in sorted(stale)),
-        *(
-            CommitOperationAdd(path, wanted[path].source)
+        wanted, there = self._wanted.contents, state.files
+        owned = tuple(f"{folder}/" for folder in self._wanted.owned)
+        stale = sorted(path for path in there.keys() - wanted.keys() if path.startswith(owned))
+        changed = (
+            path
             for path in sorted(wanted)
-            if path not in there or not _same(wanted[path], there[path])
-        ),
-    ]
-
-
-def _same(content: Content, file: RepoFile) -> bool:
-    if file.lfs is not None:
-        return content.sha256 == file.lfs.sha256
-    size = content.source.stat().st_size if isinstance(content.source, Path) else None
-    return size in (None, file.size) and content.git_oid == file.blob_id
-
-
-def _commit(api: HfApi, publication: Publication, seen: _State, retry: RetryPolicy) -> str:
-    """Upload, then commit on top of what was seen; the SHA of the commit."""
-    from huggingface_hub import CommitOperationAdd
-
-    operations = _operations(publication, seen)
-    repo_id, repo_type = publication.repo_id, publication.repo_type
-    additions = [o for o in operations if isinstance(o, CommitOperationAdd)]
-    api.preupload_lfs_files(
-        repo_id,
-        additions,
-        repo_type=repo_type,
-        revision=publication.branch,
-        free_memory=False,
-    )
-    for attempt in range(1, retry.attempts + 1):
-        try:
-            with publication.failures:
-                made = api.create_commit(
-                    repo_id,
-                    operations,
-                    commit_message=publication.message,
-                    repo_type=repo_type,
-                    revision=publication.branch,
-                    parent_commit=seen.head,
-                )
-        except (HubUnreachable, LostUpdate) as error:
-            now = _look(api, publication, publication.branch)
-            if not _operations(publication, now):
-                return now.head  # it has arrived, only the answer was lost
-            if now.head != seen.head:
-                raise _lost(publication, seen, now) from error
-            if attempt == retry.attempts:
-                raise
-            time.sleep(retry.pause(attempt))
-        else:
-            _require_complete(publication, _look(api, publication, made.oid))
-            return made.oid
-    raise AssertionError("unreachable")
-
-
-def _lost(publication: Publication, seen: _State, now: _State) -> LostUpdate:
-    name = f"{publication.repo_id}@{publication.branch}"
-    return LostUpdate(
-        f"somebody else has published to {name} meanwhile: it was {seen.head} and is {now.head} "
-        "now; nothing was published; look at what is there, then push again"
-    )
-
-
-def _require_complete(publication: Publication, state: _State) -> None:
-    left = _operations(publication, state)
-    if left:
-        raise EnvironmentFailure(
-            f"{publication.repo_id}@{state.head} is not what was sent: {left[0].path_in_repo} "
-            "differs; is there a .gitignore in the repository?"
+            if path not in there or not wanted[path].matches(there[path])
         )
+        return [
+            *(CommitOperationDelete(path, is_folder=False) for path in stale),
+            *(CommitOperationAdd(path, wanted[path].source) for path in changed),
+        ]
 
+    def commit(self, seen: _Branch, retry: RetryPolicy) -> str:
+        """Upload, then commit on top of ``seen``; returns the SHA of the commit."""
+        from huggingface_hub import CommitOperationAdd
 
-def _set_tag(api: HfApi, publication: Publication, tag: str, commit: str, at: str | None) -> None:
-    """Set a tag, as LeRobot does: the Hub cannot move one, only remove and create it."""
-    from huggingface_hub.errors import RevisionNotFoundError
+        branch, operations = self._wanted.branch, self.operations(seen)
+        additions = [o for o in operations if isinstance(o, CommitOperationAdd)]
+        self._api.preupload_lfs_files(
+            **self._repo, additions=additions, revision=branch, free_memory=False
+        )
+        name = f"{self._wanted.repo_id}@{branch}"
+        for attempt in range(1, retry.attempts + 1):
+            try:
+                with self._wanted.errors:
+                    made = self._api.create_commit(
+                        **self._repo,
+                        operations=operations,
+                        commit_message=self._wanted.message,
+                        revision=branch,
+                        parent_commit=seen.head,
+                    )
+            except (HubUnreachable, LostUpdate) as error:
+                now = self.read_branch(branch)
+                if not self.operations(now):
+                    return now.head  # the commit was made, only the answer was lost
+                if now.head != seen.head:
+                    raise LostUpdate(
+                        f"somebody else has published to {name} in the meantime: it was "
+                        f"{seen.head} and is now {now.head}; nothing was published; check that "
+                        "version, then push again"
+                    ) from error
+                if attempt == retry.attempts:
+                    raise
+                time.sleep(retry.pause(attempt))
+            else:
+                left = self.operations(self.read_branch(made.oid))
+                if left:
+                    raise EnvironmentFailure(
+                        f"{name} differs from what was sent in {left[0].path_in_repo}; is there "
+                        "a .gitignore in the repository?"
+                    )
+                oid: str = made.oid
+                return oid
+        raise AssertionError("unreachable")
 
-    repo_id, repo_type = publication.repo_id, publication.repo_type
-    if at == commit:
-        return
-    if at is not None:
-        with contextlib.suppress(RevisionNotFoundError):
-            api.delete_tag(repo_id, tag=tag, repo_type=repo_type)
-    api.create_tag(repo_id, tag=tag, revision=commit, repo_type=repo_type, exist_ok=True)
+    def set_tag(self, tag: str, commit: str, at: str | None) -> None:
+        """Set a tag, as LeRobot does: the Hub cannot move one, only remove and create it."""
+        from huggingface_hub.errors import RevisionNotFoundError
+
+        if at == commit:
+            return
+        if at is not None:
+            with contextlib.suppress(RevisionNotFoundError):
+                self._api.delete_tag(**self._repo, tag=tag)
+        self._api.create_tag(**self._repo, tag=tag, revision=commit, exist_ok=True)

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.atomic import write_json
-from egovcp.data.lock import only_writer
+from egovcp.data.destination import writer_lock
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp_experiment.cell import Cell, Found, Given, Output, Reference, filled, written
 from egovcp_experiment.tools import given_digest, read_json
@@ -60,7 +60,7 @@ class Store:
             (folder / _CELLS).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise EnvironmentFailure(f"cannot create {folder}: {error.strerror}") from error
-        with only_writer(folder, folder / _CELLS):
+        with writer_lock(folder, folder / _CELLS):
             yield
 
     def work(self, cell: Cell) -> Path:

@@ -9,7 +9,7 @@ import pytest
 
 from egovcp.data import open_dataset
 from egovcp.data.committer import work_folder
-from egovcp.data.hashes import verify_hashes
+from egovcp.data.metadata import verify_hashes
 from egovcp_collect.collect import main
 
 _FLAGS = (

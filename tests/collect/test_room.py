@@ -7,8 +7,7 @@ from types import SimpleNamespace
 import pytest
 
 from egovcp import spec
-from egovcp.data.encoded import encode
-from egovcp.data.spool import SealedEpisode
+from egovcp.data.staging import StagedEpisode, encode
 from egovcp.errors import EnvironmentFailure
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.scenario import Scenario
@@ -26,7 +25,7 @@ def _free(monkeypatch: pytest.MonkeyPatch, free: int) -> None:
 
 def test_a_sealed_frame_is_as_large_as_it_is_taken_to_be() -> None:
     ticks = 100
-    sealed = len(SealedEpisode.of(0, encode(random_episode(0, ticks))).payload)
+    sealed = len(StagedEpisode.of(0, encode(random_episode(0, ticks))).payload)
     assert ticks * room.SEALED_FRAME_BYTES < sealed < 1.05 * ticks * room.SEALED_FRAME_BYTES
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.data.committer import work_folder
-from egovcp.data.hashes import verify_hashes
+from egovcp.data.metadata import verify_hashes
 from egovcp_collect.collect import main
 
 _SHORT = (

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from egovcp.artifact import load_artifact
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
-from egovcp.data.stream import gather
-from egovcp.data.windows import mirror_rows
+from egovcp.data.samplers import gather
+from egovcp.data.store import mirror_windows
 from egovcp.errors import ArtifactError, DataError, UsageError
 from egovcp.model import Batch
 from egovcp.robot.stance import StanceController
@@ -87,7 +87,7 @@ def test_a_mirrored_window_of_lerobot_is_a_mirrored_window_of_the_stream(
     episode = np.searchsorted(store.start + store.length, ROWS, side="right")
     expected = gather(store, np.array(ROWS), episode, config.sequence_length)
     which = np.arange(len(ROWS)) % 2 == 0
-    mirror_rows(expected, np.flatnonzero(which))
+    mirror_windows(expected, np.flatnonzero(which))
     plain = to_batch(_windows(config, meta, ROWS), RowTargets.of(_reader(meta), config.returns))
     found = mirrored(plain, torch.from_numpy(which))
     valid = expected["valid"]

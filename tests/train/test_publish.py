@@ -135,7 +135,7 @@ def test_a_missing_login_is_refused_before_training(
 ) -> None:
     monkeypatch.delenv("HF_TOKEN")
     run = tmp_path / "run"
-    _refused(arguments(run, *TO_HUB), run, 5, capsys, "nobody is logged in.*hf auth login")
+    _refused(arguments(run, *TO_HUB), run, 5, capsys, "not logged in.*hf auth login")
 
 
 def test_a_token_that_may_not_write_is_refused_before_training(

@@ -180,7 +180,7 @@ def test_a_missing_dataset_is_named_before_anything_is_written(
 def test_no_dataset_at_all_is_a_question_of_usage(
     arguments: Arguments, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    _refused(arguments(tmp_path / "run", dataset__root=None), 2, capsys, "which dataset?")
+    _refused(arguments(tmp_path / "run", dataset__root=None), 2, capsys, "no dataset is named")
 
 
 def test_a_damaged_dataset_is_named(

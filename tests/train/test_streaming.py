@@ -73,7 +73,7 @@ def streamed(arguments: Arguments, commit: str) -> Arguments:
 @pytest.fixture
 def nothing_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files come only when they are read, so that which ones are here depends on no timing."""
-    monkeypatch.setattr("egovcp.hub.shelf.AHEAD", 0)
+    monkeypatch.setattr("egovcp.hub.file_cache.PREFETCH_FILES", 0)
 
 
 def _data_files(hub_home: Path) -> int:

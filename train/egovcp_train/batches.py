@@ -17,7 +17,7 @@ DEFAULT_RETURNS = ReturnConfig()
 
 
 def to_tensors(arrays: Mapping[str, NDArray[Any]], device: torch.device) -> Batch:
-    """A batch of `SequenceStream` as the tensors that the losses read."""
+    """A batch of `InMemorySampler` as the tensors that the losses read."""
     depth = torch.from_numpy(arrays["depth"].astype(np.int32))
     rest = {k: torch.from_numpy(arrays[k]) for k in Batch._fields if k != "depth"}
     return Batch(depth=depth, **rest)._replace(

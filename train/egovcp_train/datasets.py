@@ -14,19 +14,18 @@ from numpy.typing import NDArray
 from egovcp import spec
 from egovcp.cli import DatasetConfig, SelectedDatasetConfig
 from egovcp.data import (
-    BoundedStream,
     DatasetReader,
     EpisodeIndex,
     EpisodeStore,
+    InMemorySampler,
     Mix,
-    SequenceStream,
-    StreamConfig,
+    SamplerConfig,
+    StreamingSampler,
+    compute_training_stats,
+    estimate_training_stats,
     sample_files,
-    survey,
-    survey_sample,
 )
-from egovcp.data.ahead import Ahead
-from egovcp.data.order import Shard
+from egovcp.data.samplers import PrefetchIterator
 from egovcp.data.schema import INFO_PATH
 from egovcp.data.source import is_local, local_root
 from egovcp.errors import DataError, UsageError
@@ -41,7 +40,7 @@ from egovcp_train.return_scale import ReturnScale, on_task_scales, task_scales
 EVALUATION_EPISODES = 64  # of each task
 FRAME_BYTES = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (spec.STATE_DIM + 2 * spec.ACTION_DIM + 8)
 
-type Built = tuple[Ahead, EpisodeStore, Mapping[str, ReturnScale]]
+type Built = tuple[PrefetchIterator, EpisodeStore, Mapping[str, ReturnScale]]
 
 
 @dataclass(frozen=True)
@@ -52,7 +51,7 @@ class TrainingData:
     """The datasets."""
     config: TrainConfig
     """The options, ``loading.mode`` no longer auto."""
-    stream: Ahead
+    stream: PrefetchIterator
     """Batches of their windows."""
     heldout: EpisodeStore
     """Episodes to evaluate on."""
@@ -199,10 +198,10 @@ def mix_of(config: TrainConfig) -> Mix:
     return mix
 
 
-def stream_config(config: TrainConfig) -> StreamConfig:
+def stream_config(config: TrainConfig) -> SamplerConfig:
     """How windows are drawn."""
     sampling = config.sampling
-    return StreamConfig(
+    return SamplerConfig(
         batch_size=config.batch_size,
         length=sampling.length,
         burn_in=sampling.burn_in,
@@ -223,7 +222,7 @@ def _decided(config: TrainConfig, readers: Sequence[DatasetReader], ranks: Ranks
 def _in_memory(
     readers: Sequence[DatasetReader],
     config: TrainConfig,
-    sampling: StreamConfig,
+    sampling: SamplerConfig,
     mix: Mix,
     model: WorldModel,
     ranks: Ranks,
@@ -240,14 +239,14 @@ def _in_memory(
     set_normalisation(model, learning, config.returns)
     rows = ranks.rows(sampling.batch_size)
     sampling = dataclasses.replace(sampling, batch_size=ranks.count * sampling.batch_size)
-    stream = Ahead(SequenceStream(learning, sampling, mix, rows))
+    stream = PrefetchIterator(InMemorySampler(learning, sampling, mix, rows))
     return stream, heldout, scales
 
 
 def _on_disk(
     readers: Sequence[DatasetReader],
     config: TrainConfig,
-    sampling: StreamConfig,
+    sampling: SamplerConfig,
     mix: Mix,
     model: WorldModel,
     ranks: Ranks,
@@ -262,26 +261,27 @@ def _on_disk(
     if learning.is_remote:
         sample, unseen = sample_files(learning, unseen, config.loading.sample_files)
         for part in (sample, unseen):
-            part.bring()
-    heldout = EpisodeStore.read(unseen.spread(EVALUATION_EPISODES), config.returns)
+            part.download()
+    heldout = EpisodeStore.read(unseen.subsample(EVALUATION_EPISODES), config.returns)
     if learning.is_remote:
-        facts = survey_sample(learning, sample, config.returns)
+        facts = estimate_training_stats(learning, sample, config.returns)
     else:
-        facts = survey(learning, config.returns)
+        facts = compute_training_stats(learning, config.returns)
     _require_returns(readers, sample.dataset, facts.complete)
     longest = int(learning.length.max())
     state = facts.state_mean, facts.state_std
     fix_normalisation(model, *state, facts.returns, longest, config.returns)
-    stream = BoundedStream(
+    stream = StreamingSampler(
         learning,
         sampling,
         mix,
         config.loading.shuffle,
-        Shard(ranks.rank, ranks.count),
         returns=config.returns,
         checked=not learning.is_remote,
+        rank=ranks.rank,
+        ranks=ranks.count,
     )
-    return Ahead(stream), heldout, {}
+    return PrefetchIterator(stream), heldout, {}
 
 
 def _require_returns(

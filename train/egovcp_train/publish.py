@@ -8,7 +8,7 @@ from typing import Final
 
 from egovcp.artifact import FILES, Artifact, load_artifact
 from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.hub import Content, Publication, Published, RetryPolicy, publish, reserve
+from egovcp.hub import Content, Publication, Published, RetryPolicy, ensure_repository, publish
 from egovcp.terminal import echo
 from egovcp_train.card import ASSETS, CARD, CURVES, card_text
 from egovcp_train.config import PolicyConfig
@@ -25,7 +25,7 @@ def reserve_policy(policy: PolicyConfig) -> None:
     """
     if policy.push_to_hub:
         target = Publication(policy.repo_id, {}, "", private=policy.private, repo_type="model")
-        reserve(target, RETRY_POLICY)
+        ensure_repository(target, RETRY_POLICY)
 
 
 def publication(

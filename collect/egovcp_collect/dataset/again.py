@@ -9,7 +9,7 @@ import draccus
 from draccus.utils import DraccusException
 
 from egovcp.data import DatasetReader, Episode, Provenance, schema
-from egovcp.data.origin import parts_of, source_of
+from egovcp.data.provenance import source_index, source_provenances
 from egovcp.errors import DataError
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.scenario import Scenario
@@ -39,10 +39,10 @@ def simulated_again(
     Raises:
         DataError: it is not recorded how an episode came to be, or this version cannot follow it.
     """
-    sources = len(parts_of(reader.origin))
+    sources = len(source_provenances(reader.origin))
     groups: dict[tuple[int, int], list[int]] = {}
     for index in chosen:
-        source = source_of(sources, reader.metadata(index))
+        source = source_index(sources, reader.metadata(index))
         groups.setdefault((source, _number(reader, index, "seed")), []).append(index)
     for indices in groups.values():
         simulation = Simulation(_collection(reader, indices[0]), watch, pictures)
@@ -96,7 +96,7 @@ def _collection(reader: DatasetReader, index: int) -> CollectConfig:
         DataError: there is none, or this version cannot follow it.
     """
     path = reader.root / schema.COLLECTION_PATH
-    origin = _origin(reader, index, parts_of(reader.origin))
+    origin = _origin(reader, index, source_provenances(reader.origin))
     settings = {name: origin.config[name] for name in SHAPING if name in origin.config}
     if "env" not in settings:
         raise DataError.at(path, "records no configuration of the simulator to repeat", index)
@@ -116,12 +116,12 @@ def _collection(reader: DatasetReader, index: int) -> CollectConfig:
 def _origin(reader: DatasetReader, index: int, parts: Sequence[Provenance]) -> Provenance:
     """That of ``parts`` which an episode comes from."""
     try:
-        return parts[source_of(len(parts), reader.metadata(index))]
+        return parts[source_index(len(parts), reader.metadata(index))]
     except DataError as error:
         raise DataError.at(reader.root / schema.COLLECTION_PATH, error.problem, index) from error
 
 
 def _recorded_versions(reader: DatasetReader, chosen: Sequence[int]) -> Iterator[Mapping[str, Any]]:
-    parts = parts_of(reader.origin)
+    parts = source_provenances(reader.origin)
     for index in chosen:
         yield _origin(reader, index, parts).versions

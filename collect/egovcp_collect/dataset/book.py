@@ -9,8 +9,8 @@ from typing import Any
 
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, Provenance, metadata, schema
+from egovcp.data.metadata import record_problems
 from egovcp.data.provenance import parse_provenance
-from egovcp.data.records import shape_problems
 from egovcp.errors import DataError
 from egovcp_collect.dataset.origin import joint, moved, require_one_controller
 
@@ -66,7 +66,7 @@ def _own_volume(root: Path, required: bool) -> Volume | None:
     """The records of the dataset to repair, as far as they are sound; None without any."""
     path = root / schema.COLLECTION_PATH
     try:
-        content = metadata.load_object(path, root)
+        content = metadata.load_json_object(path, root)
         origin = _origin(content, path)
     except DataError as error:
         if not required:
@@ -88,7 +88,7 @@ def _origin(content: dict[str, Any], path: Path) -> Provenance:
 
 def _sound(record: object) -> Mapping[str, Any]:
     """The record, or an empty one in place of a damaged one, so that numbers stay."""
-    usable = isinstance(record, dict) and not list(shape_problems(record))
+    usable = isinstance(record, dict) and not list(record_problems(record))
     return record if usable and isinstance(record, dict) else {}
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from egovcp.data import DatasetConfig, DatasetReader
-from egovcp.data.split import HELDOUT_FRACTION, in_split
+from egovcp.data.index import HELDOUT_FRACTION, in_split
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo_lines
 

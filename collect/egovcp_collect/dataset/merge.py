@@ -11,7 +11,7 @@ from typing import Any, Final, Literal
 from tqdm import tqdm
 
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter
-from egovcp.data.duplicates import Duplicate, DuplicateFinder
+from egovcp.data.provenance import Duplicate, DuplicateFinder
 from egovcp.errors import DataError, UsageError
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo

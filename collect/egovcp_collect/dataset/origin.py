@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from egovcp.data import Provenance
-from egovcp.data.origin import SOURCE, SOURCES, parts_of, source_of
+from egovcp.data.provenance import SOURCE, SOURCES, source_index, source_provenances
 from egovcp.errors import DataError
 
 
@@ -31,7 +31,7 @@ def joint(origins: Sequence[Provenance], command: str) -> Provenance:
     first = origins[0]
     if all(without_command(origin) == without_command(first) for origin in origins):
         return first
-    parts = [part for origin in origins for part in parts_of(origin)]
+    parts = [part for origin in origins for part in source_provenances(origin)]
     return Provenance(
         controller_id=first.controller_id,
         seed=None,
@@ -45,8 +45,8 @@ def moved(facts: Mapping[str, Any], origins: Sequence[Provenance], index: int) -
     """An episode's ``metadata`` in the `joint` of ``origins``, of which its own is ``index``."""
     if all(without_command(origin) == without_command(origins[0]) for origin in origins):
         return dict(facts)
-    before = sum(len(parts_of(origin)) for origin in origins[:index])
-    return {**facts, SOURCE: before + source_of(len(parts_of(origins[index])), facts)}
+    before = sum(len(source_provenances(origin)) for origin in origins[:index])
+    return {**facts, SOURCE: before + source_index(len(source_provenances(origins[index])), facts)}
 
 
 def without_command(origin: Provenance) -> Provenance:

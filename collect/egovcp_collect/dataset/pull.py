@@ -7,11 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from egovcp.data import DatasetConfig, DatasetReader, schema
-from egovcp.data.destination import require_new, resolve_root
+from egovcp.data.destination import require_new, resolve_root, writer_lock
 from egovcp.data.files import sync_tree
-from egovcp.data.hashes import verify_hashes
-from egovcp.data.lock import only_writer
-from egovcp.data.source import Source, record, recorded
+from egovcp.data.metadata import verify_hashes
+from egovcp.data.source import Source, read_source, write_source
 from egovcp.data.version import publish
 from egovcp.errors import DataError, UsageError
 from egovcp.hub import RetryPolicy, fetch, is_repo_id, resolve
@@ -66,7 +65,9 @@ def run(config: PullConfig) -> None:
 
 
 def _is_there(root: Path, repo_id: str, commit: str) -> bool:
-    if not (root / schema.SOURCE_PATH).is_file() or recorded(root) != Source(root, repo_id, commit):
+    if not (root / schema.SOURCE_PATH).is_file() or read_source(root) != Source(
+        root, repo_id, commit
+    ):
         return False
     verify_hashes(root)
     return True
@@ -77,7 +78,7 @@ def _bring(source: Source, retry: RetryPolicy) -> None:
     aside = source.root.with_name(f".{source.root.name}.pull")
     files = aside / "files"
     files.mkdir(parents=True, exist_ok=True)
-    with only_writer(source.root, aside):
+    with writer_lock(source.root, aside):
         try:
             fetch(source.repo_id, source.commit, files, retry)
         except BaseException:
@@ -91,7 +92,7 @@ def _bring(source: Source, retry: RetryPolicy) -> None:
         except DataError:  # that is the commit itself: fetching it again would not help
             shutil.rmtree(aside)
             raise
-        record(Source(files, source.repo_id, source.commit))
+        write_source(Source(files, source.repo_id, source.commit))
         sync_tree(files)
         publish(files, source.root)
     shutil.rmtree(aside, ignore_errors=True)

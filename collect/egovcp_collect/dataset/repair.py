@@ -13,8 +13,7 @@ from tqdm import tqdm
 
 from egovcp.checks.dataset import command_problems
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode
-from egovcp.data.duplicates import DuplicateFinder
-from egovcp.data.origin import ScenarioKeys
+from egovcp.data.provenance import DuplicateFinder, ScenarioKeys
 from egovcp.data.source import Source, local_root, require_folder
 from egovcp.errors import DataError
 from egovcp.outputs import output_file, write_report

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from egovcp import spec
 from egovcp.data import Episode, schema
-from egovcp.data.columns import EPISODE_FEATURES, open_data_file, to_numpy
-from egovcp.data.parquet import damaged
+from egovcp.data.parquet import EPISODE_FEATURES, data_errors, open_data_file, to_numpy
 from egovcp.data.paths import files_below
 from egovcp.errors import DataError
 
@@ -64,7 +63,7 @@ def _episodes(file: pq.ParquetFile, path: Path) -> Iterator[Found | DataError]:
     number, parts = -1, list[pa.Table]()
     for group in range(file.num_row_groups):
         try:
-            with damaged(path):
+            with data_errors(path):
                 table = file.read_row_group(group, columns=[*schema.FEATURES], use_threads=False)
                 runs = list(_runs(table))
         except DataError as error:
@@ -105,7 +104,7 @@ def _numbers(file: pq.ParquetFile, group: int) -> list[int]:
 
 def _assembled(path: Path, number: int, parts: list[pa.Table]) -> Found | DataError:
     try:
-        with damaged(path):
+        with data_errors(path):
             table = pa.concat_tables(parts)
             columns = {name: to_numpy(table[name], name) for name in schema.FEATURES}
     except DataError as error:

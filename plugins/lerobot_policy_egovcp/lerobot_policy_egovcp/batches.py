@@ -14,7 +14,7 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.data import DatasetReader, ReturnConfig, is_terminal, mc_return, mc_valid, mirror
-from egovcp.data.source import recorded
+from egovcp.data.source import read_source
 from egovcp.errors import DataError
 from egovcp.model import Batch
 
@@ -184,7 +184,7 @@ def open_reader(root: Path, repo_id: str) -> DatasetReader:
     Raises:
         DataError: it was not written by egovcp, or is damaged.
     """
-    return DatasetReader(recorded(Path(root), repo_id))
+    return DatasetReader(read_source(Path(root), repo_id))
 
 
 def to_batch(batch: Mapping[str, Tensor], targets: RowTargets) -> Batch:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from egovcp.atomic import write_json
-from egovcp.data.hashes import covered
+from egovcp.data.metadata import hashed_files
 from egovcp.safe_files import sha256
 from tests.support.policy_mutations.editing import Random
 
@@ -37,7 +37,7 @@ SPARSE_BYTES: Final = 1 << 40
 
 def write_hashes(root: Path) -> None:
     """List the SHA-256 of the files as they are now."""
-    write_json(root / HASHES, {name: sha256(root / name) for name in covered(root)})
+    write_json(root / HASHES, {name: sha256(root / name) for name in hashed_files(root)})
 
 
 def settle_hashes(root: Path, rng: Random) -> None:

@@ -11,7 +11,7 @@ from lerobot.datasets.lerobot_dataset import LeRobotDataset
 import egovcp_collect.dataset
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, Provenance, schema
-from egovcp.data.hashes import verify_hashes
+from egovcp.data.metadata import verify_hashes
 from egovcp.data.source import Source
 from egovcp.errors import UsageError
 from egovcp_collect.dataset import card

@@ -82,7 +82,7 @@ def test_a_missing_folder_is_told_without_asking_the_hub(
         (
             replace(walk(7, 12), metadata={"seed": 5, "episode": 0}),
             d.COLLECTION,
-            r"is ball/5/0 (task/seed/number), and so is episode 0, of other content",
+            r"is ball/5/0 (task/seed/number), as episode 0, but its content differs",
         ),
         (replace(walk(0, 12), metadata={"seed": 5, "episode": 3}), d.DATA, "repeats episode 0"),
     ],

@@ -35,7 +35,7 @@ def test_every_subcommand_explains_its_options(
     [
         (["chek"], "did you mean 'check'"),
         (["check", "a", "b"], "one dataset is expected, found 2: a, b"),
-        (["check"], "which dataset?"),
+        (["check"], "no dataset is named"),
         (["check", "{sound}", "--max_problem=3"], "did you mean '--max_problems'"),
         (["check", "{sound}", "--max_problems=0"], "expected at least 1"),
         (["info", "{sound}", "--json={sound}"], "found a folder, expected a regular file"),

@@ -10,7 +10,7 @@ import pytest
 
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, EpisodeStore
-from egovcp.data.hashes import verify_hashes
+from egovcp.data.metadata import verify_hashes
 from egovcp.errors import DataError
 from egovcp_collect.dataset.cli import main
 

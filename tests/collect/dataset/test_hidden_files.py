@@ -10,8 +10,7 @@ from pathlib import Path
 import pytest
 
 from egovcp.data import DatasetConfig, DatasetReader, EpisodeStore
-from egovcp.data.committer import committing
-from egovcp.data.continued import read_version
+from egovcp.data.committer import load_append_state, open_committer
 from egovcp_collect.dataset.cli import main
 
 from .conftest import COLLECTED, write
@@ -77,8 +76,8 @@ def _merge(root: Path, new: Path) -> int:
 
 
 def _resume(root: Path, new: Path) -> int:
-    assert read_version(root).next_number == 6
-    with committing(root, COLLECTED, 3, lambda provenance: None) as committer:
+    assert load_append_state(root).next_number == 6
+    with open_committer(root, COLLECTED, 3, lambda provenance: None) as committer:
         return committer.committed
 
 

@@ -7,22 +7,21 @@ import sys
 from pathlib import Path
 
 from egovcp.data import Provenance
-from egovcp.data.committer import committing
-from egovcp.data.encoded import encode
-from egovcp.data.spool import SealedEpisode
+from egovcp.data.committer import open_committer
+from egovcp.data.staging import StagedEpisode, encode
 from egovcp.testing import random_episode
 
 
 def main(root: Path) -> None:
     sealed: set[int] = set()
-    with committing(root, Provenance("stance-1"), 3, lambda provenance: None) as committer:
+    with open_committer(root, Provenance("stance-1"), 3, lambda provenance: None) as committer:
         for number in committer.missing(100_000):
             episode = random_episode(number, length=4)
-            committer.spool.put(SealedEpisode.of(number, encode(episode)))
-            committer.note(number)
+            committer.staging.put(StagedEpisode.of(number, encode(episode)))
+            committer.mark_staged(number)
             sealed.add(number)
             print("sealed", number, flush=True)
-            if committer.shard_is_ready:
+            if committer.next_shard_is_complete:
                 committer.commit()
                 print("committed", committer.committed, flush=True)
 

@@ -14,10 +14,9 @@ import pytest
 
 from egovcp.checks.dataset import dataset_problems
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, Provenance, files
-from egovcp.data.committer import Committer, committing, work_folder
-from egovcp.data.encoded import encode
-from egovcp.data.hashes import verify_hashes
-from egovcp.data.spool import SealedEpisode
+from egovcp.data.committer import Committer, open_committer, work_folder
+from egovcp.data.metadata import verify_hashes
+from egovcp.data.staging import StagedEpisode, encode
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
 
 _RUN = Provenance("stance-1", seed=0, command="collect", versions={"a": "1"}, config={"task": "x"})
@@ -32,8 +31,8 @@ def _agree(provenance: Provenance) -> None:
 
 def _seal(committer: Committer, episodes: Sequence[Episode], numbers: Sequence[int]) -> None:
     for number in numbers:
-        committer.spool.put(SealedEpisode.of(number, encode(episodes[number])))
-        committer.note(number)
+        committer.staging.put(StagedEpisode.of(number, encode(episodes[number])))
+        committer.mark_staged(number)
 
 
 def _tree(root: Path) -> Tree:
@@ -57,7 +56,7 @@ def _commit_all(root: Path, episodes: list[Episode], steps: Sequence[int]) -> No
     """Commit after so many episodes each, in one run each."""
     done = 0
     for count in steps:
-        with committing(root, _RUN, _SHARD, _agree) as committer:
+        with open_committer(root, _RUN, _SHARD, _agree) as committer:
             assert committer.committed == done
             _seal(committer, episodes, range(done, done + count))
             assert committer.commit() == list(range(done, done + count))
@@ -65,7 +64,7 @@ def _commit_all(root: Path, episodes: list[Episode], steps: Sequence[int]) -> No
 
 
 @pytest.mark.parametrize("steps", [[6], [1] * 6, [2, 2, 2], [3, 3], [5, 1], [1, 4, 1]])
-def test_how_often_it_was_committed_leaves_no_trace(
+def test_the_dataset_does_not_depend_on_the_number_of_commits(
     tmp_path: Path, episodes: list[Episode], whole: list[Tree], steps: list[int]
 ) -> None:
     root = tmp_path / "d"
@@ -74,26 +73,26 @@ def test_how_often_it_was_committed_leaves_no_trace(
     assert [path.name for path in tmp_path.iterdir()] == ["d"]
 
 
-def test_only_what_follows_without_a_gap_is_committed(
+def test_only_episodes_without_a_gap_before_them_are_committed(
     tmp_path: Path, episodes: list[Episode], whole: list[Tree]
 ) -> None:
     root = tmp_path / "d"
-    with committing(root, _RUN, _SHARD) as committer:
+    with open_committer(root, _RUN, _SHARD) as committer:
         _seal(committer, episodes, [4, 0, 1, 2])
         assert committer.missing(6) == [3, 5]
-        assert committer.shard_is_ready
+        assert committer.next_shard_is_complete
         assert committer.commit() == [0, 1, 2]
-        assert not committer.shard_is_ready
+        assert not committer.next_shard_is_complete
         assert committer.missing(6) == [3, 5]
     assert _tree(root) == whole[3]
-    with committing(root, _RUN, _SHARD, _agree) as committer:
-        assert (committer.committed, committer.sealed) == (3, 1)
+    with open_committer(root, _RUN, _SHARD, _agree) as committer:
+        assert (committer.committed, committer.staged) == (3, 1)
         _seal(committer, episodes, [5, 3])
         committer.commit()
     assert _tree(root) == whole[6]
 
 
-def test_a_card_beside_the_data_stays(
+def test_a_commit_keeps_other_files(
     tmp_path: Path, episodes: list[Episode], whole: list[Tree]
 ) -> None:
     root = tmp_path / "d"
@@ -101,13 +100,13 @@ def test_a_card_beside_the_data_stays(
     (root / "assets").mkdir()
     (root / "README.md").write_text("card")
     (root / "assets" / "events.png").write_bytes(b"png")
-    with committing(root, _RUN, _SHARD, _agree) as committer:
+    with open_committer(root, _RUN, _SHARD, _agree) as committer:
         _seal(committer, episodes, [3, 4, 5])
         committer.commit()
     assert _tree(root) == {**whole[6], "README.md": b"card", "assets/events.png": b"png"}
 
 
-def test_every_operation_may_fail_and_the_state_is_old_or_new(
+def test_a_failed_operation_leaves_the_old_or_the_new_dataset(
     tmp_path: Path,
     episodes: list[Episode],
     whole: list[Tree],
@@ -136,7 +135,7 @@ def _commit_with(
     disk: Any, root: Path, episodes: list[Episode], monkeypatch: pytest.MonkeyPatch
 ) -> int:
     """Try to commit episodes 3 and 4; how many operations that took."""
-    with committing(root, _RUN, _SHARD, _agree) as committer:
+    with open_committer(root, _RUN, _SHARD, _agree) as committer:
         _seal(committer, episodes, [3, 4])
         with monkeypatch.context() as patch:
             disk.install(patch)
@@ -147,14 +146,14 @@ def _commit_with(
 
 
 def _commit_rest(root: Path, episodes: list[Episode]) -> None:
-    with committing(root, _RUN, _SHARD, _agree) as committer:
+    with open_committer(root, _RUN, _SHARD, _agree) as committer:
         assert committer.missing(5) == []  # nothing sealed is ever lost
         _seal(committer, episodes, [5])
         committer.commit()
 
 
 @pytest.mark.parametrize("part", range(20))
-def test_a_full_disk_loses_nothing(
+def test_a_full_disk_loses_no_episode(
     tmp_path: Path,
     episodes: list[Episode],
     whole: list[Tree],
@@ -173,7 +172,7 @@ def test_a_full_disk_loses_nothing(
     assert _tree(root) == whole[6]
 
 
-def test_without_an_exchange_of_folders_it_takes_three_renames(
+def test_publish_without_exchange_uses_three_renames(
     tmp_path: Path,
     episodes: list[Episode],
     whole: list[Tree],
@@ -189,7 +188,7 @@ def test_without_an_exchange_of_folders_it_takes_three_renames(
 
 
 @pytest.mark.parametrize("crash_after", [1, 2])
-def test_a_crash_between_the_renames_is_mended(
+def test_a_crash_between_the_renames_is_recovered(
     tmp_path: Path,
     episodes: list[Episode],
     whole: list[Tree],
@@ -198,7 +197,7 @@ def test_a_crash_between_the_renames_is_mended(
 ) -> None:
     root = tmp_path / "d"
     _commit_all(root, episodes, [3])
-    with committing(root, _RUN, _SHARD, _agree) as committer, monkeypatch.context() as patch:
+    with open_committer(root, _RUN, _SHARD, _agree) as committer, monkeypatch.context() as patch:
         _seal(committer, episodes, [3, 4])
         _crash_in_swap(patch, crash_after)
         with pytest.raises(KeyboardInterrupt):
@@ -237,34 +236,34 @@ def test_files_without_hard_links_are_copied(
 
 def test_a_second_writer_is_refused_at_once(tmp_path: Path, episodes: list[Episode]) -> None:
     root = tmp_path / "d"
-    with committing(root, _RUN, _SHARD):
+    with open_committer(root, _RUN, _SHARD):
         began = time.monotonic()
         with (
             pytest.raises(EnvironmentFailure, match=f"being written by process {os.getpid()}"),
-            committing(root, _RUN, _SHARD, _agree),
+            open_committer(root, _RUN, _SHARD, _agree),
         ):
             pass
         assert time.monotonic() - began < 1.0  # the issue's own bound, not a speed
-    with committing(root, _RUN, _SHARD) as committer:
+    with open_committer(root, _RUN, _SHARD) as committer:
         _seal(committer, episodes, [0])
         committer.commit()
 
 
-def test_a_place_where_nothing_can_be_written() -> None:
+def test_a_folder_that_is_not_writable_is_refused() -> None:
     with (
         pytest.raises(EnvironmentFailure, match="cannot write beside /proc/dataset"),
-        committing(Path("/proc/dataset"), _RUN),
+        open_committer(Path("/proc/dataset"), _RUN),
     ):
         pass
 
 
-def test_something_that_is_there_needs_resume(tmp_path: Path, episodes: list[Episode]) -> None:
+def test_an_existing_dataset_needs_resume(tmp_path: Path, episodes: list[Episode]) -> None:
     root = tmp_path / "d"
-    with committing(root, _RUN, _SHARD) as committer:
+    with open_committer(root, _RUN, _SHARD) as committer:
         _seal(committer, episodes, [1])
-    with pytest.raises(UsageError, match="unfinished collection"), committing(root, _RUN):
+    with pytest.raises(UsageError, match="unfinished collection"), open_committer(root, _RUN):
         pass
-    with committing(root, _RUN, _SHARD, _agree) as committer:
+    with open_committer(root, _RUN, _SHARD, _agree) as committer:
         _seal(committer, episodes, [0])
         committer.commit()
     with pytest.raises(UsageError, match="exists already; continue it with --resume"):
@@ -272,14 +271,14 @@ def test_something_that_is_there_needs_resume(tmp_path: Path, episodes: list[Epi
 
 
 def _commit_once(root: Path) -> None:
-    with committing(root, _RUN):
+    with open_committer(root, _RUN):
         pass
 
 
-def test_a_run_that_does_not_agree_changes_nothing(tmp_path: Path, episodes: list[Episode]) -> None:
+def test_a_refused_provenance_changes_nothing(tmp_path: Path, episodes: list[Episode]) -> None:
     root = tmp_path / "d"
     _commit_all(root, episodes, [3])
-    with committing(root, _RUN, _SHARD, _agree) as committer:
+    with open_committer(root, _RUN, _SHARD, _agree) as committer:
         _seal(committer, episodes, [4])  # 3 is missing: it stays sealed
     before = _tree(tmp_path)
 
@@ -288,12 +287,12 @@ def test_a_run_that_does_not_agree_changes_nothing(tmp_path: Path, episodes: lis
 
     with (
         pytest.raises(UsageError, match="another seed"),
-        committing(root, _RUN, _SHARD, disagree),
+        open_committer(root, _RUN, _SHARD, disagree),
     ):
         pass
     assert _tree(tmp_path) == before
-    with committing(root, _RUN, _SHARD, _agree) as committer:
-        assert committer.sealed == 1
+    with open_committer(root, _RUN, _SHARD, _agree) as committer:
+        assert committer.staged == 1
 
 
 def test_a_damaged_dataset_is_not_extended(tmp_path: Path, episodes: list[Episode]) -> None:
@@ -305,7 +304,7 @@ def test_a_damaged_dataset_is_not_extended(tmp_path: Path, episodes: list[Episod
     path.write_bytes(content)
     with (
         pytest.raises(DataError, match=r"file-000\.parquet: damaged"),
-        committing(root, _RUN, _SHARD, _agree),
+        open_committer(root, _RUN, _SHARD, _agree),
     ):
         pass
 
@@ -339,13 +338,13 @@ def _require_acknowledged(root: Path, counts: list[int]) -> None:
         assert not counts
 
 
-def test_killed_at_random_moments(tmp_path: Path) -> None:
+def test_kill_at_random_moments(tmp_path: Path) -> None:
     _kill_at_random_moments(tmp_path, 6)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
-def test_killed_at_two_hundred_random_moments(tmp_path: Path) -> None:
+def test_kill_at_two_hundred_random_moments(tmp_path: Path) -> None:
     _kill_at_random_moments(tmp_path, 200)
 
 
@@ -368,7 +367,7 @@ def test_resume_continues_after_the_highest_number(
     _without(root, episodes, left)
     steps = [added] if at_once else [[number] for number in added]
     for numbers in steps:
-        with committing(root, _RUN, _SHARD, _agree) as committer:
+        with open_committer(root, _RUN, _SHARD, _agree) as committer:
             count = committer.committed + len(numbers)
             assert committer.missing(count) == numbers
             _seal(committer, episodes, numbers)
@@ -380,15 +379,15 @@ def test_resume_continues_after_the_highest_number(
     assert not list(dataset_problems(root))
 
 
-def test_what_was_sealed_before_a_removal_is_still_taken_up(
+def test_episodes_staged_before_a_removal_are_committed(
     tmp_path: Path, episodes: list[Episode]
 ) -> None:
     root = tmp_path / "d"
     _without(root, episodes, [0, 2])
-    with committing(root, _RUN, _SHARD, _agree) as committer:
+    with open_committer(root, _RUN, _SHARD, _agree) as committer:
         _seal(committer, episodes, [4])
-    with committing(root, _RUN, _SHARD, _agree) as committer:
-        assert (committer.committed, committer.sealed) == (2, 1)
+    with open_committer(root, _RUN, _SHARD, _agree) as committer:
+        assert (committer.committed, committer.staged) == (2, 1)
         assert committer.missing(4) == [3]
         _seal(committer, episodes, [3])
         assert committer.commit() == [3, 4]
@@ -397,7 +396,7 @@ def test_what_was_sealed_before_a_removal_is_still_taken_up(
 @pytest.mark.parametrize(
     ("facts", "error", "words"),
     [
-        ({"seed": 0, "episode": 0}, DataError, "is number 0 of the collection, and so is"),
+        ({"seed": 0, "episode": 0}, DataError, "is number 0 of the collection, as episode"),
         ({"seed": 1, "episode": 1}, UsageError, "several collections and cannot be extended"),
         ({"seed": 0, "episode": "1"}, DataError, "its number is '1', expected an integer"),
         ({"seed": 0, "episode": True}, DataError, "its number is True, expected an integer"),
@@ -415,7 +414,7 @@ def test_resume_refuses_episodes_that_it_cannot_continue(
         writer.add(episodes[0])
         writer.add(replace(episodes[1], metadata=facts))
     before = _tree(root)
-    with pytest.raises(error, match=words), committing(root, _RUN, _SHARD, _agree):
+    with pytest.raises(error, match=words), open_committer(root, _RUN, _SHARD, _agree):
         pass
     assert _tree(root) == before
     assert [path.name for path in tmp_path.iterdir()] == ["d"]
@@ -427,6 +426,6 @@ def test_resume_refuses_a_merged_dataset(tmp_path: Path, episodes: list[Episode]
         writer.add(episodes[0])
     with (
         pytest.raises(UsageError, match="several collections and cannot be extended"),
-        committing(tmp_path / "d", _RUN, _SHARD, _agree),
+        open_committer(tmp_path / "d", _RUN, _SHARD, _agree),
     ):
         pass

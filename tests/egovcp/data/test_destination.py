@@ -20,9 +20,8 @@ from egovcp.data import (
     destination,
     files,
 )
-from egovcp.data.committer import committing, work_folder
-from egovcp.data.encoded import encode
-from egovcp.data.spool import SealedEpisode
+from egovcp.data.committer import open_committer, work_folder
+from egovcp.data.staging import StagedEpisode, encode
 from egovcp.errors import EnvironmentFailure, UsageError
 from tests.support.limited import run_limited
 
@@ -37,10 +36,10 @@ def _write(root: Path, episodes: list[Episode]) -> None:
 
 def _collect(root: Path, episodes: list[Episode], resume: bool = False) -> None:
     """Add those episodes that the dataset does not have yet."""
-    with committing(root, _RUN, 2, (lambda provenance: None) if resume else None) as committer:
+    with open_committer(root, _RUN, 2, (lambda provenance: None) if resume else None) as committer:
         for number in committer.missing(len(episodes)):
-            committer.spool.put(SealedEpisode.of(number, encode(episodes[number])))
-            committer.note(number)
+            committer.staging.put(StagedEpisode.of(number, encode(episodes[number])))
+            committer.mark_staged(number)
         committer.commit()
 
 
@@ -74,16 +73,16 @@ def test_a_link_and_its_target_share_one_lock(
         """Nothing to compare."""
 
     with (
-        committing(tmp_path / first, _RUN, 2, agree),
+        open_committer(tmp_path / first, _RUN, 2, agree),
         pytest.raises(EnvironmentFailure, match="real is being written by process"),
-        committing(tmp_path / second, _RUN, 2, agree),
+        open_committer(tmp_path / second, _RUN, 2, agree),
     ):
         pass
     assert work_folder(tmp_path / "link") == work_folder(tmp_path / "real")
 
 
 @pytest.mark.parametrize("write", [_write, _collect])
-def test_a_link_to_a_folder_that_is_not_there_yet(
+def test_a_link_to_an_absent_folder(
     tmp_path: Path, episodes: list[Episode], write: Callable[[Path, list[Episode]], None]
 ) -> None:
     (tmp_path / "link").symlink_to("disk/real")
@@ -110,13 +109,15 @@ def test_an_empty_folder_is_a_root(
     assert [path.name for path in tmp_path.iterdir()] == ["d"]
 
 
-def test_resume_in_an_empty_folder_begins(tmp_path: Path, episodes: list[Episode]) -> None:
+def test_resume_in_an_empty_folder_starts_a_collection(
+    tmp_path: Path, episodes: list[Episode]
+) -> None:
     (tmp_path / "d").mkdir()
     _collect(tmp_path / "d", episodes[:2], resume=True)
     assert _size(tmp_path / "d") == 2
 
 
-def test_a_folder_that_holds_something_is_refused(tmp_path: Path, episodes: list[Episode]) -> None:
+def test_a_folder_that_is_not_empty_is_refused(tmp_path: Path, episodes: list[Episode]) -> None:
     (tmp_path / "d").mkdir()
     (tmp_path / "d" / "notes.txt").write_text("mine")
     for write in (_write, _collect):
@@ -126,7 +127,7 @@ def test_a_folder_that_holds_something_is_refused(tmp_path: Path, episodes: list
 
 
 @pytest.mark.parametrize("write", [_write, _collect])
-def test_what_another_program_wrote_meanwhile_stays(
+def test_files_of_another_program_are_not_replaced(
     tmp_path: Path,
     episodes: list[Episode],
     write: Callable[[Path, list[Episode]], None],
@@ -141,7 +142,7 @@ def test_what_another_program_wrote_meanwhile_stays(
         rename(source, target)
 
     monkeypatch.setattr(files, "rename", write_first)
-    with pytest.raises(UsageError, match="not empty any more"):
+    with pytest.raises(UsageError, match="no longer empty"):
         write(root, episodes[:1])
     assert [path.name for path in root.iterdir()] == ["notes.txt"]
 
@@ -181,7 +182,7 @@ def _in_mount(root: Path, kind: str, function: Callable[[], None]) -> None:
 
 @pytest.mark.parametrize("write", [_write, _collect])
 @pytest.mark.parametrize("kind", ["tmpfs", "bind"])
-def test_an_empty_mount_point_is_refused_before_anything_is_written(
+def test_an_empty_mount_point_is_refused_before_any_write(
     tmp_path: Path,
     episodes: list[Episode],
     kind: str,
@@ -242,7 +243,7 @@ def test_a_root_that_cannot_be_renamed_loses_nothing(
         with pytest.raises(EnvironmentFailure, match=f"{root} cannot be renamed"):
             _collect(root, episodes[:2], resume=True)
     assert _size(root) == 1
-    with committing(root, _RUN, 2, lambda provenance: None) as committer:
+    with open_committer(root, _RUN, 2, lambda provenance: None) as committer:
         assert committer.missing(2) == []  # what was simulated is still sealed
         committer.commit()
     assert _size(root) == 2

@@ -35,7 +35,7 @@ def _put(name: str, frame: int, value: object):  # type: ignore[no-untyped-def]
         (lambda e: replace(e, reward=e.reward[:0]), "no frames"),
     ],
 )
-def test_every_violation_is_named(episodes: list[Episode], damage, message: str) -> None:  # type: ignore[no-untyped-def]
+def test_validate_names_the_violation(episodes: list[Episode], damage, message: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(DataError, match=message):
         damage(episodes[0]).validate()
 

@@ -37,7 +37,7 @@ def test_lerobot_reads_every_frame(loaded: LeRobotDataset, episodes: list[Episod
             row += 1
 
 
-def test_lerobot_makes_the_same_description_itself(loaded: LeRobotDataset, tmp_path: Path) -> None:
+def test_lerobot_makes_the_same_features(loaded: LeRobotDataset, tmp_path: Path) -> None:
     features = {key: dict(value) for key, value in spec.FEATURES.items()}
     theirs = LeRobotDatasetMetadata.create(
         "me/reference", spec.PLANNER_HZ, features, schema.ROBOT_TYPE, tmp_path / "reference",

@@ -37,7 +37,7 @@ def test_the_command_inside_the_state_mirrors_like_the_action() -> None:
     np.testing.assert_allclose(mirror_state(state)[9:16], expected)
 
 
-def test_every_joint_meets_its_counterpart() -> None:
+def test_every_joint_is_exchanged_with_its_counterpart() -> None:
     for name in spec.JOINT_NAMES:
         other = name.replace("left_", "?").replace("right_", "left_").replace("?", "right_")
         state = np.zeros(spec.STATE_DIM)
@@ -46,7 +46,7 @@ def test_every_joint_meets_its_counterpart() -> None:
         assert found == (-1.0 if "roll" in name or "yaw" in name else 1.0)
 
 
-def test_the_mirrored_robot_holds_its_hands_in_the_mirrored_places() -> None:
+def test_forward_kinematics_of_a_mirrored_state_are_mirrored() -> None:
     state = np.random.default_rng(3).normal(scale=0.3, size=(50, spec.STATE_DIM))
     state[:, 3:6] += [0, 0, -1]
     palms = palm_positions(state)  # (50, left and right, xyz)

@@ -9,8 +9,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from egovcp import spec
-from egovcp.data import DatasetConfig, DatasetReader
-from egovcp.data.columns import EPISODE_FEATURES
+from egovcp.data import DatasetConfig, DatasetReader, Episode, load_arrays, open_dataset
+from egovcp.data.parquet import EPISODE_FEATURES
 from egovcp.errors import DataError, UsageError
 
 _DATA = "data/chunk-000/file-000.parquet"
@@ -90,7 +90,7 @@ def _nan_at_20(rows: list) -> list:
         ),
         (
             _edit_info(lambda i: i["features"][spec.DEPTH_KEY]["info"].update(depth_unit="m")),
-            "no depth map in mm",
+            "not a depth map in mm",
         ),
         (
             _edit_info(lambda i: i.update(data_path="../{chunk_index}/{file_index}.parquet")),
@@ -124,14 +124,14 @@ def test_the_undamaged_copy_is_accepted(copy: Path) -> None:
     _read_all(copy)
 
 
-def test_one_row_group_for_all_episodes_reads_alike(copy: Path, reader: DatasetReader) -> None:
+def test_one_row_group_for_all_episodes_is_read(copy: Path, reader: DatasetReader) -> None:
     pq.write_table(pq.read_table(copy / _DATA), copy / _DATA)
     rewritten = DatasetReader.open(DatasetConfig(root=str(copy)))
     for index in range(len(reader)):
         np.testing.assert_array_equal(rewritten.read(index).depth, reader.read(index).depth)
 
 
-def test_columns_are_the_episodes_one_after_the_other(reader: DatasetReader) -> None:
+def test_read_columns_concatenates_the_episodes(reader: DatasetReader) -> None:
     columns = reader.read_columns([spec.DEPTH_KEY, spec.ACTION_KEY, "frame_index"])
     read = [reader.read(i) for i in range(len(reader))]
     np.testing.assert_array_equal(columns[spec.DEPTH_KEY], np.concatenate([e.depth for e in read]))
@@ -142,7 +142,7 @@ def test_columns_are_the_episodes_one_after_the_other(reader: DatasetReader) -> 
         reader.read_columns(["actions"])
 
 
-def test_threads_may_read_at_once(reader: DatasetReader) -> None:
+def test_reading_is_thread_safe(reader: DatasetReader) -> None:
     """As training does, which makes a batch ahead while held-out episodes are read."""
     names = tuple(EPISODE_FEATURES.values())
     expected = [reader.read_episode_columns(k, names) for k in range(len(reader))]
@@ -162,7 +162,7 @@ def test_an_episode_out_of_range_is_an_index_error(reader: DatasetReader) -> Non
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (DatasetConfig(), "which dataset"),
+        (DatasetConfig(), "no dataset is named"),
         (DatasetConfig(repo_id="../../etc"), "not of the form user/name"),
         (DatasetConfig(repo_id="name"), "not of the form user/name"),
         (DatasetConfig(root="somewhere", revision="main"), "drop it"),
@@ -173,3 +173,35 @@ def test_a_config_that_names_no_dataset_is_a_usage_error(
 ) -> None:
     with pytest.raises(UsageError, match=message):
         DatasetReader.open(config)
+
+
+def test_load_arrays_pads_the_episodes(dataset_root: Path, episodes: list[Episode]) -> None:
+    data = load_arrays(dataset_root)
+    longest = max(map(len, episodes))
+    assert data[spec.ACTION_KEY].shape == (len(episodes), longest, spec.ACTION_DIM)
+    assert data[spec.DEPTH_KEY].shape == (len(episodes), longest, spec.DEPTH_ROWS, spec.DEPTH_COLS)
+    assert data[spec.REWARD_KEY].shape == (len(episodes), longest)
+    for i, episode in enumerate(episodes):
+        valid = data["valid"][i]
+        assert valid.sum() == len(episode)
+        np.testing.assert_array_equal(data[spec.DEPTH_KEY][i, valid], episode.depth)
+        np.testing.assert_array_equal(data[spec.STATE_KEY][i, valid], episode.state)
+        assert not data[spec.STATE_KEY][i, ~valid].any()
+
+
+def test_load_arrays_reads_some_columns(reader: DatasetReader) -> None:
+    data = load_arrays(reader, ["action", "next.done"])
+    assert set(data) == {"action", "next.done", "valid"}
+    assert data["next.done"].dtype == np.bool_
+
+
+def test_open_dataset_iterates_over_episodes(dataset_root: Path, episodes: list[Episode]) -> None:
+    digests = [episode.digest() for episode in open_dataset(str(dataset_root))]
+    assert digests == [episode.digest() for episode in episodes]
+
+
+def test_unknown_columns_and_folders_are_data_errors(dataset_root: Path) -> None:
+    with pytest.raises(DataError, match="did you mean 'action'"):
+        load_arrays(dataset_root, ["actions"])
+    with pytest.raises(DataError, match=r"no such folder: .*nowhere/at/all"):
+        open_dataset("nowhere/at/all")

@@ -30,29 +30,29 @@ def test_numbers_and_ranges(text: str, numbers: list[int]) -> None:
 
 
 @pytest.mark.parametrize("text", ["0:11", "[3, 10]", "20:30", "0:999999999999"])
-def test_what_is_not_there_is_refused_with_the_number_there_is(text: str) -> None:
+def test_episodes_out_of_range_are_refused_with_the_count(text: str) -> None:
     with pytest.raises(UsageError, match=r"the dataset has 10 episodes, 0 to 9"):
         select_episodes(text, 10)
 
 
 @pytest.mark.parametrize("text", ["a", "[1, x]", "-1", "[]", "1:2:3", "1.5", f"[{'9' * 5000}]"])
-def test_what_is_no_episode_is_refused(text: str) -> None:
-    with pytest.raises(UsageError, match=r"is no episode; expected numbers, \[0, 5, 7\]"):
+def test_a_malformed_selection_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match=r"is not an episode; expected numbers, \[0, 5, 7\]"):
         select_episodes(text, 10)
 
 
 def test_an_empty_range_is_refused() -> None:
-    with pytest.raises(UsageError, match="names no episode; there are 10"):
+    with pytest.raises(UsageError, match="selects no episode; there are 10"):
         select_episodes("5:5", 10)
 
 
-def test_what_yaml_may_have_made_of_a_range_is_refused() -> None:
+def test_a_number_that_may_be_a_yaml_range_is_refused() -> None:
     """Unquoted, 1:30 is one minute and a half."""
     with pytest.raises(UsageError, match=r"write \[90\].*quote a range"):
         select_episodes("90", 100)
 
 
-def test_only_the_chosen_episodes_are_in_a_split(dataset_root: Path) -> None:
+def test_only_selected_episodes_are_in_a_split(dataset_root: Path) -> None:
     everything = EpisodeIndex.of(
         [DatasetReader.open(SelectedDatasetConfig(root=str(dataset_root)))]
     )
@@ -65,7 +65,7 @@ def test_only_the_chosen_episodes_are_in_a_split(dataset_root: Path) -> None:
 
 
 @pytest.mark.parametrize("chosen", ["0:6", "0:3", "[1, 4]", "2:"])
-def test_no_choice_of_episodes_trains_on_what_is_held_out(dataset_root: Path, chosen: str) -> None:
+def test_no_selection_trains_on_held_out_episodes(dataset_root: Path, chosen: str) -> None:
     """Neither those whose hash says so, nor the one that stands in for them."""
 
     def split(text: str, name: str) -> set[str]:

@@ -4,6 +4,7 @@ import logging
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import huggingface_hub
 import numpy as np
 import pytest
 
@@ -51,7 +52,7 @@ def test_what_the_hub_does_not_have_is_a_data_error(
         DatasetReader.open(DatasetConfig(repo_id=repo_id, revision=revision))
 
 
-def test_a_local_folder_never_asks_the_hub(
+def test_a_local_folder_does_not_contact_the_hub(
     hub: FakeHub, dataset_root: Path, tmp_path: Path
 ) -> None:
     DatasetReader.open(DatasetConfig(repo_id="me/six", root=str(dataset_root)))
@@ -77,10 +78,11 @@ def test_a_hub_that_fails_is_an_environment_failure(
     assert source.locate(SIX, QUICK).commit == commit
 
 
-def test_no_server_at_all(hub: FakeHub, commit: str) -> None:
+def test_no_server(hub: FakeHub, commit: str) -> None:
     port = urlsplit(hub.endpoint).port
     assert port
     hub.close()
+    huggingface_hub.close_session()  # the fake Hub still serves connections that are open
     with (
         reserved_port(port),
         pytest.raises(EnvironmentFailure, match="cannot be used: ConnectError"),
@@ -88,7 +90,7 @@ def test_no_server_at_all(hub: FakeHub, commit: str) -> None:
         source.locate(SIX, QUICK)
 
 
-def test_without_the_hub_an_earlier_download_serves(
+def test_without_the_hub_an_earlier_download_is_used(
     hub: FakeHub, commit: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     before = source.locate(SIX, QUICK)
@@ -98,12 +100,12 @@ def test_without_the_hub_an_earlier_download_serves(
     assert f"earlier download of commit {commit}" in caplog.text
 
 
-def test_a_folder_remembers_where_it_came_from(tmp_path: Path) -> None:
+def test_the_source_of_a_downloaded_folder_is_stored_in_it(tmp_path: Path) -> None:
     noted = source.Source(tmp_path, "me/six", "0" * 40)
-    source.record(noted)
-    assert source.recorded(tmp_path) == noted
-    assert source.recorded(tmp_path, "me/six") == noted
-    assert source.recorded(tmp_path, "you/other").commit == ""
+    source.write_source(noted)
+    assert source.read_source(tmp_path) == noted
+    assert source.read_source(tmp_path, "me/six") == noted
+    assert source.read_source(tmp_path, "you/other").commit == ""
     (tmp_path / "meta/source.json").write_text("[]")
     with pytest.raises(DataError, match=r"source\.json is damaged"):
-        source.recorded(tmp_path)
+        source.read_source(tmp_path)

@@ -40,10 +40,10 @@ def test_a_foreign_tiff_layout_is_read_too() -> None:
 
 
 @pytest.mark.parametrize("cut", [0, 50, 3000])
-def test_a_torn_frame_is_refused(cut: int) -> None:
+def test_a_truncated_frame_is_refused(cut: int) -> None:
     blobs = tiff.encode(_frames()).to_pylist()
     blobs[2] = blobs[2][:cut]
-    with pytest.raises(DataError, match="depth frame 2"):
+    with pytest.raises(DataError, match="frame 2: its depth image"):
         tiff.decode(pa.array(blobs, pa.binary()), 48, 64)
 
 

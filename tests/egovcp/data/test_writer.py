@@ -6,7 +6,7 @@ import pytest
 
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, Provenance
-from egovcp.data.version import Version
+from egovcp.data.version import VersionWriter
 from egovcp.errors import DataError, UsageError
 
 _ARRAYS = ("depth", "state", "action", "reward", "done", "success", "truncated")
@@ -38,9 +38,7 @@ def test_reading_returns_what_was_written(reader: DatasetReader, episodes: list[
         assert found.metadata == expected.metadata
 
 
-def test_shards_have_the_size_asked_for_and_read_alike(
-    reader: DatasetReader, tmp_path: Path
-) -> None:
+def test_shards_have_the_given_size(reader: DatasetReader, tmp_path: Path) -> None:
     root = _rewrite(reader, tmp_path / "small-files", shard_episodes=2)
     assert len(list(root.glob("data/*/*.parquet"))) > 2
     rolled = DatasetReader.open(DatasetConfig(root=str(root)))
@@ -92,16 +90,16 @@ def test_a_failed_run_leaves_nothing(tmp_path: Path, episodes: list[Episode]) ->
 def test_a_failure_to_complete_the_files_leaves_nothing(
     tmp_path: Path, episodes: list[Episode], monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
-    def fail(self: Version) -> None:
+    def fail(self: VersionWriter) -> None:
         raise error
 
-    monkeypatch.setattr(Version, "_write_tasks", fail)
+    monkeypatch.setattr(VersionWriter, "_write_tasks", fail)
     with pytest.raises(type(error)), DatasetWriter(tmp_path / "new", Provenance("s")) as writer:
         writer.add(episodes[0])
     assert list(tmp_path.iterdir()) == []
 
 
-def test_no_episode_is_no_dataset(tmp_path: Path) -> None:
+def test_a_dataset_without_episodes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="no episode"):
         DatasetWriter(tmp_path / "new", Provenance("stance-1")).finalize()
     assert list(tmp_path.iterdir()) == []

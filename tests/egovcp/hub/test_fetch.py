@@ -5,7 +5,16 @@ from pathlib import Path
 import pytest
 
 from egovcp.errors import DataError, EgovcpError, EnvironmentFailure
-from egovcp.hub import Content, Publication, RetryPolicy, fetch, publish, resolve
+from egovcp.hub import (
+    Content,
+    Publication,
+    RetryPolicy,
+    fetch,
+    is_local_path,
+    is_repo_id,
+    publish,
+    resolve,
+)
 from tests.support.hub import FakeHub
 from tests.support.hub.faults import Trouble
 
@@ -42,7 +51,7 @@ def require_same(folder: Path, publication: Publication) -> None:
 
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize("trouble", TROUBLES)
-def test_trouble_that_lasts_ends_clearly_and_the_next_try_succeeds(
+def test_a_lasting_fault_is_reported_and_the_next_fetch_succeeds(
     hub: FakeHub,
     publication: Publication,
     commit: str,
@@ -68,7 +77,7 @@ def test_trouble_that_lasts_ends_clearly_and_the_next_try_succeeds(
 
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize("trouble", [503, "reset", "truncate"])
-def test_trouble_that_passes_is_not_noticed(
+def test_a_transient_fault_is_retried(
     hub: FakeHub,
     publication: Publication,
     commit: str,
@@ -81,7 +90,7 @@ def test_trouble_that_passes_is_not_noticed(
     require_same(tmp_path / "folder", publication)
 
 
-def test_a_silent_hub_is_given_up(
+def test_a_silent_hub_times_out(
     hub: FakeHub, publication: Publication, commit: str, tmp_path: Path
 ) -> None:
     hub.fail("resolve", "stall")
@@ -90,7 +99,7 @@ def test_a_silent_hub_is_given_up(
     assert "ReadTimeout" in str(error)
 
 
-def test_files_that_have_arrived_are_not_fetched_again(
+def test_downloaded_files_are_not_fetched_again(
     hub: FakeHub, publication: Publication, commit: str, quick: RetryPolicy, tmp_path: Path
 ) -> None:
     hub.fail("resolve", 503, after=2)
@@ -100,7 +109,7 @@ def test_files_that_have_arrived_are_not_fetched_again(
     assert hub.requests["resolve"] == len(publication.contents) - 2
 
 
-def test_what_does_not_belong_goes(
+def test_foreign_files_are_removed(
     hub: FakeHub, publication: Publication, commit: str, tmp_path: Path
 ) -> None:
     (tmp_path / "folder/data").mkdir(parents=True)
@@ -116,17 +125,17 @@ def test_damaged_content_is_refused_and_fetched_anew(
     blob = hub.store.blob(publication.contents[name].sha256)
     sound = blob.read_bytes()
     blob.write_bytes(sound[:-1] + b"?")
-    with pytest.raises(EnvironmentFailure, match=f"{name} is not what the Hub says"):
+    with pytest.raises(EnvironmentFailure, match=f"{name} differs from the Hub's hash"):
         fetch("me/small", commit, tmp_path / "folder", HEALTHY)
     blob.write_bytes(sound)
     fetch("me/small", commit, tmp_path / "folder", HEALTHY)
     require_same(tmp_path / "folder", publication)
 
 
-def test_no_file_lands_outside_the_folder(hub: FakeHub, commit: str, tmp_path: Path) -> None:
+def test_no_file_is_written_outside_the_folder(hub: FakeHub, commit: str, tmp_path: Path) -> None:
     file = hub.store.add_small(b"x")
     evil = hub.store.advance("datasets/me/small", "main", "", "evil", {"../evil": file}).sha
-    with pytest.raises(DataError, match=r"'\.\./evil', a place outside"):
+    with pytest.raises(DataError, match=r"'\.\./evil', a path outside"):
         fetch("me/small", evil, tmp_path / "folder", HEALTHY)
     assert not (tmp_path / "evil").exists()
 
@@ -140,3 +149,41 @@ def test_what_the_hub_does_not_have_is_named(
 ) -> None:
     with pytest.raises(DataError, match=message):
         resolve(repo_id, revision, HEALTHY)
+
+
+@pytest.mark.parametrize("text", ["user/name", "u/n", "my-org/ball.v2", "a_b/c-d", "7/x"])
+def test_a_user_and_a_name_are_a_repo_id(text: str) -> None:
+    assert is_repo_id(text)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", "name", "/name", "user/", "a/b/c", "./ball", "../ball", "~/ball", "a/b--c"),
+        *("a/b..c", "a/b.git", "a/b-", "a/.b", "a b/c", "a/b\n", "a/\0", "ü/b", f"a/{'b' * 95}"),
+    ],
+)
+def test_anything_else_is_a_local_path(text: str) -> None:
+    assert not is_repo_id(text)
+    assert is_local_path(text)
+
+
+def test_an_absent_folder_of_an_existing_parent_is_a_local_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert not is_local_path("runs/bal")
+    (tmp_path / "runs").mkdir()
+    assert is_local_path("runs/bal")
+
+
+def test_a_file_or_a_broken_link_is_a_local_path(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "user").symlink_to("nowhere")
+    assert not is_local_path("user/name")
+    (tmp_path / "user").unlink()
+    (tmp_path / "user").mkdir()
+    (tmp_path / "user" / "name").symlink_to("name")
+    assert is_local_path("user/name")

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from egovcp.errors import DataError, EgovcpError, EnvironmentFailure, UsageError
-from egovcp.hub import Content, LostUpdate, Publication, RetryPolicy, publish
-from tests.support.hub import FakeHub
+from egovcp.hub import Content, LostUpdate, Publication, RetryPolicy, ensure_repository, publish
+from tests.support.hub import FakeHub, in_this_process
 from tests.support.hub.faults import Trouble
 
 REPO = "datasets/me/small"
@@ -28,8 +28,8 @@ ROUTES = (
     "tag",
 )
 REFUSALS = {
-    401: "does not know you.*hf auth login.*write access",
-    403: "may not do that.*write access",
+    401: "not logged in.*hf auth login.*write access",
+    403: "no permission.*write access",
     404: "no dataset me/small",
 }
 TROUBLES: tuple[Trouble, ...] = (*REFUSALS, 429, 503, "reset", "lose", "truncate")
@@ -60,7 +60,7 @@ def require_published(hub: FakeHub, publication: Publication, commit: str) -> No
 
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize("trouble", TROUBLES)
-def test_trouble_that_lasts_ends_clearly_and_publishes_nothing_by_halves(
+def test_a_lasting_fault_is_reported_and_publishes_all_or_nothing(
     hub: FakeHub, publication: Publication, quick: RetryPolicy, route: str, trouble: Trouble
 ) -> None:
     hub.fail(route, trouble, retry_after=0 if trouble == 429 else None)
@@ -79,7 +79,7 @@ def test_trouble_that_lasts_ends_clearly_and_publishes_nothing_by_halves(
 
 @pytest.mark.parametrize(("status", "message"), REFUSALS.items())
 @pytest.mark.parametrize("route", ["create", "lfs_batch", "commit"])
-def test_a_refusal_says_what_to_do(
+def test_a_refusal_names_the_remedy(
     hub: FakeHub,
     publication: Publication,
     quick: RetryPolicy,
@@ -96,7 +96,7 @@ def test_a_refusal_says_what_to_do(
 
 @pytest.mark.parametrize("route", ROUTES)
 @pytest.mark.parametrize("trouble", [503, "reset", "lose"])
-def test_trouble_that_passes_is_not_noticed(
+def test_a_transient_fault_is_retried(
     hub: FakeHub, publication: Publication, route: str, trouble: Trouble
 ) -> None:
     hub.fail(route, trouble, times=1)
@@ -104,7 +104,7 @@ def test_trouble_that_passes_is_not_noticed(
 
 
 @pytest.mark.parametrize("route", ["info", "lfs_upload", "commit", "tag"])
-def test_a_silent_hub_is_given_up(hub: FakeHub, publication: Publication, route: str) -> None:
+def test_a_silent_hub_times_out(hub: FakeHub, publication: Publication, route: str) -> None:
     hub.fail(route, "stall")
     found = outcome(publication, RetryPolicy(attempts=2, wait_s=0.01, timeout_s=0.5))
     if route == "commit":  # it was made, as a second look shows
@@ -116,7 +116,7 @@ def test_a_silent_hub_is_given_up(hub: FakeHub, publication: Publication, route:
     require_published(hub, publication, publish(publication, HEALTHY).commit)
 
 
-def test_nothing_is_sent_twice(hub: FakeHub, publication: Publication) -> None:
+def test_unchanged_content_is_not_sent_again(hub: FakeHub, publication: Publication) -> None:
     first = publish(publication, HEALTHY)
     assert first.new
     hub.heal()
@@ -140,7 +140,7 @@ def test_a_new_version_replaces_the_old_one_and_the_tag_follows(
     assert hub.store.refs(REPO).tags["release-1"] == first.commit
 
 
-def test_what_others_put_beside_the_dataset_stays(hub: FakeHub, publication: Publication) -> None:
+def test_files_outside_the_owned_folders_are_kept(hub: FakeHub, publication: Publication) -> None:
     publish(publication, HEALTHY)
     note = hub.store.add_small(b"a note")
     hub.store.advance(REPO, "main", "", "by hand", {"NOTES.md": note, "data/old.bin": note})
@@ -181,7 +181,9 @@ def test_a_release_keeps_its_tag(hub: FakeHub, publication: Publication) -> None
     assert hub.store.commit(REPO, "main").sha == first.commit
 
 
-def test_private_data_is_not_put_in_public(hub: FakeHub, publication: Publication) -> None:
+def test_a_private_publication_to_a_public_repository_is_refused(
+    hub: FakeHub, publication: Publication
+) -> None:
     publish(replace(publication, private=True), HEALTHY)
     assert hub.store.refs(REPO).private
     hub.store.create("datasets/me/public", private=False)
@@ -190,14 +192,14 @@ def test_private_data_is_not_put_in_public(hub: FakeHub, publication: Publicatio
     assert set(hub.store.commit("datasets/me/public", "main").files) == {".gitattributes"}
 
 
-def test_a_branch_is_made_and_leaves_main_alone(hub: FakeHub, publication: Publication) -> None:
+def test_a_new_branch_leaves_main_unchanged(hub: FakeHub, publication: Publication) -> None:
     tried = publish(replace(publication, branch="trial", moving_tag=""), HEALTHY)
     refs = hub.store.refs(REPO)
     assert refs.branches["trial"] == tried.commit != refs.branches["main"]
     assert not refs.tags
 
 
-def test_a_pause_that_the_hub_asks_for_is_made(
+def test_retry_after_is_obeyed(
     hub: FakeHub, publication: Publication, caplog: pytest.LogCaptureFixture
 ) -> None:
     hub.fail("lfs_batch", 429, times=1, retry_after=2)
@@ -206,14 +208,14 @@ def test_a_pause_that_the_hub_asks_for_is_made(
     assert "429 Too Many Requests; trying again in 2 s" in caplog.text
 
 
-def test_but_not_a_pause_without_end(hub: FakeHub, publication: Publication) -> None:
+def test_a_retry_after_above_the_limit_is_an_error(hub: FakeHub, publication: Publication) -> None:
     hub.fail("lfs_upload", 429, retry_after=3601)
-    with pytest.raises(EnvironmentFailure, match=r"asks to wait 3601 s.*longer than 300 s"):
+    with pytest.raises(EnvironmentFailure, match=r"demands a pause of 3601 s.*longer than 300 s"):
         publish(publication, HEALTHY)
 
 
 def test_a_wrong_id_is_a_usage_error(hub: FakeHub, publication: Publication) -> None:
-    with pytest.raises(UsageError, match="no id of a dataset"):
+    with pytest.raises(UsageError, match="is not the id of a dataset"):
         publish(replace(publication, repo_id="me/a--b"), HEALTHY)
     assert not hub.requests
 
@@ -228,3 +230,62 @@ def test_a_large_file_is_read_from_disk(
     file = hub.store.commit(REPO, commit).files["data/large.parquet"]
     assert file.lfs
     assert hub.store.blob(file.sha256).read_bytes() == path.read_bytes()
+
+
+POLICY = Publication("me/policy", {"config.json": Content(b"{}")}, "a policy", repo_type="model")
+
+
+@pytest.fixture
+def logged_in(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_TOKEN", "hf_right")
+
+
+def test_ensure_repository_needs_a_token(
+    hub: FakeHub, quick: RetryPolicy, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("HF_TOKEN", raising=False)
+    with pytest.raises(EnvironmentFailure, match=r"not logged in.*hf auth login"):
+        ensure_repository(POLICY, quick)
+    assert not hub.requests
+
+
+@pytest.mark.usefixtures("logged_in")
+def test_a_token_without_write_access_is_refused(tmp_path: Path, quick: RetryPolicy) -> None:
+    with (
+        FakeHub(tmp_path / "hub", token="hf_other") as hub,
+        in_this_process(hub.endpoint, tmp_path / "home"),
+        pytest.raises(EnvironmentFailure, match="write access to models of me"),
+    ):
+        ensure_repository(POLICY, quick)
+
+
+@pytest.mark.usefixtures("logged_in")
+def test_ensure_repository_refuses_a_public_one_for_private_data(
+    hub: FakeHub, quick: RetryPolicy
+) -> None:
+    ensure_repository(POLICY, quick)
+    with pytest.raises(UsageError, match="is public, but --private was given"):
+        ensure_repository(replace(POLICY, private=True), quick)
+
+
+@pytest.mark.usefixtures("logged_in")
+@pytest.mark.parametrize("private", [False, True])
+def test_an_ensured_repository_is_empty_until_published(
+    hub: FakeHub, quick: RetryPolicy, private: bool
+) -> None:
+    policy = replace(POLICY, private=private)
+    ensure_repository(policy, quick)
+    ensure_repository(policy, quick)
+    assert "config.json" not in hub.store.commit("models/me/policy", "main").files
+    assert hub.store.refs("models/me/policy").private == private
+    commit = publish(policy, quick).commit
+    assert hub.store.commit("models/me/policy", "main").sha == commit
+    assert "config.json" in hub.store.commit("models/me/policy", "main").files
+
+
+def test_a_model_and_a_dataset_may_share_a_name(hub: FakeHub, quick: RetryPolicy) -> None:
+    publish(POLICY, quick)
+    dataset = replace(POLICY, contents={"info.json": Content(b"{}")}, repo_type="dataset")
+    publish(dataset, quick)
+    assert "info.json" not in hub.store.commit("models/me/policy", "main").files
+    assert "config.json" not in hub.store.commit("datasets/me/policy", "main").files

@@ -10,7 +10,7 @@ import huggingface_hub
 import pytest
 
 from egovcp.hub import HubUnreachable, RetryPolicy, retrying
-from egovcp.hub.retry import RetryingClient, http_library
+from egovcp.hub.retry import http_library
 from tests.support.hub import FakeHub, client_factory
 
 
@@ -56,9 +56,9 @@ def test_the_client_of_a_users_factory_sends_the_requests(hub: FakeHub, quick: R
 
 
 def test_connections_stay_open_between_blocks(hub: FakeHub, quick: RetryPolicy) -> None:
-    client, sessions = RetryingClient(quick), []
+    sessions = []
     for _ in range(2):
-        with client.open():
+        with retrying(quick):
             assert ask(hub, None) == 200
             sessions.append(huggingface_hub.get_session())
     assert sessions[0] is sessions[1]
@@ -74,43 +74,47 @@ def test_a_refused_connection_is_repeated(
 
 
 def test_a_fork_inside_a_block_does_not_lock_the_child(hub: FakeHub, quick: RetryPolicy) -> None:
-    client = RetryingClient(quick)
     hub.fail("whoami", 503)
 
     def child() -> int:
-        with client.open(), pytest.raises(HubUnreachable, match="2 times"):
+        with retrying(quick), pytest.raises(HubUnreachable, match="2 times"):
             ask(hub, None)
-        with retrying(quick):  # another policy than that of the parent's block
-            return 7
+        return 7
 
-    with client.open():
+    with retrying(RetryPolicy(attempts=1)):  # another policy than that of the child
         assert in_fork(child) == 7
-    with retrying(quick):
-        pass
+    with retrying(quick), pytest.raises(HubUnreachable, match="2 times"):
+        ask(hub, None)
 
 
-def test_threads_share_a_client_and_others_wait(hub: FakeHub, quick: RetryPolicy) -> None:
-    client, alone = RetryingClient(quick), threading.Event()
+def test_the_policy_of_the_oldest_open_block_applies_to_all_threads(
+    hub: FakeHub, quick: RetryPolicy
+) -> None:
+    hub.fail("whoami", 503)
+    opened, close = threading.Event(), threading.Event()
 
     def other() -> None:
-        with retrying(quick):
-            alone.set()
+        with retrying(RetryPolicy(attempts=1)):
+            opened.set()
+            close.wait(20)
 
-    waiting = threading.Thread(target=other, daemon=True)
-    with client.open():
-        with client.open():
-            waiting.start()
-            assert ask(hub, None) == 200
-        assert not alone.wait(0.2)
-        assert ask(hub, None) == 200
-    assert alone.wait(20)
-    waiting.join(20)
+    thread = threading.Thread(target=other, daemon=True)
+    with retrying(quick):
+        thread.start()
+        assert opened.wait(20)
+        with pytest.raises(HubUnreachable, match="2 times"):
+            ask(hub, None)
+    with pytest.raises(HubUnreachable):
+        ask(hub, None)
+    assert hub.requests["whoami"] == 3
+    close.set()
+    thread.join(20)
+    assert ask(hub, None) == 503
 
 
 def test_the_next_request_starts_with_all_attempts(hub: FakeHub, quick: RetryPolicy) -> None:
-    client = RetryingClient(quick)
     hub.fail("whoami", 503)
     for asked in (2, 4):
-        with client.open(), pytest.raises(HubUnreachable, match="2 times"):
+        with retrying(quick), pytest.raises(HubUnreachable, match="2 times"):
             ask(hub, None)
         assert hub.requests["whoami"] == asked

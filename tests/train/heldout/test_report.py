@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
-from egovcp.data.index import spread
+from egovcp.data.index import evenly_spaced
 from egovcp.model import Batch
 from egovcp.testing import random_batch, toy_model
 from egovcp_train.evaluation import evaluate
@@ -81,9 +81,9 @@ def test_the_table_has_a_line_for_everything_that_was_measured() -> None:
 
 
 def test_episodes_are_spread_evenly() -> None:
-    assert spread(np.arange(5), None).tolist() == [0, 1, 2, 3, 4]
-    assert spread(np.arange(5), 9).tolist() == [0, 1, 2, 3, 4]
-    assert spread(10 * np.arange(9), 3).tolist() == [0, 40, 80]
+    assert evenly_spaced(np.arange(5), None).tolist() == [0, 1, 2, 3, 4]
+    assert evenly_spaced(np.arange(5), 9).tolist() == [0, 1, 2, 3, 4]
+    assert evenly_spaced(10 * np.arange(9), 3).tolist() == [0, 40, 80]
 
 
 def test_recorded_episodes_are_whole_and_padded(dataset_root) -> None:

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from egovcp.data import EpisodeStore
-from egovcp.data.index import spread
-from egovcp.data.windows import gather
+from egovcp.data.index import evenly_spaced
+from egovcp.data.store import gather
 from egovcp.model import Batch
 from egovcp_train.batches import to_tensors
 
@@ -36,7 +36,7 @@ def recorded(
     """
     for task in sorted(set(store.tasks)):
         own = np.flatnonzero(np.array(store.tasks) == task)
-        own = spread(own, per_task)
+        own = evenly_spaced(own, per_task)
         own = own[np.argsort(store.length[own], kind="stable")]  # little padding
         for first in range(0, len(own), EPISODES_AT_ONCE):
             which = own[first : first + EPISODES_AT_ONCE]

@@ -11,20 +11,19 @@ import numpy as np
 import pytest
 
 from egovcp.data import (
-    BoundedStream,
     DatasetConfig,
     DatasetReader,
     DatasetWriter,
     EpisodeIndex,
     EpisodeStore,
+    InMemorySampler,
     Mix,
     Provenance,
     ReturnConfig,
-    SequenceStream,
-    Shard,
+    SamplerConfig,
     ShuffleConfig,
-    StreamConfig,
-    survey,
+    StreamingSampler,
+    compute_training_stats,
 )
 from egovcp.errors import DataError, UsageError
 
@@ -58,19 +57,21 @@ def six(reader: DatasetReader) -> EpisodeIndex:
     return EpisodeIndex.of([reader])
 
 
-def _config(**changes: object) -> StreamConfig:
-    return StreamConfig(**{"batch_size": 8, "length": 4, "mirror": False, **changes})
+def _config(**changes: object) -> SamplerConfig:
+    return SamplerConfig(**{"batch_size": 8, "length": 4, "mirror": False, **changes})
 
 
 def _same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
     return a.keys() == b.keys() and all(np.array_equal(a[k], b[k]) for k in a)
 
 
-def test_a_batch_is_that_of_the_stream_in_memory(six: EpisodeIndex, reader: DatasetReader) -> None:
+def test_batches_have_the_rows_of_the_in_memory_sampler(
+    six: EpisodeIndex, reader: DatasetReader
+) -> None:
     """Same keys, shapes and types; every valid row is that of its episode, targets included."""
     store = EpisodeStore.load([reader], returns=RETURNS)
-    pattern = next(SequenceStream(store, _config(burn_in=2)))
-    stream = BoundedStream(six, _config(burn_in=2), shuffle=FEW, returns=RETURNS)
+    pattern = next(InMemorySampler(store, _config(burn_in=2)))
+    stream = StreamingSampler(six, _config(burn_in=2), shuffle=FEW, returns=RETURNS)
     for batch in (next(stream) for _ in range(30)):
         assert {k: (v.shape, v.dtype) for k, v in batch.items()} == {
             k: (v.shape, v.dtype) for k, v in pattern.items()
@@ -87,7 +88,7 @@ def test_a_batch_is_that_of_the_stream_in_memory(six: EpisodeIndex, reader: Data
 
 
 def test_every_row_is_visited(six: EpisodeIndex) -> None:
-    stream = BoundedStream(six, _config(), shuffle=FEW)
+    stream = StreamingSampler(six, _config(), shuffle=FEW)
     seen = set()
     for batch in (next(stream) for _ in range(200)):
         pairs = zip(np.repeat(batch["episode"], 4), batch["t"].ravel(), strict=True)
@@ -96,7 +97,7 @@ def test_every_row_is_visited(six: EpisodeIndex) -> None:
 
 
 def test_episodes_are_drawn_in_proportion_to_their_frames(six: EpisodeIndex) -> None:
-    stream = BoundedStream(six, _config(batch_size=32), shuffle=FEW)
+    stream = StreamingSampler(six, _config(batch_size=32), shuffle=FEW)
     drawn = np.bincount(
         np.concatenate([next(stream)["episode"] for _ in range(150)]), minlength=len(six)
     )
@@ -110,9 +111,9 @@ def test_resuming_any_number_of_times_continues_with_exactly_the_next_batches(
     """Across many epochs: six episodes yield about 16 windows in each."""
     config = _config(batch_size=batch_size, mirror=True, burn_in=1)
 
-    def make() -> BoundedStream:
+    def make() -> StreamingSampler:
         mix = Mix(tasks={"wall": 2.0})
-        return BoundedStream(six, config, mix, FEW, returns=RETURNS)
+        return StreamingSampler(six, config, mix, FEW, returns=RETURNS)
 
     straight, stopped = make(), make()
     for _ in range(8):
@@ -123,61 +124,61 @@ def test_resuming_any_number_of_times_continues_with_exactly_the_next_batches(
 
 
 def test_a_seed_repeats_the_batches_and_another_gives_others(six: EpisodeIndex) -> None:
-    one, two = (next(BoundedStream(six, _config(), shuffle=FEW)) for _ in range(2))
+    one, two = (next(StreamingSampler(six, _config(), shuffle=FEW)) for _ in range(2))
     assert _same(one, two)
-    assert not _same(one, next(BoundedStream(six, _config(seed=1), shuffle=FEW)))
+    assert not _same(one, next(StreamingSampler(six, _config(seed=1), shuffle=FEW)))
 
 
-def test_other_options_or_data_are_not_resumed(six: EpisodeIndex, reader: DatasetReader) -> None:
-    state = BoundedStream(six, _config(), shuffle=FEW).state_dict()
-    with pytest.raises(UsageError, match="episodes 3 -> 4"):
-        BoundedStream(six, _config(), shuffle=ShuffleConfig(4)).load_state_dict(state)
-    with pytest.raises(UsageError, match="workers 1 -> 2"):
-        BoundedStream(six, _config(), shuffle=FEW, shard=Shard(workers=2)).load_state_dict(state)
-    with pytest.raises(DataError, match="episodes have changed"):
-        BoundedStream(six.select(np.arange(5)), _config(), shuffle=FEW).load_state_dict(state)
-    store = EpisodeStore.load([reader])
-    with pytest.raises(UsageError, match="bounded"):
-        SequenceStream(store, _config()).load_state_dict(state)
-    with pytest.raises(UsageError, match="bounded"):
-        BoundedStream(six, _config()).load_state_dict(SequenceStream(store, _config()).state_dict())
-
-
-# --- several workers, several datasets --------------------------------------------------------
-@pytest.mark.parametrize(("ranks", "workers"), [(1, 2), (2, 1), (3, 2)])
-def test_every_worker_of_every_rank_yields_its_own_episodes(
-    make_index: MakeIndex, ranks: int, workers: int
+def test_resuming_with_other_options_or_data_is_refused(
+    six: EpisodeIndex, reader: DatasetReader
 ) -> None:
-    """Fewer files than workers, too."""
+    state = StreamingSampler(six, _config(), shuffle=FEW).state_dict()
+    with pytest.raises(UsageError, match="episodes 3 -> 4"):
+        StreamingSampler(six, _config(), shuffle=ShuffleConfig(4)).load_state_dict(state)
+    with pytest.raises(UsageError, match="ranks 1 -> 2"):
+        StreamingSampler(six, _config(), shuffle=FEW, ranks=2).load_state_dict(state)
+    with pytest.raises(DataError, match="episodes have changed"):
+        StreamingSampler(six.select(np.arange(5)), _config(), shuffle=FEW).load_state_dict(state)
+    store = EpisodeStore.load([reader])
+    with pytest.raises(UsageError, match="has streamed its data"):
+        InMemorySampler(store, _config()).load_state_dict(state)
+    with pytest.raises(UsageError, match="had its data in memory"):
+        StreamingSampler(six, _config()).load_state_dict(
+            InMemorySampler(store, _config()).state_dict()
+        )
+
+
+# --- several processes, several datasets ------------------------------------------------------
+@pytest.mark.parametrize("ranks", [2, 6])
+def test_every_rank_yields_its_own_episodes(make_index: MakeIndex, ranks: int) -> None:
+    """Also with fewer files than ranks."""
     index = make_index(10, 7)
     drawn: list[set[int]] = []
     for rank in range(ranks):
-        for worker in range(workers):
-            shard = Shard(rank, ranks, worker, workers)
-            stream = BoundedStream(index, _config(), shuffle=FEW, shard=shard)
-            drawn.append({e for _ in range(60) for e in next(stream)["episode"].tolist()})
-            assert drawn[-1] == set(stream.episodes.tolist())
+        stream = StreamingSampler(index, _config(), shuffle=FEW, rank=rank, ranks=ranks)
+        drawn.append({e for _ in range(60) for e in next(stream)["episode"].tolist()})
+        assert drawn[-1] == set(stream.episodes.tolist())
     assert sum(map(len, drawn)) == len(index)
     assert set.union(*drawn) == set(range(len(index)))
 
 
 def test_files_stay_whole_where_there_are_enough_of_them(make_index: MakeIndex) -> None:
     index = make_index(4, 6, 5, 3)
-    shards = [BoundedStream(index, _config(), shard=Shard(i, 2)).episodes for i in range(2)]
+    shards = [StreamingSampler(index, _config(), rank=i, ranks=2).episodes for i in range(2)]
     datasets = [set(index.dataset[episodes].tolist()) for episodes in shards]
     assert not datasets[0] & datasets[1]
 
 
-def test_too_many_workers_are_refused(six: EpisodeIndex) -> None:
-    with pytest.raises(UsageError, match="use fewer workers"):
-        BoundedStream(six, _config(), shard=Shard(ranks=7))
+def test_too_many_ranks_are_refused(six: EpisodeIndex) -> None:
+    with pytest.raises(UsageError, match="use fewer processes"):
+        StreamingSampler(six, _config(), ranks=7)
     with pytest.raises(UsageError, match="rank 2 of 2"):
-        BoundedStream(six, _config(), shard=Shard(rank=2, ranks=2))
+        StreamingSampler(six, _config(), rank=2, ranks=2)
 
 
-def test_datasets_are_drawn_by_weight_whatever_their_size(make_index: MakeIndex) -> None:
+def test_datasets_are_drawn_by_weight(make_index: MakeIndex) -> None:
     index = make_index(20, 6)
-    stream = BoundedStream(index, _config(batch_size=32), Mix((1.0, 3.0)), ShuffleConfig(8))
+    stream = StreamingSampler(index, _config(batch_size=32), Mix((1.0, 3.0)), ShuffleConfig(8))
     episodes = np.concatenate([next(stream)["episode"] for _ in range(100)])
     drawn = Counter(index.dataset[episodes].tolist())
     assert drawn[1] / drawn.total() == pytest.approx(0.75, abs=0.04)
@@ -190,14 +191,14 @@ def test_held_out_episodes_are_never_read(
     heldout = set(EpisodeIndex.of(index.readers, "heldout", 0.2).identities)
     assert len(heldout) > 1
     read = set()
-    read_again = EpisodeIndex.read_again
+    read_unchecked = EpisodeIndex.read_unchecked
 
     def noted(self: EpisodeIndex, episode: int) -> object:
         read.add(self.identities[episode])
-        return read_again(self, episode)
+        return read_unchecked(self, episode)
 
-    monkeypatch.setattr(EpisodeIndex, "read_again", noted)
-    stream = BoundedStream(index, _config(), shuffle=FEW)
+    monkeypatch.setattr(EpisodeIndex, "read_unchecked", noted)
+    stream = StreamingSampler(index, _config(), shuffle=FEW)
     for _ in range(40):
         next(stream)
     assert read == set(index.identities)
@@ -209,7 +210,7 @@ def _peak(index: EpisodeIndex) -> int:
     """Bytes, of arrays, while batches are drawn."""
     len(index.length)
     tracemalloc.start()
-    stream = BoundedStream(index, _config(), shuffle=FEW)
+    stream = StreamingSampler(index, _config(), shuffle=FEW)
     for _ in range(40):
         next(stream)
     _, peak = tracemalloc.get_traced_memory()
@@ -224,7 +225,7 @@ def test_memory_does_not_grow_with_the_number_of_episodes(make_index: MakeIndex)
 
 
 @pytest.mark.parametrize("checked", [True, False])
-def test_what_is_not_checked_yet_is_compared_with_its_digest_before_it_is_drawn(
+def test_unchecked_episodes_are_compared_with_their_digest(
     make_index: MakeIndex, checked: bool
 ) -> None:
     root = make_index(6).readers[0].root
@@ -233,7 +234,7 @@ def test_what_is_not_checked_yet_is_compared_with_its_digest_before_it_is_drawn(
     collection["episodes"][4]["sha256"] = "0" * 64
     path.write_text(json.dumps(collection))
     index = EpisodeIndex.of([DatasetReader.open(DatasetConfig(root=str(root)))])
-    stream = BoundedStream(index, _config(), shuffle=ShuffleConfig(2), checked=checked)
+    stream = StreamingSampler(index, _config(), shuffle=ShuffleConfig(2), checked=checked)
     drawn: list[int] = []
 
     def draw() -> None:
@@ -249,9 +250,9 @@ def test_what_is_not_checked_yet_is_compared_with_its_digest_before_it_is_drawn(
         assert 4 not in drawn
 
 
-def test_a_file_that_is_damaged_under_way_is_named(make_index: MakeIndex) -> None:
+def test_a_file_that_is_damaged_later_is_named(make_index: MakeIndex) -> None:
     index = make_index(20)
-    stream = BoundedStream(index, _config(), shuffle=FEW)
+    stream = StreamingSampler(index, _config(), shuffle=FEW)
     next(stream)
     path: Path = index.files[0]
     index.readers[0]._open_file.cache_clear()
@@ -261,22 +262,22 @@ def test_a_file_that_is_damaged_under_way_is_named(make_index: MakeIndex) -> Non
 
 
 @pytest.mark.parametrize("shuffle", [ShuffleConfig(0), ShuffleConfig(3, 0.0)])
-def test_senseless_windows_are_refused(six: EpisodeIndex, shuffle: ShuffleConfig) -> None:
+def test_invalid_window_options_are_refused(six: EpisodeIndex, shuffle: ShuffleConfig) -> None:
     with pytest.raises(UsageError, match=r"shuffle\.\w+=0(\.0)?: expected"):
-        BoundedStream(six, _config(), shuffle=shuffle)
+        StreamingSampler(six, _config(), shuffle=shuffle)
 
 
-def test_a_survey_says_what_the_arrays_say(six: EpisodeIndex, reader: DatasetReader) -> None:
+def test_training_stats_equal_those_of_the_arrays(six: EpisodeIndex, reader: DatasetReader) -> None:
     store = EpisodeStore.load([reader], returns=RETURNS)
-    facts = survey(six, RETURNS)
+    facts = compute_training_stats(six, RETURNS)
     np.testing.assert_allclose(facts.state_mean, store.state.mean(0, dtype=np.float64), atol=1e-9)
     np.testing.assert_allclose(facts.state_std, store.state.std(0, dtype=np.float64), rtol=1e-9)
     np.testing.assert_array_equal(facts.returns, store.mc_return[store.mc_valid])
 
 
-def test_survey_counts_the_complete_returns_of_each_dataset(make_index: MakeIndex) -> None:
+def test_training_stats_count_the_complete_returns_of_each_dataset(make_index: MakeIndex) -> None:
     index = make_index(6, 3)
     store = EpisodeStore.read(index, RETURNS)
     dataset = np.repeat(store.dataset, store.length)
     expected = [int(store.mc_valid[dataset == number].sum()) for number in (0, 1)]
-    assert survey(index, RETURNS).complete.tolist() == expected
+    assert compute_training_stats(index, RETURNS).complete.tolist() == expected

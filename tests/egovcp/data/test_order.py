@@ -11,16 +11,16 @@ from egovcp.data import (
     DatasetReader,
     DatasetWriter,
     EpisodeStore,
+    InMemorySampler,
     Mix,
     Provenance,
-    SequenceStream,
-    StreamConfig,
+    SamplerConfig,
 )
 from egovcp.errors import UsageError
 
 from .conftest import MakeEpisode
 
-CONFIG = StreamConfig(batch_size=32, length=4, mirror=True)
+CONFIG = SamplerConfig(batch_size=32, length=4, mirror=True)
 
 
 @pytest.fixture(scope="module")
@@ -35,17 +35,17 @@ def both(
     return EpisodeStore.load([reader, DatasetReader.open(DatasetConfig(root=str(root)))])
 
 
-def _windows(store: EpisodeStore, mix: Mix, config: StreamConfig = CONFIG) -> np.ndarray:
-    stream = SequenceStream(store, config, mix)
+def _windows(store: EpisodeStore, mix: Mix, config: SamplerConfig = CONFIG) -> np.ndarray:
+    stream = InMemorySampler(store, config, mix)
     return np.concatenate([next(stream)["episode"] for _ in range(100)])
 
 
-def test_a_dataset_is_drawn_by_its_weight_whatever_its_size(both: EpisodeStore) -> None:
+def test_a_dataset_is_drawn_by_its_weight(both: EpisodeStore) -> None:
     drawn = Counter(both.dataset[_windows(both, Mix(datasets=(3.0, 1.0)))].tolist())
     assert drawn[0] / drawn.total() == pytest.approx(0.75, abs=0.03)
 
 
-def test_a_task_is_drawn_more_often_than_by_chance_by_its_weight(both: EpisodeStore) -> None:
+def test_a_task_weight_multiplies_its_share(both: EpisodeStore) -> None:
     tasks = np.array(both.tasks)
     frames = {task: both.length[tasks == task].sum() for task in set(both.tasks)}
     drawn = Counter(tasks[_windows(both, Mix(tasks={"wall": 3.0, "arch": 0.0}))].tolist())
@@ -54,26 +54,26 @@ def test_a_task_is_drawn_more_often_than_by_chance_by_its_weight(both: EpisodeSt
     assert drawn["wall"] / drawn["ball"] == pytest.approx(odds, rel=0.15)
 
 
-def test_without_weights_every_frame_counts_alike(both: EpisodeStore) -> None:
+def test_without_weights_all_frames_are_equally_likely(both: EpisodeStore) -> None:
     drawn = np.bincount(_windows(both, Mix()), minlength=len(both.length))
     np.testing.assert_allclose(drawn / drawn.sum(), both.length / both.num_frames, atol=0.03)
 
 
 def test_a_mixed_stream_resumes_with_exactly_the_next_batches(both: EpisodeStore) -> None:
     mix = Mix((1.0, 2.0), {"ball": 2.0})
-    straight, stopped = (SequenceStream(both, CONFIG, mix) for _ in range(2))
+    straight, stopped = (InMemorySampler(both, CONFIG, mix) for _ in range(2))
     for _ in range(3):  # three times stopped and resumed
         for _ in range(4):
             expected, found = next(straight), next(stopped)
             assert all(np.array_equal(expected[k], found[k]) for k in expected)
         state = json.loads(json.dumps(stopped.state_dict()))
-        stopped = SequenceStream(both, CONFIG, mix).load_state_dict(state)
+        stopped = InMemorySampler(both, CONFIG, mix).load_state_dict(state)
 
 
-def test_other_weights_are_not_resumed(both: EpisodeStore) -> None:
-    state = SequenceStream(both, CONFIG, Mix((1.0, 2.0))).state_dict()
+def test_resuming_with_other_weights_is_refused(both: EpisodeStore) -> None:
+    state = InMemorySampler(both, CONFIG, Mix((1.0, 2.0))).state_dict()
     with pytest.raises(UsageError, match=r"datasets \[1.0, 2.0\] -> \[2.0, 2.0\]"):
-        SequenceStream(both, CONFIG, Mix((2.0, 2.0))).load_state_dict(state)
+        InMemorySampler(both, CONFIG, Mix((2.0, 2.0))).load_state_dict(state)
 
 
 @pytest.mark.parametrize(
@@ -86,6 +86,6 @@ def test_other_weights_are_not_resumed(both: EpisodeStore) -> None:
         (Mix(tasks={"ball": float("nan")}), "weight of nan"),
     ],
 )
-def test_senseless_weights_are_refused(both: EpisodeStore, mix: Mix, message: str) -> None:
+def test_invalid_weights_are_refused(both: EpisodeStore, mix: Mix, message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        SequenceStream(both, CONFIG, mix)
+        InMemorySampler(both, CONFIG, mix)

@@ -1,4 +1,7 @@
+"""Batches from episodes in memory, and batches prefetched in a thread."""
+
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -9,14 +12,18 @@ from egovcp.data import (
     DatasetReader,
     DatasetWriter,
     Episode,
+    EpisodeIndex,
     EpisodeStore,
+    InMemorySampler,
     Provenance,
     ReturnConfig,
-    SequenceStream,
-    StreamConfig,
+    SamplerConfig,
+    ShuffleConfig,
+    StreamingSampler,
 )
+from egovcp.data.index import in_split
 from egovcp.data.mirror import mirror_action, mirror_state
-from egovcp.data.split import in_split
+from egovcp.data.samplers import PrefetchIterator
 from egovcp.errors import DataError, UsageError
 
 
@@ -25,8 +32,8 @@ def store(reader: DatasetReader) -> EpisodeStore:
     return EpisodeStore.load([reader], returns=ReturnConfig(steps=5))
 
 
-def _config(**changes: object) -> StreamConfig:
-    return StreamConfig(**{"batch_size": 8, "length": 6, "mirror": False, **changes})
+def _config(**changes: object) -> SamplerConfig:
+    return SamplerConfig(**{"batch_size": 8, "length": 6, "mirror": False, **changes})
 
 
 def _same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
@@ -36,7 +43,7 @@ def _same(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> bool:
 def test_every_row_of_a_window_is_the_row_of_its_episode(
     store: EpisodeStore, episodes: list[Episode]
 ) -> None:
-    stream = SequenceStream(store, _config())
+    stream = InMemorySampler(store, _config())
     for batch in (next(stream) for _ in range(20)):
         for b, episode in enumerate(batch["episode"]):
             t, source = batch["t"][b], episodes[episode]
@@ -62,7 +69,7 @@ def test_prev_action_is_the_action_before_and_neutral_at_the_start(
 
 
 def test_every_row_is_visited(store: EpisodeStore) -> None:
-    stream = SequenceStream(store, _config())
+    stream = InMemorySampler(store, _config())
     seen = set()
     for batch in (next(stream) for _ in range(150)):
         rows = store.start[batch["episode"]][:, None] + batch["t"]
@@ -71,8 +78,8 @@ def test_every_row_is_visited(store: EpisodeStore) -> None:
 
 
 def test_a_seed_gives_the_same_batches_and_another_seed_others(store: EpisodeStore) -> None:
-    one, two = (SequenceStream(store, _config(mirror=True)) for _ in range(2))
-    other = SequenceStream(store, _config(mirror=True, seed=1))
+    one, two = (InMemorySampler(store, _config(mirror=True)) for _ in range(2))
+    other = InMemorySampler(store, _config(mirror=True, seed=1))
     first = next(one)
     assert _same(first, next(two))
     assert not _same(first, next(other))
@@ -80,12 +87,12 @@ def test_a_seed_gives_the_same_batches_and_another_seed_others(store: EpisodeSto
 
 def test_resuming_continues_with_exactly_the_next_batches(store: EpisodeStore) -> None:
     config = _config(mirror=True, burn_in=2)
-    straight = SequenceStream(store, config)
-    stopped = SequenceStream(store, config)
+    straight = InMemorySampler(store, config)
+    stopped = InMemorySampler(store, config)
     for _ in range(7):
         next(straight), next(stopped)
     state = json.loads(json.dumps(stopped.state_dict()))
-    resumed = SequenceStream(store, config).load_state_dict(state)
+    resumed = InMemorySampler(store, config).load_state_dict(state)
     for _ in range(5):
         assert _same(next(straight), next(resumed))
 
@@ -93,16 +100,16 @@ def test_resuming_continues_with_exactly_the_next_batches(store: EpisodeStore) -
 def test_resuming_with_other_data_or_settings_is_refused(
     store: EpisodeStore, reader: DatasetReader
 ) -> None:
-    state = SequenceStream(store, _config()).state_dict()
+    state = InMemorySampler(store, _config()).state_dict()
     with pytest.raises(UsageError, match="length 6 -> 7"):
-        SequenceStream(store, _config(length=7)).load_state_dict(state)
+        InMemorySampler(store, _config(length=7)).load_state_dict(state)
     fewer = EpisodeStore.load([reader], "train", heldout_fraction=0.5)
     with pytest.raises(DataError, match="episodes have changed"):
-        SequenceStream(fewer, _config()).load_state_dict(state)
+        InMemorySampler(fewer, _config()).load_state_dict(state)
 
 
 def test_burn_in_rows_count_only_at_the_start_of_an_episode(store: EpisodeStore) -> None:
-    stream = SequenceStream(store, _config(burn_in=3))
+    stream = InMemorySampler(store, _config(burn_in=3))
     for batch in (next(stream) for _ in range(20)):
         assert batch["valid"].shape == (8, 9)
         inside = batch["t"][:, 0] > 0
@@ -111,8 +118,8 @@ def test_burn_in_rows_count_only_at_the_start_of_an_episode(store: EpisodeStore)
 
 
 def test_mirrored_windows_are_reflections(store: EpisodeStore) -> None:
-    plain = SequenceStream(store, _config(batch_size=64))
-    mirrored = SequenceStream(store, _config(batch_size=64, mirror=True))
+    plain = InMemorySampler(store, _config(batch_size=64))
+    mirrored = InMemorySampler(store, _config(batch_size=64, mirror=True))
     a, b = next(plain), next(mirrored)
     flipped = (a["depth"] != b["depth"]).any(axis=(1, 2, 3))
     assert 10 < flipped.sum() < 54
@@ -123,7 +130,7 @@ def test_mirrored_windows_are_reflections(store: EpisodeStore) -> None:
     np.testing.assert_array_equal(a["mc_return"], b["mc_return"])
 
 
-def test_the_splits_part_the_episodes(reader: DatasetReader) -> None:
+def test_the_splits_partition_the_episodes(reader: DatasetReader) -> None:
     train, heldout = (
         EpisodeStore.load([reader], split, heldout_fraction=0.5) for split in ("train", "heldout")
     )
@@ -166,9 +173,60 @@ def test_stream_refuses_settings_out_of_bounds(
     store: EpisodeStore, changes: dict[str, object]
 ) -> None:
     with pytest.raises(UsageError, match="expected"):
-        SequenceStream(store, _config(**changes))
+        InMemorySampler(store, _config(**changes))
 
 
 def test_an_unknown_split_is_refused(reader: DatasetReader) -> None:
     with pytest.raises(UsageError, match="did you mean 'heldout'"):
         EpisodeStore.load([reader], "held_out")
+
+
+type MakeStream = Callable[[], StreamingSampler]
+
+
+@pytest.fixture
+def make_stream(reader: DatasetReader) -> MakeStream:
+    config = SamplerConfig(batch_size=4, length=4)
+    index = EpisodeIndex.of([reader])
+    return lambda: StreamingSampler(index, config, shuffle=ShuffleConfig(3))
+
+
+def test_prefetching_from_memory_keeps_the_batches(reader: DatasetReader) -> None:
+    store, config = EpisodeStore.load([reader]), SamplerConfig(batch_size=4, length=4)
+    plain, ahead = InMemorySampler(store, config), PrefetchIterator(InMemorySampler(store, config))
+    for _ in range(5):
+        assert ahead.state_dict() == plain.state_dict()
+        expected, found = next(plain), next(ahead)
+        assert all(np.array_equal(expected[k], found[k]) for k in expected)
+
+
+def test_prefetching_keeps_batches_and_states(make_stream: MakeStream) -> None:
+    plain, ahead = make_stream(), PrefetchIterator(make_stream())
+    for _ in range(10):
+        assert ahead.state_dict() == plain.state_dict()
+        expected, found = next(plain), next(ahead)
+        assert all(np.array_equal(expected[k], found[k]) for k in expected)
+
+
+def test_loading_a_state_drops_the_prefetched_batch(make_stream: MakeStream) -> None:
+    plain, ahead = make_stream(), PrefetchIterator(make_stream())
+    state = json.loads(json.dumps(ahead.state_dict()))
+    first = next(plain)
+    for _ in range(3):
+        next(ahead)
+        ahead.load_state_dict(state)
+        assert ahead.state_dict() == state
+        assert np.array_equal(next(ahead)["state"], first["state"])
+
+
+def test_errors_of_the_thread_are_raised_by_next(
+    make_stream: MakeStream, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def damaged(index: EpisodeIndex, episode: int) -> None:
+        raise DataError(f"episode {episode} is damaged")
+
+    monkeypatch.setattr(EpisodeIndex, "read_unchecked", damaged)
+    ahead = PrefetchIterator(make_stream())
+    for _ in range(2):
+        with pytest.raises(DataError, match="is damaged"):
+            next(ahead)

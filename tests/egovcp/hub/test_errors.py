@@ -7,15 +7,17 @@ import pytest
 from huggingface_hub import constants
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.hub import Publication, RetryPolicy, explained, publish, token
+from egovcp.hub import Publication, RetryPolicy, hub_errors, hub_token, publish
 from tests.support.hub import FakeHub
 
 
 @pytest.mark.parametrize("bad", ["hf_abc\x01def", "hf_abc def", "hf_abć"])
-def test_a_token_that_is_none_is_refused_unseen(monkeypatch: pytest.MonkeyPatch, bad: str) -> None:
+def test_an_invalid_token_is_refused_and_not_shown(
+    monkeypatch: pytest.MonkeyPatch, bad: str
+) -> None:
     monkeypatch.setenv("HF_TOKEN", bad)
     with pytest.raises(UsageError, match="hf auth login") as caught:
-        token()
+        hub_token()
     assert "hf_" not in str(caught.value)
 
 
@@ -28,18 +30,18 @@ def test_a_token_that_the_server_echoes_is_hidden(
         publish(publication, quick)
 
 
-def test_the_disk_is_not_the_network(tmp_path: Path) -> None:
-    with pytest.raises(FileNotFoundError), explained("me/small"):
+def test_a_missing_file_is_not_a_network_error(tmp_path: Path) -> None:
+    with pytest.raises(FileNotFoundError), hub_errors("me/small"):
         (tmp_path / "none").read_bytes()
 
 
-def test_a_full_disk_is_not_the_network() -> None:
-    with pytest.raises(OSError, match="No space left") as caught, explained("me/small"):
+def test_a_full_disk_is_not_a_network_error() -> None:
+    with pytest.raises(OSError, match="No space left") as caught, hub_errors("me/small"):
         raise OSError(errno.ENOSPC, "No space left on device")
     assert caught.value.errno == errno.ENOSPC
 
 
-def test_offline_means_offline(
+def test_offline_mode_sends_no_request(
     hub: FakeHub, publication: Publication, quick: RetryPolicy, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
