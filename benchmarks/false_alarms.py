@@ -1,16 +1,19 @@
 """Checks of the live runner on a healthy simulated robot: none may reject a reading or hold.
 
 Fails (exit code 1) if one does. The robot walks, is pushed, braces and blocks; see
-`egovcp_deploy.fault_injection.false_alarms`.
+`tests.support.robots.healthy_run`.
 """
 
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
 from report import parser, publish
 
-from egovcp_deploy.fault_injection.false_alarms import SITUATIONS, HealthyRun
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests.support
+
+from tests.support.robots.healthy_run import SITUATIONS, HealthyRun
 
 
 def main() -> None:

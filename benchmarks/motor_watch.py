@@ -18,7 +18,7 @@ from egovcp.sim.config import SensorConfig
 from egovcp.sim.robot import noise_std
 from egovcp.spec import CONTROLLER_HZ, JOINT_NAMES, STATE_SLICES
 from egovcp_deploy.pilot.motor_watch import MotorWatch
-from egovcp_deploy.robots.body import BodyState, MotorCommand
+from egovcp_deploy.robots.base import LowState, MotorCommand
 from egovcp_train.lowlevel import events
 from egovcp_train.lowlevel.physics import Physics
 from egovcp_train.lowlevel.sensing import measure
@@ -64,7 +64,7 @@ def play(
             torque = x.torque[i].copy()
             if dropped and tick >= _DROPPED_TICK:
                 torque[_KNEE] = 0.0
-            reading = BodyState(
+            reading = LowState(
                 tick * _TICK_NS,
                 state[i, STATE_SLICES["joint_position"]],
                 state[i, STATE_SLICES["joint_velocity"]],

@@ -11,7 +11,6 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from tick_filter import Unplanned
 from tick_logging import percentiles
 
@@ -27,7 +26,7 @@ from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Request, State
-from egovcp_deploy.robots.body import BodyState, MotorCommand
+from egovcp_deploy.robots.base import LowState, MotorCommand
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
 
 _CONTROLLER = "stance"
@@ -35,10 +34,10 @@ _SETTLE_TICKS = 10  # after a switch between the two cases
 
 
 class _Unchecked(PlausibilityFilter):
-    """Believes everything."""
+    """Accepts every reading."""
 
-    def judge(self, body: BodyState, torque: NDArray[np.float64]) -> str:
-        """Nothing is wrong."""
+    def check(self, state: LowState) -> str:
+        """Find nothing."""
         return ""
 
 
@@ -46,7 +45,7 @@ class _Unwatched(MotorWatch):
     """Finds nothing."""
 
     def update(
-        self, reading: BodyState, command: MotorCommand | None, standing: bool = True
+        self, reading: LowState, command: MotorCommand | None, standing: bool = True
     ) -> MotorVerdict:
         """Nothing is wrong."""
         return MotorVerdict()

@@ -29,7 +29,7 @@ CONFIGS = {
     "egovcp-tune-gait": "egovcp_train.lowlevel.tune:TuneConfig",
     "egovcp-deploy": "egovcp_deploy.config:DeployConfig",
     "egovcp-eval": "egovcp_deploy.evaluate:EvalConfig",
-    "egovcp-fake-g1": "egovcp_deploy.robots.fake.command:FakeConfig",
+    "egovcp-fake-g1": "egovcp_deploy.robots.fake.command:FakeG1Config",
     "egovcp-depth-server": "egovcp_deploy.robots.depth_server:DepthServerConfig",
     "egovcp-experiment": "egovcp_experiment.config:ExperimentConfig",
 }

@@ -21,7 +21,7 @@ from egovcp_deploy.options import make_output_dir, versions
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.policy import RolloutPolicy, backend_of
 from egovcp_deploy.recording import recording, run_info
-from egovcp_deploy.robots import Robot
+from egovcp_deploy.robots import LockstepRobot
 from egovcp_deploy.robots.replay import open_recordings
 from egovcp_deploy.runner import RolloutSummary, Runner
 
@@ -74,7 +74,7 @@ def make_robot(config: DeployConfig) -> SimRobot:
 
 
 def _play(
-    config: DeployConfig, artifact: Artifact | None, robot: Robot, policy: RolloutPolicy
+    config: DeployConfig, artifact: Artifact | None, robot: LockstepRobot, policy: RolloutPolicy
 ) -> None:
     """Record one rollout after the other and, whatever ends them, sum up the complete ones."""
     thinker = Thinker(policy, config.imagine)
@@ -102,7 +102,11 @@ def _play(
 
 
 def _info(
-    config: DeployConfig, artifact: Artifact | None, robot: Robot, episode: int, backend: str
+    config: DeployConfig,
+    artifact: Artifact | None,
+    robot: LockstepRobot,
+    episode: int,
+    backend: str,
 ) -> RunInfo:
     return run_info(
         config.task,
@@ -125,7 +129,7 @@ def _show(bar: Any, tick: Tick) -> None:
 def _report(
     config: DeployConfig,
     artifact: Artifact | None,
-    robot: Robot,
+    robot: LockstepRobot,
     backend: str,
     summaries: Sequence[RolloutSummary],
 ) -> dict[str, Any]:

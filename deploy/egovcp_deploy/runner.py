@@ -20,7 +20,7 @@ from egovcp.spec import ACTION_BOX, ACTION_HANDS
 from egovcp_deploy.pilot.desk import SKIPPED, Desk, Reply
 from egovcp_deploy.pilot.pilot import REJECTED, Pilot
 from egovcp_deploy.pilot.states import Limits, Request, State
-from egovcp_deploy.robots.base import Outcome, Robot, Sensed
+from egovcp_deploy.robots.base import ActionResult, LockstepRobot, RobotObservation
 
 LOGGED_CANDIDATES: Final = 32  # best first; more would hide the picture
 
@@ -81,7 +81,7 @@ class Runner:
     def __init__(
         self,
         desk: Desk,
-        robot: Robot,
+        robot: LockstepRobot,
         rate: FixedRate,
         max_ticks: int | None = None,
         limits: Limits | None = None,
@@ -138,7 +138,7 @@ class Runner:
             timing_ms=timing,
         )
 
-    def _consult(self, index: int, sensed: Sensed) -> Reply | None:
+    def _consult(self, index: int, sensed: RobotObservation) -> Reply | None:
         """Judge the situation and ask the planner; its reply, if it comes before the tick ends."""
         pilot, now = self._pilot, self._rate.clock.now_ns()
         pilot.sense(now, sensed.state, sensed.depth)
@@ -166,7 +166,9 @@ class Stopwatch:
         self._last = now
 
 
-def _outcome(sensed: Sensed, outcome: Outcome, events: tuple[str, ...]) -> dict[str, Any]:
+def _outcome(
+    sensed: RobotObservation, outcome: ActionResult, events: tuple[str, ...]
+) -> dict[str, Any]:
     """The fields of `Tick` that the robot fills."""
     return {
         "reward": outcome.reward,

@@ -18,7 +18,7 @@ from egovcp.sim import robot
 from egovcp.sim.config import STANDING_PUSHES
 from egovcp.spec import ACTION_RATE_LIMIT, COMMAND_SLICE
 from egovcp_deploy.deploy import main
-from egovcp_deploy.robots import Outcome
+from egovcp_deploy.robots import ActionResult
 from egovcp_deploy.robots.sim import SimRobot
 
 #: What ``auto`` may stand for.
@@ -205,7 +205,7 @@ def interrupted_in(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     def arrange(episode: int) -> None:
         act = SimRobot.act
 
-        def interrupted(robot: SimRobot, action: NDArray[np.float64]) -> Outcome:
+        def interrupted(robot: SimRobot, action: NDArray[np.float64]) -> ActionResult:
             if robot.scenario.episode == episode and robot.env.tick[0] == 4:
                 signal.raise_signal(signal.SIGINT)
             return act(robot, action)

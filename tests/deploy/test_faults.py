@@ -16,7 +16,7 @@ from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.states import Request, State
-from egovcp_deploy.robots import Outcome, Sensed
+from egovcp_deploy.robots import ActionResult, RobotObservation
 from egovcp_deploy.robots.sim import SimRobot
 from egovcp_deploy.runner import Runner
 from egovcp_deploy.safety import HOLD_RATE
@@ -57,7 +57,9 @@ class Steady:
 class Disturbed:
     """A simulated robot whose readings or body are tampered with, by tick."""
 
-    def __init__(self, robot: SimRobot, tamper: Callable[[int, Sensed, SimRobot], Sensed]) -> None:
+    def __init__(
+        self, robot: SimRobot, tamper: Callable[[int, RobotObservation, SimRobot], RobotObservation]
+    ) -> None:
         self._robot, self._tamper, self.tick, self.damped_at = robot, tamper, 0, -1
 
     @property
@@ -72,10 +74,10 @@ class Disturbed:
         self.tick, self.damped_at = 0, -1
         self._robot.start(episode)
 
-    def observe(self) -> Sensed:
+    def observe(self) -> RobotObservation:
         return self._tamper(self.tick, self._robot.observe(), self._robot)
 
-    def act(self, action: NDArray[np.float64]) -> Outcome:
+    def act(self, action: NDArray[np.float64]) -> ActionResult:
         assert np.isfinite(action).all()
         assert np.abs(action).max() <= 1.0
         self.tick += 1
@@ -90,7 +92,7 @@ class Disturbed:
         self._robot.close()
 
 
-def untouched(tick: int, sensed: Sensed, robot: SimRobot) -> Sensed:
+def untouched(tick: int, sensed: RobotObservation, robot: SimRobot) -> RobotObservation:
     return sensed
 
 
@@ -106,7 +108,7 @@ def sim() -> Iterator[SimRobot]:
 def play(
     sim: SimRobot,
     policy: Steady,
-    tamper: Callable[[int, Sensed, SimRobot], Sensed] = untouched,
+    tamper: Callable[[int, RobotObservation, SimRobot], RobotObservation] = untouched,
     delay_ms: Callable[[int], int] = lambda tick: 0,
     operator: Callable[[int], Request | None] = lambda tick: None,
 ) -> tuple[list[Tick], Disturbed]:
@@ -163,18 +165,20 @@ def test_a_planner_that_stops_is_noticed_in_200_ms_and_the_hands_ease(sim: SimRo
     assert ticks[-1].base.position_w[2] > 0.7  # it stands
 
 
-def frozen(begin: int, ticks: int, what: str) -> Callable[[int, Sensed, SimRobot], Sensed]:
+def frozen(
+    begin: int, ticks: int, what: str
+) -> Callable[[int, RobotObservation, SimRobot], RobotObservation]:
     """The readings of tick ``begin`` are repeated for ``ticks`` more."""
-    kept: list[Sensed] = []
+    kept: list[RobotObservation] = []
 
-    def tamper(tick: int, sensed: Sensed, robot: SimRobot) -> Sensed:
+    def tamper(tick: int, sensed: RobotObservation, robot: SimRobot) -> RobotObservation:
         if tick == begin:
             kept.append(sensed)
         if not begin < tick <= begin + ticks:
             return sensed
         if what == "picture":
-            return Sensed(kept[0].depth, sensed.state)
-        return Sensed(sensed.depth, kept[0].state)
+            return RobotObservation(kept[0].depth, sensed.state)
+        return RobotObservation(sensed.depth, kept[0].state)
 
     return tamper
 
@@ -223,8 +227,8 @@ def test_nothing_but_nan_is_held(sim: SimRobot) -> None:
 def test_a_robot_that_is_pushed_over_is_damped_within_60_ms_of_tilting(sim: SimRobot) -> None:
     tilts: list[float] = []
 
-    def push(tick: int, sensed: Sensed, robot: SimRobot) -> Sensed:
-        body = robot.env.instances[0].robot
+    def push(tick: int, sensed: RobotObservation, robot: SimRobot) -> RobotObservation:
+        body = robot.env.lanes[0].robot
         if tick == 20:
             body.data.qvel[:3] += (0.0, 3.0, 0.0)
             body.data.qvel[3:6] += (-4.0, 0.0, 0.0)

@@ -14,7 +14,7 @@ from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM, STATE_SLICES
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.pilot import REJECTED
-from egovcp_deploy.robots import Outcome, Sensed
+from egovcp_deploy.robots import ActionResult, RobotObservation
 from egovcp_deploy.runner import LOGGED_CANDIDATES, Runner
 from tests.support.sinks import MemorySink
 
@@ -80,17 +80,17 @@ class FakeRobot:
     def start(self, episode: int) -> None:
         self.count = 0
 
-    def observe(self) -> Sensed:
+    def observe(self) -> RobotObservation:
         picture = np.full((48, 64), 1000 + self.count, np.uint16)
         state = np.zeros(STATE_DIM, np.float32)
         state[STATE_SLICES["projected_gravity"].stop - 1] = -1.0
         state[STATE_SLICES["joint_velocity"]] = self.count  # no reading is like the one before
-        return Sensed(picture, state)
+        return RobotObservation(picture, state)
 
-    def act(self, action: NDArray[np.float64]) -> Outcome:
+    def act(self, action: NDArray[np.float64]) -> ActionResult:
         assert np.isfinite(action).all()
         self.count += 1
-        return Outcome(
+        return ActionResult(
             sent=action / 2,
             reward=float(self.count),
             truncated=self.count >= self.limit,
@@ -197,7 +197,7 @@ def test_overruns_are_counted(late_ms: int) -> None:
     clock = LockstepClock()
 
     class Slow(FakeRobot):
-        def act(self, action: NDArray[np.float64]) -> Outcome:
+        def act(self, action: NDArray[np.float64]) -> ActionResult:
             clock.advance(late_ms * 1_000_000)
             return super().act(action)
 

@@ -19,7 +19,7 @@ from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp_deploy.live.hardware import CameraOptions
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.robots.bridge import BridgeConfig
-from egovcp_deploy.robots.zmq_eye import ZmqEyeConfig
+from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 from lerobot_robot_egovcp import EgovcpG1, EgovcpG1Config
 
 #: A test is about the wire, not about how busy this machine is.
@@ -30,7 +30,7 @@ def config(tmp_path: Path, bridge: int = 1, command: int = 1, camera: int = 1) -
     return EgovcpG1Config(
         calibration_dir=tmp_path,
         bridge=BridgeConfig(state_port=bridge, command_port=command),
-        camera=CameraOptions(server=ZmqEyeConfig(port=camera)),
+        camera=CameraOptions(server=ZmqCameraConfig(port=camera)),
         controller="stance",
         limits=PATIENT,
         by_itself=True,

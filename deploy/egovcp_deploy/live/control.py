@@ -20,8 +20,13 @@ from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Request, State
 from egovcp_deploy.pilot.velocity import VelocityCommand
-from egovcp_deploy.robots.body import Body, BodyState, Eye, MotorCommand
-from egovcp_deploy.robots.proprioception import proprioception
+from egovcp_deploy.robots.base import (
+    DepthCamera,
+    LowLevelRobot,
+    LowState,
+    MotorCommand,
+    proprioception,
+)
 
 Array = NDArray[np.float64]
 
@@ -56,8 +61,8 @@ class ControlLoop:
 
     def __init__(
         self,
-        body: Body,
-        eye: Eye,
+        body: LowLevelRobot,
+        eye: DepthCamera,
         controller: LowLevelController,
         pilot: Pilot,
         velocity: VelocityCommand | None = None,
@@ -76,7 +81,7 @@ class ControlLoop:
         self._command: MotorCommand | None = None  # the last one written
         self._count = 0
         self._open = False  # o_t is out, a_t is not decided
-        self._reading: BodyState | None = None
+        self._reading: LowState | None = None
         self._rising_from: Array | None = None
         self._moving: Array = np.zeros(3)
 
@@ -110,7 +115,7 @@ class ControlLoop:
         self._body.write(self._command)
         self._count += 1
 
-    def _judge(self, now_ns: int, request: Request | None, reading: BodyState | None) -> None:
+    def _judge(self, now_ns: int, request: Request | None, reading: LowState | None) -> None:
         """Move the state machine on by what the motors report and the operator wants."""
         verdict = MotorVerdict()
         if reading is not None:
@@ -126,7 +131,7 @@ class ControlLoop:
             skipped=self._skipped(),
         )
 
-    def _read(self) -> BodyState | None:
+    def _read(self) -> LowState | None:
         """The newest reading that is all numbers; a broken one would poison the controller."""
         reading = self._body.read()
         if reading is not None and is_finite(reading):
@@ -147,7 +152,7 @@ class ControlLoop:
         self._moving = self._velocity.at(now_ns, allowed=self.state is State.RUN)
 
     def _motors(
-        self, now_ns: int, before: State, reading: BodyState | None, state: Array | None
+        self, now_ns: int, before: State, reading: LowState | None, state: Array | None
     ) -> MotorCommand:
         mode = 0 if reading is None else reading.mode
         position = None if reading is None else reading.joint_position
@@ -168,7 +173,7 @@ class ControlLoop:
         return motors.following(target, *gains, mode)
 
 
-def is_finite(reading: BodyState) -> bool:
+def is_finite(reading: LowState) -> bool:
     """Whether a reading is all numbers, with a quaternion that is a rotation."""
     q = np.asarray(reading.quaternion_w)
     parts = (reading.joint_position, reading.joint_velocity, reading.angular_velocity)

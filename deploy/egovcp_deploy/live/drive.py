@@ -29,7 +29,7 @@ from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.policy import backend_of
 from egovcp_deploy.recording import missing_ticks, recording, run_info
-from egovcp_deploy.robots.realsense_eye import require_realsense
+from egovcp_deploy.robots.realsense_camera import require_realsense
 
 SIMULATED_S: Final = 15.0  # in RUN: the crane lets go, the robot settles, the episode
 

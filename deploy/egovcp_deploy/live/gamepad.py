@@ -21,7 +21,7 @@ from egovcp.errors import EnvironmentFailure
 from egovcp.terminal import echo
 from egovcp_deploy.live.buttons import Buttons
 from egovcp_deploy.live.link import Order
-from egovcp_deploy.robots.remote import Remote
+from egovcp_deploy.robots.remote_control import RemoteControl
 
 _EVENT: Final = struct.Struct("<IhBB")
 _BUTTON, _AXIS = 0x01, 0x02
@@ -123,10 +123,10 @@ class Gamepad:
         return [*orders, Order(quit=True)] if pressed >= {"L1", "select"} else orders
 
     @property
-    def _sticks(self) -> Remote:
+    def _sticks(self) -> RemoteControl:
         axis = self._options.axis
         lx, ly, rx = (self._axes.get(number, 0.0) for number in (axis.lx, axis.ly, axis.rx))
-        return Remote(lx=lx, ly=-ly, rx=rx)
+        return RemoteControl(lx=lx, ly=-ly, rx=rx)
 
     def _events(self) -> Iterator[frozenset[str]]:
         """The buttons that are held, after each time one was pressed or let go."""

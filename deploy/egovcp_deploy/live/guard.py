@@ -11,14 +11,14 @@ from typing import Final
 
 from egovcp.log.async_sink import warn_on_stderr
 from egovcp_deploy.live.process import last_words
-from egovcp_deploy.robots.body import Body
-from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
+from egovcp_deploy.robots.base import LowLevelRobot
+from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
 
 _ROUNDS: Final = 20  # of last words, 50 ms each
 
 
 @contextmanager
-def spare_body(config: BridgeConfig) -> Iterator[BridgeBody]:
+def spare_body(config: BridgeConfig) -> Iterator[BridgeRobot]:
     """A second connection to the robot that only speaks: 500 states a second are not decoded for
     a few last words, which need the robot's mode and no more. What the operator should know of the
     robot is printed once.
@@ -26,12 +26,12 @@ def spare_body(config: BridgeConfig) -> Iterator[BridgeBody]:
     Raises:
         EnvironmentFailure: the robot does not answer.
     """
-    body = BridgeBody(config)
+    body = BridgeRobot(config)
     body.connect()
     try:
         if body.warning:
             warn_on_stderr(f"egovcp-deploy: warning: {body.warning}")
-        body.deafen()
+        body.stop_receiving()
         yield body
     finally:
         body.close()
@@ -46,7 +46,9 @@ class Guard:
         wanted: whether the process is supposed to end.
     """
 
-    def __init__(self, process: BaseProcess, body: Body, wanted: Callable[[], bool]) -> None:
+    def __init__(
+        self, process: BaseProcess, body: LowLevelRobot, wanted: Callable[[], bool]
+    ) -> None:
         self._process, self._body, self._wanted = process, body, wanted
         self.acted = False
         """Whether the robot had to be damped from here."""

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from typing import Final
 
-from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
-from egovcp_deploy.robots.realsense_eye import RealSenseEye, RealSenseEyeConfig
-from egovcp_deploy.robots.zmq_eye import ZmqEye, ZmqEyeConfig
+from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
+from egovcp_deploy.robots.realsense_camera import RealSenseConfig, RealSenseDepthCamera
+from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig, ZmqDepthCamera
 
 REALSENSE: Final = "realsense"
 CAMERAS: Final = ("server", REALSENSE)
@@ -20,9 +20,9 @@ class CameraOptions:
     type: str = "server"
     """server: one that sends pictures, egovcp-depth-server or egovcp-fake-g1. realsense: one at
     this machine."""
-    server: ZmqEyeConfig = field(default_factory=ZmqEyeConfig)
+    server: ZmqCameraConfig = field(default_factory=ZmqCameraConfig)
     """Where the server is."""
-    realsense: RealSenseEyeConfig = field(default_factory=RealSenseEyeConfig)
+    realsense: RealSenseConfig = field(default_factory=RealSenseConfig)
     """Which RealSense camera."""
 
 
@@ -40,8 +40,8 @@ class HardwareOptions:
 class Hardware:
     """What the control loop reads and writes."""
 
-    body: BridgeBody
-    eye: ZmqEye | RealSenseEye
+    body: BridgeRobot
+    eye: ZmqDepthCamera | RealSenseDepthCamera
 
     def link(self, now_ns: int) -> dict[str, float]:
         """How the messages of the last second arrived, for the log: `Tick.link`."""
@@ -52,8 +52,8 @@ class Hardware:
             **{f"state_{name}": value for name, value in asdict(states).items()},
             **{f"image_{name}": value for name, value in asdict(images).items()},
         }
-        if picture is not None and picture.taken_ns is not None:
-            found["image_age_ms"] = (now_ns - picture.taken_ns) / 1e6
+        if picture is not None and picture.captured_ns is not None:
+            found["image_age_ms"] = (now_ns - picture.captured_ns) / 1e6
         return found
 
     def close(self) -> None:
@@ -68,7 +68,7 @@ def open_hardware(options: HardwareOptions) -> Hardware:
     Raises:
         EnvironmentFailure: one does not answer.
     """
-    body = BridgeBody(options.bridge)
+    body = BridgeRobot(options.bridge)
     body.connect()
     try:
         return Hardware(body, open_eye(options.camera))
@@ -77,14 +77,14 @@ def open_hardware(options: HardwareOptions) -> Hardware:
         raise
 
 
-def open_eye(options: CameraOptions) -> ZmqEye | RealSenseEye:
+def open_eye(options: CameraOptions) -> ZmqDepthCamera | RealSenseDepthCamera:
     """Connect to the camera.
 
     Raises:
         EnvironmentFailure: it does not answer.
     """
     if options.type == REALSENSE:
-        return RealSenseEye.connect(options.realsense)
-    eye = ZmqEye(options.server)
+        return RealSenseDepthCamera.connect(options.realsense)
+    eye = ZmqDepthCamera(options.server)
     eye.connect()
     return eye

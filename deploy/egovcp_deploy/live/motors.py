@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import NUM_JOINTS
-from egovcp_deploy.robots.body import MotorCommand
+from egovcp_deploy.robots.base import MotorCommand
 
 Array = NDArray[np.float64]
 

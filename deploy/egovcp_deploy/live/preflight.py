@@ -26,13 +26,12 @@ from egovcp_deploy.dry_run import Finding, examine
 from egovcp_deploy.live.hardware import open_eye
 from egovcp_deploy.pilot.motor_watch import MotorWatch, hottest
 from egovcp_deploy.pilot.states import Limits
-from egovcp_deploy.robots import machine
-from egovcp_deploy.robots.arrivals import ArrivalStats
-from egovcp_deploy.robots.body import BodyState, Picture
-from egovcp_deploy.robots.bridge import BridgeBody
-from egovcp_deploy.robots.proprioception import projected_gravity
-from egovcp_deploy.robots.realsense_eye import RealSenseEye
-from egovcp_deploy.robots.zmq_eye import ZmqEye
+from egovcp_deploy.robots.base import DepthImage, LowState, projected_gravity
+from egovcp_deploy.robots.bridge import BridgeRobot
+from egovcp_deploy.robots.g1_variants import describe_variant
+from egovcp_deploy.robots.realsense_camera import RealSenseDepthCamera
+from egovcp_deploy.robots.subscriber import ArrivalStats
+from egovcp_deploy.robots.zmq_camera import ZmqDepthCamera
 
 Array = NDArray[np.float64]
 
@@ -52,7 +51,7 @@ _FEET: Final = [LINK_NAMES.index(f"{side}_ankle_roll_link") for side in ("left",
 class Heard:
     """What arrived within `LISTEN_S`."""
 
-    reading: BodyState | None = None
+    reading: LowState | None = None
     """The newest."""
     states: ArrivalStats = field(default_factory=ArrivalStats)
     motors: str = ""
@@ -74,12 +73,12 @@ def examine_hardware(config: DeployConfig, artifact: Artifact | None) -> Iterato
 
     yield examine("controller", controller)
     with ExitStack() as stack:
-        body = BridgeBody(config.robot.bridge)
+        body = BridgeRobot(config.robot.bridge)
         robot = examine("robot", lambda: _connect(body))
         yield robot
         if robot.error is None:
             stack.callback(body.close)
-        eyes: list[ZmqEye | RealSenseEye] = []
+        eyes: list[ZmqDepthCamera | RealSenseDepthCamera] = []
 
         def camera() -> str:
             eyes.append(open_eye(config.robot.camera))
@@ -98,10 +97,10 @@ def examine_hardware(config: DeployConfig, artifact: Artifact | None) -> Iterato
             yield examine("image age", lambda: image_age(heard.image_ages_ms, most_ms))
 
 
-def _examine_robot(body: BridgeBody, heard: Heard, limits: Limits) -> Iterator[Finding]:
+def _examine_robot(body: BridgeRobot, heard: Heard, limits: Limits) -> Iterator[Finding]:
     reading = heard.reading
     assert reading is not None, "called once one has arrived"
-    yield Finding("mode", machine.describe(reading.mode))
+    yield Finding("mode", describe_variant(reading.mode))
     yield examine("joints", lambda: joint_offsets(reading.joint_position))
     yield examine("posture", lambda: posture(reading.joint_position, reading.quaternion_w))
     yield examine("motors", lambda: motors(reading, heard))
@@ -110,23 +109,25 @@ def _examine_robot(body: BridgeBody, heard: Heard, limits: Limits) -> Iterator[F
     yield examine("other publishers", lambda: _alone(body))
 
 
-def _connect(body: BridgeBody) -> str:
+def _connect(body: BridgeRobot) -> str:
     body.connect()
     return f"answers at {body.config.host}"
 
 
-def _alone(body: BridgeBody) -> str:
-    if body.trouble:
-        raise EnvironmentFailure(body.trouble)
+def _alone(body: BridgeRobot) -> str:
+    if body.refusal:
+        raise EnvironmentFailure(body.refusal)
     return "none noticed"
 
 
-def listen(body: BridgeBody | None, eye: ZmqEye | RealSenseEye | None, seconds: float) -> Heard:
+def listen(
+    body: BridgeRobot | None, eye: ZmqDepthCamera | RealSenseDepthCamera | None, seconds: float
+) -> Heard:
     """Watch both for a while; None: not there, and not waited for."""
     heard, watch = Heard(), MotorWatch()
     if body is None and eye is None:
         return heard
-    seen: Picture | None = None
+    seen: DepthImage | None = None
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         if body is not None and (reading := body.read()) is not None:
@@ -136,8 +137,8 @@ def listen(body: BridgeBody | None, eye: ZmqEye | RealSenseEye | None, seconds: 
             heard.motor_events += verdict.events
         if eye is not None and (picture := eye.read()) is not seen and picture is not None:
             seen = picture
-            if picture.taken_ns is not None:
-                heard.image_ages_ms.append((time.monotonic_ns() - picture.taken_ns) / 1e6)
+            if picture.captured_ns is not None:
+                heard.image_ages_ms.append((time.monotonic_ns() - picture.captured_ns) / 1e6)
         time.sleep(0.001)
     now = time.monotonic_ns()
     if body is not None:
@@ -218,7 +219,7 @@ def posture(position: Array, quaternion_w: Array) -> str:
     )
 
 
-def motors(reading: BodyState, heard: Heard) -> str:
+def motors(reading: LowState, heard: Heard) -> str:
     """The hottest motor, and which checks are off.
 
     Raises:

@@ -27,8 +27,8 @@ from egovcp_deploy.live.link import Link, Order, RemoteDesk
 from egovcp_deploy.live.priority import CONTROL, RECEIVING, raise_priority
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Limits, Request, State
-from egovcp_deploy.robots.body import Body
-from egovcp_deploy.robots.remote import Remote
+from egovcp_deploy.robots.base import LowLevelRobot
+from egovcp_deploy.robots.remote_control import RemoteControl
 
 _ORPHAN_TICKS: Final = 100  # a damped robot without a planner is left after 2 s
 _LAST_WORDS: Final = 10  # how often the motors are told to damp at the end
@@ -51,7 +51,7 @@ class ControlSetup:
 
 
 def control_process(setup: ControlSetup) -> None:
-    """Body of the process; returns when it is told to quit, or is no longer needed."""
+    """LowLevelRobot of the process; returns when it is told to quit, or is no longer needed."""
     os.setsid()  # a terminal that is closed, Ctrl-Z and Ctrl-\ are not for who balances a robot
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the planner's process to judge
     quitting = Flag()
@@ -100,9 +100,9 @@ class ControlProcess:
             hardware.eye,
             make_controller(setup.controller),
             Pilot(self._desk, setup.limits),
-            refusal=lambda: hardware.body.trouble,
+            refusal=lambda: hardware.body.refusal,
             fault=lambda: hardware.body.fault,
-            skipped=lambda: hardware.body.skipped,
+            skipped=lambda: hardware.body.rejected,
             link=hardware.link,
         )
         self._remote = RemoteKeys()
@@ -153,10 +153,10 @@ class RemoteKeys:
     def __init__(self) -> None:
         self._buttons = Buttons()
 
-    def orders(self, body: Body) -> list[Order]:
+    def orders(self, body: LowLevelRobot) -> list[Order]:
         """What was pressed since the last call, and where the sticks point."""
         reading = body.read()
-        remote = None if reading is None else Remote.parse(reading.remote)
+        remote = None if reading is None else RemoteControl.parse(reading.remote)
         if remote is None:
             return []
         vx, vy, turn = remote.velocity.tolist()
@@ -164,7 +164,7 @@ class RemoteKeys:
         return orders + self._buttons.orders(remote.pressed)
 
 
-def last_words(body: Body) -> None:
+def last_words(body: LowLevelRobot) -> None:
     """Tell the motors to damp, a few times over."""
     clock = MonotonicClock()
     for _ in range(_LAST_WORDS):

@@ -17,10 +17,10 @@ from egovcp.workers import inherited_by_workers
 from egovcp_deploy.config import DeployConfig
 from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions
 from egovcp_deploy.robots.bridge import BridgeConfig
-from egovcp_deploy.robots.zmq_eye import ZmqEyeConfig
+from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 
 if TYPE_CHECKING:
-    from egovcp_deploy.robots.fake.command import FakeConfig
+    from egovcp_deploy.robots.fake.command import FakeG1Config
 
 _START_S: Final = 60.0
 _FOR_EVER_S: Final = 1e9
@@ -38,9 +38,9 @@ def simulated(config: DeployConfig, outcomes: Path) -> Iterator[HardwareOptions]
         EnvironmentFailure: the simulator is not installed, or does not come up.
     """
     from egovcp_deploy.robots.fake.bridge import Ports
-    from egovcp_deploy.robots.fake.command import FakeConfig
+    from egovcp_deploy.robots.fake.command import FakeG1Config
 
-    fake = FakeConfig(
+    fake = FakeG1Config(
         task=config.task,
         seed=config.seed,
         pause=_FOR_EVER_S,  # one episode; the robot stays where it is
@@ -61,7 +61,7 @@ def simulated(config: DeployConfig, outcomes: Path) -> Iterator[HardwareOptions]
         process.join()
 
 
-def _serve(fake: FakeConfig, pipe: Connection, parent: int) -> None:
+def _serve(fake: FakeG1Config, pipe: Connection, parent: int) -> None:
     """Runs in the simulator's process."""
     import signal
 
@@ -84,7 +84,7 @@ def _ports(pipe: Connection) -> tuple[int, int, int]:
 
 def _options(config: DeployConfig, ports: tuple[int, int, int]) -> HardwareOptions:
     command, state, camera = ports
-    eye = ZmqEyeConfig(port=camera, vertical_fov=config.env.camera.vertical_fov)
+    eye = ZmqCameraConfig(port=camera, vertical_fov=config.env.camera.vertical_fov)
     return HardwareOptions(
         BridgeConfig(state_port=state, command_port=command),
         replace(CameraOptions(), server=eye),

@@ -1,4 +1,4 @@
-"""`egovcp-mcap`: look at recorded runs, save torn ones, turn them into data and back."""
+"""`egovcp-mcap`: inspect recorded runs, recover torn ones, convert them to datasets and back."""
 
 from __future__ import annotations
 
@@ -18,44 +18,42 @@ PROG: Final = "egovcp-mcap"
 
 
 @dataclass(frozen=True)
-class Subcommand:
-    """Where a subcommand lives, how it is called, and what the help says of it.
-
-    ``names`` are the options that its arguments without a flag stand for, in order; ``many``
-    takes all of them.
-    """
+class McapSubcommand:
+    """One subcommand: its module with ``CONFIG`` and ``run``, and its help."""
 
     module: str
     usage: str
     summary: str
     names: tuple[str, ...] = ()
+    """Options that arguments without a flag stand for, in order."""
     many: str = ""
+    """The list option that takes all arguments without a flag; empty: none."""
 
 
-SUBCOMMANDS: Final[Mapping[str, Subcommand]] = MappingProxyType(
+SUBCOMMANDS: Final[Mapping[str, McapSubcommand]] = MappingProxyType(
     {
-        "info": Subcommand(
+        "info": McapSubcommand(
             "egovcp_deploy.mcap.info",
             "info FILE",
-            "what is in it: the run, ticks, rates, topics, gaps; whole or torn",
+            "its content: run, ticks, rates, topics, gaps; complete or torn",
             ("file",),
         ),
-        "recover": Subcommand(
+        "recover": McapSubcommand(
             "egovcp_deploy.mcap.recover",
             "recover TORN OUT",
-            "copy every whole tick of a torn file into a new one with an index",
+            "copy every complete tick of a torn file to a new one with an index",
             ("file", "output"),
         ),
-        "to-dataset": Subcommand(
+        "to-dataset": McapSubcommand(
             "egovcp_deploy.mcap.to_dataset",
             "to-dataset FILE... --dataset.root=ROOT",
-            "rollouts as episodes of a new LeRobot dataset, to train on",
+            "convert rollouts to episodes of a new LeRobot dataset for training",
             many="files",
         ),
-        "from-dataset": Subcommand(
+        "from-dataset": McapSubcommand(
             "egovcp_deploy.mcap.from_dataset",
             "from-dataset ROOT OUT --episode=N",
-            "an episode of a dataset as a recording",
+            "convert an episode of a dataset to a recording",
             ("dataset.root", "output"),
         ),
     }
@@ -86,17 +84,17 @@ def _help() -> str:
         [
             f"usage: {PROG} SUBCOMMAND [FILES] [--NAME=VALUE ...]",
             "",
-            "Look at recorded runs (MCAP), save torn ones, turn them into datasets and back.",
+            "Inspect recorded runs (MCAP), recover torn ones, convert them to datasets and back.",
             "",
             *lines,
             "",
-            f"`{PROG} SUBCOMMAND --help` explains the options of one.",
+            f"`{PROG} SUBCOMMAND --help` lists the options of one.",
         ]
     )
 
 
-def _flags(args: Sequence[str], entry: Subcommand) -> list[str]:
-    """The arguments with those that have no flag turned into flags."""
+def _flags(args: Sequence[str], entry: McapSubcommand) -> list[str]:
+    """Turn the arguments without a flag into flags."""
     flags = [arg for arg in args if arg.startswith("-")]
     places = [arg for arg in args if not arg.startswith("-")]
     if entry.many:

@@ -1,4 +1,4 @@
-"""`egovcp-mcap from-dataset`: an episode of a dataset as a recording, to look at or to replay."""
+"""`egovcp-mcap from-dataset`: convert an episode of a dataset to a recording."""
 
 from __future__ import annotations
 
@@ -15,15 +15,14 @@ from egovcp.terminal import echo
 
 @dataclass(frozen=True)
 class FromDatasetConfig:
-    """Write an episode of a dataset as a recording (MCAP). `to-dataset` makes the same rows of
-    it again."""
+    """Convert an episode of a dataset to a recording (MCAP); `to-dataset` restores the rows."""
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """The dataset: a folder, or an id of the Hub."""
+    """The dataset: a folder, or an id on the Hub."""
     episode: int = 0
-    """Which episode, counted from 0."""
+    """Index of the episode, from 0."""
     output: str = output_file()
-    """The recording to create."""
+    """The new recording."""
 
 
 CONFIG = FromDatasetConfig
@@ -35,10 +34,12 @@ def run(config: FromDatasetConfig) -> None:
     Raises:
         UsageError: there is no such episode, or no output is named.
         DataError: the dataset is damaged.
-        EnvironmentFailure: the output exists, or what reads datasets is not installed.
+        EnvironmentFailure: the output exists, or the packages that read datasets are missing.
     """
     if not config.output:
-        raise UsageError("where to? egovcp-mcap from-dataset ROOT OUT.mcap --episode=N")
+        raise UsageError(
+            "no output given; usage: egovcp-mcap from-dataset ROOT OUT.mcap --episode=N"
+        )
     require_packages("egovcp-deploy", "reading a dataset", *DATA_MODULES)
     from egovcp.data import DatasetReader
     from egovcp.rollouts import run_info, ticks_of

@@ -1,4 +1,4 @@
-"""`egovcp-mcap recover`: the readable ticks of a torn or damaged recording, in a new file."""
+"""`egovcp-mcap recover`: copy the readable ticks of a torn or damaged recording."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egovcp.terminal import echo
 @dataclass(frozen=True)
 class RecoverConfig:
     """Copy all readable ticks of a torn or damaged recording into a new file with an index, and
-    report which ticks are lost. The old file is not changed, and nothing is overwritten."""
+    report which ticks are lost. No existing file is changed."""
 
     file: str = ""
     """The torn or damaged recording."""
@@ -34,7 +34,7 @@ def run(config: RecoverConfig) -> None:
         EnvironmentFailure: the output exists, or the disk is full.
     """
     if not config.file or not config.output:
-        raise UsageError("from where, and where to? egovcp-mcap recover TORN OUT")
+        raise UsageError("two files are needed; usage: egovcp-mcap recover TORN OUT")
     ticks, reader = recover(Path(config.file), Path(config.output))
     echo(f"{config.output}: {ticks} ticks; {config.file} {_state(reader)}")
 
@@ -43,14 +43,14 @@ def _state(reader: RecordingReader) -> str:
     if reader.damaged:
         torn = ", and its end is missing" if reader.torn else ""
         return f"is damaged: {reader.loss_text()}{torn}"
-    return "is torn: its end is missing" if reader.torn else "was complete already"
+    return "is torn: its end is missing" if reader.torn else "was already complete"
 
 
 def recover(source: Path, output: Path) -> tuple[int, RecordingReader]:
     """Copy the readable ticks of ``source``.
 
     Returns:
-        Their number, and the reader, which knows what is lost.
+        Their number, and the reader, which describes the losses.
     """
     reader = RecordingReader(source)
     copy = McapFile(output)

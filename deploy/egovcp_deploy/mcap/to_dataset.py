@@ -1,4 +1,4 @@
-"""`egovcp-mcap to-dataset`: rollouts as episodes of a dataset, from the robot back to training."""
+"""`egovcp-mcap to-dataset`: convert recorded rollouts to episodes of a dataset."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal
 from egovcp.cli import DatasetConfig
 from egovcp.errors import DataError, UsageError
 from egovcp.log.mcap_reader import ROW_TOPICS, RecordingReader
-from egovcp.log.tick import RunInfo, Tick
+from egovcp.log.tick import Tick
 from egovcp.packages import DATA_MODULES, require_packages
 from egovcp.terminal import echo
 from egovcp_deploy.pilot.states import State
@@ -22,42 +22,46 @@ from egovcp_deploy.pilot.states import State
 if TYPE_CHECKING:
     from egovcp.data import Episode, Provenance
 
+_PER_EPISODE = ("pose", "dataset", "index in the dataset", "scenario", "time_limit", "command")
+
 
 @dataclass(frozen=True)
 class ToDatasetConfig:
-    """Make a LeRobot dataset out of recorded rollouts, one episode each: row t is what was observed
-    at tick t, the action as it was sent, the reward after it, and whether that was the end.
+    """Convert recorded rollouts to a LeRobot dataset, one episode each: row t is the observation
+    of tick t, the action that was sent, the reward after it, and whether the episode ended.
 
-    The robots must have had the same low-level controller: what an action does depends on it.
+    All robots must have had the same low-level controller, which determines the effect of actions.
     `egovcp-dataset merge` joins the dataset with others of that controller.
     """
 
     files: list[str] = field(default_factory=list)
     """The recordings, MCAP files."""
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """Where the dataset goes; without a root, into LeRobot's local folder under its id."""
+    """The new dataset; without a root, it is written to LeRobot's local folder under its id."""
     gaps: Literal["refuse", "cut"] = "refuse"
-    """What to do with a recording in which ticks are missing: rows of an episode are one period
-    apart. refuse: nothing is written; cut: keep what comes before the first gap (not what comes
-    after it, since an episode begins in the neutral pose)."""
+    """How to treat a recording with missing ticks, since rows of an episode are one period apart.
+    refuse: fail; cut: keep the ticks before the first gap (not those after it, since an episode
+    begins in the neutral pose)."""
 
 
 CONFIG = ToDatasetConfig
 
 
 def run(config: ToDatasetConfig) -> None:
-    """Convert, and say what was kept.
+    """Convert the recordings and print what was kept.
 
     Raises:
         UsageError: no file is given, or the dataset exists.
-        DataError: a file is no recording of ours, is damaged, has gaps, another controller, or
-            repeats another file.
-        EnvironmentFailure: what writes datasets is not installed.
+        DataError: a file is not a recording of ours, is damaged, has gaps or another controller,
+            or repeats another file.
+        EnvironmentFailure: the packages that write datasets are missing.
     """
     if not config.files:
-        raise UsageError("which recordings? egovcp-mcap to-dataset FILE... --dataset.root=ROOT")
+        raise UsageError(
+            "no recordings given; usage: egovcp-mcap to-dataset FILE... --dataset.root=ROOT"
+        )
     if config.dataset.revision:
-        raise UsageError("--dataset.revision has no meaning for a new dataset; drop it")
+        raise UsageError("--dataset.revision does not apply to a new dataset; omit it")
     require_packages("egovcp-deploy", "writing a dataset", *DATA_MODULES)
     from egovcp.data import DatasetWriter
     from egovcp.data.destination import require_new, resolve_root
@@ -66,9 +70,9 @@ def run(config: ToDatasetConfig) -> None:
     paths = [Path(os.path.expanduser(file)) for file in config.files]
     root = resolve_root(local_root(config.dataset))
     require_new(root)
-    known = provenance(paths)
+    common = provenance(paths)
     require_different(paths, config.gaps)
-    with DatasetWriter(root, known) as writer:
+    with DatasetWriter(root, common) as writer:
         for path in paths:
             episode, cut = read_episode(path, config.gaps)
             writer.add(episode)
@@ -77,10 +81,10 @@ def run(config: ToDatasetConfig) -> None:
 
 
 def provenance(paths: Sequence[Path]) -> Provenance:
-    """What the recordings have in common.
+    """Collect what the recordings have in common; configuration and versions are the first's.
 
     Raises:
-        DataError: they have different low-level controllers, or one does not say which.
+        DataError: the low-level controllers differ, or one is not recorded.
     """
     from egovcp.data import Provenance
     from egovcp.rollouts import CONTROLLER
@@ -96,26 +100,21 @@ def provenance(paths: Sequence[Path]) -> Provenance:
                 f"{paths[0]} with {ids[paths[0]]}; make a dataset of each"
             )
     first = infos[paths[0]]
-    command = shlex.join(["egovcp-mcap", "to-dataset", *(str(path.absolute()) for path in paths)])
     return Provenance(
         controller_id=ids[paths[0]],
-        command=command,
+        command=shlex.join(
+            ["egovcp-mcap", "to-dataset", *(str(path.absolute()) for path in paths)]
+        ),
         versions=dict(first.versions),
-        config=_config(first),
+        config={name: value for name, value in first.config.items() if name not in _PER_EPISODE},
     )
 
 
-def _config(info: RunInfo) -> dict[str, object]:
-    """The run's configuration, without what is of one episode alone."""
-    own = ("pose", "dataset", "index in the dataset", "scenario", "time_limit", "command")
-    return {name: value for name, value in info.config.items() if name not in own}
-
-
 def require_different(paths: Sequence[Path], gaps: str = "refuse") -> None:
-    """Check that each recording holds another run, before anything is written.
+    """Check that each recording is of another run, before anything is written.
 
-    A copy of a recording is recognised by its rows. The copy may end earlier: a torn or damaged
-    recording that was recovered begins with the same rows.
+    A copy is recognised by its rows. It may end earlier: a torn or damaged recording that was
+    recovered begins with the same rows.
 
     Raises:
         DataError: two recordings have the same rows, or one cannot be converted.
@@ -134,45 +133,47 @@ def require_different(paths: Sequence[Path], gaps: str = "refuse") -> None:
 
 
 def _row_digests(episode: Episode) -> list[bytes]:
-    """A digest of each row: what was observed, sent and earned."""
+    """A digest of each row: observation, action and reward."""
     columns = (episode.depth, episode.state, episode.action, episode.reward)
     rows = (b"".join(column[t].tobytes() for column in columns) for t in range(len(episode)))
     return [hashlib.blake2b(row, digest_size=16).digest() for row in rows]
 
 
 def read_episode(path: Path, gaps: str = "refuse") -> tuple[Episode, str]:
-    """A recording as an episode, and words on what was left out.
+    """Convert a recording to an episode.
+
+    Returns:
+        The episode, and a text on what was left out.
 
     Raises:
-        DataError: not a recording of ours, it is damaged, ticks are missing, or a value is out of
-            its range.
+        DataError: not a recording of ours, damaged, with missing ticks or invalid values.
     """
     from egovcp.rollouts import episode_of
 
     reader = RecordingReader(path)
     try:
-        moments = reader.raw_ticks()
-        ticks = _until_over(_driven(raw.tick(ROW_TOPICS) for raw in moments))
-        deque(moments, maxlen=0)  # read on to the end: damage may follow the episode
+        raw_ticks = reader.raw_ticks()
+        ticks = _until_end(_planned(raw.tick(ROW_TOPICS) for raw in raw_ticks))
+        deque(raw_ticks, maxlen=0)  # read on to the end: damage may follow the episode
         reader.require_undamaged()
-        whole, why = _before_gap(ticks)
-        if why and gaps == "refuse":
+        kept, gap = _before_gap(ticks)
+        if gap and gaps == "refuse":
             raise DataError(
-                f"{why}; rows of an episode are one period apart. --gaps=cut keeps what comes "
+                f"{gap}; rows of an episode are one period apart. --gaps=cut keeps what comes "
                 "before the first gap"
             )
-        episode = episode_of(reader.info, whole)
+        episode = episode_of(reader.info, kept)
         episode.validate()
     except DataError as error:
         place = "" if str(error).startswith(str(path)) else f"{path}: "
         raise DataError(f"{place}{error}") from error
-    cut = f", cut: {why}" if why else ""
+    cut = f", cut: {gap}" if gap else ""
     return episode, cut if reader.complete else f"{cut}; the file is torn there"
 
 
-def _driven(ticks: Iterator[Tick]) -> Iterator[Tick]:
-    """The ticks from the planner's first to its last; before, a robot on the wall clock stands
-    up, and after it is damped. A recording that knows no states is taken as it is."""
+def _planned(ticks: Iterator[Tick]) -> Iterator[Tick]:
+    """The ticks from the first to the last in RUN, without those in which a robot on the wall clock
+    stands up or is damped; all ticks of a recording without states."""
     begun = False
     for tick in ticks:
         if tick.mode in ("", State.RUN):
@@ -183,8 +184,8 @@ def _driven(ticks: Iterator[Tick]) -> Iterator[Tick]:
             yield tick
 
 
-def _until_over(ticks: Iterator[Tick]) -> list[Tick]:
-    """The ticks up to the one that ends the episode; the robot may have been recorded longer."""
+def _until_end(ticks: Iterator[Tick]) -> list[Tick]:
+    """The ticks up to the one that ends the episode; a recording may continue after it."""
     kept = []
     for tick in ticks:
         kept.append(tick)
@@ -193,21 +194,19 @@ def _until_over(ticks: Iterator[Tick]) -> list[Tick]:
     return kept
 
 
-def _is_first(tick: Tick) -> bool:
-    """Whether the planner took over at ``tick``."""
-    return tick.index == 0 or any(f"-> {State.RUN}" in event for event in tick.events)
-
-
 def _before_gap(ticks: Sequence[Tick]) -> tuple[list[Tick], str]:
     """The ticks before the first gap, and where that is; empty if there is none."""
     from egovcp.rollouts import follows
 
-    if ticks and not _is_first(ticks[0]):
-        return [], "its first ticks are missing"
+    if ticks:
+        first = ticks[0]
+        entered_run = any(f"-> {State.RUN}" in event for event in first.events)
+        if first.index > 0 and not entered_run:
+            return [], "its first ticks are missing"
     for i in range(1, len(ticks)):
         before, tick = ticks[i - 1], ticks[i]
         if not follows(before, tick):
             count = tick.index - before.index - 1
-            words = f"{count} ticks are missing" if count else "the robot paused"
-            return list(ticks[:i]), f"{words} after tick {before.index}"
+            what = f"{count} ticks are missing" if count else "the robot paused"
+            return list(ticks[:i]), f"{what} after tick {before.index}"
     return list(ticks), ""

@@ -18,8 +18,8 @@ from egovcp.log.tick import MotorReadings
 from egovcp.rate import NS_PER_S
 from egovcp.robot.g1 import EFFORT_LIMIT
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS
-from egovcp_deploy.robots.body import BodyState, MotorCommand
-from egovcp_deploy.robots.motor_fields import fault_words
+from egovcp_deploy.robots.base import LowState, MotorCommand
+from egovcp_deploy.robots.wire import fault_text
 
 Array = NDArray[np.floating]
 
@@ -41,7 +41,7 @@ WINDING: Final = HeatLimits(90.0, 105.0, 120.0)
 #: 40 deg C, which is the coldest that it stays beside a hot winding.
 SINGLE: Final = HeatLimits(65.0, 72.0, 80.0)
 
-#: Status bits (`motor_fields.MOTOR_STATUS_BITS`) that forbid to go on standing under load.
+#: Status bits (`wire.MOTOR_STATUS_BITS`) that forbid to go on standing under load.
 OVERLOAD_BITS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x10 | 0x20 | 0x80 | 0x200
 #: Status bits of a motor that does not know its position or is not connected: it does not obey.
 DROPPED_BITS: Final = 0x400 | 0x800 | 0x1000 | 0x4000 | 0x40000000 | 0x80000000
@@ -95,7 +95,7 @@ class MotorWatch:
         self._last = MotorVerdict()
 
     def update(
-        self, reading: BodyState, command: MotorCommand | None, standing: bool = True
+        self, reading: LowState, command: MotorCommand | None, standing: bool = True
     ) -> MotorVerdict:
         """Judge the newest reading; the same one again changes nothing.
 
@@ -139,7 +139,7 @@ class MotorWatch:
     # --- motors that do not obey ---------------------------------------------------------
     def _why_damp(
         self,
-        reading: BodyState,
+        reading: LowState,
         motors: MotorReadings,
         command: MotorCommand | None,
         elapsed: float,
@@ -163,12 +163,12 @@ class MotorWatch:
         if joint is None:
             return ""
         bits = int(faults[joint])
-        what = f"it reports {fault_words(bits)}" if bits else "its mode says that it is off"
+        what = f"it reports {fault_text(bits)}" if bits else "its mode says that it is off"
         return f"the motor of {JOINT_NAMES[joint]} does not obey: {what}"
 
     def _why_torque(
         self,
-        reading: BodyState,
+        reading: LowState,
         motors: MotorReadings,
         command: MotorCommand,
         elapsed: float,
@@ -226,13 +226,13 @@ class MotorWatch:
             return ""
         for joint in np.flatnonzero(motors.faults & ~self._faults):
             bits = int(motors.faults[joint])
-            events.append(f"the motor of {JOINT_NAMES[joint]} reports: {fault_words(bits)}")
+            events.append(f"the motor of {JOINT_NAMES[joint]} reports: {fault_text(bits)}")
         self._faults = motors.faults
         overloaded = np.flatnonzero(motors.faults & OVERLOAD_BITS)
         if not len(overloaded):
             return ""
         joint = int(overloaded[0])
-        return f"the motor of {JOINT_NAMES[joint]} reports {fault_words(int(motors.faults[joint]))}"
+        return f"the motor of {JOINT_NAMES[joint]} reports {fault_text(int(motors.faults[joint]))}"
 
     def _why_heat(self, motors: MotorReadings, elapsed: float, events: list[str]) -> str:
         """Held once a motor has been too hot for a while, until all are cool enough to arm."""
@@ -260,7 +260,7 @@ class MotorWatch:
     def _why_refuse(self, motors: MotorReadings) -> str:
         if motors.faults is not None and motors.faults.any():
             joint = int(np.flatnonzero(motors.faults)[0])
-            words = fault_words(int(motors.faults[joint]))
+            words = fault_text(int(motors.faults[joint]))
             return f"the motor of {JOINT_NAMES[joint]} reports {words}; see Unitree's app"
         if motors.temperature is None:
             return ""
@@ -318,7 +318,7 @@ class _Persistence:
         return joint if self._seconds[joint] >= limit - 1e-9 else None
 
 
-def _asked(command: MotorCommand, reading: BodyState) -> Array:
+def _asked(command: MotorCommand, reading: LowState) -> Array:
     """(29,) N m that a command asks for, within what the motors can do."""
     torque = command.stiffness * (command.position - reading.joint_position)
     torque -= command.damping * reading.joint_velocity

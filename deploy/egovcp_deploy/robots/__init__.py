@@ -1,5 +1,5 @@
-"""Robots that the runner can drive: one small Protocol, one module per robot."""
+"""Robots that the runner can drive, one module per robot; `base` defines the interfaces."""
 
-from egovcp_deploy.robots.base import Outcome, Robot, Sensed
+from egovcp_deploy.robots.base import ActionResult, LockstepRobot, RobotObservation
 
-__all__ = ["Outcome", "Robot", "Sensed"]
+__all__ = ["ActionResult", "LockstepRobot", "RobotObservation"]

@@ -1,4 +1,9 @@
-"""What the runner needs of a robot, simulated or real."""
+"""Interfaces of robots.
+
+`LockstepRobot` takes planner actions and advances time itself: the simulator and replayed runs.
+`LowLevelRobot` and `DepthCamera` are the motors, IMU and camera of a robot on the wall clock, whose
+low-level controller runs in our process.
+"""
 
 from __future__ import annotations
 
@@ -9,12 +14,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.tick import BasePose, CameraView, SceneObject
+from egovcp.log.tick import BasePose, CameraView, MotorReadings, SceneObject
+from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Sensed:
-    """One observation o_t, and in simulation the truth beside it, for logs only."""
+class RobotObservation:
+    """One observation o_t. A simulator adds the true poses, for logs only."""
 
     depth: NDArray[np.uint16]
     """(48, 64) planar depth, mm, 0 invalid."""
@@ -25,10 +33,10 @@ class Sensed:
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What followed from an action; a real robot knows only what it was sent."""
+class ActionResult:
+    """Result of one action. A recording of a real robot contains only what was sent."""
 
-    sent: NDArray[np.float64]
+    sent: Array
     """(7,) the action that took effect, box units."""
     reward: float = 0.0
     reward_terms: Mapping[str, float] = field(default_factory=dict)
@@ -38,35 +46,137 @@ class Outcome:
     events: tuple[str, ...] = ()
 
 
-class Robot(Protocol):
-    """A robot with its low-level controller running, ready to take actions at 25 Hz."""
+class LockstepRobot(Protocol):
+    """A robot with a running low-level controller that takes actions at 25 Hz of its own time."""
 
     @property
     def controller_id(self) -> str:
-        """Identity of the low-level controller; an artifact drives only its data's."""
+        """Identity of the low-level controller; it must match that of the policy's data."""
         ...
 
     @property
     def camera(self) -> CameraView:
-        """Mount and field of view of the head camera, in the present episode."""
+        """Mount and field of view of the head camera in the current episode."""
         ...
 
     def start(self, episode: int) -> None:
         """Begin rollout number ``episode`` in the neutral pose."""
         ...
 
-    def observe(self) -> Sensed:
-        """The newest observation."""
+    def observe(self) -> RobotObservation:
+        """Return the newest observation."""
         ...
 
-    def act(self, action: NDArray[np.float64]) -> Outcome:
-        """Send an action (7,) that has passed the safety filter."""
+    def act(self, action: Array) -> ActionResult:
+        """Apply an action (7,) that has passed the safety filter, and advance one tick."""
         ...
 
     def damp(self) -> None:
-        """Damp the motors until the next `start`, whatever is sent: a standing robot sinks."""
+        """Damp the motors until the next `start`; later actions have no effect."""
         ...
 
     def close(self) -> None:
-        """Release what the robot holds; further calls do nothing."""
+        """Release all resources; may be called more than once."""
         ...
+
+
+@dataclass(frozen=True)
+class LowState:
+    """One reading of joints, IMU and remote control (Unitree's ``rt/lowstate``)."""
+
+    time_ns: int
+    """Time of arrival on this machine's monotonic clock."""
+    joint_position: Array
+    """(29,) rad, ``spec.JOINT_NAMES`` order."""
+    joint_velocity: Array
+    """(29,) rad/s."""
+    quaternion_w: Array
+    """(4,) orientation of the pelvis, (w, x, y, z)."""
+    angular_velocity: Array
+    """(3,) rad/s, pelvis frame."""
+    mode: int = 0
+    """``mode_machine``; every command must repeat it."""
+    remote: bytes = b""
+    """Message of the operator's remote control (`remote_control`); empty if there is none."""
+    motors: MotorReadings | None = None
+    """Torque, temperature and status of the motors; None if the robot does not report them."""
+    command_sources: int | None = None
+    """Number of programs that sent commands in the last 0.5 s; None if unknown. An extension that
+    LeRobot's bridge does not have."""
+
+
+@dataclass(frozen=True)
+class MotorCommand:
+    """Joint targets: each motor applies stiffness * (position - q) - damping * dq."""
+
+    position: Array
+    """(29,) rad, ``spec.JOINT_NAMES`` order."""
+    stiffness: Array
+    """(29,) N m/rad; all zero: damping only."""
+    damping: Array
+    """(29,) N m s/rad."""
+    mode: int = 0
+    """`LowState.mode` of the newest reading."""
+
+
+@dataclass(frozen=True)
+class DepthImage:
+    """One depth image."""
+
+    time_ns: int
+    """Time of arrival on this machine's monotonic clock."""
+    depth: NDArray[np.uint16]
+    """(48, 64) planar depth, mm, 0 invalid."""
+    captured_ns: int | None = None
+    """Time at which the camera driver received it, on the same clock and without network delay;
+    None if unknown."""
+
+
+class LowLevelRobot(Protocol):
+    """Motors and IMU. No call blocks."""
+
+    def read(self) -> LowState | None:
+        """Return the newest reading; None before the first."""
+        ...
+
+    def write(self, command: MotorCommand) -> None:
+        """Send joint targets; they hold until the next command."""
+        ...
+
+    def close(self) -> None:
+        """Release the connection; may be called more than once."""
+        ...
+
+
+class DepthCamera(Protocol):
+    """A depth camera. No call blocks."""
+
+    def read(self) -> DepthImage | None:
+        """Return the newest image; None before the first."""
+        ...
+
+    def close(self) -> None:
+        """Release the camera; may be called more than once."""
+        ...
+
+
+def proprioception(state: LowState, command: NDArray[np.floating]) -> Array:
+    """Convert a reading to proprioception, (74,) in the layout of `spec.STATE_SLICES`.
+
+    Args:
+        state: the reading.
+        command: (10,) the last one sent: velocity 3, hands 6 (m), height (m).
+    """
+    out = np.empty(STATE_DIM)
+    out[STATE_SLICES["angular_velocity"]] = state.angular_velocity
+    out[STATE_SLICES["projected_gravity"]] = projected_gravity(state.quaternion_w)
+    out[COMMAND_SLICE] = command
+    out[STATE_SLICES["joint_position"]] = state.joint_position
+    out[STATE_SLICES["joint_velocity"]] = state.joint_velocity
+    return out
+
+
+def projected_gravity(quaternion_w: NDArray[np.floating]) -> Array:
+    """Rotate the world's down (0, 0, -1) into the frame of a unit quaternion wxyz (4,)."""
+    w, x, y, z = (float(part) for part in quaternion_w)
+    return np.array([2.0 * (w * y - x * z), -2.0 * (w * x + y * z), 2.0 * (x * x + y * y) - 1.0])

@@ -1,7 +1,7 @@
-"""The G1 behind LeRobot's bridge: a `Body` whose motors are at the other end of a wire.
+"""Low-level access to a G1 through LeRobot's bridge.
 
-A thread of its own receives, checks and time-stamps every reading; `BridgeBody.read` only looks
-at the newest. Commands go out at once or not at all: none waits for a robot to come back.
+A thread receives, checks and time-stamps every reading; `BridgeRobot.read` returns the newest.
+Commands are sent at once or dropped: none is queued until a robot returns.
 """
 
 from __future__ import annotations
@@ -10,248 +10,242 @@ import time
 from dataclasses import dataclass
 from typing import Final
 
-import numpy as np
 import zmq
 
 from egovcp.bounds import bounded, check_bounds
 from egovcp.errors import EnvironmentFailure
-from egovcp_deploy.robots.arrivals import Arrivals
-from egovcp_deploy.robots.body import BodyState, MotorCommand
-from egovcp_deploy.robots.listener import Listener, join, probe
-from egovcp_deploy.robots.machine import objection, warning
+from egovcp_deploy.robots.base import LowState, MotorCommand
+from egovcp_deploy.robots.command_conflict import CommandConflictDetector
+from egovcp_deploy.robots.g1_variants import variant_refusal, variant_warning
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
-from egovcp_deploy.robots.publisher import PublisherWatch
+from egovcp_deploy.robots.subscriber import (
+    ArrivalMonitor,
+    Subscriber,
+    connect_socket,
+    connection_error,
+)
 from egovcp_deploy.robots.wire import (
     COMMAND_PORT,
-    MOST_BYTES,
+    MAX_BYTES,
     STATE_PORT,
-    Garbled,
+    MalformedMessage,
     decode_state,
     encode_command,
 )
 
+MODE_CHANGE_S: Final = 0.1  # shorter changes of the mode machine are ignored
 _START: Final = (
     "start it on the robot: python -m lerobot.robots.unitree_g1.run_g1_server; or without a "
     "robot, here: egovcp-fake-g1"
 )
 
 
-MODE_CHANGE_S: Final = 0.1  # a single reading with another mode is not believed
-
-
 @dataclass(frozen=True)
 class BridgeConfig:
-    """Where the robot is."""
+    """Connection to LeRobot's bridge."""
 
     host: str = "127.0.0.1"
-    """Where LeRobot's bridge runs; a G1 is 192.168.123.164 unless told otherwise, egovcp-fake-g1
-    is here."""
+    """Host of LeRobot's bridge: usually 192.168.123.164 for a G1, 127.0.0.1 for egovcp-fake-g1."""
     state_port: int = bounded(STATE_PORT, least=1, most=65535)
-    """Its port for states."""
+    """Port for states."""
     command_port: int = bounded(COMMAND_PORT, least=1, most=65535)
-    """Its port for commands."""
+    """Port for commands."""
     mode: int | None = None
-    """Mode machine that the robot must report, which tells its hardware; null: any with 29 joints
-    and a free waist. Naming one with a locked waist accepts it."""
+    """Required mode machine, which identifies the robot's variant; null: any with 29 joints and a
+    free waist. Naming a mode with a locked waist accepts it."""
     consistency: bool = True
-    """Reject readings whose positions and speeds contradict each other. Bounds are always on."""
+    """Reject readings whose positions and speeds contradict each other. Bounds are always
+    checked."""
 
     def __post_init__(self) -> None:
         check_bounds(self)
 
 
 @dataclass
-class Traffic:
-    """What has passed over the wire."""
+class BridgeCounters:
+    """Messages received and sent."""
 
     readings: int = 0
     implausible: int = 0
-    """Readings that no G1 can produce (`plausibility`); none was used."""
+    """Rejected readings that no G1 can produce (`plausibility`)."""
     repeated: int = 0
-    """Readings equal to the last, bit for bit: noise never repeats, so the driver is stuck."""
-    garbled: int = 0
-    """Messages that made no sense."""
-    problem: str = ""
-    """What was wrong with the last of them."""
+    """Readings identical to the last one: sensor noise never repeats, so the driver is stuck."""
+    malformed: int = 0
+    """Messages that are not states."""
     sent: int = 0
     dropped: int = 0
-    """Commands not sent, for nobody was there to take them."""
-    refused: int = 0
-    """Commands not sent, for no motor could follow them."""
+    """Commands that were not sent because no bridge was connected."""
+    invalid: int = 0
+    """Commands that were not sent because no motor could follow them."""
+    problem: str = ""
+    """Reason for the last rejected reading or command."""
 
 
-class BridgeBody:
-    """`Body` over LeRobot's bridge. Call `connect` first."""
+class BridgeRobot:
+    """`LowLevelRobot` over LeRobot's bridge. Call `connect` first."""
 
     def __init__(self, config: BridgeConfig | None = None) -> None:
         self.config = config or BridgeConfig()
-        self.traffic = Traffic()
-        self.watch = PublisherWatch()
-        self.arrivals = Arrivals()
-        """Of usable readings; messages that are not usable count as lost."""
+        self.counters = BridgeCounters()
+        self.arrivals = ArrivalMonitor()
+        """Arrivals of usable readings; unusable messages count as lost."""
+        self._conflicts = CommandConflictDetector()
         self._filter = PlausibilityFilter(self.config.consistency)
-        self._newest: BodyState | None = None
+        self._newest: LowState | None = None
         self._payload = b""
-        self._mode: int | None = None
-        self._other_mode_ns: int | None = None  # since when another mode has been reported
-        self._skipped = 0  # readings since the newest that was used
-        self._why_skipped = ""
-        self._listener: Listener | None = None
+        self._mode: int | None = None  # of the first reading
+        self._mode_changed_ns: int | None = None
+        self._rejected = 0  # readings since the newest usable one
+        self._rejection = ""
+        self._subscriber: Subscriber | None = None
 
     def connect(self, timeout: float = 5.0) -> None:
-        """Wait for the first reading.
+        """Wait up to ``timeout`` s for the first reading.
 
         Raises:
-            EnvironmentFailure: none came within ``timeout`` s, or the robot is another.
+            EnvironmentFailure: no reading arrived, or it is of an unexpected robot.
         """
         self._open()
         deadline = time.monotonic() + timeout
         while self._newest is None and time.monotonic() < deadline:
             time.sleep(0.005)
-        try:
-            if self._newest is None:
-                raise EnvironmentFailure(self._diagnosis(timeout))
-            if trouble := self._mode_trouble() or self._machine_trouble():
-                raise EnvironmentFailure(trouble)
-        except EnvironmentFailure:
+        newest, confirmed = self._newest, self.config.mode is not None
+        if newest is None:
+            problem = self._timeout_reason(timeout)
+        else:
+            problem = self._unexpected_mode() or variant_refusal(newest.mode, confirmed)
+        if problem:
             self.close()
-            raise
+            raise EnvironmentFailure(problem)
 
     def _open(self) -> None:
         config = self.config
         self._context = zmq.Context()
         self._commands = self._context.socket(zmq.PUSH)
-        self._commands.setsockopt(zmq.CONFLATE, 1)  # a newer command replaces one that waits
-        self._commands.setsockopt(zmq.IMMEDIATE, 1)  # and none waits for a peer that is not there
+        self._commands.setsockopt(zmq.CONFLATE, 1)  # a newer command replaces a queued one
+        self._commands.setsockopt(zmq.IMMEDIATE, 1)  # nothing is queued without a connection
         try:
-            join(self._commands, config.host, config.command_port)
-            self._listener = Listener(config.host, config.state_port, MOST_BYTES, self._take)
+            connect_socket(self._commands, config.host, config.command_port)
+            self._subscriber = Subscriber(config.host, config.state_port, MAX_BYTES, self._handle)
         except EnvironmentFailure:
             self._context.destroy(linger=0)
             raise
 
-    def deafen(self) -> None:
-        """Listen no more: what is left is the way to the motors, and the last reading."""
-        assert self._listener is not None, "connect first"
-        self._listener.close()
+    def stop_receiving(self) -> None:
+        """Stop the receiving thread; `write` still works, and `read` keeps the last reading."""
+        assert self._subscriber is not None, "connect first"
+        self._subscriber.close()
 
-    def _take(self, payload: bytes, time_ns: int) -> bool:
-        """A message that arrived at ``time_ns``; whether it is a usable reading."""
+    def _handle(self, payload: bytes, time_ns: int) -> bool:
+        """Process a message that arrived at ``time_ns``; whether it is a usable reading."""
         if payload == self._payload:
-            self.traffic.repeated += 1
+            self.counters.repeated += 1
             return False
         self._payload = payload
         try:
             state = decode_state(payload, time_ns)
-        except Garbled as error:
-            self.traffic.garbled += 1
-            self._skip(str(error), time_ns)
+        except MalformedMessage as error:
+            self.counters.malformed += 1
+            self._reject(str(error), time_ns)
             return False
-        if problem := self._filter.judge(state.body, np.asarray(state.motors.torque, np.float64)):
-            self.traffic.implausible += 1
-            self._skip(problem, time_ns)
+        if problem := self._filter.check(state):
+            self.counters.implausible += 1
+            self._reject(problem, time_ns)
             return False
-        self.traffic.readings += 1
-        self.arrivals.arrived(time_ns)
-        self.watch.heard(state)
-        self._watch_mode(state.body)
-        self._newest = state.body
-        self._skipped = 0
+        self.counters.readings += 1
+        self.arrivals.record_arrival(time_ns)
+        self._conflicts.update(state)
+        self._track_mode(state)
+        self._newest = state
+        self._rejected = 0
         return True
 
-    def _skip(self, problem: str, time_ns: int) -> None:
-        self.arrivals.lost(time_ns)
-        self._skipped += 1
-        self._why_skipped = self.traffic.problem = problem
+    def _reject(self, problem: str, time_ns: int) -> None:
+        self.arrivals.record_loss(time_ns)
+        self._rejected += 1
+        self._rejection = self.counters.problem = problem
 
-    def _watch_mode(self, body: BodyState) -> None:
+    def _track_mode(self, state: LowState) -> None:
         if self._mode is None:
-            self._mode = body.mode
-        if body.mode == self._mode:
-            self._other_mode_ns = None
-        elif self._other_mode_ns is None:
-            self._other_mode_ns = body.time_ns
+            self._mode = state.mode
+        if state.mode == self._mode:
+            self._mode_changed_ns = None
+        elif self._mode_changed_ns is None:
+            self._mode_changed_ns = state.time_ns
 
-    def read(self) -> BodyState | None:
-        """The newest reading; its time is that of its arrival, whenever it is read."""
+    def read(self) -> LowState | None:
+        """Return the newest reading; its time is its time of arrival."""
         return self._newest
 
     def write(self, command: MotorCommand) -> None:
-        """Send servo targets, or count why not: see `traffic`."""
+        """Send joint targets; a command that cannot be sent is counted in `counters`."""
         try:
-            payload = encode_command(command)
-        except Garbled as error:
-            self.traffic.refused += 1
-            self.traffic.problem = str(error)
-            return
-        try:
-            self._commands.send(payload, zmq.NOBLOCK)
+            self._commands.send(encode_command(command), zmq.NOBLOCK)
+        except MalformedMessage as error:
+            self.counters.invalid += 1
+            self.counters.problem = str(error)
         except zmq.Again:
-            self.traffic.dropped += 1
-            return
-        self.traffic.sent += 1
-        self.watch.sent(command, time.monotonic_ns())
+            self.counters.dropped += 1
+        else:
+            self.counters.sent += 1
+            self._conflicts.record_command(command, time.monotonic_ns())
 
     @property
-    def trouble(self) -> str:
-        """Why the robot must not be armed now, in words; empty: nothing is known against it.
+    def refusal(self) -> str:
+        """Why the robot must not be armed now; empty: no reason.
 
-        Another robot or mode than expected, or motors that obey somebody else (see `publisher`).
+        An unexpected mode machine, or motors that follow other commands (`command_conflict`).
         """
-        return self._mode_trouble() or self.watch.verdict
+        return self._unexpected_mode() or self._conflicts.refusal
 
     @property
     def fault(self) -> str:
-        """Why the motors must be damped, in words; empty: nothing.
+        """Why the motors must be damped; empty: no reason.
 
-        The mode machine has been another than at the start for `MODE_CHANGE_S`: the robot no
-        longer is what the controller assumes, or has left low-level control.
+        The mode machine has differed from the first one for `MODE_CHANGE_S`: the robot does not
+        match the controller's assumptions any more, or has left low-level control.
         """
-        newest, since = self._newest, self._other_mode_ns
+        newest, since = self._newest, self._mode_changed_ns
         if newest is None or since is None or newest.time_ns - since < MODE_CHANGE_S * 1e9:
             return ""
         return f"the mode machine changed from {self._mode} to {newest.mode}"
 
     @property
-    def skipped(self) -> str:
-        """What was wrong with the messages since the newest reading; empty: there were none."""
-        count, why = self._skipped, self._why_skipped
-        return f"{count} readings rejected, the last: {why}" if count else ""
+    def rejected(self) -> str:
+        """Number and reason of the readings rejected since the newest one; empty: none."""
+        count = self._rejected
+        return f"{count} readings rejected, the last: {self._rejection}" if count else ""
 
     @property
     def warning(self) -> str:
-        """What the operator should know of this robot; empty: nothing."""
-        return "" if self._newest is None else warning(self._newest.mode)
+        """Warning for the operator of this robot; empty: none."""
+        return "" if self._newest is None else variant_warning(self._newest.mode)
 
-    def _machine_trouble(self) -> str:
-        assert self._newest is not None, "asked after the first reading"
-        return objection(self._newest.mode, confirmed=self.config.mode is not None)
-
-    def _mode_trouble(self) -> str:
+    def _unexpected_mode(self) -> str:
         found = self._newest.mode if self._newest else None
-        wanted = self._mode if self.config.mode is None else self.config.mode
-        if found == wanted:
+        expected = self._mode if self.config.mode is None else self.config.mode
+        if found == expected:
             return ""
         return (
-            f"the robot reports mode machine {found}, expected {wanted}; it is another robot, "
+            f"the robot reports mode machine {found}, expected {expected}; it is another robot, "
             "or in another mode: check it, then start again"
         )
 
-    def _diagnosis(self, timeout: float) -> str:
-        """Why no reading came."""
-        config, traffic = self.config, self.traffic
-        where = f"{config.host}:{config.state_port}"
-        if traffic.garbled:
+    def _timeout_reason(self, timeout: float) -> str:
+        """Why no reading arrived."""
+        counters = self.counters
+        where = f"{self.config.host}:{self.config.state_port}"
+        if counters.malformed:
             return (
-                f"{traffic.garbled} messages from {where}, none a state of a G1: "
-                f"{traffic.problem}; expected LeRobot's bridge there, of lerobot 0.6"
+                f"{counters.malformed} messages from {where}, none a state of a G1: "
+                f"{counters.problem}; expected LeRobot's bridge there, of lerobot 0.6"
             )
-        if traffic.implausible:
+        if counters.implausible:
             return (
-                f"{traffic.implausible} states from {where}, none that a G1 can be in: "
-                f"{traffic.problem}; check the robot's sensors and joints"
+                f"{counters.implausible} states from {where}, none that a G1 can be in: "
+                f"{counters.problem}; check the robot's sensors and joints"
             )
-        if reason := probe(config.host, config.state_port):
+        if reason := connection_error(self.config.host, self.config.state_port):
             return f"nothing at {where} ({reason}): expected LeRobot's bridge; {_START}"
         return (
             f"no state from {where} within {timeout:g} s, although something listens there; "
@@ -259,12 +253,12 @@ class BridgeBody:
         )
 
     def close(self) -> None:
-        """End the thread and let go of the sockets; further calls do nothing.
+        """Stop the thread and close the sockets; may be called more than once.
 
-        Sends nothing: the motors keep what they were told last.
+        Sends nothing: the motors keep their last command.
         """
-        if self._listener is None or self._commands.closed:
+        if self._subscriber is None or self._commands.closed:
             return
-        self._listener.close()
+        self._subscriber.close()
         self._commands.close()
         self._context.term()

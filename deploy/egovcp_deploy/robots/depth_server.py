@@ -1,4 +1,4 @@
-"""`egovcp-depth-server`: gives the depth camera of this machine to a planner on another."""
+"""`egovcp-depth-server`: publishes the depth camera of this machine for a planner elsewhere."""
 
 from __future__ import annotations
 
@@ -15,71 +15,63 @@ from egovcp.cli import run_command
 from egovcp.errors import EnvironmentFailure
 from egovcp.rate import NS_PER_S, FixedRate, MonotonicClock
 from egovcp.terminal import echo
-from egovcp_deploy.robots.body import Eye, Picture
-from egovcp_deploy.robots.depth_wire import WirePicture, encode_picture
-from egovcp_deploy.robots.realsense_eye import RealSenseEye, RealSenseEyeConfig
+from egovcp_deploy.robots.base import DepthCamera, DepthImage
+from egovcp_deploy.robots.realsense_camera import RealSenseConfig, RealSenseDepthCamera
+from egovcp_deploy.robots.subscriber import bind_socket
 from egovcp_deploy.robots.wire import CAMERA_PORT
+from egovcp_deploy.robots.zmq_camera import DepthFrame, encode_frame
 
 PROG: Final = "egovcp-depth-server"
-_LOOK_HZ: Final = 200  # how often the camera is asked for something new
+_POLL_HZ: Final = 200
 
 
 @dataclass(frozen=True)
 class DepthServerConfig:
-    """Publish the pictures of a RealSense depth camera, as small as the policy wants them.
+    """Publish the images of a RealSense depth camera, resampled to the policy's size.
 
     Untested on hardware.
     """
 
-    camera: RealSenseEyeConfig = field(default_factory=RealSenseEyeConfig)
-    """The camera."""
+    camera: RealSenseConfig = field(default_factory=RealSenseConfig)
+    """RealSense camera and its mode."""
     host: str = "127.0.0.1"
-    """Interface to listen on; the loopback lets nobody else in, the address of the robot's own
-    network its machines."""
+    """Interface to listen on. The default is reachable from this machine only; give the address of
+    the robot's network to serve that network."""
     port: int = bounded(CAMERA_PORT, least=0, most=65535)
-    """Port."""
+    """Port; 0: any free one."""
 
 
 class DepthServer:
-    """Publishes an `Eye`, each picture once.
+    """Publishes each image of a `DepthCamera` once.
 
     Raises:
         EnvironmentFailure: the port is in use.
     """
 
-    def __init__(self, eye: Eye, vertical_fov: float, host: str, port: int) -> None:
-        self._eye, self._fov = eye, vertical_fov
-        self._last: Picture | None = None
+    def __init__(self, camera: DepthCamera, vertical_fov: float, host: str, port: int) -> None:
+        self._camera, self._fov = camera, vertical_fov
+        self._last: DepthImage | None = None
         self._sequence = 0
         self._context = zmq.Context()
         self._end = self._context.socket(zmq.PUB)
-        self._end.setsockopt(zmq.LINGER, 0)
         self._end.setsockopt(zmq.SNDHWM, 2)
         try:
-            self._end.bind(f"tcp://{host}:{port or '*'}")
-        except zmq.ZMQError as error:
-            self._context.destroy(linger=0)
-            raise EnvironmentFailure(
-                f"cannot listen at {host}:{port}: {error.strerror}; end what uses the port, or "
-                "choose another"
-            ) from error
-
-    @property
-    def port(self) -> int:
-        """Where it listens."""
-        return int(self._end.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
+            self.port = bind_socket(self._end, host, port)
+        except EnvironmentFailure:
+            self.close()
+            raise
 
     def step(self) -> None:
-        """Publish the newest picture, unless it has been."""
-        picture = self._eye.read()
-        if picture is None or picture is self._last:
+        """Publish the newest image, unless it has been published."""
+        image = self._camera.read()
+        if image is None or image is self._last:
             return
-        self._last = picture
+        self._last = image
         self._sequence += 1
-        taken_ns = picture.taken_ns
-        age = math.nan if taken_ns is None else (time.monotonic_ns() - taken_ns) / NS_PER_S
-        sent = WirePicture(self._sequence, self._fov, picture.depth, age)
-        self._end.send(encode_picture(sent))
+        age = math.nan
+        if image.captured_ns is not None:
+            age = (time.monotonic_ns() - image.captured_ns) / NS_PER_S
+        self._end.send(encode_frame(DepthFrame(self._sequence, self._fov, image.depth, age)))
 
     def close(self) -> None:
         """Stop listening."""
@@ -97,17 +89,17 @@ def serve(config: DepthServerConfig) -> None:
     Raises:
         EnvironmentFailure: no driver, no such camera, or a port in use.
     """
-    eye = RealSenseEye.connect(config.camera)
+    camera = RealSenseDepthCamera.connect(config.camera)
     try:
-        server = DepthServer(eye, config.camera.vertical_fov, config.host, config.port)
+        server = DepthServer(camera, config.camera.vertical_fov, config.host, config.port)
         echo(f"{PROG}: depth at {config.host}:{server.port}; Ctrl-C ends it")
-        rate = FixedRate(_LOOK_HZ, MonotonicClock())
+        rate = FixedRate(_POLL_HZ, MonotonicClock())
         rate.start()
         while True:
             server.step()
             rate.wait()
     finally:
-        eye.close()
+        camera.close()
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
-"""A robot that has already lived: plays a recorded run back through a policy.
+"""Plays a recorded run back through a policy.
 
-Observations are the recorded ones, and what was sent is what was sent then, whatever the policy
-plans now. So its recurrence takes the same steps as when the run was recorded, bit for bit, and
-one can look into it again, or let another model watch the same run.
+Observations and sent actions are the recorded ones, whatever the policy plans. So its recurrence
+repeats the recorded run's bit for bit, and the run can be inspected again or shown to another
+model.
 """
 
 from __future__ import annotations
@@ -21,39 +21,39 @@ from egovcp.log.tick import CameraView, Tick
 from egovcp.packages import DATA_MODULES, require_packages
 from egovcp.sim.config import CameraConfig
 from egovcp_deploy.pilot.states import State
-from egovcp_deploy.robots.base import Outcome, Sensed
+from egovcp_deploy.robots.base import ActionResult, RobotObservation
 
 if TYPE_CHECKING:
     from egovcp.data import DatasetReader
 
-ENDS: Final = "recording ends"
+RECORDING_ENDS: Final = "recording ends"
 
 
 @dataclass(frozen=True)
-class Recorded:
-    """One run, row t = (o_t, what followed from a_t)."""
+class RecordedRun:
+    """One run; row t is o_t and the result of a_t."""
 
-    name: str
-    """Where it comes from."""
+    source: str
+    """File, or dataset and episode."""
     controller_id: str
-    """Low-level controller that the robot ran."""
+    """Low-level controller of the robot."""
     camera: CameraView
-    sensed: Sequence[Sensed]
-    outcomes: Sequence[Outcome]
+    observations: Sequence[RobotObservation]
+    results: Sequence[ActionResult]
 
     def __post_init__(self) -> None:
-        if not self.sensed:
-            raise DataError(f"{self.name} holds no ticks; there is nothing to play back")
+        if not self.observations:
+            raise DataError(f"{self.source} has no ticks; there is nothing to play back")
 
     def __len__(self) -> int:
-        return len(self.sensed)
+        return len(self.observations)
 
 
 class ReplayRobot:
-    """`Robot` whose rollout i is the i-th recording.
+    """`LockstepRobot` whose rollout i is the i-th recording.
 
     Args:
-        count: how many recordings there are.
+        count: number of recordings.
         load: reads the i-th.
 
     Raises:
@@ -61,7 +61,7 @@ class ReplayRobot:
         DataError: the first is damaged.
     """
 
-    def __init__(self, count: int, load: Callable[[int], Recorded]) -> None:
+    def __init__(self, count: int, load: Callable[[int], RecordedRun]) -> None:
         if count < 1:
             raise UsageError("no recordings to play back")
         self.count = count
@@ -71,62 +71,63 @@ class ReplayRobot:
 
     @property
     def controller_id(self) -> str:
-        """Of the robot that was recorded."""
+        """Low-level controller of the recorded robot."""
         return self._run.controller_id
 
     @property
     def camera(self) -> CameraView:
-        """As it was mounted; of an episode of a dataset as far as that is known."""
+        """The recorded mount; for an episode of a dataset, defaults replace what is not stored."""
         return self._run.camera
 
     def start(self, episode: int) -> None:
         """Go to the beginning of recording ``episode``.
 
         Raises:
-            UsageError: there are not so many.
+            UsageError: there is no such recording.
             DataError: it is damaged.
         """
         if not 0 <= episode < self.count:
-            raise UsageError(
-                f"rollout {episode} was asked for, but there are {self.count} recordings"
-            )
+            raise UsageError(f"no recording {episode}; there are {self.count} recordings")
         if episode != self._number:
             self._run, self._number = self._load(episode), episode
         self._tick = 0
 
-    def observe(self) -> Sensed:
-        """What the robot sensed then."""
-        return self._run.sensed[self._tick]
+    def observe(self) -> RobotObservation:
+        """Return the recorded observation."""
+        return self._run.observations[self._tick]
 
-    def act(self, action: NDArray[np.float64]) -> Outcome:
-        """What was sent then, instead of ``action``, and what followed; the time moves on."""
-        outcome = self._run.outcomes[self._tick]
+    def act(self, action: NDArray[np.float64]) -> ActionResult:
+        """Return the recorded result, ignoring ``action``, and advance one tick."""
+        result = self._run.results[self._tick]
         if self._tick + 1 < len(self._run):
             self._tick += 1
-        elif not outcome.terminated:
-            cut = () if outcome.truncated else (ENDS,)
-            return replace(outcome, truncated=True, events=(*outcome.events, *cut))
-        return outcome
+        elif not result.terminated:
+            end = () if result.truncated else (RECORDING_ENDS,)
+            return replace(result, truncated=True, events=(*result.events, *end))
+        return result
 
     def damp(self) -> None:
-        """The past cannot be changed."""
+        """Do nothing."""
 
     def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing."""
 
 
 def open_recordings(path: Path) -> ReplayRobot:
-    """A recording, a folder of them as egovcp-deploy leaves it, or a LeRobot dataset on disk.
+    """Open a recording, a folder of them as egovcp-deploy writes it, or a LeRobot dataset.
 
     Raises:
-        UsageError: nothing of that kind is there.
+        UsageError: the path is none of these.
         DataError: it is damaged.
-        EnvironmentFailure: datasets cannot be read here.
+        EnvironmentFailure: the packages that read datasets are not installed.
     """
     if path.is_file():
         return ReplayRobot(1, lambda _: recorded_run(path))
     if (path / "meta" / "info.json").is_file():
-        reader = _reader(path)
+        require_packages("egovcp-deploy", "reading a dataset", *DATA_MODULES)
+        from egovcp.data import DatasetConfig, DatasetReader
+
+        reader = DatasetReader.open(DatasetConfig(root=str(path)))
         return ReplayRobot(len(reader), lambda i: recorded_episode(reader, i))
     found = sorted(path.glob("*.mcap"), key=_number)
     if not found:
@@ -138,40 +139,36 @@ def open_recordings(path: Path) -> ReplayRobot:
 
 
 def _number(path: Path) -> tuple[int, str]:
-    """rollout-10 comes after rollout-9."""
+    """Sort key that puts rollout-10 after rollout-9."""
     digits = "".join(c for c in path.stem if c.isdigit())
     return int(digits or 0), path.name
 
 
-def recorded_run(path: Path) -> Recorded:
-    """The run in an MCAP file of ours, also if its end is missing.
+def recorded_run(path: Path) -> RecordedRun:
+    """Read the run of an MCAP file, which may be torn.
 
-    One on the wall clock begins where the planner took over: its recurrence started there.
+    A run on the wall clock begins at the first tick in RUN, where the policy's recurrence started.
 
     Raises:
-        DataError: it is none, is damaged, or holds no ticks.
+        DataError: not a recording of ours, damaged, or without ticks.
     """
     recording = read_recording(path, damaged_ok=False)
-    ticks = recording.ticks[_take_over(recording.ticks) :]
-    return Recorded(
-        name=str(path),
+    first = next((i for i, tick in enumerate(recording.ticks) if tick.mode == State.RUN), 0)
+    ticks = recording.ticks[first:]
+    return RecordedRun(
+        source=str(path),
         controller_id=recording.info.hashes.get("low_level_controller", ""),
         camera=recording.info.camera,
-        sensed=[
-            Sensed(tick.depth, np.asarray(tick.state, np.float32), tick.base, tick.scene)
+        observations=[
+            RobotObservation(tick.depth, np.asarray(tick.state, np.float32), tick.base, tick.scene)
             for tick in ticks
         ],
-        outcomes=[_outcome(tick) for tick in ticks],
+        results=[_result(tick) for tick in ticks],
     )
 
 
-def _take_over(ticks: Sequence[Tick]) -> int:
-    """The tick at which the robot was handed to the planner; 0 if nothing tells of it."""
-    return next((i for i, tick in enumerate(ticks) if tick.mode == State.RUN), 0)
-
-
-def _outcome(tick: Tick) -> Outcome:
-    return Outcome(
+def _result(tick: Tick) -> ActionResult:
+    return ActionResult(
         sent=np.asarray(tick.action_sent, np.float64),
         reward=tick.reward,
         reward_terms=tick.reward_terms,
@@ -182,15 +179,8 @@ def _outcome(tick: Tick) -> Outcome:
     )
 
 
-def _reader(root: Path) -> DatasetReader:
-    require_packages("egovcp-deploy", "reading a dataset", *DATA_MODULES)
-    from egovcp.data import DatasetConfig, DatasetReader
-
-    return DatasetReader.open(DatasetConfig(root=str(root)))
-
-
-def recorded_episode(reader: DatasetReader, index: int) -> Recorded:
-    """One episode of a dataset.
+def recorded_episode(reader: DatasetReader, index: int) -> RecordedRun:
+    """Read one episode of a dataset.
 
     Raises:
         DataError: it is damaged.
@@ -198,13 +188,16 @@ def recorded_episode(reader: DatasetReader, index: int) -> Recorded:
     episode = reader.read(index)
     mount = CameraConfig()
     pitch = float(reader.metadata(index).get("camera_pitch", CameraView.pitch))
-    return Recorded(
-        name=f"{reader.root}, episode {index}",
+    return RecordedRun(
+        source=f"{reader.root}, episode {index}",
         controller_id=reader.controller_id,
         camera=CameraView("torso_link", mount.position, pitch, mount.vertical_fov),
-        sensed=[Sensed(d, s.copy()) for d, s in zip(episode.depth, episode.state, strict=True)],
-        outcomes=[
-            Outcome(
+        observations=[
+            RobotObservation(depth, state.copy())
+            for depth, state in zip(episode.depth, episode.state, strict=True)
+        ],
+        results=[
+            ActionResult(
                 sent=episode.action[t].astype(np.float64),
                 reward=float(episode.reward[t]),
                 terminated=bool(episode.done[t] and not episode.truncated[t]),

@@ -1,4 +1,4 @@
-"""The simulated robot: one row of `VectorEnv` in lock-step, time passes only in ``act``."""
+"""The simulated robot: one row of `VectorEnv` in lock-step."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from egovcp.log.tick import BasePose, CameraView, SceneObject
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import Observation, VectorEnv
 from egovcp.sim.tasks.base import Solid
-from egovcp_deploy.robots.base import Outcome, Sensed
+from egovcp_deploy.robots.base import ActionResult, RobotObservation
 from egovcp_deploy.scenarios import held_out
 
-_BEGINS: Final = {"ball": "ball thrown", "wall": "robot pushed", "arch": "passage begins"}
-#: Reward terms, and what it means when one is first paid in an episode.
-_MEANS: Final = {
+_START_EVENTS: Final = {"ball": "ball thrown", "wall": "robot pushed", "arch": "passage begins"}
+#: Reward term -> event that is logged when the term is first nonzero in an episode.
+_TERM_EVENTS: Final = {
     "block": "ball blocked by a hand",
     "hit": "ball hit the body",
     "brace": "hand braces on the wall",
@@ -28,7 +28,7 @@ _MEANS: Final = {
 
 
 class SimRobot:
-    """Plays the held-out scenarios of ``task``; rollout i is scenario i of ``seed``."""
+    """`LockstepRobot` whose rollout i is held-out scenario i of ``task`` and ``seed``."""
 
     def __init__(self, config: EnvConfig, task: str, seed: int) -> None:
         self._env = VectorEnv(config, num_envs=1)
@@ -37,7 +37,7 @@ class SimRobot:
         self._task = task
         self._seed = seed
         self._observation: Observation | None = None
-        self._reported: set[str] = set()
+        self._logged: set[str] = set()
 
     @property
     def controller_id(self) -> str:
@@ -46,39 +46,39 @@ class SimRobot:
 
     @property
     def camera(self) -> CameraView:
-        """The camera as this episode's randomisation has mounted it."""
+        """The camera with this episode's randomised pitch."""
         pitch = self._env.instances[0].camera_pitch if self._env.instances else 0.0
         return CameraView("torso_link", self._mount, pitch, self._fov)
 
     @property
     def env(self) -> VectorEnv:
-        """The simulator, for scripted policies that see the truth."""
+        """The simulator, for scripted policies that use its privileged state."""
         return self._env
 
     def start(self, episode: int) -> None:
         """Reset to scenario ``episode``."""
         self.scenario = held_out(self._task, self._seed, episode)
         self._observation = self._env.reset([self.scenario])
-        self._reported = set()
+        self._logged = set()
 
-    def observe(self) -> Sensed:
-        """The observation, with pelvis pose and scene as the simulator has them."""
+    def observe(self) -> RobotObservation:
+        """Return the observation, with the simulator's poses of pelvis and scene."""
         assert self._observation is not None, "start an episode first"
         truth = self._env.privileged_state()
         pelvis = truth.pelvis_w[0]
-        return Sensed(
+        return RobotObservation(
             depth=self._observation.depth[0],
             state=self._observation.state[0],
             base=BasePose(pelvis[:3].copy(), pelvis[3:].copy()),
             scene=tuple(_scene_object(solid) for solid in truth.solids[0]),
         )
 
-    def act(self, action: NDArray[np.float64]) -> Outcome:
-        """Send ``action`` and let 40 ms of simulated time pass."""
+    def act(self, action: NDArray[np.float64]) -> ActionResult:
+        """Apply ``action`` for 40 ms of simulated time."""
         result = self._env.step(action[None])
         self._observation = result.observation
         terms = {name: float(values[0]) for name, values in result.reward_terms.items()}
-        return Outcome(
+        return ActionResult(
             sent=result.sent_action[0],
             reward=float(result.reward[0]),
             reward_terms=terms,
@@ -89,21 +89,21 @@ class SimRobot:
         )
 
     def _events(self, terms: dict[str, float]) -> list[str]:
-        """What happened for the first time in this episode."""
+        """Events that happened for the first time in this episode."""
         truth = self._env.privileged_state()
         begun = float(truth.since_event[0]) > 0.0
-        happened = [_BEGINS[truth.task[0]]] if begun else []
-        happened += [text for name, text in _MEANS.items() if terms.get(name, 0.0) != 0.0]
-        fresh = [text for text in happened if text not in self._reported]
-        self._reported.update(fresh)
-        return fresh
+        events = [_START_EVENTS[truth.task[0]]] if begun else []
+        events += [text for name, text in _TERM_EVENTS.items() if terms.get(name, 0.0) != 0.0]
+        events = [text for text in events if text not in self._logged]
+        self._logged.update(events)
+        return events
 
     def damp(self) -> None:
         """Damp the simulated motors until the next `start`."""
         self._env.damp(0)
 
     def close(self) -> None:
-        """End the simulator's threads."""
+        """Stop the simulator's threads."""
         self._env.close()
 
 

@@ -1,22 +1,26 @@
-"""LeRobot's bridge to the Unitree G1, byte by byte: JSON over ZMQ, one message per frame.
+"""Message format of LeRobot's bridge to the Unitree G1: JSON over ZMQ, one message per frame.
 
     rt/lowcmd    PUSH -> port 6000    {"topic", "data": {mode_pr, mode_machine, motor_cmd: 35 x
                                        {mode, q, dq, kp, kd, tau}}}
     rt/lowstate  SUB <- port 6001     {"topic", "data": {motor_state: 35 x {q, dq, tau_est, ...},
                                        imu_state, wireless_remote, mode_machine}}
 
-Per motor a state may also carry ``temperature`` (deg C: one number, as LeRobot's bridge sends it,
+Per motor a state may also have ``temperature`` (deg C: one number, as LeRobot's bridge sends it,
 or casing and winding, as the robot does), ``motorstate`` (status bits), ``lost`` (packets) and
-``mode`` (1: obeys). Names and meanings are those of Unitree's ``MotorState_``.
+``mode`` (1: enabled). Names and meanings are those of Unitree's ``MotorState_``. An optional field
+that is absent or invalid is not reported; the rest of the state is used.
 
-The first 29 of the 35 motors are ``spec.JOINT_NAMES`` in order; the others are not fitted. What
-arrives may be torn or hostile: everything is checked, and what is wrong is `Garbled`.
+The first 29 of the 35 motors are ``spec.JOINT_NAMES`` in order; the others are not fitted. Received
+messages may be damaged or hostile: every required value is checked, and an invalid message raises
+`MalformedMessage`.
 """
 
 from __future__ import annotations
 
 import base64
 import json
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Final, Never
 
@@ -26,8 +30,7 @@ from numpy.typing import NDArray
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS
-from egovcp_deploy.robots.body import BodyState, MotorCommand
-from egovcp_deploy.robots.motor_fields import decode_motor_fields, encode_motor_fields
+from egovcp_deploy.robots.base import LowState, MotorCommand
 
 Array = NDArray[np.float64]
 
@@ -37,73 +40,94 @@ CAMERA_PORT: Final = 5555
 COMMAND_TOPIC: Final = "rt/lowcmd"
 STATE_TOPIC: Final = "rt/lowstate"
 MOTOR_SLOTS: Final = 35
-MOST_BYTES: Final = 64 * 1024  # ten times a message
+MAX_BYTES: Final = 64 * 1024  # ten times a message
 SERIES: Final = 0  # mode_pr: ankles and waist are commanded as pitch and roll, not motor by motor
 
 _ENABLED: Final = 1
 _NOT_FITTED: Final = {"mode": 0, "q": 0.0, "dq": 0.0, "kp": 0.0, "kd": 0.0, "tau": 0.0}
-# Beyond these no G1 can be: joints turn by less than 3.2 rad, motors by less than 40 rad/s.
-_MOST_ANGLE: Final = 10.0  # rad
-_MOST_SPEED: Final = 200.0  # rad/s
-_MOST_TORQUE: Final = 1000.0  # N m
-_MOST_GAIN: Final = 1e4
+# Far beyond any G1: joints turn by less than 3.2 rad, motors by less than 40 rad/s.
+_MAX_ANGLE: Final = 10.0  # rad
+_MAX_SPEED: Final = 200.0  # rad/s
+_MAX_TORQUE: Final = 1000.0  # N m
+_MAX_GAIN: Final = 1e4
 _ROUNDING: Final = 1e-6  # rad
-_QUATERNION_SLACK: Final = 0.1  # an IMU that is not ready sends zeros
+_QUATERNION_TOLERANCE: Final = 0.1  # an IMU that is not ready sends zeros
+_MIN_DEGREES, _MAX_DEGREES = -40.0, 250.0  # range of the motors' temperature sensors, deg C
+
+#: ``motorstate``: bit -> meaning, from Unitree's developer documentation of the G1 ("Common
+#: mistakes and definitions"). Untested on hardware.
+MOTOR_STATUS_BITS: Final = {
+    0x1: "overcurrent",
+    0x2: "transient overvoltage",
+    0x4: "sustained overvoltage",
+    0x8: "transient undervoltage",
+    0x10: "chip overheating",
+    0x20: "MOSFET too hot or too cold",
+    0x40: "MOSFET temperature sensor",
+    0x80: "casing too hot or too cold",
+    0x100: "casing temperature sensor",
+    0x200: "winding overheating",
+    0x400: "rotor encoder 1",
+    0x800: "rotor encoder 2",
+    0x1000: "output encoder",
+    0x2000: "calibration data",
+    0x4000: "unexpected reset",
+    0x8000: "motor locked, authentication",
+    0x10000: "chip validation",
+    0x20000: "calibration mode",
+    0x40000: "communication checksum",
+    0x80000: "driver version too low",
+    0x40000000: "motor lost the connection to the robot's computer",
+    0x80000000: "the robot's computer lost the connection to the motor",
+}
+DISCONNECTED: Final = 0x80000000
 
 
-class Garbled(Exception):
-    """A message is not what it should be; the text says how."""
-
-
-@dataclass(frozen=True)
-class LowState:
-    """All that we use of one ``rt/lowstate``."""
-
-    body: BodyState
-    sources: int | None = None
-    """Programs whose commands reached the robot in the last half second; None: not told. Our own
-    addition, ``command_sources``: LeRobot's bridge does not know."""
-
-    @property
-    def motors(self) -> MotorReadings:
-        """Torque, temperature and status of the motors."""
-        assert self.body.motors is not None, "every rt/lowstate has them"
-        return self.body.motors
+class MalformedMessage(Exception):
+    """A message that violates its format; the text says how."""
 
 
 @dataclass(frozen=True)
 class LowCommand:
-    """One ``rt/lowcmd`` as the robot takes it."""
+    """One ``rt/lowcmd`` as the robot receives it."""
 
     motors: MotorCommand
     velocity: Array
-    """(29,) rad/s that the damping works against."""
+    """(29,) rad/s, target of the damping term."""
     torque: Array
-    """(29,) N m on top."""
+    """(29,) N m, added to the controller's."""
     enabled: NDArray[np.bool_]
-    """(29,) motors that are to obey at all."""
+    """(29,) motors that must follow the command."""
     series: bool
-    """Whether ankles and waist are meant as pitch and roll."""
+    """Whether ankles and waist are commanded as pitch and roll."""
+
+
+def fault_text(bits: int) -> str:
+    """Describe status bits, such as ``winding overheating (0x200)``."""
+    names = [meaning for bit, meaning in MOTOR_STATUS_BITS.items() if bits & bit]
+    if bits & ~sum(MOTOR_STATUS_BITS):
+        names.append("unknown")
+    return f"{', '.join(names)} (0x{bits:x})"
 
 
 def encode_command(command: MotorCommand) -> bytes:
-    """``rt/lowcmd``.
+    """Encode a ``rt/lowcmd``.
 
     Raises:
-        Garbled: the command is not numbers of the right shape and sign, or beyond all bounds; it
+        MalformedMessage: a value has the wrong shape or sign, or is out of bounds; the command
             must not be sent.
     """
-    position = _checked(command.position, _MOST_ANGLE, "position")
+    position = _checked(command.position, _MAX_ANGLE, "position")
     target = np.asarray(command.position)
-    beyond = (target < TARGET_LOW - _ROUNDING) | (target > TARGET_HIGH + _ROUNDING)
-    if beyond.any():
-        i = int(beyond.argmax())
-        raise Garbled(
+    outside = (target < TARGET_LOW - _ROUNDING) | (target > TARGET_HIGH + _ROUNDING)
+    if outside.any():
+        i = int(outside.argmax())
+        raise MalformedMessage(
             f"target of {JOINT_NAMES[i]} is {target[i]:+.2f} rad, expected {TARGET_LOW[i]:.2f} to "
             f"{TARGET_HIGH[i]:.2f}"
         )
-    stiffness = _checked(command.stiffness, _MOST_GAIN, "stiffness", least=0.0)
-    damping = _checked(command.damping, _MOST_GAIN, "damping", least=0.0)
+    stiffness = _checked(command.stiffness, _MAX_GAIN, "stiffness", minimum=0.0)
+    damping = _checked(command.damping, _MAX_GAIN, "damping", minimum=0.0)
     motors = [
         {"mode": _ENABLED, "q": q, "dq": 0.0, "kp": kp, "kd": kd, "tau": 0.0}
         for q, kp, kd in zip(position, stiffness, damping, strict=True)
@@ -113,55 +137,53 @@ def encode_command(command: MotorCommand) -> bytes:
     return json.dumps({"topic": COMMAND_TOPIC, "data": data}).encode()
 
 
-def _checked(values: Array, most: float, name: str, least: float = -np.inf) -> list[float]:
+def _checked(values: Array, most: float, name: str, minimum: float = -np.inf) -> list[float]:
     array = np.asarray(values, np.float64)
-    if array.shape != (NUM_JOINTS,) or not ((np.abs(array) <= most) & (array >= least)).all():
-        raise Garbled(f"{name} of a command is not {NUM_JOINTS} possible numbers")
+    if array.shape != (NUM_JOINTS,) or not ((np.abs(array) <= most) & (array >= minimum)).all():
+        raise MalformedMessage(f"{name} of a command is not {NUM_JOINTS} numbers within bounds")
     numbers: list[float] = array.tolist()
     return numbers
 
 
 def decode_command(payload: bytes) -> LowCommand:
-    """The inverse of `encode_command`, for whoever plays the robot.
+    """Decode a ``rt/lowcmd``; the robot's side of `encode_command`.
 
     Raises:
-        Garbled: it is none.
+        MalformedMessage: the message is not a valid command.
     """
     data = _data(payload, COMMAND_TOPIC)
     motors = _motors(data, "motor_cmd")
-    column = {
-        name: _numbers([motor.get(name) for motor in motors], most, name)
-        for name, most in (
-            ("q", _MOST_ANGLE),
-            ("dq", _MOST_SPEED),
-            ("kp", _MOST_GAIN),
-            ("kd", _MOST_GAIN),
-            ("tau", _MOST_TORQUE),
-        )
-    }
-    modes = [motor.get("mode") for motor in motors]
+
+    def column(name: str, most: float) -> Array:
+        return _numbers([motor.get(name) for motor in motors], most, name)
+
     return LowCommand(
-        MotorCommand(column["q"], column["kp"], column["kd"], _mode(data, "mode_machine")),
-        velocity=column["dq"],
-        torque=column["tau"],
-        enabled=np.array([mode == _ENABLED for mode in modes]),
+        MotorCommand(
+            column("q", _MAX_ANGLE),
+            column("kp", _MAX_GAIN),
+            column("kd", _MAX_GAIN),
+            _mode(data, "mode_machine"),
+        ),
+        velocity=column("dq", _MAX_SPEED),
+        torque=column("tau", _MAX_TORQUE),
+        enabled=np.array([motor.get("mode") == _ENABLED for motor in motors]),
         series=_mode(data, "mode_pr") == SERIES,
     )
 
 
 def encode_state(state: LowState, acceleration: Array) -> bytes:
-    """``rt/lowstate`` as LeRobot's bridge sends it.
+    """Encode a ``rt/lowstate`` as LeRobot's bridge sends it.
 
     Args:
-        state: the reading; ``command_sources`` is left out where it is None.
+        state: the reading, with `LowState.motors`; ``command_sources`` is omitted if it is None.
         acceleration: (3,) specific force in the IMU frame, m/s^2.
     """
-    body = state.body
+    assert state.motors is not None, "every rt/lowstate has torques"
     columns = {
-        "q": body.joint_position.tolist(),
-        "dq": body.joint_velocity.tolist(),
+        "q": state.joint_position.tolist(),
+        "dq": state.joint_velocity.tolist(),
         "tau_est": state.motors.torque.tolist(),
-        **encode_motor_fields(state.motors),
+        **_encode_optional_fields(state.motors),
     }
     rows = zip(*columns.values(), strict=True)
     motors = [dict(zip(columns, row, strict=True)) for row in rows]
@@ -169,111 +191,108 @@ def encode_state(state: LowState, acceleration: Array) -> bytes:
     data = {
         "motor_state": motors + [empty] * (MOTOR_SLOTS - NUM_JOINTS),
         "imu_state": {
-            "quaternion": body.quaternion_w.tolist(),
-            "gyroscope": body.angular_velocity.tolist(),
+            "quaternion": state.quaternion_w.tolist(),
+            "gyroscope": state.angular_velocity.tolist(),
             "accelerometer": acceleration.tolist(),
-            "rpy": _roll_pitch_yaw(body.quaternion_w),
+            "rpy": _roll_pitch_yaw(state.quaternion_w),
             "temperature": 35.0,
         },
-        "wireless_remote": base64.b64encode(body.remote).decode("ascii"),
-        "mode_machine": body.mode,
+        "wireless_remote": base64.b64encode(state.remote).decode("ascii"),
+        "mode_machine": state.mode,
     }
-    if state.sources is not None:
-        data["command_sources"] = state.sources
+    if state.command_sources is not None:
+        data["command_sources"] = state.command_sources
     return json.dumps({"topic": STATE_TOPIC, "data": data}).encode()
 
 
 def decode_state(payload: bytes, time_ns: int) -> LowState:
-    """The reading in a ``rt/lowstate`` that arrived at ``time_ns``.
+    """Decode a ``rt/lowstate`` that arrived at ``time_ns``; the result has `LowState.motors`.
 
     Raises:
-        Garbled: it is none, or says what no robot can measure.
+        MalformedMessage: the message is not a valid state.
     """
     data = _data(payload, STATE_TOPIC)
     motors = _motors(data, "motor_state")
     imu = data.get("imu_state")
     if not isinstance(imu, dict):
-        raise Garbled("imu_state is missing")
-    quaternion = _numbers(imu.get("quaternion"), 1.0 + _QUATERNION_SLACK, "quaternion", 4)
+        raise MalformedMessage("imu_state is missing")
+    quaternion = _numbers(imu.get("quaternion"), 1.0 + _QUATERNION_TOLERANCE, "quaternion", 4)
     norm = float(np.linalg.norm(quaternion))
-    if abs(norm - 1.0) > _QUATERNION_SLACK:
-        raise Garbled(f"the quaternion has length {norm:.2f}, expected 1")
-    sources = data.get("command_sources")
-    body = BodyState(
+    if abs(norm - 1.0) > _QUATERNION_TOLERANCE:
+        raise MalformedMessage(f"the quaternion has length {norm:.2f}, expected 1")
+    has_sources = data.get("command_sources") is not None
+    return LowState(
         time_ns=time_ns,
-        joint_position=_numbers([m.get("q") for m in motors], _MOST_ANGLE, "q"),
-        joint_velocity=_numbers([m.get("dq") for m in motors], _MOST_SPEED, "dq"),
+        joint_position=_numbers([m.get("q") for m in motors], _MAX_ANGLE, "q"),
+        joint_velocity=_numbers([m.get("dq") for m in motors], _MAX_SPEED, "dq"),
         quaternion_w=quaternion / norm,
-        angular_velocity=_numbers(imu.get("gyroscope"), _MOST_SPEED, "gyroscope", 3),
+        angular_velocity=_numbers(imu.get("gyroscope"), _MAX_SPEED, "gyroscope", 3),
         mode=_mode(data, "mode_machine"),
         remote=_remote(data.get("wireless_remote", "")),
-        motors=MotorReadings(
-            _numbers([m.get("tau_est") for m in motors], _MOST_TORQUE, "tau_est"),
-            **decode_motor_fields(motors),
-        ),
+        motors=_motor_readings(motors),
+        command_sources=_mode(data, "command_sources") if has_sources else None,
     )
-    return LowState(body, None if sources is None else _mode(data, "command_sources"))
 
 
 def _data(payload: bytes, topic: str) -> dict[str, Any]:
     """The content of a message on ``topic``."""
-    if len(payload) > MOST_BYTES:
-        raise Garbled(f"{len(payload)} bytes, expected at most {MOST_BYTES}")
+    if len(payload) > MAX_BYTES:
+        raise MalformedMessage(f"{len(payload)} bytes, expected at most {MAX_BYTES}")
     try:
-        message = json.loads(payload, parse_constant=_refuse)
+        message = json.loads(payload, parse_constant=_reject_constant)
     except (ValueError, RecursionError) as error:
-        raise Garbled(f"not JSON: {str(error)[:80]}") from error
+        raise MalformedMessage(f"not JSON: {str(error)[:80]}") from error
     if not isinstance(message, dict) or message.get("topic") != topic:
-        raise Garbled(f"no message on {topic}")
+        raise MalformedMessage(f"not a message on {topic}")
     data = message.get("data")
     if not isinstance(data, dict):
-        raise Garbled("no data")
+        raise MalformedMessage("data is missing")
     return data
 
 
-def _refuse(constant: str) -> Never:
-    raise ValueError(f"{constant} is no number")
+def _reject_constant(constant: str) -> Never:
+    raise ValueError(f"{constant} is not a number")
 
 
 def _motors(data: dict[str, Any], name: str) -> list[dict[str, Any]]:
     """The motors that are fitted."""
     motors = data.get(name)
     if not isinstance(motors, list) or len(motors) != MOTOR_SLOTS:
-        raise Garbled(f"{name} is no list of {MOTOR_SLOTS}")
+        raise MalformedMessage(f"{name} is not a list of {MOTOR_SLOTS}")
     if not all(isinstance(motor, dict) for motor in motors):
-        raise Garbled(f"{name} holds something else than motors")
+        raise MalformedMessage(f"{name} has an entry that is not a motor")
     return motors[:NUM_JOINTS]
 
 
 def _numbers(values: object, most: float, name: str, count: int = NUM_JOINTS) -> Array:
     """(count,) finite numbers within +-``most``."""
     if not isinstance(values, list) or len(values) != count:
-        raise Garbled(f"{name} is not {count} numbers")
+        raise MalformedMessage(f"{name} is not {count} numbers")
     if not {float, int}.issuperset(map(type, values)):
-        raise Garbled(f"{name} holds something else than numbers")
+        raise MalformedMessage(f"{name} has an entry that is not a number")
     try:
         array = np.array(values, np.float64)
     except OverflowError as error:
-        raise Garbled(f"{name} holds a number beyond all bounds") from error
+        raise MalformedMessage(f"{name} has a number that is too large") from error
     if not (np.abs(array) <= most).all():
-        raise Garbled(f"{name} is not finite or beyond {most:g}")
+        raise MalformedMessage(f"{name} is not finite or beyond {most:g}")
     return array
 
 
 def _mode(data: dict[str, Any], name: str) -> int:
     mode = data.get(name)
     if type(mode) is not int or not 0 <= mode <= 255:
-        raise Garbled(f"{name} is no number from 0 to 255")
+        raise MalformedMessage(f"{name} is not an integer from 0 to 255")
     return mode
 
 
 def _remote(text: object) -> bytes:
     if not isinstance(text, str):
-        raise Garbled("wireless_remote is no text")
+        raise MalformedMessage("wireless_remote is not a string")
     try:
         return base64.b64decode(text, validate=True)
     except ValueError as error:
-        raise Garbled("wireless_remote is not base64") from error
+        raise MalformedMessage("wireless_remote is not base64") from error
 
 
 def _roll_pitch_yaw(quaternion: Array) -> list[float]:
@@ -283,3 +302,54 @@ def _roll_pitch_yaw(quaternion: Array) -> list[float]:
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
     yaw = np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
     return [float(roll), float(pitch), float(yaw)]
+
+
+def _motor_readings(motors: Sequence[dict[str, Any]]) -> MotorReadings:
+    """Torques, and the optional fields that are valid."""
+    modes = _integers([motor.get("mode") for motor in motors])
+    return MotorReadings(
+        torque=_numbers([m.get("tau_est") for m in motors], _MAX_TORQUE, "tau_est"),
+        temperature=_temperatures([motor.get("temperature") for motor in motors]),
+        faults=_integers([motor.get("motorstate") for motor in motors]),
+        lost=_integers([motor.get("lost") for motor in motors]),
+        enabled=None if modes is None else modes == _ENABLED,
+    )
+
+
+def _encode_optional_fields(motors: MotorReadings) -> dict[str, list[Any]]:
+    """Field name -> one value per motor, of the fields that are not None."""
+    fields: dict[str, list[Any]] = {}
+    if motors.temperature is not None:
+        rows = motors.temperature.tolist()
+        fields["temperature"] = [row[0] if len(row) == 1 else row for row in rows]
+    if motors.faults is not None:
+        fields["motorstate"] = motors.faults.tolist()
+    if motors.lost is not None:
+        fields["lost"] = motors.lost.tolist()
+    if motors.enabled is not None:
+        fields["mode"] = motors.enabled.astype(int).tolist()
+    return fields
+
+
+def _temperatures(values: Sequence[object]) -> Array | None:
+    """(29, 1) or (29, 2) deg C, NaN for invalid values; None if no motor reports any: bridges
+    without temperatures omit the field or fill it with zeros."""
+    rows = [value if isinstance(value, list) else [value] for value in values]
+    width = len(rows[0])
+    if width not in (1, 2) or any(len(row) != width for row in rows):
+        return None
+    array = np.array([list(map(_degrees, row)) for row in rows])
+    return array if np.nan_to_num(array).any() else None
+
+
+def _degrees(value: object) -> float:
+    if type(value) in (int, float) and _MIN_DEGREES <= value <= _MAX_DEGREES:  # type: ignore[operator]
+        return float(value)  # type: ignore[arg-type]
+    return math.nan
+
+
+def _integers(values: Sequence[object]) -> NDArray[np.int64] | None:
+    """(29,) unsigned 32-bit integers; None if any value is not one."""
+    if all(type(value) is int and 0 <= value < 2**32 for value in values):
+        return np.array(values, np.int64)
+    return None

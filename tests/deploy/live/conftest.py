@@ -21,7 +21,7 @@ from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
 from egovcp_deploy.pilot.desk import InlineDesk, Report, Thinker
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Limits, Request, State
-from egovcp_deploy.robots.body import BodyState, MotorCommand, Picture
+from egovcp_deploy.robots.base import DepthImage, LowState, MotorCommand
 
 TICK_NS = 20_000_000
 QUICK = [
@@ -74,14 +74,14 @@ class SimBody:
 
     def __init__(self, robot: LiveRobot, clock: LockstepClock, faults: Faults) -> None:
         self._robot, self._clock, self._faults = robot, clock, faults
-        self._last: BodyState | None = None
+        self._last: LowState | None = None
         self.commands: list[MotorCommand] = []
 
-    def read(self) -> BodyState | None:
+    def read(self) -> LowState | None:
         if self._faults.frozen or self._faults.silent:
             return self._last
         m = self._robot.measure()
-        reading = BodyState(
+        reading = LowState(
             self._clock.now_ns(),
             m.joint_position,
             m.joint_velocity,
@@ -116,12 +116,12 @@ class SimEye:
 
     def __init__(self, robot: LiveRobot, clock: LockstepClock, faults: Faults) -> None:
         self._robot, self._clock, self._faults = robot, clock, faults
-        self._last: Picture | None = None
+        self._last: DepthImage | None = None
 
-    def read(self) -> Picture | None:
+    def read(self) -> DepthImage | None:
         if not self._faults.blind or self._last is None:
             _, depth = self._robot.depth_image
-            self._last = Picture(self._clock.now_ns(), depth)
+            self._last = DepthImage(self._clock.now_ns(), depth)
         return self._last
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import ACTION_BOX, COMMAND_SLICE, STATE_SLICES
 from egovcp_deploy.pilot.states import Request, State
-from egovcp_deploy.robots.body import MotorCommand
+from egovcp_deploy.robots.base import MotorCommand
 from egovcp_deploy.robots.wire import encode_command
 
 from .conftest import Rig

@@ -20,8 +20,8 @@ from egovcp_deploy.live.process import RemoteKeys
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Limits, State
-from egovcp_deploy.robots.fake.stage import Schedule, Stage
-from egovcp_deploy.robots.sim_body import SimBody
+from egovcp_deploy.robots.fake.episodes import EpisodeSchedule, EpisodeSequencer
+from tests.support.robots.sim_low_level import SimLowLevelRobot
 
 from .conftest import TICK_NS, Reaching
 
@@ -46,11 +46,13 @@ def test_a_planner_that_goes_on_meets_the_next_episode_standing(name: str, pause
     quiet = EpisodeConfig(ticks=50, event_ticks=(5, 5), empty_probability=1.0)
     robot = LiveRobot(EnvConfig(controller=name, ball_episode=quiet))
     robot.start(Scenario("ball", 0, 0))
-    body = SimBody(robot)
-    stage = Stage(body, lambda n: Scenario("ball", 0, n) if n < 3 else None, Schedule(pause=pause))
+    body = SimLowLevelRobot(robot)
+    episodes = EpisodeSequencer(
+        body, lambda n: Scenario("ball", 0, n) if n < 3 else None, EpisodeSchedule(pause=pause)
+    )
     clock, controller = LockstepClock(), make_controller(name)
     desk = InlineDesk(Thinker(Crouching()), clock)
-    loop = ControlLoop(body, body.eye, controller, Pilot(desk, Limits()))
+    loop = ControlLoop(body, body.camera, controller, Pilot(desk, Limits()))
     operator, remote = Auto((0.0, 0.0, 0.0), 0.0), RemoteKeys()
     seen: set[tuple[Phase, State]] = set()
     for _ in range(2500):
@@ -59,10 +61,10 @@ def test_a_planner_that_goes_on_meets_the_next_episode_standing(name: str, pause
         loop.tick(clock.now_ns(), Wishes(requests[-1] if requests else None))
         seen.add((robot.phase, loop.state))
         for _ in range(4):
-            stage.step()
+            episodes.step()
         clock.advance(TICK_NS)
-        if stage.finished:
+        if episodes.finished:
             break
-    assert [outcome.fallen for outcome in stage.outcomes] == [False] * 3
+    assert [outcome.fallen for outcome in episodes.outcomes] == [False] * 3
     assert State.DAMP not in {state for _, state in seen}
     assert {state for phase, state in seen if phase is Phase.EPISODE} == {State.RUN}

@@ -14,7 +14,7 @@ from egovcp_deploy.live.gamepad import Gamepad, GamepadButtons, GamepadOptions
 from egovcp_deploy.live.link import Order
 from egovcp_deploy.pilot.states import Request
 from egovcp_deploy.pilot.velocity import VelocityCommand
-from egovcp_deploy.robots.remote import FULL_STICK
+from egovcp_deploy.robots.remote_control import FULL_STICK
 
 A, B, Y, L1, SELECT, START = 0, 1, 3, 4, 6, 7
 LX, LY, RX = 0, 1, 3

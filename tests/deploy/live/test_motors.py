@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER, TARGET_HIGH, TARGET_LOW
 from egovcp_deploy.live import motors
-from egovcp_deploy.robots.body import MotorCommand
+from egovcp_deploy.robots.base import MotorCommand
 from egovcp_deploy.robots.wire import decode_command, encode_command
 
 Array = NDArray[np.float64]

@@ -16,10 +16,11 @@ from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp_deploy.deploy import main
 from egovcp_deploy.live.preflight import arrivals, image_age, joint_offsets, posture
-from egovcp_deploy.robots.arrivals import ArrivalStats
 from egovcp_deploy.robots.fake import FakeBridge, Ports
-from egovcp_deploy.robots.fake.running import Running
-from egovcp_deploy.robots.machine import describe
+from egovcp_deploy.robots.g1_variants import describe_variant
+from egovcp_deploy.robots.subscriber import ArrivalStats
+from tests.support.robots.fake_g1 import FakeG1Thread
+from tests.support.robots.fault_messages import edited, without_motor_fields
 
 NEUTRAL = standing_pose(ACTION_BOX.neutral[-1]).joints
 KNEE = JOINT_NAMES.index("left_knee_joint")
@@ -98,9 +99,11 @@ def test_the_age_of_images_is_measured_where_the_camera_tells() -> None:
 
 
 def test_modes_in_words() -> None:
-    assert describe(5) == "mode machine 5: 29 joints, waist free"
-    assert describe(6).startswith("mode machine 6: 29 joints, waist locked; warning: the waist")
-    assert "not known" in describe(77)
+    assert describe_variant(5) == "mode machine 5: 29 joints, waist free"
+    assert describe_variant(6).startswith(
+        "mode machine 6: 29 joints, waist locked; warning: the waist"
+    )
+    assert "not known" in describe_variant(77)
 
 
 type Look = Callable[..., tuple[int, dict[str, str]]]
@@ -121,14 +124,14 @@ def look(
     limits = {"STATE_HZ": 5.0, "IMAGE_HZ": 1.0, "MOST_LOST": 0.95, "LISTEN_S": 1.5}
     for name, value in limits.items():
         monkeypatch.setattr(f"egovcp_deploy.live.preflight.{name}", value)
-    monkeypatch.setattr("egovcp_deploy.robots.publisher.GAP_S", 2.0)
+    monkeypatch.setattr("egovcp_deploy.robots.command_conflict.GAP_S", 2.0)
 
     def look(change: Callable[[FakeBridge], object], detailed: bool = True) -> Any:
         robot.start(Scenario("ball", 0, 0))
         ports = Ports(command_port=0, state_port=0, camera_port=0)
         fake = FakeBridge(robot, ports, detailed=detailed)
         change(fake)
-        running = Running(fake)
+        running = FakeG1Thread(fake)
         try:
             code = main(
                 [
@@ -168,20 +171,24 @@ def test_a_robot_that_is_well_is_go_in_every_line(look: Look) -> None:
 
 
 def test_a_hot_motor_is_a_no_go_and_named(look: Look) -> None:
-    code, lines = look(lambda fake: fake.faults.obey("hot_motor left_ankle_roll 110"))
+    code, lines = look(lambda fake: fake.faults.apply("hot_motor left_ankle_roll 110"))
     assert code == 5
     assert lines["motors"].startswith("NO-GO")
     assert "left_ankle_roll_joint is at casing 35 deg C, winding 110 deg C" in lines["motors"]
 
 
+def without_temperatures(fake: FakeBridge) -> None:
+    fake.alter_state = edited(without_motor_fields("temperature"))
+
+
 def test_a_bridge_without_temperatures_is_go_and_says_which_checks_are_off(look: Look) -> None:
-    _, lines = look(lambda fake: fake.faults.obey("no_temperature"), detailed=False)
+    _, lines = look(without_temperatures, detailed=False)
     assert lines["motors"].startswith("go")
     assert "no temperatures are reported; checks that are off" in lines["motors"]
 
 
 def test_a_robot_with_a_locked_waist_is_a_no_go(look: Look) -> None:
-    code, lines = look(lambda fake: fake.faults.obey("mode 6"))
+    code, lines = look(lambda fake: fake.faults.apply("mode 6"))
     assert code == 5
     assert lines["robot"].startswith("NO-GO")
     assert "waist is locked" in lines["robot"]
@@ -189,6 +196,6 @@ def test_a_robot_with_a_locked_waist_is_a_no_go(look: Look) -> None:
 
 
 def test_another_program_that_commands_is_a_no_go(look: Look) -> None:
-    code, lines = look(lambda fake: fake.faults.obey("intruder"))
+    code, lines = look(lambda fake: fake.faults.apply("other_publisher"))
     assert code == 5
     assert lines["other publishers"].startswith("NO-GO")

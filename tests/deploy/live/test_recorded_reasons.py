@@ -28,8 +28,8 @@ from egovcp_deploy.mcap.cli import main as mcap
 from egovcp_deploy.pilot.desk import Thinker
 from egovcp_deploy.pilot.states import Limits, State
 from egovcp_deploy.robots.fake import FakeBridge, Ports
-from egovcp_deploy.robots.fake.running import Running, config_of
-from egovcp_deploy.robots.zmq_eye import ZmqEyeConfig
+from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
+from tests.support.robots.fake_g1 import FakeG1Thread, bridge_config
 
 from .conftest import QUIET, Reaching
 
@@ -44,7 +44,7 @@ def test_a_recording_says_why_the_robot_was_held_and_damped(
     robot = LiveRobot(QUIET)
     robot.start(Scenario("ball", 0, 0))
     fake = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
-    running = Running(fake)
+    running = FakeG1Thread(fake)
     try:
         drive(fake, file, tmp_path)
     finally:
@@ -72,7 +72,7 @@ def test_a_recording_says_why_the_robot_was_held_and_damped(
 def drive(fake: FakeBridge, file: Path, folder: Path) -> None:
     """From INIT to RUN; then a motor overheats, and once the robot is held another drops out."""
     options = HardwareOptions(
-        config_of(fake), CameraOptions(server=ZmqEyeConfig(port=fake.ports.camera_port))
+        bridge_config(fake), CameraOptions(server=ZmqCameraConfig(port=fake.ports.camera_port))
     )
     address = f"ipc://{folder}/link"
     setup = ControlSetup(address, options, "stance", PATIENT, os.getppid())
@@ -87,9 +87,9 @@ def drive(fake: FakeBridge, file: Path, folder: Path) -> None:
 
         def break_motors(tick: Tick) -> None:
             if tick.mode == State.RUN:
-                fake.faults.obey("hot_motor left_ankle_roll 125")
+                fake.faults.apply("hot_motor left_ankle_roll 125")
             if tick.mode == State.HOLD:
-                fake.faults.obey("dropped_motor left_knee")
+                fake.faults.apply("dropped_motor left_knee")
 
         operator = Auto((0.0, 0.0, 0.0), 0.0)
         loop = PlannerLoop(

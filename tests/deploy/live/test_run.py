@@ -24,7 +24,7 @@ from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp_deploy.pilot.states import State
 from egovcp_deploy.robots.fake import FakeBridge, Ports
-from egovcp_deploy.robots.fake.running import Running, eventually
+from tests.support.robots.fake_g1 import FakeG1Thread, eventually
 
 from .conftest import PATIENT, QUICK
 
@@ -93,7 +93,7 @@ class Stand:
 def drive(robot: LiveRobot, artifact_dir: Path, tmp_path: Path) -> Iterator[Callable[..., Stand]]:
     robot.start(Scenario("ball", 0, 0))
     fake = FakeBridge(robot, Ports(command_port=0, state_port=0, camera_port=0))
-    running, programs = Running(fake), list[subprocess.Popen[str]]()
+    running, programs = FakeG1Thread(fake), list[subprocess.Popen[str]]()
 
     def start(*flags: str, before: str = "") -> Stand:
         folder, ports = tmp_path / "run", fake.ports
@@ -177,8 +177,8 @@ def test_killing_the_planner_leaves_a_robot_that_stands_until_it_is_told_to_end(
     commands = {p.pid: " ".join(p.cmdline()) for p in others}
     end(stand.program)
     stand.program.wait()
-    before = stand.fake.counts.commands
-    assert eventually(lambda: stand.fake.counts.commands > before + 50)
+    before = stand.fake.counters.commands
+    assert eventually(lambda: stand.fake.counters.commands > before + 50)
     assert stand.holds
     needed = {control.pid, *(p.pid for p in others if "resource_tracker" in commands[p.pid])}
     assert not psutil.wait_procs([p for p in others if p.pid not in needed], timeout=60)[1]

@@ -16,7 +16,7 @@ import pytest
 from egovcp.errors import DataError
 from egovcp.log.mcap_reader import read_recording
 from egovcp_deploy.pilot.states import State
-from egovcp_deploy.robots.fake.running import eventually
+from tests.support.robots.fake_g1 import eventually
 
 from .conftest import PATIENT, QUICK
 

@@ -1,5 +1,4 @@
-"""A damaged recording: its readable ticks are recovered, the loss is reported, nothing else
-accepts it."""
+"""Damaged recordings: `recover` keeps the readable ticks; other commands refuse the file."""
 
 from __future__ import annotations
 
@@ -45,7 +44,7 @@ def messages(path: Path) -> dict[int, dict[str, bytes]]:
     }
 
 
-def test_a_flipped_byte_costs_at_most_the_tick_that_it_hits(record: Record, tmp_path: Path) -> None:
+def test_a_flipped_byte_loses_at_most_its_tick(record: Record, tmp_path: Path) -> None:
     whole = record()
     expected, chunks = messages(whole), chunk_ranges(whole)
     random = np.random.default_rng(0)
@@ -93,7 +92,7 @@ def test_recover_reports_every_damaged_place(
     assert sorted(messages(tmp_path / "out.mcap")) == [1, 2, 5, 6]
 
 
-def test_a_hole_of_zeros_costs_the_ticks_in_it(record: Record, tmp_path: Path) -> None:
+def test_a_range_of_zeros_loses_the_ticks_in_it(record: Record, tmp_path: Path) -> None:
     whole = record()
     chunks, content = chunk_ranges(whole), bytearray(whole.read_bytes())
     content[chunks[2][50] : chunks[4][50]] = bytes(chunks[4][50] - chunks[2][50])
@@ -158,7 +157,7 @@ def test_metadata_damaged_in_both_copies_is_refused(
     assert not (tmp_path / "out.mcap").exists()
 
 
-def test_a_size_that_damage_made_huge_allocates_nothing(record: Record, tmp_path: Path) -> None:
+def test_a_damaged_size_allocates_nothing(record: Record, tmp_path: Path) -> None:
     from tests.support.limited import run_limited
 
     whole = record()

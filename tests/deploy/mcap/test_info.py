@@ -38,8 +38,8 @@ def live(tick: Tick) -> Tick:
     return replace(tick, mode=MODES[k], events=EVENTS.get(k, ()), motors=motors)
 
 
-def test_every_change_of_state_has_its_time_and_reason(record: Record) -> None:
-    changes = summarise(record(keep=live)).history.changes
+def test_state_changes_have_time_and_reason(record: Record) -> None:
+    changes = summarise(record(keep=live)).changes
     assert [(c.before, c.after, c.reason) for c in changes] == [
         ("armed", "run", "the operator asked for it"),
         ("run", "hold", "no new picture for 210 ms"),
@@ -49,7 +49,7 @@ def test_every_change_of_state_has_its_time_and_reason(record: Record) -> None:
     assert [c.time_s for c in changes] == pytest.approx([0.04, 0.12, 0.2, 0.24])
 
 
-def test_info_in_words(record: Record, capsys: pytest.CaptureFixture[str]) -> None:
+def test_info_as_text(record: Record, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["info", str(record(keep=live))]) == 0
     out = capsys.readouterr().out
     assert "    0.24 s  run -> damp: the pelvis is tilted by 1.10 rad" in out
@@ -60,7 +60,7 @@ def test_info_in_words(record: Record, capsys: pytest.CaptureFixture[str]) -> No
     assert "winding overheating (0x200)" in ankle
 
 
-def test_info_in_json(record: Record, tmp_path: Path) -> None:
+def test_info_as_json(record: Record, tmp_path: Path) -> None:
     assert main(["info", str(record(keep=live)), f"--json={tmp_path / 'i.json'}"]) == 0
     report = json.loads((tmp_path / "i.json").read_text())
     assert report["states"][-1]["reason"] == "the pelvis is tilted by 1.10 rad"
@@ -78,4 +78,4 @@ def test_a_recording_without_motors_has_no_table(
     file = record()
     assert main(["info", str(file)]) == 0
     assert "max torque" not in capsys.readouterr().out
-    assert summarise(file).history.joints is None
+    assert summarise(file).joints is None

@@ -1,4 +1,4 @@
-"""Torn anywhere, a recording gives back every tick that was whole."""
+"""Every complete tick of a torn recording is recovered."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def chunk_ends(path: Path) -> list[int]:
     return [chunk.chunk_start_offset + chunk.chunk_length for chunk in summary.chunk_indexes]
 
 
-def test_every_whole_tick_is_recovered_wherever_it_is_cut(record: Record, tmp_path: Path) -> None:
+def test_every_complete_tick_of_a_torn_file_is_recovered(record: Record, tmp_path: Path) -> None:
     whole = record()
     content, ends = whole.read_bytes(), chunk_ends(whole)
     assert len(ends) == 8
@@ -47,7 +47,7 @@ def test_every_whole_tick_is_recovered_wherever_it_is_cut(record: Record, tmp_pa
         assert torn.read_bytes() == content[:cut]
 
 
-def test_what_is_recovered_has_an_index(record: Record, tmp_path: Path) -> None:
+def test_a_recovered_file_has_an_index(record: Record, tmp_path: Path) -> None:
     whole, torn = record(), tmp_path / "torn.mcap"
     torn.write_bytes(whole.read_bytes()[: chunk_ends(whole)[4] + 100])
     assert main(["recover", str(torn), str(tmp_path / "out.mcap")]) == 0
@@ -59,7 +59,7 @@ def test_what_is_recovered_has_an_index(record: Record, tmp_path: Path) -> None:
     assert len(summary.metadata_indexes) == 2  # the second is a copy
 
 
-def test_garbage_in_the_middle_is_where_it_ends(record: Record, tmp_path: Path) -> None:
+def test_ticks_before_garbage_are_read(record: Record, tmp_path: Path) -> None:
     whole = record()
     ends = chunk_ends(whole)
     for number, seed in enumerate(range(20)):
@@ -81,7 +81,7 @@ def test_nothing_is_overwritten(record: Record, capsys: pytest.CaptureFixture[st
     assert other.read_bytes() == before
 
 
-def test_info_says_what_is_there(
+def test_info_reports_missing_ticks(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = record(missing=(3, 4))
@@ -97,7 +97,7 @@ def test_info_says_what_is_there(
     assert report["rate_hz"] == pytest.approx(6 / 0.32)
 
 
-def test_info_of_a_torn_file_says_how_to_save_it(
+def test_info_of_a_torn_file_names_the_recovery(
     record: Record, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = record()
@@ -137,7 +137,7 @@ WRONG = {
 
 @pytest.mark.parametrize("kind", WRONG)
 @pytest.mark.parametrize("command", ["info", "recover", "to-dataset"])
-def test_what_is_no_recording_is_refused_in_one_line(
+def test_other_files_are_refused_in_one_line(
     kind: str, command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path, out = tmp_path / "a.mcap", tmp_path / "out"
@@ -163,5 +163,5 @@ def test_what_is_no_recording_is_refused_in_one_line(
         ["info", "a", "--nonsense=1"],
     ],
 )
-def test_usage(args: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_usage_is_refused(args: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(args) == 2

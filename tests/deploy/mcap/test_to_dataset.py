@@ -1,4 +1,4 @@
-"""A rollout becomes an episode that the dataset's own tools accept; and the way back."""
+"""Conversion of recordings to a dataset and back."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_episode_to_recording_to_episode_is_the_identity(
         assert before.metadata == after.metadata
 
 
-def test_rows_are_what_was_sent(record: Record, tmp_path: Path) -> None:
+def test_rows_have_the_sent_actions(record: Record, tmp_path: Path) -> None:
     planned = np.full(7, 0.9, np.float32)
     file = record(keep=lambda tick: replace(tick, action_planned=planned))
     assert main(["to-dataset", str(file), f"--dataset.root={tmp_path / 'new'}"]) == 0
@@ -50,7 +50,7 @@ def test_rows_are_what_was_sent(record: Record, tmp_path: Path) -> None:
     assert list(dataset_problems(tmp_path / "new")) == []
 
 
-def test_after_a_fall_nothing_is_kept(
+def test_ticks_after_a_fall_are_dropped(
     record: Record, fallen: Callable[[Tick], Tick], tmp_path: Path
 ) -> None:
     info = replace(INFO, config={"env": {"ball_episode": {"ticks": 40}}})
@@ -68,7 +68,7 @@ def test_rollouts_of_one_scenario_are_different_episodes(record: Record, tmp_pat
     assert reader.metadata(0)["rollout"]["seed"] == INFO.seed
 
 
-def test_controllers_do_not_mix(
+def test_different_controllers_are_refused(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     other = replace(INFO, hashes={CONTROLLER: "walk-2"})
@@ -112,7 +112,7 @@ def test_a_pause_is_a_gap(
         (replace(INFO, task="sequence"), "its task is 'sequence'"),
     ],
 )
-def test_what_a_dataset_needs_to_know(
+def test_missing_run_information_is_refused(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str], info: object, words: str
 ) -> None:
     file = record(info=info)
@@ -128,7 +128,7 @@ def test_values_out_of_range_are_refused(
     assert "state is not finite" in capsys.readouterr().err
 
 
-def test_it_trains(record: Record, tmp_path: Path) -> None:
+def test_the_dataset_can_be_trained_on(record: Record, tmp_path: Path) -> None:
     from egovcp_train.train import main as train
 
     files = [str(record(f"{n}.mcap", number=n)) for n in range(3)]
@@ -159,7 +159,7 @@ def live(tick: Tick) -> Tick:
     return replace(tick, mode=modes[tick.index], events=events)
 
 
-def test_of_a_run_on_the_wall_clock_the_part_that_the_planner_drove(
+def test_a_live_run_is_reduced_to_its_ticks_in_run(
     record: Record, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = record(keep=live)
@@ -196,3 +196,22 @@ def test_the_same_rollout_twice_is_refused_before_anything_is_written(
         assert main([*call, f"--dataset.root={tmp_path / 'new'}"]) == 3
         assert f"{other} repeats {file}" in capsys.readouterr().err
         assert not [path for path in tmp_path.iterdir() if "new" in path.name]
+
+
+@pytest.mark.parametrize("is_there", [True, False])
+def test_a_link_as_destination_is_followed(is_there: bool, record: Record, tmp_path: Path) -> None:
+    link, real = tmp_path / "link", tmp_path / "real"
+    link.symlink_to(real)
+    if is_there:
+        real.mkdir()
+    assert main(["to-dataset", str(record()), f"--dataset.root={link}"]) == 0
+    assert link.is_symlink()
+    assert len(open_dataset(real)) == 1
+
+
+def test_a_mount_point_is_refused(
+    record: Record, mount_point: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["to-dataset", str(record()), f"--dataset.root={mount_point}"]) == 5
+    assert f"{mount_point} is a mount point" in capsys.readouterr().err
+    assert not list(mount_point.iterdir())

@@ -11,7 +11,7 @@ from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.spec import JOINT_NAMES
 from egovcp_deploy.pilot.motor_watch import CASING, SINGLE, WINDING, MotorVerdict, MotorWatch
-from egovcp_deploy.robots.body import BodyState, MotorCommand
+from egovcp_deploy.robots.base import LowState, MotorCommand
 
 TICK_NS = 20_000_000
 KNEE = JOINT_NAMES.index("left_knee_joint")
@@ -27,9 +27,9 @@ HEALTHY = MotorReadings(
 HOLD_STILL = MotorCommand(ZERO, STIFFNESS, DAMPING)
 
 
-def reading(time_ns: int, motors: MotorReadings, position: np.ndarray = ZERO) -> BodyState:
+def reading(time_ns: int, motors: MotorReadings, position: np.ndarray = ZERO) -> LowState:
     upright = np.array([1.0, 0, 0, 0])
-    return BodyState(time_ns, position, ZERO, upright, np.zeros(3), motors=motors)
+    return LowState(time_ns, position, ZERO, upright, np.zeros(3), motors=motors)
 
 
 class WatchRig:

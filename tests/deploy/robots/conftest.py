@@ -1,4 +1,4 @@
-"""A fake robot behind real sockets, with its time in the hands of the test."""
+"""A fake G1 on real sockets."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import pytest
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
-from egovcp_deploy.robots.bridge import BridgeBody
+from egovcp_deploy.robots.bridge import BridgeRobot
 from egovcp_deploy.robots.fake import FakeBridge, Ports
-from egovcp_deploy.robots.fake.running import PATIENCE_S, Running, config_of
+from tests.support.robots.fake_g1 import TIMEOUT_S, FakeG1Thread, bridge_config
 
 SHORT = EpisodeConfig(ticks=20, event_ticks=(3, 4), empty_probability=0.0)
 
@@ -23,7 +23,7 @@ def live() -> LiveRobot:
 
 @pytest.fixture
 def fake(live: LiveRobot) -> Iterator[FakeBridge]:
-    """On the crane; nothing moves until somebody steps it."""
+    """On the gantry; advances only when a test steps it."""
     live.start(Scenario("ball", 0, 0))
     bridge = FakeBridge(live, Ports(command_port=0, state_port=0, camera_port=0))
     yield bridge
@@ -31,16 +31,16 @@ def fake(live: LiveRobot) -> Iterator[FakeBridge]:
 
 
 @pytest.fixture
-def running(fake: FakeBridge) -> Iterator[Running]:
-    time_passes = Running(fake)
-    yield time_passes
-    time_passes.stop()
+def running(fake: FakeBridge) -> Iterator[FakeG1Thread]:
+    thread = FakeG1Thread(fake)
+    yield thread
+    thread.stop()
 
 
 @pytest.fixture
-def body(running: Running) -> Iterator[BridgeBody]:
+def body(running: FakeG1Thread) -> Iterator[BridgeRobot]:
     """Connected to the running fake."""
-    found = BridgeBody(config_of(running.fake))
-    found.connect(PATIENCE_S)
+    found = BridgeRobot(bridge_config(running.fake))
+    found.connect(TIMEOUT_S)
     yield found
     found.close()

@@ -1,4 +1,4 @@
-"""The fake robot: a controller on the other side of the wire carries it through its episodes."""
+"""The fake G1, driven by a controller over the bridge."""
 
 from __future__ import annotations
 
@@ -14,24 +14,23 @@ from egovcp.robot.controllers import make_controller
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.sim.live import LiveRobot, Phase
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import ACTION_BOX
-from egovcp_deploy.robots.body import MotorCommand
-from egovcp_deploy.robots.bridge import BridgeBody
-from egovcp_deploy.robots.depth_wire import decode_picture
-from egovcp_deploy.robots.fake import FakeBridge, Faults, Ports
+from egovcp.spec import ACTION_BOX, JOINT_NAMES
+from egovcp_deploy.robots.base import MotorCommand, proprioception
+from egovcp_deploy.robots.bridge import BridgeRobot
+from egovcp_deploy.robots.fake import FakeBridge, InjectedFaults, Ports
 from egovcp_deploy.robots.fake.bridge import MODE, WATCHDOG_S
-from egovcp_deploy.robots.fake.running import PATIENCE_S, Running, config_of, eventually
-from egovcp_deploy.robots.fake.stage import Schedule, Stage, spoken
-from egovcp_deploy.robots.proprioception import proprioception
+from egovcp_deploy.robots.fake.episodes import EpisodeSchedule, EpisodeSequencer, outcome_text
 from egovcp_deploy.robots.wire import encode_command
+from egovcp_deploy.robots.zmq_camera import decode_frame
+from tests.support.robots.fake_g1 import TIMEOUT_S, FakeG1Thread, bridge_config, eventually
 
 NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
 
 
-class Puppeteer:
-    """A fake and a controller in lock-step, over real sockets."""
+class LockstepDriver:
+    """Steps a fake G1 and a controller in turn, over real sockets."""
 
-    def __init__(self, fake: FakeBridge, body: BridgeBody) -> None:
+    def __init__(self, fake: FakeBridge, body: BridgeRobot) -> None:
         self.fake, self.body = fake, body
         self.controller = make_controller("stance")
         self.controller.reset(self._state()[None])
@@ -41,103 +40,109 @@ class Puppeteer:
         assert body is not None
         return proprioception(body, NEUTRAL)
 
-    def tick(self, stage: Stage) -> None:
+    def tick(self, episodes: EpisodeSequencer) -> None:
         """20 ms of the robot's life, after which the controller answers to its newest state."""
         for _ in range(4):
-            seen = self.body.traffic.readings
-            self._insist(
-                stage.step, lambda n=seen: stage.finished or self.body.traffic.readings > n
+            seen = self.body.counters.readings
+            self._send_until(
+                episodes.step, lambda n=seen: episodes.finished or self.body.counters.readings > n
             )
         target = self.controller.step(self._state()[None])[0]
-        c, heard = self.controller, self.fake.counts.commands
+        c, received = self.controller, self.fake.counters.commands
         command = MotorCommand(target, c.stiffness, c.damping, MODE)
-        self._insist(lambda: self.body.write(command), lambda: self._heard(heard))
+        self._send_until(lambda: self.body.write(command), lambda: self._received(received))
 
-    def _insist(self, send: Callable[[], object], arrived: Callable[[], bool]) -> None:
+    def _send_until(self, send: Callable[[], object], arrived: Callable[[], bool]) -> None:
         """Send until it arrives: a reader that joins anew, as after a second of silence on a busy
         machine, never sees what was published meanwhile."""
         for _ in range(20):
             send()
-            if eventually(arrived, patience=5.0):
+            if eventually(arrived, timeout=5.0):
                 return
         raise AssertionError("twenty messages, and none arrived")
 
-    def _heard(self, before: int) -> bool:
-        self.fake._listen()
-        return self.fake.counts.commands > before
+    def _received(self, before: int) -> bool:
+        self.fake._receive()
+        return self.fake.counters.commands > before
 
 
 @pytest.fixture
-def puppeteer(running: Running, body: BridgeBody) -> Puppeteer:
+def driver(running: FakeG1Thread, body: BridgeRobot) -> LockstepDriver:
     running.stop()
-    return Puppeteer(running.fake, body)
+    return LockstepDriver(running.fake, body)
 
 
-def test_a_controller_behind_the_wire_carries_it_through_its_episodes(puppeteer: Puppeteer) -> None:
-    said: list[str] = []
+def test_a_controller_plays_all_episodes_over_the_bridge(driver: LockstepDriver) -> None:
+    log: list[str] = []
     scenarios = [Scenario("ball", 1, 0), Scenario("wall", 1, 1)]
-    stage = Stage(
-        puppeteer.fake,
+    episodes = EpisodeSequencer(
+        driver.fake,
         lambda n: scenarios[n] if n < 2 else None,
-        Schedule(gantry=0.5, settle=0.5, pause=0.1),
-        said.append,
+        EpisodeSchedule(gantry=0.5, settle=0.5, pause=0.1),
+        log.append,
     )
     heights = []
-    while not stage.finished:
-        puppeteer.tick(stage)
-        if not puppeteer.fake.over:
-            heights.append(puppeteer.fake.robot.robot.pelvis_height)
-        assert "obeys" not in puppeteer.body.trouble
-    assert [outcome.scenario for outcome in stage.outcomes] == scenarios
-    assert [outcome.ticks for outcome in stage.outcomes] == [20, 20]
-    assert not stage.outcomes[0].fallen
+    while not episodes.finished:
+        driver.tick(episodes)
+        if driver.fake.robot.phase is not Phase.OVER:
+            heights.append(driver.fake.robot.robot.pelvis_height)
+        assert "does not follow" not in driver.body.refusal
+    assert [outcome.scenario for outcome in episodes.outcomes] == scenarios
+    assert [outcome.ticks for outcome in episodes.outcomes] == [20, 20]
+    assert not episodes.outcomes[0].fallen
     assert min(heights) > 0.6
-    assert said[:3] == ["episode 0 (ball): on the crane", "the crane lets go", "the task begins"]
-    assert said[3] == spoken(stage.outcomes[0])
+    assert log[:3] == [
+        "episode 0 (ball): on the gantry",
+        "the gantry releases the robot",
+        "the task begins",
+    ]
+    assert log[3] == outcome_text(episodes.outcomes[0])
 
 
-def test_the_crane_waits_for_commands_that_hold(fake: FakeBridge) -> None:
-    stage = Stage(fake, lambda n: Scenario("ball", 0, 0), Schedule(gantry=0.0))
+def test_the_gantry_waits_for_commands_with_stiffness(fake: FakeBridge) -> None:
+    episodes = EpisodeSequencer(fake, lambda n: Scenario("ball", 0, 0), EpisodeSchedule(gantry=0.0))
     for _ in range(100):
-        stage.step()
+        episodes.step()
     assert fake.robot.phase is Phase.HELD
     send(fake, MotorCommand(np.zeros(29), np.zeros(29), DAMPING, MODE))
-    stage.step()
+    episodes.step()
     assert fake.robot.phase is Phase.HELD, "damping holds nothing"
     send(fake, MotorCommand(np.zeros(29), STIFFNESS, DAMPING, MODE))
-    stage.step()
-    stage.step()
+    episodes.step()
+    episodes.step()
     assert fake.robot.phase is Phase.FREE
 
 
-def test_the_crane_may_wait_to_be_told(fake: FakeBridge) -> None:
-    stage = Stage(fake, lambda n: Scenario("ball", 0, 0), Schedule(gantry=None))
+def test_the_gantry_waits_for_release_without_a_schedule(fake: FakeBridge) -> None:
+    episodes = EpisodeSequencer(
+        fake, lambda n: Scenario("ball", 0, 0), EpisodeSchedule(gantry=None)
+    )
     send(fake, MotorCommand(np.zeros(29), STIFFNESS, DAMPING, MODE))
     for _ in range(20):
-        stage.step()
+        episodes.step()
     assert fake.robot.phase is Phase.HELD
-    fake.faults.obey("")
-    stage.step()
+    fake.faults.apply("")
+    episodes.step()
     assert fake.robot.phase is Phase.FREE
 
 
 def send(fake: FakeBridge, command: MotorCommand) -> None:
-    """As any client would, and wait until the fake has heard it."""
+    """As any client would, and wait until the fake has received it."""
     send_raw(fake, encode_command(command))
 
 
 def send_raw(fake: FakeBridge, payload: bytes) -> None:
-    counts = fake.counts
-    before = (counts.commands, counts.garbled, counts.ignored)
+    counts = fake.counters
+    before = (counts.commands, counts.malformed, counts.ignored)
     with zmq.Context() as context, context.socket(zmq.PUSH) as client:
         client.connect(f"tcp://{fake.ports.host}:{fake.ports.command_port}")
         client.send(payload)
 
-        def heard() -> bool:
-            fake._listen()
-            return (counts.commands, counts.garbled, counts.ignored) != before
+        def received() -> bool:
+            fake._receive()
+            return (counts.commands, counts.malformed, counts.ignored) != before
 
-        assert eventually(heard)
+        assert eventually(received)
 
 
 def test_without_commands_the_motors_damp(fake: FakeBridge) -> None:
@@ -151,36 +156,36 @@ def test_without_commands_the_motors_damp(fake: FakeBridge) -> None:
 
 def test_commands_for_another_mode_are_ignored(fake: FakeBridge) -> None:
     send(fake, MotorCommand(np.zeros(29), STIFFNESS, DAMPING, MODE + 1))
-    assert (fake.counts.ignored, fake.counts.commands) == (1, 0)
+    assert (fake.counters.ignored, fake.counters.commands) == (1, 0)
     assert not fake.commanded
 
 
-def test_nonsense_is_counted(fake: FakeBridge) -> None:
+def test_malformed_commands_are_counted(fake: FakeBridge) -> None:
     send_raw(fake, b"hello")
-    assert (fake.counts.garbled, fake.counts.commands) == (1, 0)
+    assert (fake.counters.malformed, fake.counters.commands) == (1, 0)
 
 
-def test_a_deaf_robot_hears_nothing(body: BridgeBody, running: Running) -> None:
-    running.fake.faults.deaf = True
+def test_ignored_commands_are_not_counted(body: BridgeRobot, running: FakeG1Thread) -> None:
+    running.fake.faults.ignore_commands = True
     for _ in range(20):
         body.write(MotorCommand(np.zeros(29), STIFFNESS, DAMPING, MODE))
         time.sleep(0.005)
-    assert running.fake.counts.commands == 0
+    assert running.fake.counters.commands == 0
 
 
-def test_a_push_knocks_it_over(puppeteer: Puppeteer) -> None:
-    stage = Stage(
-        puppeteer.fake, lambda n: Scenario("ball", 2, n), Schedule(gantry=0.2, settle=100.0)
+def test_a_push_makes_the_robot_fall(driver: LockstepDriver) -> None:
+    episodes = EpisodeSequencer(
+        driver.fake, lambda n: Scenario("ball", 2, n), EpisodeSchedule(gantry=0.2, settle=100.0)
     )
-    while puppeteer.fake.robot.phase is Phase.HELD:
-        puppeteer.tick(stage)
-    puppeteer.fake.faults.obey("push")
+    while driver.fake.robot.phase is Phase.HELD:
+        driver.tick(episodes)
+    driver.fake.faults.apply("push")
     for _ in range(75):
-        puppeteer.tick(stage)
-    assert [outcome.fallen for outcome in stage.outcomes] == [True]
+        driver.tick(episodes)
+    assert [outcome.fallen for outcome in episodes.outcomes] == [True]
 
 
-def test_lost_messages_are_lost(body: BridgeBody, running: Running) -> None:
+def test_dropped_messages_do_not_arrive(body: BridgeRobot, running: FakeG1Thread) -> None:
     running.fake.faults.drop = 1.0
     time.sleep(0.1)
     last = body.read()
@@ -200,65 +205,66 @@ def viewer(fake: FakeBridge) -> zmq.Socket[bytes]:
     context.destroy(linger=0)
 
 
-def test_pictures_come_at_the_cameras_rate(viewer: zmq.Socket[bytes], running: Running) -> None:
-    first = decode_picture(viewer.recv())
-    second = decode_picture(viewer.recv())
+def test_images_are_numbered_and_repeat_when_frozen(
+    viewer: zmq.Socket[bytes], running: FakeG1Thread
+) -> None:
+    first = decode_frame(viewer.recv())
+    second = decode_frame(viewer.recv())
     assert second.sequence == first.sequence + 1
     assert first.depth.any()
     assert first.vertical_fov == pytest.approx(running.fake.robot.config.camera.vertical_fov)
     running.fake.faults.freeze_camera = True
-    repeated = [decode_picture(viewer.recv()).sequence for _ in range(4)]
+    repeated = [decode_frame(viewer.recv()).sequence for _ in range(4)]
     assert repeated[-1] == repeated[-2]
 
 
-def test_one_port_is_not_for_two(fake: FakeBridge, live: LiveRobot) -> None:
+def test_a_used_port_is_refused(fake: FakeBridge, live: LiveRobot) -> None:
     taken = Ports(command_port=fake.ports.command_port, state_port=0, camera_port=0)
     with pytest.raises(EnvironmentFailure, match="another egovcp-fake-g1"):
         FakeBridge(live, taken)
 
 
-def test_it_counts_the_programs_that_send(live: LiveRobot) -> None:
+def test_command_sources_are_counted(live: LiveRobot) -> None:
     live.start(Scenario("ball", 0, 0))
     ports = Ports(command_port=0, state_port=0, camera_port=0)
     fake = FakeBridge(live, ports, announce=True)
-    running = Running(fake)
-    one, two = BridgeBody(config_of(fake)), BridgeBody(config_of(fake))
+    running = FakeG1Thread(fake)
+    one, two = BridgeRobot(bridge_config(fake)), BridgeRobot(bridge_config(fake))
     try:
         for body in (one, two):
-            body.connect(PATIENCE_S)
+            body.connect(TIMEOUT_S)
         damp = MotorCommand(np.zeros(29), np.zeros(29), DAMPING, MODE)
 
         def noticed() -> bool:
             one.write(damp)
             two.write(damp)
-            return "1 other program(s)" in one.trouble
+            return "1 other program(s)" in one.refusal
 
         assert eventually(noticed)
     finally:
         for part in (one, two, running, fake):
-            part.stop() if isinstance(part, Running) else part.close()
+            part.stop() if isinstance(part, FakeG1Thread) else part.close()
 
 
-def test_words_set_faults_and_heal_them() -> None:
-    faults = Faults()
+def test_console_commands_set_and_clear_faults() -> None:
+    faults = InjectedFaults()
     for line in ("freeze_state", "drop 0.25", "mode 3", "push 1 -0.5"):
-        faults.obey(line)
-    assert faults == Faults(freeze_state=True, drop=0.25, mode=3, push=(1.0, -0.5))
-    for line in ("gyroscope 150", "joint_speed -25", "flood 20"):
-        faults.obey(line)
-    assert (faults.gyroscope, faults.joint_speed, faults.flood) == (150.0, -25.0, 20)
-    assert "flood" not in faults.obey("flood off")
-    faults.obey("freeze_state off")
+        faults.apply(line)
+    assert faults == InjectedFaults(freeze_state=True, drop=0.25, mode=3, push=(1.0, -0.5))
+    assert "drop" not in faults.apply("drop off")
+    faults.apply("hot_motor left_knee 110")
+    assert faults.hot_motor == (JOINT_NAMES.index("left_knee_joint"), 110.0)
+    faults.apply("freeze_state off")
     assert not faults.freeze_state
-    assert faults.obey("heal") == "faults: none"
-    assert faults == Faults()
+    assert faults.apply("clear") == "faults: none"
+    assert faults == InjectedFaults()
 
 
 @pytest.mark.parametrize(
-    "line", ["frieze_state", "drop", "drop much", "push hard", "push 1", "flood nan"]
+    "line", ["frieze_state", "drop", "drop much", "push hard", "push 1", "drop nan", "mode 300"]
 )
-def test_words_that_mean_nothing_are_refused(line: str) -> None:
-    faults = Faults()
+def test_unknown_console_commands_are_refused(line: str) -> None:
+    faults = InjectedFaults()
     with pytest.raises(UsageError):
-        faults.obey(line)
-    assert faults == Faults()
+        faults.apply(line)
+    assert faults == InjectedFaults()

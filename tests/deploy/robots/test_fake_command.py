@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from egovcp.rate import LockstepClock
-from egovcp_deploy.robots.bridge import BridgeBody, BridgeConfig
-from egovcp_deploy.robots.fake.command import Pace, main
+from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
+from egovcp_deploy.robots.fake.command import StepPacer, main
 
 FLAGS = (
     "--ports.command_port=0",
@@ -43,10 +43,10 @@ def ports_of(process: subprocess.Popen[str]) -> BridgeConfig:
     raise AssertionError("it never listened")
 
 
-def test_it_serves_obeys_words_and_writes_outcomes(tmp_path: Path) -> None:
+def test_it_executes_console_commands_and_writes_outcomes(tmp_path: Path) -> None:
     out = tmp_path / "outcomes.json"
     process = start("--episodes=1", "--settle=0", "--pause=0", f"--json={out}")
-    body = BridgeBody(ports_of(process))
+    body = BridgeRobot(ports_of(process))
     body.connect()
     body.close()
     assert process.stdin is not None
@@ -61,8 +61,8 @@ def test_it_serves_obeys_words_and_writes_outcomes(tmp_path: Path) -> None:
     assert outcome["reward"] == pytest.approx(sum(outcome["reward_terms"].values()))
 
 
-@pytest.mark.parametrize(("word", "code"), [("quit", 0), ("die", 1)])
-def test_it_ends_on_a_word(word: str, code: int) -> None:
+@pytest.mark.parametrize(("word", "code"), [("quit", 0), ("crash", 1)])
+def test_it_ends_on_a_console_command(word: str, code: int) -> None:
     process = start()
     ports_of(process)
     process.communicate(f"{word}\n", timeout=60)
@@ -92,9 +92,9 @@ def test_bad_options_are_refused(
     assert words in capsys.readouterr().err
 
 
-def test_a_late_step_is_made_up_for_and_a_long_stall_is_not() -> None:
+def test_late_steps_are_made_up_for_up_to_a_limit() -> None:
     clock = LockstepClock()
-    pace = Pace(clock)
+    pace = StepPacer(clock)
     assert [pace.due() for _ in range(3)] == [1, 1, 1]
     clock.advance(12_000_000)  # to 22 ms: those of 15 and 20 ms
     assert pace.due() == 2

@@ -1,4 +1,4 @@
-"""Readings that no G1 can produce are rejected; those of a healthy robot never are."""
+"""Readings that no G1 can produce are rejected; those of a healthy robot are not."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import VELOCITY_LIMIT
 from egovcp.spec import JOINT_NAMES
-from egovcp_deploy.fault_injection.false_alarms import HealthyRun, Situation
-from egovcp_deploy.robots.body import BodyState
+from egovcp_deploy.robots.base import LowState
 from egovcp_deploy.robots.plausibility import JUMP_RESYNC_S, RESYNC_S, PlausibilityFilter
+from tests.support.robots.healthy_run import HealthyRun, Situation
 
 KNEE = JOINT_NAMES.index("left_knee_joint")
 STEP_NS = 5_000_000
@@ -40,9 +41,9 @@ class StandingRobot:
         self.quaternion = np.array([1.0, 0.0, 0.0, 0.0])
         self.torque = np.zeros(29)
 
-    def at(self, time_ns: int) -> BodyState:
+    def at(self, time_ns: int) -> LowState:
         parts = (self.position, self.speed, self.quaternion, self.rate)
-        return BodyState(time_ns, *parts)
+        return LowState(time_ns, *parts, motors=MotorReadings(self.torque))
 
 
 Change = Callable[[StandingRobot], None]
@@ -58,7 +59,7 @@ def problems(
         reading = StandingRobot(rng)
         if k >= ONSET:
             change(reading)
-        found.append(plausibility.judge(reading.at(k * step_ns), reading.torque))
+        found.append(plausibility.check(reading.at(k * step_ns)))
     assert not any(found[:ONSET])
     return found[ONSET:]
 
@@ -98,7 +99,7 @@ def rolled(reading: StandingRobot) -> None:
         (torque(900.0), "left_knee_joint torque (N m) is 900.00"),
     ],
 )
-def test_beyond_what_a_g1_can_do_every_reading_is_rejected(change: Change, words: str) -> None:
+def test_readings_out_of_bounds_are_rejected(change: Change, words: str) -> None:
     for consistency in (True, False):
         found = problems(change, consistency=consistency)
         assert all(found)
@@ -124,13 +125,13 @@ def test_contradictions_are_rejected_at_every_rate(
     assert any(words in problem for problem in found)
 
 
-def test_the_knee_that_is_too_fast_is_named_with_the_values() -> None:
+def test_the_reason_names_the_joint_and_the_values() -> None:
     reason = problems(speed(25.0))[-1]
     assert "left_knee_joint moved by" in reason
     assert "now +25.0 rad/s" in reason
 
 
-def test_one_bad_reading_costs_only_itself() -> None:
+def test_only_the_implausible_reading_is_rejected() -> None:
     def once(change: Change) -> Change:
         count = iter(range(1000))
         return lambda reading: change(reading) if next(count) == 0 else None
@@ -151,14 +152,14 @@ def test_random_readings_within_bounds_are_rejected() -> None:
     assert all(problems(wild))
 
 
-def test_a_jump_is_believed_after_the_robot_would_have_been_damped() -> None:
+def test_a_position_jump_is_accepted_after_the_damping_limit() -> None:
     found = problems(position(0.5), duration=200)
     believed = found.index("")
     assert 0.2 < believed * STEP_NS * 1e-9 < 2 * RESYNC_S
     assert not any(found[believed:])
 
 
-def test_a_speed_that_jumps_is_believed_once_positions_follow_it() -> None:
+def test_a_speed_jump_is_accepted_once_positions_follow() -> None:
     ticks = iter(range(1000))
 
     def moved(reading: StandingRobot) -> None:
@@ -179,10 +180,10 @@ def test_a_speed_that_jumps_is_believed_once_positions_follow_it() -> None:
     ],
     ids=lambda situation: situation.name,
 )
-def test_a_healthy_robot_causes_no_alarm(situation: Situation) -> None:
+def test_a_healthy_robot_causes_no_false_alarm(situation: Situation) -> None:
     """``benchmarks/false_alarms.py`` plays ten minutes of this."""
     healthy = HealthyRun(situation)
-    healthy.play(0, most_s=8.0)
+    healthy.play(0, max_s=8.0)
     assert healthy.alarms.seconds > 4.0
     assert healthy.alarms.readings > 800
     assert healthy.alarms.rejected == []

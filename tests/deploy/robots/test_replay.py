@@ -1,4 +1,4 @@
-"""A recorded run, played back: the same filter takes the same steps, bit for bit."""
+"""Replay of recorded runs."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from egovcp.rate import FixedRate, LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.testing import random_episode
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
-from egovcp_deploy.robots import Robot
-from egovcp_deploy.robots.replay import ENDS, ReplayRobot, open_recordings, recorded_run
+from egovcp_deploy.robots import LockstepRobot
+from egovcp_deploy.robots.replay import RECORDING_ENDS, ReplayRobot, open_recordings, recorded_run
 from egovcp_deploy.robots.sim import SimRobot
 from egovcp_deploy.runner import Runner
 from tests.support.sinks import MemorySink
@@ -66,7 +66,7 @@ def watched(artifact_dir: Path, askew: float = 0.0) -> Watched:
     return Watched(load_artifact(str(artifact_dir)).make_policy(1, seed=5), askew)
 
 
-def run(policy: Watched, robot: Robot, sink: Sink) -> None:
+def run(policy: Watched, robot: LockstepRobot, sink: Sink) -> None:
     clock = LockstepClock()
     Runner(InlineDesk(Thinker(policy), clock), robot, FixedRate(25, clock)).run(sink)
 
@@ -105,7 +105,7 @@ def recorded(
 
 @pytest.mark.parametrize("askew", [0.0, 0.5])
 @pytest.mark.parametrize("episode", [0, 1])
-def test_the_recurrence_takes_the_same_steps(
+def test_replay_repeats_the_recurrence_bit_for_bit(
     recorded: tuple[Path, list[Watched]], artifact_dir: Path, episode: int, askew: float
 ) -> None:
     folder, thoughts = recorded
@@ -118,7 +118,7 @@ def test_the_recurrence_takes_the_same_steps(
     assert again.values == then.values
 
 
-def test_everything_that_was_recorded_comes_back(
+def test_replay_returns_everything_recorded(
     recorded: tuple[Path, list[Watched]], artifact_dir: Path
 ) -> None:
     folder, _ = recorded
@@ -149,7 +149,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def test_an_episode_of_a_dataset_plays_back(dataset: Path, artifact_dir: Path) -> None:
+def test_replay_of_a_dataset_episode(dataset: Path, artifact_dir: Path) -> None:
     robot = open_recordings(dataset)
     assert robot.count == 2
     assert robot.controller_id == "stance-1"
@@ -165,7 +165,7 @@ def test_an_episode_of_a_dataset_plays_back(dataset: Path, artifact_dir: Path) -
         assert len(ticks) == len(episode)
 
 
-def test_a_run_on_the_wall_clock_begins_where_the_planner_took_over(
+def test_a_live_run_begins_with_the_first_tick_in_run(
     recorded: tuple[Path, list[Watched]], tmp_path: Path
 ) -> None:
     """While the robot stands up the planner runs along; its recurrence starts anew with RUN."""
@@ -180,10 +180,10 @@ def test_a_run_on_the_wall_clock_begins_where_the_planner_took_over(
     sink.close()
     run = recorded_run(tmp_path / "live.mcap")
     assert len(run) == TICKS
-    np.testing.assert_array_equal(run.sensed[0].state, ticks[0].state)
+    np.testing.assert_array_equal(run.observations[0].state, ticks[0].state)
 
 
-def test_a_recording_that_was_torn_off_ends_where_it_ends(
+def test_a_torn_recording_ends_truncated(
     recorded: tuple[Path, list[Watched]], artifact_dir: Path, tmp_path: Path
 ) -> None:
     whole = (recorded[0] / "rollout-0.mcap").read_bytes()
@@ -192,10 +192,12 @@ def test_a_recording_that_was_torn_off_ends_where_it_ends(
     ticks = play(watched(artifact_dir), open_recordings(torn))
     assert 0 < len(ticks) < TICKS
     assert ticks[-1].truncated
-    assert ENDS in ticks[-1].events
+    assert RECORDING_ENDS in ticks[-1].events
 
 
-def test_what_is_not_there_is_said(recorded: tuple[Path, list[Watched]], tmp_path: Path) -> None:
+def test_missing_recordings_are_reported(
+    recorded: tuple[Path, list[Watched]], tmp_path: Path
+) -> None:
     with pytest.raises(UsageError, match="no recording, folder of recordings"):
         open_recordings(tmp_path)
     with pytest.raises(UsageError, match="there are 2 recordings"):

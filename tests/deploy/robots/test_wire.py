@@ -1,10 +1,11 @@
-"""What goes over the wire is what LeRobot's bridge speaks, and nothing else is believed."""
+"""Compatibility with LeRobot's bridge, and rejection of everything else."""
 
 from __future__ import annotations
 
 import importlib
 import json
 import sys
+from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
@@ -17,22 +18,30 @@ from lerobot.robots.unitree_g1.unitree_sdk2_socket import LowStateMsg
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
 from egovcp.spec import JOINT_NAMES
-from egovcp_deploy.robots.body import BodyState, MotorCommand
-from egovcp_deploy.robots.remote import Remote
+from egovcp_deploy.robots.base import LowState, MotorCommand
+from egovcp_deploy.robots.remote_control import RemoteControl
 from egovcp_deploy.robots.wire import (
     COMMAND_TOPIC,
     MOTOR_SLOTS,
-    Garbled,
-    LowState,
+    MalformedMessage,
     decode_command,
     decode_state,
     encode_command,
     encode_state,
+    fault_text,
 )
 
 GRAVITY = np.array([0.0, 0.0, 9.81])
 COUNT = np.arange(29.0)
+INDEX = np.arange(29)
 TARGETS = TARGET_LOW + COUNT / 28 * (TARGET_HIGH - TARGET_LOW)
+FULL = MotorReadings(
+    torque=INDEX / 2.0,
+    temperature=np.stack([30.0 + INDEX, 40.0 + INDEX], axis=1),
+    faults=np.where(INDEX == 3, 0x80000000, 0),
+    lost=INDEX,
+    enabled=INDEX != 3,
+)
 
 
 def command(**changes: Any) -> MotorCommand:
@@ -42,17 +51,17 @@ def command(**changes: Any) -> MotorCommand:
 
 def reading(sources: int | None = None) -> LowState:
     quaternion = np.array([0.9, 0.1, -0.3, 0.2])
-    body = BodyState(
+    return LowState(
         time_ns=7,
         joint_position=COUNT / 10,
         joint_velocity=-COUNT,
         quaternion_w=quaternion / np.linalg.norm(quaternion),
         angular_velocity=np.array([0.1, 0.2, 0.3]),
         mode=5,
-        remote=Remote(ly=0.5).to_bytes(),
+        remote=RemoteControl(ly=0.5).to_bytes(),
         motors=MotorReadings(COUNT * 2),
+        command_sources=sources,
     )
-    return LowState(body, sources)
 
 
 def changed(payload: bytes, path: tuple[Any, ...], value: Any) -> bytes:
@@ -125,45 +134,45 @@ def test_we_read_what_lerobots_bridge_sends(server: Any) -> None:
         rpy=[0, 0, 0],
         temperature=30,
     )
-    remote = Remote(lx=0.25).to_bytes()
+    remote = RemoteControl(lx=0.25).to_bytes()
     sent = SimpleNamespace(motor_state=motors, imu_state=imu, wireless_remote=remote)
     sent.mode_machine = 5
     payload = json.dumps({"topic": server.kTopicLowState, "data": server.lowstate_to_dict(sent)})
     got = decode_state(payload.encode(), 11)
-    np.testing.assert_array_equal(got.body.joint_position, COUNT / 10)
-    np.testing.assert_array_equal(got.body.joint_velocity, -COUNT)
+    np.testing.assert_array_equal(got.joint_position, COUNT / 10)
+    np.testing.assert_array_equal(got.joint_velocity, -COUNT)
     np.testing.assert_array_equal(got.motors.torque, 2 * COUNT)
-    np.testing.assert_array_equal(got.body.angular_velocity, [1, 2, 3])
-    assert (got.body.mode, got.body.time_ns, got.sources) == (5, 11, None)
-    assert Remote.parse(got.body.remote) == Remote(lx=0.25)
+    np.testing.assert_array_equal(got.angular_velocity, [1, 2, 3])
+    assert (got.mode, got.time_ns, got.command_sources) == (5, 11, None)
+    assert RemoteControl.parse(got.remote) == RemoteControl(lx=0.25)
 
 
 def test_lerobots_client_reads_our_states() -> None:
     state = reading()
     message = LowStateMsg(json.loads(encode_state(state, GRAVITY))["data"])
-    assert [m.q for m in message.motor_state[:29]] == state.body.joint_position.tolist()
-    assert [m.dq for m in message.motor_state[:29]] == state.body.joint_velocity.tolist()
+    assert [m.q for m in message.motor_state[:29]] == state.joint_position.tolist()
+    assert [m.dq for m in message.motor_state[:29]] == state.joint_velocity.tolist()
     assert [m.tau_est for m in message.motor_state[:29]] == state.motors.torque.tolist()
     assert len(message.motor_state) == MOTOR_SLOTS
-    assert message.imu_state.quaternion == state.body.quaternion_w.tolist()
-    assert message.imu_state.gyroscope == state.body.angular_velocity.tolist()
-    assert message.wireless_remote == state.body.remote
+    assert message.imu_state.quaternion == state.quaternion_w.tolist()
+    assert message.imu_state.gyroscope == state.angular_velocity.tolist()
+    assert message.wireless_remote == state.remote
     assert message.mode_machine == 5
 
 
 @pytest.mark.parametrize("sources", [None, 2])
-def test_states_survive_the_wire(sources: int | None) -> None:
+def test_state_round_trip(sources: int | None) -> None:
     state = reading(sources)
     back = decode_state(encode_state(state, GRAVITY), 7)
     for name in ("joint_position", "joint_velocity", "angular_velocity"):
-        np.testing.assert_array_equal(getattr(back.body, name), getattr(state.body, name))
-    np.testing.assert_allclose(back.body.quaternion_w, state.body.quaternion_w, rtol=1e-12)
+        np.testing.assert_array_equal(getattr(back, name), getattr(state, name))
+    np.testing.assert_allclose(back.quaternion_w, state.quaternion_w, rtol=1e-12)
     np.testing.assert_array_equal(back.motors.torque, state.motors.torque)
-    assert (back.body.mode, back.body.remote) == (5, state.body.remote)
-    assert back.sources == sources
+    assert (back.mode, back.remote) == (5, state.remote)
+    assert back.command_sources == sources
 
 
-def test_commands_survive_the_wire() -> None:
+def test_command_round_trip() -> None:
     back = decode_command(encode_command(command()))
     for name in ("position", "stiffness", "damping"):
         np.testing.assert_array_equal(getattr(back.motors, name), getattr(command(), name))
@@ -188,8 +197,8 @@ def test_commands_survive_the_wire() -> None:
         {"damping": np.full(29, 1e9)},
     ],
 )
-def test_an_impossible_command_is_never_encoded(changes: dict[str, Any]) -> None:
-    with pytest.raises(Garbled):
+def test_an_invalid_command_is_not_encoded(changes: dict[str, Any]) -> None:
+    with pytest.raises(MalformedMessage):
         encode_command(command(**changes))
 
 
@@ -223,8 +232,8 @@ Q3 = ("data", "motor_state", 3, "q")
         (("data", "command_sources"), "two"),
     ],
 )
-def test_a_state_that_makes_no_sense_is_garbled(path: tuple[Any, ...], value: Any) -> None:
-    with pytest.raises(Garbled):
+def test_an_invalid_state_is_malformed(path: tuple[Any, ...], value: Any) -> None:
+    with pytest.raises(MalformedMessage):
         decode_state(changed(encode_state(reading(), GRAVITY), path, value), 0)
 
 
@@ -232,13 +241,13 @@ def test_a_state_that_makes_no_sense_is_garbled(path: tuple[Any, ...], value: An
     "payload",
     [b"", b"\xff\xfe", b"null", b"[" * 60_000, b"9" * 60_000, b" " * 10**6, b'{"topic": "rt/lo'],
 )
-def test_bytes_that_are_no_message_are_garbled(payload: bytes) -> None:
+def test_invalid_bytes_are_malformed(payload: bytes) -> None:
     for decode in (lambda raw: decode_state(raw, 0), decode_command):
-        with pytest.raises(Garbled):
+        with pytest.raises(MalformedMessage):
             decode(payload)
 
 
-def test_mutated_messages_are_read_or_garbled_and_nothing_else() -> None:
+def test_mutated_messages_are_decoded_or_malformed() -> None:
     rng = np.random.default_rng(0)
     payloads = (encode_state(reading(2), GRAVITY), encode_command(command()))
     for _ in range(2000):
@@ -250,17 +259,17 @@ def test_mutated_messages_are_read_or_garbled_and_nothing_else() -> None:
                 raw[rng.integers(len(raw))] = rng.integers(256)
             try:
                 got: Any = decode(bytes(raw[: rng.integers(len(raw) // 2, 2 * len(raw))]))
-            except Garbled:
+            except MalformedMessage:
                 continue
-            arrays = vars(got.body if isinstance(got, LowState) else got.motors).values()
+            arrays = vars(got if isinstance(got, LowState) else got.motors).values()
             assert all(np.isfinite(a).all() for a in arrays if isinstance(a, np.ndarray))
 
 
-def test_the_remote_control_survives_the_wire() -> None:
-    remote = Remote(0.5, -0.25, 1.0, -1.0, frozenset({"A", "R1", "left"}))
+def test_remote_control_round_trip() -> None:
+    remote = RemoteControl(0.5, -0.25, 1.0, -1.0, frozenset({"A", "R1", "left"}))
     raw = remote.to_bytes()
     assert len(raw) == 40
-    assert Remote.parse(raw) == remote
+    assert RemoteControl.parse(raw) == remote
 
 
 def test_buttons_have_the_order_of_lerobot() -> None:
@@ -268,17 +277,98 @@ def test_buttons_have_the_order_of_lerobot() -> None:
     for name, bit in bits.items():
         raw = bytearray(40)
         raw[2:4] = (1 << bit).to_bytes(2, "little")
-        assert Remote.parse(bytes(raw)) == Remote(pressed=frozenset({name}))
+        assert RemoteControl.parse(bytes(raw)) == RemoteControl(pressed=frozenset({name}))
 
 
-@pytest.mark.parametrize("raw", [b"", b"\x00" * 39, b"\xff" * 40, Remote(lx=2.0).to_bytes()])
-def test_a_remote_control_that_makes_no_sense_is_none(raw: bytes) -> None:
-    assert Remote.parse(raw) is None
+@pytest.mark.parametrize("raw", [b"", b"\x00" * 39, b"\xff" * 40, RemoteControl(lx=2.0).to_bytes()])
+def test_an_invalid_remote_control_is_none(raw: bytes) -> None:
+    assert RemoteControl.parse(raw) is None
 
 
-def test_sticks_ask_for_a_velocity() -> None:
+def test_velocity_of_the_sticks() -> None:
     wish = np.array([0.3, -0.1, 0.25])
-    np.testing.assert_allclose(Remote.asking_for(wish).velocity, wish)
-    assert Remote(ly=1.0).velocity[0] > 0, "forward"
-    assert Remote(lx=1.0).velocity[1] < 0, "right"
-    assert Remote(rx=1.0).velocity[2] < 0, "clockwise"
+    np.testing.assert_allclose(RemoteControl.from_velocity(wish).velocity, wish)
+    assert RemoteControl(ly=1.0).velocity[0] > 0, "forward"
+    assert RemoteControl(lx=1.0).velocity[1] < 0, "right"
+    assert RemoteControl(rx=1.0).velocity[2] < 0, "clockwise"
+
+
+def state_message(motors: MotorReadings = FULL) -> bytes:
+    zero = np.zeros(29)
+    state = LowState(0, zero, zero, np.array([1.0, 0, 0, 0]), np.zeros(3), motors=motors)
+    return encode_state(state, GRAVITY)
+
+
+def read_motors(payload: bytes) -> MotorReadings:
+    motors = decode_state(payload, 1).motors
+    assert motors is not None
+    return motors
+
+
+def with_motors(change: Callable[[dict[str, Any]], object]) -> MotorReadings:
+    """Of the full message, after ``change`` of each motor."""
+    parsed = json.loads(state_message())
+    for motor in parsed["data"]["motor_state"]:
+        change(motor)
+    return read_motors(json.dumps(parsed).encode())
+
+
+def test_optional_motor_fields_round_trip() -> None:
+    back = read_motors(state_message())
+    for name in ("torque", "temperature", "faults", "lost", "enabled"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(FULL, name))
+
+
+def test_motor_field_names_are_those_of_unitree() -> None:
+    motor = json.loads(state_message())["data"]["motor_state"][3]
+    assert motor["temperature"] == [33.0, 43.0]
+    assert (motor["motorstate"], motor["lost"], motor["mode"]) == (0x80000000, 3, 0)
+
+
+def test_one_temperature_per_motor_is_accepted() -> None:
+    back = with_motors(lambda motor: motor.update(temperature=41.5))
+    np.testing.assert_array_equal(back.temperature, np.full((29, 1), 41.5))
+
+
+@pytest.mark.parametrize(
+    ("name", "field"),
+    [
+        ("temperature", "temperature"),
+        ("motorstate", "faults"),
+        ("lost", "lost"),
+        ("mode", "enabled"),
+    ],
+)
+def test_an_absent_motor_field_is_none(name: str, field: str) -> None:
+    back = with_motors(lambda motor: motor.pop(name, None))
+    fields = {"temperature", "faults", "lost", "enabled"}
+    assert getattr(back, field) is None
+    assert all(getattr(back, other) is not None for other in fields - {field})
+
+
+@pytest.mark.parametrize("value", ["hot", None, [], [1, 2, 3], {}, True, 1e300, -1, 1.5])
+def test_an_invalid_optional_field_keeps_the_reading(value: object) -> None:
+    back = with_motors(
+        lambda motor: motor.update(temperature=value, motorstate=value, lost=value, mode=value)
+    )
+    np.testing.assert_array_equal(back.torque, FULL.torque)
+    assert back.faults is None
+    assert back.lost is None
+    assert back.enabled is None
+
+
+def test_an_impossible_temperature_is_nan() -> None:
+    back = with_motors(lambda motor: motor.update(temperature=[500.0, 43.0]))
+    assert np.isnan(back.temperature[:, 0]).all()
+    np.testing.assert_array_equal(back.temperature[:, 1], 43.0)
+
+
+@pytest.mark.parametrize("zeros", [0.0, [0, 0]])
+def test_all_zero_temperatures_are_none(zeros: object) -> None:
+    assert with_motors(lambda motor: motor.update(temperature=zeros)).temperature is None
+
+
+def test_status_bits_as_text() -> None:
+    assert fault_text(0x200) == "winding overheating (0x200)"
+    assert fault_text(0x201) == "overcurrent, winding overheating (0x201)"
+    assert fault_text(0x100000) == "unknown (0x100000)"

@@ -1,6 +1,6 @@
-"""A G1 that is not there: the simulator behind the wire of LeRobot's bridge."""
+"""A simulated G1 behind the protocol of LeRobot's bridge."""
 
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
-from egovcp_deploy.robots.fake.faults import Faults
+from egovcp_deploy.robots.fake.faults import InjectedFaults
 
-__all__ = ["FakeBridge", "Faults", "Ports"]
+__all__ = ["FakeBridge", "InjectedFaults", "Ports"]

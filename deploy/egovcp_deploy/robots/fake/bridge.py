@@ -1,13 +1,12 @@
-"""The simulated robot behind the wire: one call of `FakeBridge.step` is 5 ms of its life.
+"""A simulated G1 behind the protocol of LeRobot's bridge.
 
-Commands in, physics, a state out; a picture whenever the camera has one. What the motors do
-without commands is this fake's own choice, not knowledge about the robot: after 0.2 s they damp.
+One call of `FakeBridge.step` advances it by 5 ms: receive commands, step the physics, send a state,
+and send a depth image when the camera has a new one. Without commands for 0.2 s its motors damp;
+this is a choice of the fake, not known behaviour of the robot.
 """
 
 from __future__ import annotations
 
-import os
-from collections import deque
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from typing import Final
@@ -20,57 +19,56 @@ from egovcp.bounds import bounded
 from egovcp.errors import EnvironmentFailure
 from egovcp.log.tick import MotorReadings
 from egovcp.robot.g1 import DAMPING, STIFFNESS
-from egovcp.sim.live import DAMPED, LiveRobot, Phase, ServoCommand
-from egovcp.spec import JOINT_NAMES, NUM_JOINTS, PHYSICS_DT
-from egovcp_deploy.robots.body import BodyState
-from egovcp_deploy.robots.depth_wire import WirePicture, encode_picture
-from egovcp_deploy.robots.fake.faults import Faults
-from egovcp_deploy.robots.motor_fields import DISCONNECTED
-from egovcp_deploy.robots.remote import Remote
+from egovcp.sim.live import DAMPED, LiveRobot, ServoCommand
+from egovcp.spec import NUM_JOINTS, PHYSICS_DT
+from egovcp_deploy.robots.base import LowState
+from egovcp_deploy.robots.fake.faults import InjectedFaults
+from egovcp_deploy.robots.remote_control import RemoteControl
+from egovcp_deploy.robots.subscriber import bind_socket
 from egovcp_deploy.robots.wire import (
     CAMERA_PORT,
     COMMAND_PORT,
-    MOST_BYTES,
+    DISCONNECTED,
+    MAX_BYTES,
     STATE_PORT,
-    Garbled,
     LowCommand,
-    LowState,
+    MalformedMessage,
     decode_command,
     encode_state,
 )
+from egovcp_deploy.robots.zmq_camera import DepthFrame, encode_frame
 
 WATCHDOG_S: Final = 0.2
-MODE: Final = 5  # what the fake reports as its mode machine
+MODE: Final = 5  # the fake's mode machine
 _MOTOR_DEG_C: Final = 35.0
-_COUNTED_S: Final = 0.5  # how long a program counts as one that sends commands
-_MOST_PER_STEP: Final = 100  # commands taken in within 5 ms; the rest waits
-GARBAGE_BYTES: Final = 2000
-_FALSE_JOINT: Final = JOINT_NAMES.index("left_knee_joint")
+_SOURCE_TIMEOUT_S: Final = 0.5  # since its last command a program no longer counts as a source
+_MAX_COMMANDS: Final = 100  # received per step
 
 
 @dataclass(frozen=True)
 class Ports:
-    """Where the fake listens; port 0 stands for any that is free."""
+    """Address of the fake G1; port 0 selects any free port."""
 
     host: str = "127.0.0.1"
-    """Interface; the loopback lets nobody else in."""
+    """Interface to listen on; the default is reachable from this machine only."""
     command_port: int = bounded(COMMAND_PORT, least=0, most=65535)
-    """Commands."""
+    """Port for commands."""
     state_port: int = bounded(STATE_PORT, least=0, most=65535)
-    """States."""
+    """Port for states."""
     camera_port: int = bounded(CAMERA_PORT, least=0, most=65535)
-    """Depth pictures, in our own format."""
+    """Port for depth images, in the format of egovcp-depth-server."""
 
 
 @dataclass
-class Counts:
-    """What came in."""
+class CommandCounters:
+    """Received messages on the command port."""
 
     commands: int = 0
-    """Obeyed, or replaced by a newer one within the same 5 ms."""
-    garbled: int = 0
+    """Applied, or replaced by a newer command within the same step."""
+    malformed: int = 0
     ignored: int = 0
-    """For another mode machine than the robot's, or motor by motor; a G1 obeys neither."""
+    """For another mode machine, or with ankles and waist commanded motor by motor; a G1 ignores
+    both."""
 
 
 class FakeBridge:
@@ -79,10 +77,9 @@ class FakeBridge:
     Args:
         robot: in an episode (`LiveRobot.start`).
         ports: where to listen.
-        faults: may be changed at any time.
-        announce: whether states tell how many programs send commands, which LeRobot's bridge
+        announce: whether states report how many programs send commands, which LeRobot's bridge
             does not.
-        detailed: whether states tell casing and winding temperatures, status and lost packets of
+        detailed: whether states have casing and winding temperatures, status and lost packets of
             each motor; LeRobot's bridge sends one temperature and no status.
 
     Raises:
@@ -93,114 +90,97 @@ class FakeBridge:
         self,
         robot: LiveRobot,
         ports: Ports | None = None,
-        faults: Faults | None = None,
         announce: bool = False,
         detailed: bool = False,
     ) -> None:
-        self._robot = robot
-        self.faults = faults or Faults()
+        self.robot = robot
+        self.faults = InjectedFaults()
+        """May be changed at any time."""
         self.pressed: frozenset[str] = frozenset()
-        self.tamper_state: Callable[[bytes], Iterable[bytes]] = lambda message: (message,)
-        """A state as it is -> the messages that are sent for it."""
-        self.tamper_picture: Callable[[bytes], Iterable[bytes]] = lambda message: (message,)
-        """Likewise for pictures."""
+        self.alter_state: Callable[[bytes], Iterable[bytes]] = lambda message: (message,)
+        """State message -> the messages that are sent instead."""
+        self.alter_image: Callable[[bytes], Iterable[bytes]] = lambda message: (message,)
+        """Depth message -> the messages that are sent instead."""
         self.on_command: Callable[[bytes], None] = lambda message: None
         """Called with every message on the command port."""
-        self.counts = Counts()
+        self.counters = CommandCounters()
         self._announce = announce
         self._detailed = detailed
         self._rng = np.random.default_rng(0)
-        self._senders: dict[int, float] = {}
+        self._sources: dict[int, float] = {}  # connection -> time of its last command
         self._time = 0.0  # s of simulated time since the start
         self._last_command = -np.inf
         self._servos = DAMPED
         self._last_state = b""
         self._sequence = 0
-        self._shown: tuple[int, int] | None = None
+        self._image: tuple[int, int] | None = None  # episode and step of the last image
         self._episode = 0
         self._context = zmq.Context()
-        wanted = ports or Ports()
-        self._commands = self._bind(zmq.PULL, wanted.host, wanted.command_port)
-        self._states = self._bind(zmq.PUB, wanted.host, wanted.state_port)
-        self._pictures = self._bind(zmq.PUB, wanted.host, wanted.camera_port)
-        ends = (self._commands, self._states, self._pictures)
-        self.ports = Ports(wanted.host, *map(_port, ends))
+        ports = ports or Ports()
+        try:
+            self._commands, command_port = self._bind(zmq.PULL, ports.host, ports.command_port)
+            self._states, state_port = self._bind(zmq.PUB, ports.host, ports.state_port)
+            self._images, camera_port = self._bind(zmq.PUB, ports.host, ports.camera_port)
+        except EnvironmentFailure:
+            self.close()
+            raise
+        self.ports = Ports(ports.host, command_port, state_port, camera_port)
         """Where it listens."""
 
-    def _bind(self, kind: int, host: str, port: int) -> zmq.Socket[bytes]:
+    def _bind(self, kind: int, host: str, port: int) -> tuple[zmq.Socket[bytes], int]:
         end = self._context.socket(kind)
-        end.setsockopt(zmq.LINGER, 0)
         end.setsockopt(zmq.SNDHWM, 20)
-        end.setsockopt(zmq.MAXMSGSIZE, MOST_BYTES)
-        try:
-            end.bind(f"tcp://{host}:{port or '*'}")
-        except zmq.ZMQError as error:
-            end.close()
-            self._context.destroy(linger=0)
-            raise EnvironmentFailure(
-                f"cannot listen at {host}:{port}: {error.strerror}; end what uses the port, "
-                "perhaps another egovcp-fake-g1, or choose another"
-            ) from error
-        return end
-
-    @property
-    def robot(self) -> LiveRobot:
-        """What is behind the wire."""
-        return self._robot
+        end.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
+        return end, bind_socket(end, host, port)
 
     @property
     def commanded(self) -> bool:
-        """Whether the motors are told to hold anything."""
+        """Whether the last command has stiffness, so that the motors hold a pose."""
         return self._servos is not DAMPED and bool(self._servos.stiffness.any())
 
-    @property
-    def time(self) -> float:
-        """s of simulated time since the start, all episodes together."""
-        return self._time
-
     def next_episode(self) -> None:
-        """Whoever holds the robot has started another episode."""
+        """Notify that `robot` has started another episode."""
         self._episode += 1
 
     def step(self) -> None:
-        """Let 5 ms pass."""
-        self._listen()
-        self._happen()
-        self.robot.drive(self._obeyed())
+        """Advance by 5 ms."""
+        self._receive()
+        self._apply_single_faults()
+        self.robot.drive(self._applied())
         self.robot.advance()
         self._time += PHYSICS_DT
         self._publish_state()
-        self._publish_picture()
+        self._publish_image()
 
-    def _listen(self) -> None:
-        """Take the newest command that makes sense; without any for too long, damp."""
-        waiting: deque[bytes] = deque()
-        while len(waiting) < _MOST_PER_STEP:
+    def _receive(self) -> None:
+        """Apply the newest valid command; without one for `WATCHDOG_S`, damp."""
+        waiting: list[bytes] = []
+        while len(waiting) < _MAX_COMMANDS:
             try:
                 frame = self._commands.recv(zmq.NOBLOCK, copy=False)
             except zmq.Again:
                 break
-            self._senders[int(frame.get(zmq.SRCFD))] = self._time
+            self._sources[int(frame.get(zmq.SRCFD))] = self._time
             waiting.append(frame.bytes)
             self.on_command(frame.bytes)
-        while waiting and not self.faults.deaf:
-            if self._take(waiting.pop()):
-                self.counts.commands += len(waiting)
+        while waiting and not self.faults.ignore_commands:
+            if self._accept(waiting.pop()):
+                self.counters.commands += len(waiting)
                 break
         if self._time - self._last_command > WATCHDOG_S:
             self._servos = DAMPED
 
-    def _take(self, payload: bytes) -> bool:
-        """Whether the command is obeyed."""
+    def _accept(self, payload: bytes) -> bool:
+        """Whether the command is applied."""
         try:
             command = decode_command(payload)
-        except Garbled:
-            self.counts.garbled += 1
+        except MalformedMessage:
+            self.counters.malformed += 1
             return False
         if command.motors.mode != self._mode or not command.series:
-            self.counts.ignored += 1
+            self.counters.ignored += 1
             return False
-        self.counts.commands += 1
+        self.counters.commands += 1
         self._last_command = self._time
         self._servos = _servos(command)
         return True
@@ -209,8 +189,7 @@ class FakeBridge:
     def _mode(self) -> int:
         return MODE if self.faults.mode is None else self.faults.mode
 
-    def _happen(self) -> None:
-        """Faults that happen once."""
+    def _apply_single_faults(self) -> None:
         faults = self.faults
         if faults.push is not None:
             self.robot.push(np.array([*faults.push, 0.0]))
@@ -219,9 +198,12 @@ class FakeBridge:
             self.robot.release()
             faults.release = False
 
-    def _obeyed(self) -> ServoCommand:
-        """What the motors do: what they are told, or what a fault makes them do."""
-        servos = self._intruder() if self.faults.intruder else self._servos
+    def _applied(self) -> ServoCommand:
+        """The command that the motors follow, including faults."""
+        servos = self._servos
+        if self.faults.other_publisher:
+            joints = self.robot.robot.data.qpos[self.robot.robot.index.joint_qpos]
+            servos = ServoCommand(joints + 0.1, STIFFNESS, DAMPING)
         if self.faults.dropped_motor is None:
             return servos
         works = np.arange(NUM_JOINTS) != self.faults.dropped_motor
@@ -233,7 +215,7 @@ class FakeBridge:
         )
 
     def _motors(self, torque: NDArray[np.float64]) -> MotorReadings:
-        """What the motors report, in as much detail as this fake's states have."""
+        """What the motors report."""
         faults = self.faults
         temperature = np.full((NUM_JOINTS, 2), _MOTOR_DEG_C)
         if faults.hot_motor is not None:
@@ -241,7 +223,7 @@ class FakeBridge:
             temperature[joint] = _MOTOR_DEG_C, degrees
         if not self._detailed:
             temperature = temperature.mean(axis=1, keepdims=True)  # as LeRobot's bridge does
-        readings = MotorReadings(torque, None if faults.no_temperature else temperature)
+        readings = MotorReadings(torque, temperature)
         if not self._detailed:
             return readings
         status, lost = np.zeros(NUM_JOINTS, np.int64), np.zeros(NUM_JOINTS, np.int64)
@@ -250,86 +232,66 @@ class FakeBridge:
             lost[faults.dropped_motor] = self.robot.steps
         return replace(readings, faults=status, lost=lost, enabled=status == 0)
 
-    def _intruder(self) -> ServoCommand:
-        """Another program, which holds every joint where it is, a little askew."""
-        joints = self.robot.robot.data.qpos[self.robot.robot.index.joint_qpos]
-        return ServoCommand(joints + 0.1, STIFFNESS, DAMPING)
-
     def _publish_state(self) -> None:
         faults = self.faults
         if faults.mute_state:
             return
         if not (faults.freeze_state and self._last_state):
-            self._last_state = self._state()
-        if self._lost():
+            self._last_state = self._encode_state()
+        if self._is_dropped():
             return
-        torn = faults.garble_state and self.robot.steps % 2
-        state = self._last_state[: len(self._last_state) // 2 if torn else None]
-        for message in self.tamper_state(state):
-            self._states.send(message)
-        for _ in range(faults.flood):
-            self._states.send(os.urandom(GARBAGE_BYTES))
+        cut = faults.truncate_state and self.robot.steps % 2
+        message = self._last_state[: len(self._last_state) // 2 if cut else None]
+        for altered in self.alter_state(message):
+            self._states.send(altered)
 
-    def _lost(self) -> bool:
+    def _is_dropped(self) -> bool:
         return self.faults.drop > 0.0 and bool(self._rng.random() < self.faults.drop)
 
-    def _state(self) -> bytes:
-        seen = self.robot.measure()
-        speed, rate = seen.joint_velocity, seen.angular_velocity
-        if self.faults.joint_speed:
-            speed[_FALSE_JOINT] = self.faults.joint_speed
-        if self.faults.gyroscope:
-            rate[0] = self.faults.gyroscope
-        body = BodyState(
+    def _encode_state(self) -> bytes:
+        measured = self.robot.measure()
+        remote = RemoteControl.from_velocity(self.robot.operator_velocity, self.pressed)
+        state = LowState(
             time_ns=0,
-            joint_position=seen.joint_position,
-            joint_velocity=speed,
-            quaternion_w=seen.quaternion_w,
-            angular_velocity=rate,
+            joint_position=measured.joint_position,
+            joint_velocity=measured.joint_velocity,
+            quaternion_w=measured.quaternion_w,
+            angular_velocity=measured.angular_velocity,
             mode=self._mode,
-            remote=Remote.asking_for(self.robot.operator_velocity, self.pressed).to_bytes(),
-            motors=self._motors(seen.torque),
+            remote=remote.to_bytes(),
+            motors=self._motors(measured.torque),
+            command_sources=self._command_sources(),
         )
-        return encode_state(LowState(body, self._sources()), seen.acceleration)
+        return encode_state(state, measured.acceleration)
 
-    def _sources(self) -> int | None:
+    def _command_sources(self) -> int | None:
         """How many programs send commands."""
         if not (self._announce or self.faults.announce):
             return None
-        recent = sum(self._time - last < _COUNTED_S for last in self._senders.values())
+        recent = sum(self._time - last < _SOURCE_TIMEOUT_S for last in self._sources.values())
         return recent + self.faults.announce
 
-    def _publish_picture(self) -> None:
-        taken, depth = self.robot.depth_image
-        if self.faults.mute_camera or (self._episode, taken) == self._shown:
+    def _publish_image(self) -> None:
+        step, depth = self.robot.depth_image
+        if self.faults.mute_camera or (self._episode, step) == self._image:
             return
-        self._shown = (self._episode, taken)
+        self._image = (self._episode, step)
         if not self.faults.freeze_camera:
             self._sequence += 1
             fov = self.robot.config.camera.vertical_fov
-            age = (self.robot.steps - taken) * PHYSICS_DT
-            self._last_picture = encode_picture(WirePicture(self._sequence, fov, depth, age))
-        if self._sequence and not self._lost():
-            for message in self.tamper_picture(self._last_picture):
-                self._pictures.send(message)
-
-    @property
-    def over(self) -> bool:
-        """Whether the episode has come to its end."""
-        return self.robot.phase is Phase.OVER
+            age = (self.robot.steps - step) * PHYSICS_DT
+            self._last_image = encode_frame(DepthFrame(self._sequence, fov, depth, age))
+        if self._sequence and not self._is_dropped():
+            for altered in self.alter_image(self._last_image):
+                self._images.send(altered)
 
     def close(self) -> None:
         """Stop listening."""
         self._context.destroy(linger=0)
 
 
-def _port(end: zmq.Socket[bytes]) -> int:
-    """The port that a socket is bound to."""
-    return int(end.getsockopt_string(zmq.LAST_ENDPOINT).rpartition(":")[2])
-
-
 def _servos(command: LowCommand) -> ServoCommand:
-    """What the motors do; one that is not enabled does nothing at all."""
+    """The command for the simulation; a motor that is not enabled gives no torque."""
     on = command.enabled.astype(np.float64)
     motors = command.motors
     return ServoCommand(

@@ -1,4 +1,4 @@
-"""`egovcp-fake-g1`: the simulated robot on the wall clock, behind the wire of the real one."""
+"""`egovcp-fake-g1`: a simulated G1 in real time behind the protocol of LeRobot's bridge."""
 
 from __future__ import annotations
 
@@ -21,141 +21,137 @@ from egovcp.sim.scenario import Scenario
 from egovcp.spec import PHYSICS_DT
 from egovcp.terminal import echo
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
-from egovcp_deploy.robots.fake.faults import WORDS, Faults
-from egovcp_deploy.robots.fake.stage import Schedule, Stage
+from egovcp_deploy.robots.fake.episodes import EpisodeSchedule, EpisodeSequencer
+from egovcp_deploy.robots.fake.faults import FAULT_COMMANDS, InjectedFaults
 from egovcp_deploy.scenarios import held_out
 
 PROG: Final = "egovcp-fake-g1"
 _STEP_NS: Final = round(PHYSICS_DT * NS_PER_S)
-_MOST_BEHIND: Final = 20  # steps; what is lost beyond them is lost
+_MAX_STEPS: Final = 20  # made up for after a delay; older ones are skipped
 _EPILOG: Final = (
-    "Speaks LeRobot's JSON over ZMQ for the motors and our own format for depth. Without a command "
-    "for 0.2 s its motors damp: its own choice, not the robot's. While it runs it takes words, one "
-    f"a line: Enter or release lets the crane go, quit ends it, and {', '.join(WORDS)} make "
-    "something go wrong (push 0.5 0, drop 0.3, mode 4, hot_motor left_knee 125, dropped_motor "
-    "left_knee, intruder off, heal)."
+    "Motors use LeRobot's JSON over ZMQ, depth the format of egovcp-depth-server. Without a "
+    "command for 0.2 s the motors damp, which a real robot does not do. While it runs it reads "
+    "commands from the terminal, one per line: Enter or release makes the gantry release the "
+    f"robot, quit ends the program, and {', '.join(FAULT_COMMANDS)} inject faults (push 0.5 0, "
+    "drop 0.3, mode 4, hot_motor left_knee 125, dropped_motor left_knee, other_publisher off, "
+    "clear)."
 )
 
 
 @dataclass(frozen=True)
-class FakeConfig:
-    """A G1 that is not there, for egovcp-deploy --robot.type=unitree_g1 and for tests.
+class FakeG1Config:
+    """A simulated G1 for egovcp-deploy --robot.type=unitree_g1 and for tests.
 
-    Plays held-out scenarios of one task, each from the crane to its outcome.
+    Plays held-out scenarios of one task, each from the gantry to its outcome.
     """
 
     task: str = "ball"
     """Scene: ball, wall, arch, or sequence (several in one episode, --env.sequence.parts)."""
     seed: int = bounded(0, least=0)
-    """Which held-out scenarios, the same that egovcp-eval plays."""
+    """Seed of the held-out scenarios, as in egovcp-eval."""
     episode: int = bounded(0, least=0)
-    """Number of the first."""
+    """Number of the first scenario."""
     episodes: int = bounded(0, least=0, most=1_000_000)
-    """How many; 0: until interrupted."""
+    """Number of episodes; 0: until interrupted."""
     gantry: float | None = bounded(3.0, least=0)
-    """How long the motors must have been told to hold something, without a break, before the crane
-    that holds the pelvis lets go, s; 0: at the first command; null: only on the word release."""
+    """How long the motors must have held a pose without a break before the gantry releases the
+    robot, s; 0: at the first command; null: only on the command release."""
     settle: float = bounded(2.0, least=0)
     """From there to the beginning of the task, s."""
     pause: float = bounded(2.0, least=0)
-    """From the end of an episode to the next, which begins on the crane, s; at least 1.5."""
+    """From the end of an episode to the next, which begins on the gantry, s; at least 1.5."""
     ports: Ports = field(default_factory=Ports)
     """Where to listen."""
     announce: bool = False
-    """Tell in every state how many programs send commands, which LeRobot's bridge does not."""
+    """Report in every state how many programs send commands, which LeRobot's bridge does not."""
     detailed: bool = False
-    """Tell casing and winding temperatures, status and lost packets of each motor in every state;
+    """Report casing and winding temperatures, status and lost packets of each motor in every state;
     LeRobot's bridge sends one temperature and no status."""
     json: str = output_file()
     """File for the outcomes, rewritten after each episode."""
     env: EnvConfig = field(default_factory=evaluation_config)
-    """Scenes, sensors, delays and randomisation. The controller only says in which pose to stand
-    and whether the arch comes to the robot; the delay of actions is that of the wire."""
+    """Scenes, sensors, delays and randomisation. The controller only selects the pose to stand in
+    and whether the arch comes to the robot; the delay of actions is that of the connection."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return run_command(FakeConfig, run, argv, prog=PROG, epilog=_EPILOG)
+    return run_command(FakeG1Config, run, argv, prog=PROG, epilog=_EPILOG)
 
 
-def run(config: FakeConfig, opened: Callable[[Ports], None] = lambda ports: None) -> None:
-    """Serve until the episodes are over, or the user has had enough.
+def run(config: FakeG1Config, opened: Callable[[Ports], None] = lambda ports: None) -> None:
+    """Serve until the episodes are over or the user ends it.
 
     Args:
         config: the options.
-        opened: is told where the robot listens, once it does.
+        opened: called with the ports once the robot listens.
 
     Raises:
-        UsageError: an option makes no sense.
+        UsageError: an option is invalid.
         EnvironmentFailure: a port is in use.
     """
-    _check(config)
+    first = held_out(config.task, config.seed, config.episode)
     robot = LiveRobot(config.env)
-    robot.start(held_out(config.task, config.seed, config.episode))
-    bridge = FakeBridge(robot, config.ports, announce=config.announce, detailed=config.detailed)
-    schedule = Schedule(config.gantry, config.settle, config.pause)
-    stage = Stage(bridge, _scenarios(config), schedule, _say)
-    try:
-        opened(bridge.ports)
-        _live(config, bridge, stage)
-    except KeyboardInterrupt:
-        _say("interrupted")
-    finally:
-        bridge.close()
-        _sum_up(stage.outcomes)
+    robot.start(first)
 
-
-def _check(config: FakeConfig) -> None:
-    held_out(config.task, config.seed, 0)
-
-
-def _scenarios(config: FakeConfig) -> Any:
     def scenario(number: int) -> Scenario | None:
         if config.episodes and number >= config.episodes:
             return None
         return held_out(config.task, config.seed, config.episode + number)
 
-    return scenario
+    bridge = FakeBridge(robot, config.ports, announce=config.announce, detailed=config.detailed)
+    schedule = EpisodeSchedule(config.gantry, config.settle, config.pause)
+    episodes = EpisodeSequencer(bridge, scenario, schedule, _print)
+    try:
+        opened(bridge.ports)
+        _serve(config, bridge, episodes)
+    except KeyboardInterrupt:
+        _print("interrupted")
+    finally:
+        bridge.close()
+        if outcomes := episodes.outcomes:
+            successes = sum(outcome.success for outcome in outcomes)
+            _print(f"{len(outcomes)} episodes, {successes} successes")
 
 
-def _live(config: FakeConfig, bridge: FakeBridge, stage: Stage) -> None:
-    """Keep step with the wall clock."""
+def _serve(config: FakeG1Config, bridge: FakeBridge, episodes: EpisodeSequencer) -> None:
+    """Step in real time."""
     ports = bridge.ports
-    _say(
+    _print(
         f"listening on {ports.host}: commands {ports.command_port}, states {ports.state_port}, "
         f"depth {ports.camera_port}; Ctrl-C ends it"
     )
-    words, pace, written = Console(), Pace(MonotonicClock()), 0
-    while not stage.finished:
-        for _ in range(pace.due()):
-            stage.step()
-        if not words.obeyed(bridge.faults):
+    console, pacer, written = Console(), StepPacer(MonotonicClock()), 0
+    while not episodes.finished:
+        for _ in range(pacer.due()):
+            episodes.step()
+        if not console.process(bridge.faults):
             return
-        if bridge.faults.die:
+        if bridge.faults.crash:
             os._exit(1)
-        if config.json and len(stage.outcomes) > written:
-            written = len(stage.outcomes)
-            outcomes = [record(outcome) for outcome in stage.outcomes]
-            write_report(config.json, outcomes, durable=False)  # quickly: the robot waits
+        if config.json and len(episodes.outcomes) > written:
+            written = len(episodes.outcomes)
+            report = [outcome_json(outcome) for outcome in episodes.outcomes]
+            write_report(config.json, report, durable=False)  # an fsync would delay the robot
 
 
-class Pace:
-    """How many steps of 5 ms are due on a clock."""
+class StepPacer:
+    """Counts the steps of 5 ms that are due on a clock."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._next_ns = clock.now_ns()
 
     def due(self) -> int:
-        """Sleep until a step is due; how many are, at most `_MOST_BEHIND`."""
+        """Sleep until a step is due; returns the number of due steps, at most `_MAX_STEPS`."""
         self._clock.sleep_until(self._next_ns)
         steps = (self._clock.now_ns() - self._next_ns) // _STEP_NS + 1
         self._next_ns += steps * _STEP_NS
-        return min(int(steps), _MOST_BEHIND)
+        return min(int(steps), _MAX_STEPS)
 
 
 class Console:
-    """Words from the terminal, read by a thread of their own."""
+    """Commands from the terminal, read in a thread."""
 
     def __init__(self) -> None:
         self._lines: queue.SimpleQueue[str] = queue.SimpleQueue()
@@ -165,21 +161,21 @@ class Console:
         for line in sys.stdin:
             self._lines.put(line.strip())
 
-    def obeyed(self, faults: Faults) -> bool:
-        """Do what has been said since; false: to end."""
+    def process(self, faults: InjectedFaults) -> bool:
+        """Execute the commands since the last call; False: the user wants to end."""
         while not self._lines.empty():
             line = self._lines.get()
             if line == "quit":
                 return False
             try:
-                _say(faults.obey(line))
+                _print(faults.apply(line))
             except UsageError as error:
-                _say(str(error))
+                _print(str(error))
         return True
 
 
-def record(outcome: EpisodeOutcome) -> dict[str, Any]:
-    """An outcome for a JSON file."""
+def outcome_json(outcome: EpisodeOutcome) -> dict[str, Any]:
+    """An outcome as JSON."""
     return {
         "task": outcome.scenario.task,
         "episode": outcome.scenario.episode,
@@ -192,13 +188,7 @@ def record(outcome: EpisodeOutcome) -> dict[str, Any]:
     }
 
 
-def _sum_up(outcomes: Sequence[EpisodeOutcome]) -> None:
-    if outcomes:
-        won = sum(outcome.success for outcome in outcomes)
-        _say(f"{len(outcomes)} episodes, {won} successes")
-
-
-def _say(line: str) -> None:
+def _print(line: str) -> None:
     echo(f"{PROG}: {line}")
 
 

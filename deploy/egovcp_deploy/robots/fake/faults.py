@@ -1,4 +1,4 @@
-"""What can be made to go wrong with the fake robot, and the words that do it."""
+"""Faults of the fake G1, and the console commands that set them."""
 
 from __future__ import annotations
 
@@ -8,132 +8,106 @@ from typing import Final
 from egovcp.errors import UsageError, suggest
 from egovcp.spec import JOINT_NAMES
 
-_PUSH: Final = (-2.5, 1.0)  # m/s: nothing stands that
-_WEAKEST: Final = JOINT_NAMES.index("left_ankle_roll_joint")  # overheats first on real robots
+_PUSH: Final = (-2.5, 1.0)  # m/s: no controller withstands it
+_DEFAULT_JOINT: Final = JOINT_NAMES.index("left_ankle_roll_joint")  # overheats first on real robots
 _HOT: Final = 125.0  # deg C
 
 
 @dataclass
-class Faults:
-    """All off. Set from outside at any time."""
+class InjectedFaults:
+    """Faults of the fake G1, all off by default. May be changed at any time."""
 
     freeze_state: bool = False
-    """The same state again and again, as from a driver that hangs."""
+    """Repeat the last state, as a driver that hangs."""
     mute_state: bool = False
-    """No states."""
-    garble_state: bool = False
-    """Every second state is torn."""
+    """Send no states."""
+    truncate_state: bool = False
+    """Cut every second state in half."""
     freeze_camera: bool = False
-    """The same picture again and again."""
+    """Repeat the last image."""
     mute_camera: bool = False
-    """No pictures."""
+    """Send no images."""
     drop: float = 0.0
-    """Share of states and pictures that are lost."""
-    deaf: bool = False
-    """Commands are not heard."""
+    """Share of states and images that are lost."""
+    ignore_commands: bool = False
     announce: bool = False
-    """States tell of one more program that sends commands."""
-    intruder: bool = False
-    """Another program holds every joint where it is, and nothing tells of it."""
+    """Report one more program that sends commands."""
+    other_publisher: bool = False
+    """Another program holds every joint where it is, without being reported."""
     mode: int | None = None
-    """The robot reports another mode machine."""
+    """Report this mode machine."""
     hot_motor: tuple[int, float] | None = None
-    """A joint's motor reports this temperature, deg C (of its winding, where it reports two)."""
+    """Joint whose motor reports this temperature, deg C (of its winding, if it reports two)."""
     dropped_motor: int | None = None
-    """A joint's motor no longer obeys: no torque. Without detailed states nothing tells of it."""
-    no_temperature: bool = False
-    """States carry no temperatures, as from older firmware."""
-    gyroscope: float = 0.0
-    """The gyroscope's x axis reports this rate, rad/s, whatever the robot does."""
-    joint_speed: float = 0.0
-    """The left knee reports this speed, rad/s, whatever it does."""
-    flood: int = 0
-    """Messages of 2 kB of garbage on the state port, for each state."""
-    push: tuple[float, float] | None = None
+    """Joint whose motor gives no torque. Only detailed states report it."""
+    push: tuple[float, ...] | None = None
     """Change of the base's velocity, m/s, world x and y; happens once."""
     release: bool = False
-    """The crane lets go, once."""
-    die: bool = False
-    """The fake ends at once, without a word on the wire."""
+    """The gantry releases the robot, once."""
+    crash: bool = False
+    """The process ends at once, without sending anything."""
 
     @property
     def active(self) -> list[str]:
-        """Names of those that are on."""
+        """Names of the faults that are on."""
         return [f.name for f in fields(self) if getattr(self, f.name) != f.default]
 
-    def obey(self, line: str) -> str:
-        """Do what a line of the console says; return what to answer.
+    def apply(self, line: str) -> str:
+        """Execute a line of the console; returns the answer. An empty line is ``release``.
 
         Raises:
-            UsageError: it says nothing that is known.
+            UsageError: the line is not a known command.
         """
         word, *rest = line.split() or ["release"]
-        if word == "heal":
-            self.__init__()  # type: ignore[misc]
+        if word not in FAULT_COMMANDS:
+            raise UsageError(f"unknown {word!r}{suggest(word, FAULT_COMMANDS)}")
+        if word == "clear":
+            self._reset(*(f.name for f in fields(self)))
+        elif rest == ["off"]:
+            self._reset(word)
         elif word == "push":
-            self.push = _pair(rest) if rest else _PUSH
-        elif word in ("hot_motor", "dropped_motor"):
-            self._set_motor(word, rest)
-        elif word in _NUMBERS:
-            self._set_number(word, rest)
-        elif word in _SWITCHES:
-            setattr(self, word, rest != ["off"])
+            self.push = tuple(_numbers(rest, "push 0.5 0", 2)) if rest else _PUSH
+        elif word == "dropped_motor":
+            self.dropped_motor = _joint(rest)
+        elif word == "hot_motor":
+            degrees = _numbers(rest[1:], "hot_motor left_knee 125", 1) if rest[1:] else [_HOT]
+            self.hot_motor = _joint(rest), degrees[0]
+        elif word == "drop":
+            self.drop = _numbers(rest, "drop 0.5", 1, high=1.0)[0]
+        elif word == "mode":
+            self.mode = int(_numbers(rest, "mode 6", 1, high=255.0)[0])
         else:
-            raise UsageError(f"unknown {word!r}{suggest(word, WORDS)}")
+            setattr(self, word, True)
         return f"faults: {', '.join(self.active) or 'none'}"
 
-    def _set_number(self, word: str, rest: list[str]) -> None:
-        kind, low, high, example = _NUMBERS[word]
-        if rest == ["off"]:
-            setattr(self, word, getattr(Faults(), word))
-            return
-        try:
-            number = float(rest[0])
-            setattr(self, word, kind(min(max(number, low), high)))
-        except (IndexError, ValueError) as error:
-            raise UsageError(f"{word} needs a number, such as {word} {example}") from error
-
-    def _set_motor(self, word: str, rest: list[str]) -> None:
-        if rest == ["off"]:
-            setattr(self, word, None)
-            return
-        joint = _joint(rest[0]) if rest else _WEAKEST
-        if word == "dropped_motor":
-            self.dropped_motor = joint
-            return
-        try:
-            self.hot_motor = joint, float(rest[1]) if len(rest) > 1 else _HOT
-        except ValueError as error:
-            raise UsageError(
-                "hot_motor takes a joint and deg C, such as hot_motor left_knee_joint 125"
-            ) from error
+    def _reset(self, *names: str) -> None:
+        for name in names:
+            setattr(self, name, getattr(InjectedFaults, name))
 
 
-def _joint(name: str) -> int:
-    """Index of a joint, whose ending ``_joint`` may be left out."""
+def _numbers(
+    words: list[str], example: str, count: int, *, high: float | None = None
+) -> list[float]:
+    """Parse ``count`` numbers, from 0 to ``high`` if that is given."""
+    try:
+        numbers = [float(word) for word in words]
+    except ValueError:
+        numbers = []
+    if len(numbers) == count and (high is None or all(0.0 <= n <= high for n in numbers)):
+        return numbers
+    limits = "" if high is None else f" from 0 to {high:g}"
+    raise UsageError(f"expected {count} number(s){limits}, such as {example}")
+
+
+def _joint(rest: list[str]) -> int:
+    """Index of a joint; the ending ``_joint`` may be omitted."""
+    if not rest:
+        return _DEFAULT_JOINT
     names = {joint.removesuffix("_joint"): i for i, joint in enumerate(JOINT_NAMES)}
-    found = names.get(name.removesuffix("_joint"))
+    found = names.get(rest[0].removesuffix("_joint"))
     if found is None:
-        raise UsageError(f"unknown joint {name!r}{suggest(name, names)}")
+        raise UsageError(f"unknown joint {rest[0]!r}{suggest(rest[0], names)}")
     return found
 
 
-def _pair(words: list[str]) -> tuple[float, float]:
-    try:
-        x, y = map(float, words)
-    except ValueError as error:
-        raise UsageError("push takes two velocities in m/s, such as push 0.5 0") from error
-    return x, y
-
-
-#: Word -> type, least, greatest and an example of its number.
-_NUMBERS: Final[dict[str, tuple[type[int] | type[float], float, float, str]]] = {
-    "drop": (float, 0.0, 1.0, "0.5"),
-    "mode": (int, 0, 255, "6"),
-    "gyroscope": (float, -1e6, 1e6, "150"),
-    "joint_speed": (float, -1e6, 1e6, "190"),
-    "flood": (int, 0, 1000, "20"),
-}
-_SWITCHES: Final = tuple(f.name for f in fields(Faults) if f.type == "bool")
-#: All that `Faults.obey` knows.
-WORDS: Final = (*_SWITCHES, *_NUMBERS, "hot_motor", "dropped_motor", "push", "heal")
+FAULT_COMMANDS: Final = (*(f.name for f in fields(InjectedFaults)), "clear")

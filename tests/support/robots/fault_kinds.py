@@ -1,4 +1,4 @@
-"""Every kind of fault that a live run is tested with, and what must come of it."""
+"""The faults that live runs are tested with, and the required reactions."""
 
 from __future__ import annotations
 
@@ -13,31 +13,32 @@ import numpy as np
 
 from egovcp.plan import PolicyStep
 from egovcp.spec import ACTION_DIM
-from egovcp_deploy.fault_injection import messages as m
-from egovcp_deploy.fault_injection.messages import Tamper
-from egovcp_deploy.fault_injection.proxy import Stream
-from egovcp_deploy.fault_injection.rig import FaultRig, answer_steadily, steady
 from egovcp_deploy.live.link import Order, encode_reply
 from egovcp_deploy.pilot.desk import Reply, Report
 from egovcp_deploy.pilot.states import Request
-from egovcp_deploy.robots.motor_fields import DISCONNECTED
+from egovcp_deploy.robots.wire import DISCONNECTED
+
+from . import fault_messages as m
+from .fault_messages import Alteration
+from .fault_rig import FaultRig, Planner, constant_plan, constant_reply
+from .stream_proxy import StreamFault
 
 Begin = Callable[[FaultRig], None]
 
 
 class Reaction(StrEnum):
-    """What must come of a fault."""
+    """Required reaction to a fault."""
 
     RUN = "run"
-    """It is bridged: never damped, never held for want of proprioception, and back in RUN."""
+    """Never damped, never held for missing proprioception, and in RUN afterwards."""
     HOLD = "hold"
-    """Held, not damped, and back in RUN when the fault is over."""
+    """Held, not damped, and in RUN afterwards."""
     DAMP = "damp"
-    """Damped within the limit of the last good reading."""
+    """Damped within the time limit after the last valid reading."""
     LATER = "later"
-    """Damped at some time: once the robot tilts, or once no more good states get through."""
+    """Damped at any time: once the robot tilts, or once no more valid states arrive."""
     ANY = "any"
-    """Not known here, or not the runner's to decide; only the commands are judged."""
+    """Any reaction; only the commands are checked."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +47,12 @@ class FaultKind:
 
     Args:
         name: unique.
-        reaction: what must come of it.
+        reaction: required.
         begin: starts it; called in the robot's thread, between two steps.
-        duration_s: how long it lasts, if it does not damp.
-        since_onset: whether times count from the onset, for faults that are not of the states;
-            else from the last good state.
-        reason: part of the reason that must be reported for HOLD or DAMP; empty: any.
+        duration_s: how long it lasts, unless the robot is damped before.
+        since_onset: whether times count from the onset, for faults that do not affect the states;
+            else from the last valid state.
+        reason: required part of the reason reported for HOLD or DAMP; empty: any.
     """
 
     name: str
@@ -63,24 +64,24 @@ class FaultKind:
 
 
 def _fault(name: str, value: object = True) -> Begin:
-    """One of the fake's own faults (`robots.fake.Faults`)."""
+    """Set one of `InjectedFaults`."""
     return lambda rig: setattr(rig.fake.faults, name, value)
 
 
-def _states(tamper: Tamper) -> Begin:
-    return lambda rig: setattr(rig.fake, "tamper_state", tamper)
+def _states(alteration: Alteration) -> Begin:
+    return lambda rig: setattr(rig.fake, "alter_state", alteration)
 
 
-def _states_anew(make: Callable[[], Tamper]) -> Begin:
-    """Likewise with a tamper that has a memory, made when the fault begins."""
-    return lambda rig: setattr(rig.fake, "tamper_state", make())
+def _stateful(make: Callable[[], Alteration]) -> Begin:
+    """As `_states`, with an alteration that has a state and is made when the fault begins."""
+    return lambda rig: setattr(rig.fake, "alter_state", make())
 
 
 def _replaced(*messages: bytes) -> Begin:
     return _states(lambda message: messages)
 
 
-def _instead(messages: Callable[[], Iterable[bytes]]) -> Begin:
+def _generated(messages: Callable[[], Iterable[bytes]]) -> Begin:
     return _states(lambda message: messages())
 
 
@@ -96,7 +97,7 @@ def _dropped(status: int, mode: int) -> Begin:
 
     def begin(rig: FaultRig) -> None:
         rig.fake.faults.dropped_motor = m.KNEE
-        rig.fake.tamper_state = lambda message: enabled(*motorstate(message))
+        rig.fake.alter_state = lambda message: enabled(*motorstate(message))
 
     return begin
 
@@ -108,11 +109,11 @@ def _number(number: str) -> Begin:
 _FULL_RATE: Final = 100  # messages per state, 20 000 a second
 
 
-def _stream(stream: Stream, tamper: Tamper | None = None) -> Begin:
+def _stream(fault: StreamFault, alteration: Alteration | None = None) -> Begin:
     def begin(rig: FaultRig) -> None:
-        rig.proxy.stream = stream
-        if tamper is not None:
-            rig.fake.tamper_state = tamper
+        rig.proxy.fault = fault
+        if alteration is not None:
+            rig.fake.alter_state = alteration
 
     return begin
 
@@ -121,10 +122,10 @@ _R, _H, _D, _ANY = Reaction.RUN, Reaction.HOLD, Reaction.DAMP, Reaction.ANY
 
 _STATES: Final = (
     FaultKind("state: silent", _D, _fault("mute_state")),
-    FaultKind("state: silent for 60 ms", _R, _states_anew(lambda: m.for_seconds(0.06, m.nothing))),
-    FaultKind("state: silent for 150 ms", _H, _states_anew(lambda: m.for_seconds(0.15, m.nothing))),
+    FaultKind("state: silent for 60 ms", _R, _stateful(lambda: m.for_seconds(0.06, m.nothing))),
+    FaultKind("state: silent for 150 ms", _H, _stateful(lambda: m.for_seconds(0.15, m.nothing))),
     FaultKind("state: frozen", _D, _fault("freeze_state")),
-    FaultKind("state: every second torn", _R, _fault("garble_state")),
+    FaultKind("state: every second torn", _R, _fault("truncate_state")),
     FaultKind("state: all torn", _D, _states(lambda message: (message[: len(message) // 2],))),
     FaultKind("state: 30 % lost", _R, _fault("drop", 0.3)),
     FaultKind("state: empty messages", _D, _replaced(b"")),
@@ -161,18 +162,18 @@ _STATES: Final = (
         _states(m.edited(m.imu("quaternion", lambda q: [2 * v for v in q]))),
     ),
 )
-_gyro: Final = m.edited(m.imu("gyroscope", lambda w: [150.0, *w[1:]]))
+_gyro: Final = m.edited(m.gyroscope(150.0))
 _speed: Final = m.edited(m.motor(m.KNEE, "dq", lambda v: 190.0))
 _jump: Final = m.edited(m.motor(m.KNEE, "q", lambda q: q + 0.5))
 _IMPLAUSIBLE: Final = (
-    FaultKind("gyroscope: 150 rad/s", _D, _fault("gyroscope", 150.0)),
-    FaultKind("gyroscope: 150 rad/s once", _R, _states_anew(lambda: m.once(_gyro))),
-    FaultKind("gyroscope: 150 rad/s at 50 Hz", _R, _states_anew(lambda: m.every(4, _gyro))),
-    FaultKind("gyroscope: 20 rad/s", _D, _fault("gyroscope", 20.0)),
-    FaultKind("joint speed: 190 rad/s", _D, _fault("joint_speed", 190.0)),
-    FaultKind("joint speed: 190 rad/s once", _R, _states_anew(lambda: m.once(_speed))),
-    FaultKind("joint speed: 190 rad/s at 50 Hz", _R, _states_anew(lambda: m.every(4, _speed))),
-    FaultKind("joint speed: 25 rad/s", _D, _fault("joint_speed", 25.0)),
+    FaultKind("gyroscope: 150 rad/s", _D, _states(_gyro)),
+    FaultKind("gyroscope: 150 rad/s once", _R, _stateful(lambda: m.once(_gyro))),
+    FaultKind("gyroscope: 150 rad/s at 50 Hz", _R, _stateful(lambda: m.every(4, _gyro))),
+    FaultKind("gyroscope: 20 rad/s", _D, _states(m.edited(m.gyroscope(20.0)))),
+    FaultKind("joint speed: 190 rad/s", _D, _states(_speed)),
+    FaultKind("joint speed: 190 rad/s once", _R, _stateful(lambda: m.once(_speed))),
+    FaultKind("joint speed: 190 rad/s at 50 Hz", _R, _stateful(lambda: m.every(4, _speed))),
+    FaultKind("joint speed: 25 rad/s", _D, _knee("dq", 25.0)),
     FaultKind(
         "joint speed: all +-190 rad/s",
         _D,
@@ -180,7 +181,7 @@ _IMPLAUSIBLE: Final = (
     ),
     FaultKind("joint position: 9 rad", _D, _knee("q", 9.0)),
     FaultKind("joint position: jumps by 0.5 rad", _D, _states(_jump)),
-    FaultKind("joint position: jumps by 0.5 rad once", _R, _states_anew(lambda: m.once(_jump))),
+    FaultKind("joint position: jumps by 0.5 rad once", _R, _stateful(lambda: m.once(_jump))),
     FaultKind(
         "joint position: all zero", _D, _states(m.edited(m.all_motors("q", lambda i, q: 0.0)))
     ),
@@ -189,7 +190,7 @@ _IMPLAUSIBLE: Final = (
     FaultKind(
         "torque: 900 N m once",
         _R,
-        _states_anew(lambda: m.once(m.edited(m.motor(m.KNEE, "tau_est", lambda t: 900.0)))),
+        _stateful(lambda: m.once(m.edited(m.motor(m.KNEE, "tau_est", lambda t: 900.0)))),
     ),
     FaultKind(
         "orientation: jumps by 0.8 rad", _D, _states(m.edited(m.imu("quaternion", m.rolled)))
@@ -197,17 +198,17 @@ _IMPLAUSIBLE: Final = (
     FaultKind(
         "orientation: jumps by 0.8 rad once",
         _R,
-        _states_anew(lambda: m.once(m.edited(m.imu("quaternion", m.rolled)))),
+        _stateful(lambda: m.once(m.edited(m.imu("quaternion", m.rolled)))),
     ),
     FaultKind("mode machine: 5 to 6", _D, _fault("mode", 6)),
     FaultKind("mode machine: 5 to 4", _D, _fault("mode", 4)),
     FaultKind(
         "mode machine: 0 once",
         _R,
-        _states_anew(lambda: m.once(m.edited(m.set_field("mode_machine", 0)))),
+        _stateful(lambda: m.once(m.edited(m.set_field("mode_machine", 0)))),
     ),
 )
-_OVERHEATED: Final = 0x200  # status bits, see `motor_fields.MOTOR_STATUS_BITS`
+_OVERHEATED: Final = 0x200  # status bits, see `wire.MOTOR_STATUS_BITS`
 
 
 def _motor(
@@ -226,7 +227,7 @@ _MOTORS: Final = (
         1.0,
     ),
     _motor("status overheated", _H, _knee("motorstate", _OVERHEATED), "winding overheating", 1.0),
-    _motor("no temperatures", _R, _fault("no_temperature")),
+    _motor("no temperatures", _R, _states(m.edited(m.without_motor_fields("temperature")))),
     _motor("temperature 900 deg C", _R, _knee("temperature", [900, 900])),
     _motor(
         "no status, mode and temperature",
@@ -243,16 +244,18 @@ _MOTORS: Final = (
     ),
 )
 _FLOODS: Final = (
-    FaultKind("flood: 2 kB garbage, 40 per 10 ms", _R, _fault("flood", 20)),
-    FaultKind("flood: the same without states", _D, _instead(lambda: m.garbage(20))),
+    FaultKind(
+        "flood: 2 kB garbage, 40 per 10 ms", _R, _states(m.followed_by(lambda: m.garbage(20)))
+    ),
+    FaultKind("flood: the same without states", _D, _generated(lambda: m.garbage(20))),
     FaultKind(
         "flood: garbage at full rate", _ANY, _states(m.followed_by(lambda: m.garbage(_FULL_RATE)))
     ),
     FaultKind(
-        "flood: the same without states, full rate", _D, _instead(lambda: m.garbage(_FULL_RATE))
+        "flood: the same without states, full rate", _D, _generated(lambda: m.garbage(_FULL_RATE))
     ),
-    FaultKind("flood: 30 kB of valid JSON without states", _D, _instead(lambda: m.valid_json(5))),
-    FaultKind("flood: one state repeated", _D, _states_anew(lambda: m.repeats())),
+    FaultKind("flood: 30 kB of valid JSON without states", _D, _generated(lambda: m.valid_json(5))),
+    FaultKind("flood: one state repeated", _D, _stateful(lambda: m.repeats())),
     FaultKind(
         "flood: oversized messages",
         Reaction.LATER,
@@ -260,45 +263,47 @@ _FLOODS: Final = (
     ),
     FaultKind("flood: oversized without states", _D, _replaced(*[b"x" * 200_000] * 4)),
     FaultKind(
-        "flood: garbage in split packets", _D, _stream(Stream.SPLIT, lambda message: m.garbage(4))
+        "flood: garbage in split packets",
+        _D,
+        _stream(StreamFault.SPLIT, lambda message: m.garbage(4)),
     ),
-    FaultKind("connection: split packets", _R, _stream(Stream.SPLIT)),
-    FaultKind("connection: 20 kB/s", _D, _stream(Stream.SLOW)),
-    FaultKind("connection: stalls", _D, _stream(Stream.STALL)),
-    FaultKind("connection: cut, port closed", _D, _stream(Stream.CUT)),
+    FaultKind("connection: split packets", _R, _stream(StreamFault.SPLIT)),
+    FaultKind("connection: 20 kB/s", _D, _stream(StreamFault.SLOW)),
+    FaultKind("connection: stalls", _D, _stream(StreamFault.STALL)),
+    FaultKind("connection: cut, port closed", _D, _stream(StreamFault.CUT)),
 )
 
 
-def _pictures(tamper: Tamper) -> Begin:
-    return lambda rig: setattr(rig.fake, "tamper_picture", tamper)
+def _images(alteration: Alteration) -> Begin:
+    return lambda rig: setattr(rig.fake, "alter_image", alteration)
 
 
-def _picture(name: str, reaction: Reaction, begin: Begin) -> FaultKind:
-    return FaultKind(f"picture: {name}", reaction, begin, since_onset=True)
+def _image(name: str, reaction: Reaction, begin: Begin) -> FaultKind:
+    return FaultKind(f"image: {name}", reaction, begin, since_onset=True)
 
 
-_PICTURES: Final = (
-    _picture("silent", _H, _fault("mute_camera")),
-    _picture("frozen", _H, _fault("freeze_camera")),
-    _picture("cut short", _H, _pictures(lambda message: (message[:-100],))),
-    _picture("wrong checksum", _H, _pictures(m.bad_checksum)),
-    _picture("another field of view", _H, _pictures(m.wrong_field_of_view)),
-    _picture("garbage", _H, _pictures(lambda message: m.garbage(1))),
-    _picture("flood of garbage", _R, _pictures(m.followed_by(lambda: m.garbage(20)))),
-    _picture("oversized", _H, _pictures(lambda message: (message * 20,))),
+_IMAGES: Final = (
+    _image("silent", _H, _fault("mute_camera")),
+    _image("frozen", _H, _fault("freeze_camera")),
+    _image("cut short", _H, _images(lambda message: (message[:-100],))),
+    _image("wrong checksum", _H, _images(m.bad_checksum)),
+    _image("another field of view", _H, _images(m.wrong_field_of_view)),
+    _image("garbage", _H, _images(lambda message: m.garbage(1))),
+    _image("flood of garbage", _R, _images(m.followed_by(lambda: m.garbage(20)))),
+    _image("oversized", _H, _images(lambda message: (message * 20,))),
 )
 
 
-def _planner(answer: Callable[[Report], list[list[bytes]]]) -> Begin:
-    return lambda rig: setattr(rig, "answer", answer)
+def _planner(planner: Planner) -> Begin:
+    return lambda rig: setattr(rig, "planner", planner)
 
 
-def _planner_anew(make: Callable[[], Callable[[Report], list[list[bytes]]]]) -> Begin:
-    """Likewise with an answer that has a memory, made when the fault begins."""
-    return lambda rig: setattr(rig, "answer", make())
+def _stateful_planner(make: Callable[[], Planner]) -> Begin:
+    """As `_planner`, with a planner that has a state and is made when the fault begins."""
+    return lambda rig: setattr(rig, "planner", make())
 
 
-def _plan_of(value: float) -> Callable[[Report], list[list[bytes]]]:
+def _plan_of(value: float) -> Planner:
     return lambda report: [encode_reply(_filled(report, np.full((1, 4, ACTION_DIM), value)))]
 
 
@@ -307,37 +312,33 @@ def _filled(report: Report, plan: np.ndarray[Any, np.dtype[np.floating[Any]]]) -
     return Reply(report.tick, PolicyStep(values[:, 0], values, iterations=1), 1.0)
 
 
-def _shaking() -> Callable[[Report], list[list[bytes]]]:
+def _shaking() -> Planner:
     rng = np.random.default_rng(0)
     return lambda report: [
         encode_reply(_filled(report, rng.choice([-1.0, 1.0], (1, 4, ACTION_DIM))))
     ]
 
 
-def _late(ticks: int) -> Callable[[Report], list[list[bytes]]]:
+def _late(ticks: int) -> Planner:
     waiting: list[list[bytes]] = []
 
     def answer(report: Report) -> list[list[bytes]]:
-        waiting.append(encode_reply(steady(report)))
+        waiting.append(encode_reply(constant_reply(report)))
         return [waiting.pop(0)] if len(waiting) > ticks else []
 
     return answer
 
 
 def _shifted(report: Report) -> list[list[bytes]]:
-    return [encode_reply(Reply(report.tick + 1000, steady(report).step, 1.0))]
+    return [encode_reply(Reply(report.tick + 1000, constant_reply(report).step, 1.0))]
 
 
-def _told(*orders: Order) -> Begin:
-    def begin(rig: FaultRig) -> None:
-        for order in orders:
-            rig.order(order)
-
-    return begin
+def _order(order: Order) -> Begin:
+    return lambda rig: rig.order(order)
 
 
 def _flood_of_messages(rig: FaultRig) -> None:
-    rig.answer = lambda report: [*([g] for g in m.garbage(100)), *answer_steadily(report)]
+    rig.planner = lambda report: [*([g] for g in m.garbage(100)), *constant_plan(report)]
 
 
 def _pressed(*buttons: str) -> Begin:
@@ -350,7 +351,7 @@ def _other(name: str, reaction: Reaction, begin: Begin, duration_s: float = 0.5)
 
 _OTHERS: Final = (
     _other("planner: silent", _H, _planner(lambda report: [])),
-    _other("planner: 200 ms late", _H, _planner_anew(lambda: _late(5))),
+    _other("planner: 200 ms late", _H, _stateful_planner(lambda: _late(5))),
     _other("planner: plans NaN", _H, _planner(_plan_of(np.nan)), 0.6),
     _other("planner: plans Infinity", _H, _planner(_plan_of(np.inf)), 0.6),
     _other("planner: plans 1e30", _R, _planner(_plan_of(1e30))),
@@ -358,9 +359,9 @@ _OTHERS: Final = (
     _other("planner: answers garbage", _H, _planner(lambda report: [m.garbage(1), [b"", b""]])),
     _other("planner: answers of other ticks", _H, _planner(_shifted)),
     _other("planner: flood of messages", _ANY, _flood_of_messages),
-    _other("operator: velocity NaN", _R, _told(Order(velocity=(np.nan,) * 3))),
-    _other("operator: velocity 1e9", _R, _told(Order(velocity=(1e9,) * 3))),
-    _other("operator: emergency stop", _D, _told(Order(Request.ESTOP))),
+    _other("operator: velocity NaN", _R, _order(Order(velocity=(np.nan,) * 3))),
+    _other("operator: velocity 1e9", _R, _order(Order(velocity=(1e9,) * 3))),
+    _other("operator: emergency stop", _D, _order(Order(Request.ESTOP))),
     _other("remote control: emergency stop", _D, _pressed("L1", "B")),
     _other(
         "remote control: sticks NaN",
@@ -369,8 +370,8 @@ _OTHERS: Final = (
     ),
     _other("robot: pushed", _R, _fault("push", (0.2, 0.0))),
     _other("robot: pushed over", Reaction.LATER, _fault("push", (-2.5, 1.0)), 3.0),
-    _other("robot: hears no commands", Reaction.LATER, _fault("deaf"), 4.0),
-    _other("robot: another program commands it", _ANY, _fault("intruder")),
+    _other("robot: ignores commands", Reaction.LATER, _fault("ignore_commands"), 4.0),
+    _other("robot: another program sends commands", _ANY, _fault("other_publisher")),
 )
 
 
@@ -392,8 +393,8 @@ FAULTS: Final = (
     *_IMPLAUSIBLE,
     *_MOTORS,
     *_FLOODS,
-    *_PICTURES,
+    *_IMAGES,
     *_OTHERS,
     *_PROCESSES,
 )
-"""All kinds; names are unique."""
+"""All faults; names are unique."""

@@ -1,12 +1,13 @@
-"""A live run that faults are injected into: fake G1, wire, control process, scripted planner.
+"""A live run for fault injection: fake G1, ZMQ, control process, scripted planner.
 
-The control process is the real one, in a process of its own; here its robot is simulated on the
-wall clock, its planner answers every report, and every command that it sends is recorded.
+The control process is the real one. In this process its robot is simulated in real time, its
+planner answers every report, and every command that it sends is recorded.
 """
 
 from __future__ import annotations
 
 import gc
+import multiprocessing
 import os
 import signal
 import threading
@@ -15,6 +16,7 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from multiprocessing.process import BaseProcess
 from typing import Final
 
 import numpy as np
@@ -27,41 +29,54 @@ from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import DAMPED, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
-from egovcp_deploy.fault_injection.forked import start_control_process
-from egovcp_deploy.fault_injection.proxy import Proxy, Stream
 from egovcp_deploy.live.guard import Guard, spare_body
 from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions
 from egovcp_deploy.live.link import Link, Order, decode_report, encode_order, encode_reply
 from egovcp_deploy.live.priority import RECEIVING, raised_priority
-from egovcp_deploy.live.process import ControlSetup
+from egovcp_deploy.live.process import ControlSetup, control_process
 from egovcp_deploy.live.run_folder import run_folder
 from egovcp_deploy.pilot.desk import Reply, Report
 from egovcp_deploy.pilot.states import Limits, Request, State
 from egovcp_deploy.robots.bridge import BridgeConfig
-from egovcp_deploy.robots.fake import FakeBridge, Faults, Ports
-from egovcp_deploy.robots.fake.command import Pace
-from egovcp_deploy.robots.wire import Garbled, decode_command
-from egovcp_deploy.robots.zmq_eye import ZmqEyeConfig
+from egovcp_deploy.robots.fake import FakeBridge, InjectedFaults, Ports
+from egovcp_deploy.robots.fake.command import StepPacer
+from egovcp_deploy.robots.wire import MalformedMessage, decode_command
+from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
+
+from .stream_proxy import StreamFault, StreamProxy
 
 Array = NDArray[np.float64]
-Answer = Callable[[Report], list[list[bytes]]]
+Planner = Callable[[Report], list[list[bytes]]]
+"""Report -> the messages that are sent as an answer."""
 
 LIMITS: Final = Limits(stand_s=0.1, recover_s=0.2)
 _START_S: Final = 60.0
 _STARTS: Final = 5
-_REPORT_S: Final = 0.1  # for the report that says why
+_REPORT_S: Final = 0.1  # until the report with the reason arrives
+
+_FORKSERVER: Final = multiprocessing.get_context("forkserver")
+# Each child imports the main module again, so its imports are preloaded as well.
+_FORKSERVER.set_forkserver_preload(
+    [
+        __name__,
+        "egovcp_deploy.live.process",
+        "egovcp.robot.controllers",
+        "egovcp.sim.live",
+        "pytest",
+    ]
+)
 
 
 @dataclass(frozen=True)
-class Command:
+class ReceivedCommand:
     """One message on the command port."""
 
     time_ns: int
     position: Array | None
-    """(29,) rad; None: it was no command."""
+    """(29,) rad; None: the message was malformed."""
     damped: bool
-    """Whether no motor is told to hold anything."""
-    sound: bool
+    """Whether the stiffness of all motors is zero."""
+    valid: bool
     """Whether it is finite and within the bounds of the joints' targets."""
 
 
@@ -72,7 +87,7 @@ class Observed:
     modes: list[tuple[int, str]] = field(default_factory=list)
     """(time, state) of each report."""
     events: list[str] = field(default_factory=list)
-    commands: list[Command] = field(default_factory=list)
+    commands: list[ReceivedCommand] = field(default_factory=list)
     onset_ns: int = 0
     """When the fault began."""
     last_good_ns: int = 0
@@ -80,49 +95,52 @@ class Observed:
 
     @property
     def damped_ns(self) -> int | None:
-        """When the first command that damps arrived; None: none did."""
+        """When the first damping command arrived; None: none did."""
         return next((c.time_ns for c in self.commands if c.damped), None)
 
     @property
     def held_ns(self) -> int | None:
-        """When the first report from HOLD was made, to 40 ms; None: none was."""
+        """When the first report from HOLD was made, a multiple of 40 ms; None: none was."""
         return next((t for t, mode in self.modes if mode == State.HOLD), None)
 
     @property
-    def greatest_change(self) -> float:
-        """Greatest change of a target between two commands, rad."""
+    def max_change(self) -> float:
+        """Largest change of a target between two commands, rad."""
         following = [c.position for c in self.commands if not c.damped and c.position is not None]
         if len(following) < 2:
             return 0.0
         return float(np.abs(np.diff(np.stack(following), axis=0)).max())
 
 
-def steady(report: Report, level: float = 0.3) -> Reply:
+def constant_reply(report: Report, level: float = 0.3) -> Reply:
     """A plan that reaches a little, with the pelvis at its neutral height."""
     plan = np.full((1, 4, ACTION_DIM), level, np.float32)
     plan[..., -1] = 0.0
     return Reply(report.tick, PolicyStep(plan[:, 0], plan, iterations=1), 1.0)
 
 
-def answer_steadily(report: Report) -> list[list[bytes]]:
-    """What a planner without faults sends for a report."""
-    return [encode_reply(steady(report))]
+def constant_plan(report: Report) -> list[list[bytes]]:
+    """Answer of a planner without faults."""
+    return [encode_reply(constant_reply(report))]
+
+
+def _run_control_process(setup: ControlSetup) -> None:
+    control_process(replace(setup, parent=os.getppid()))  # the fork server
 
 
 class FaultRig:
-    """Starts runs and lets things go wrong in them. Close it afterwards."""
+    """Starts live runs and injects faults into them. Close it afterwards."""
 
     def __init__(self) -> None:
         quiet = EpisodeConfig(empty_probability=1.0)  # never begins: there is no time limit
         self._robot = LiveRobot(EnvConfig(controller="stance", ball_episode=quiet))
         self._robot.start(Scenario("ball", 0, 0))
         free = Ports(command_port=0, state_port=0, camera_port=0)
-        with raised_priority(RECEIVING):  # a robot has computers of its own
+        with raised_priority(RECEIVING):  # a real robot has its own computers
             self.fake = FakeBridge(self._robot, free, detailed=True)
-            self.proxy = Proxy(self.fake.ports.state_port)
+            self.proxy = StreamProxy(self.fake.ports.state_port)
         self.fake.on_command = self._record
-        self.answer: Answer = answer_steadily
-        """The planner: messages to send for a report."""
+        self.planner: Planner = constant_plan
         self._tasks: deque[tuple[Callable[[], None], threading.Event]] = deque()
         self._outbox: deque[list[bytes]] = deque()
         self._observed = Observed()
@@ -138,9 +156,9 @@ class FaultRig:
 
     # --- the robot's thread --------------------------------------------------------------
     def _simulate(self) -> None:
-        pace = Pace(MonotonicClock())
+        pacer = StepPacer(MonotonicClock())
         while not self._closing.is_set():
-            for _ in range(pace.due()):
+            for _ in range(pacer.due()):
                 while self._tasks:
                     task, done = self._tasks.popleft()
                     task()
@@ -159,12 +177,14 @@ class FaultRig:
         now = time.monotonic_ns()
         try:
             motors = decode_command(message).motors
-        except Garbled:
-            self._observed.commands.append(Command(now, None, damped=False, sound=False))
-            return
-        inside = (motors.position >= TARGET_LOW - 1e-6) & (motors.position <= TARGET_HIGH + 1e-6)
-        damped = not motors.stiffness.any()
-        self._observed.commands.append(Command(now, motors.position, damped, bool(inside.all())))
+        except MalformedMessage:
+            command = ReceivedCommand(now, None, damped=False, valid=False)
+        else:
+            target = motors.position
+            inside = (target >= TARGET_LOW - 1e-6) & (target <= TARGET_HIGH + 1e-6)
+            damped = not motors.stiffness.any()
+            command = ReceivedCommand(now, target, damped, valid=bool(inside.all()))
+        self._observed.commands.append(command)
 
     # --- the planner's thread ------------------------------------------------------------
     def _plan(self, link: Link, ending: threading.Event) -> None:
@@ -178,13 +198,13 @@ class FaultRig:
                 self._mode = report.mode
                 self._observed.modes.append((report.time_ns, report.mode))
                 self._observed.events += report.events
-                for message in self.answer(report):
+                for message in self.planner(report):
                     link.send(message)
 
     # --- a run ---------------------------------------------------------------------------
     @property
     def mode(self) -> str:
-        """State of the state machine as reported last; empty: nothing was reported."""
+        """Last reported state of the state machine; empty: no report yet."""
         return self._mode
 
     @property
@@ -193,17 +213,17 @@ class FaultRig:
         return self._session is not None and self._mode == State.RUN and self.process.is_alive()
 
     def ensure_running(self) -> None:
-        """From wherever the run is, to RUN, on the robot's own feet."""
+        """Bring the run to RUN with the robot on its feet, from any state."""
         if self.running and self._robot.robot.pelvis_height > 0.6:
             return None
         for attempt in range(_STARTS):
             self.end_run()
-            self.heal()
+            self.clear_faults()
             self.in_robot(self._hang_up)
             self._session = ExitStack()
             try:
                 return self._start(self._session)
-            except RuntimeError:  # a machine that is busy starting things
+            except RuntimeError:  # a busy machine
                 if attempt == _STARTS - 1:
                     raise
             except BaseException:
@@ -219,8 +239,8 @@ class FaultRig:
     def _start(self, stack: ExitStack) -> None:
         ports, fov = self.fake.ports, self._robot.config.camera.vertical_fov
         bridge = BridgeConfig(state_port=self.proxy.port, command_port=ports.command_port)
-        eye = ZmqEyeConfig(port=ports.camera_port, vertical_fov=fov)
-        hardware = HardwareOptions(bridge, replace(CameraOptions(), server=eye))
+        camera = ZmqCameraConfig(port=ports.camera_port, vertical_fov=fov)
+        hardware = HardwareOptions(bridge, replace(CameraOptions(), server=camera))
         address = f"ipc://{stack.enter_context(run_folder())}/link"
         with raised_priority(RECEIVING):
             link = Link(address, serve=True)
@@ -229,7 +249,11 @@ class FaultRig:
         spare = stack.enter_context(spare_body(bridge))
         setup = ControlSetup(address, hardware, "stance", LIMITS, os.getpid())
         self._mode, self._ending = "", False
-        self.process = start_control_process(setup)
+        self.process: BaseProcess = _FORKSERVER.Process(
+            target=_run_control_process, args=(setup,), daemon=True
+        )
+        with raised_priority(RECEIVING):  # inherited by the fork server
+            self.process.start()
         stack.callback(self._end_process)
         guard = Guard(self.process, spare, lambda: self._ending)
         stack.callback(guard.join_if_acting)
@@ -251,14 +275,14 @@ class FaultRig:
 
     def _reach(self, request: Request, target: State) -> None:
         deadline = time.monotonic() + _START_S
-        ask = 0.0
+        next_request = 0.0
         while self._mode != target:
             now = time.monotonic()
             if now > deadline or (self._mode == State.DAMP and target is not State.DAMP):
-                raise RuntimeError(f"{self._mode or 'silent'}: {self._observed.events[-3:]}")
-            if self._mode and now > ask:
+                raise RuntimeError(f"{self._mode or 'no report'}: {self._observed.events[-3:]}")
+            if self._mode and now > next_request:
                 self.order(Order(request))
-                ask = now + 0.04
+                next_request = now + 0.04
             time.sleep(0.005)
 
     def _end_process(self) -> None:
@@ -269,26 +293,23 @@ class FaultRig:
         self.process.join()
 
     def order(self, order: Order) -> None:
-        """What the operator says."""
-        self.send(encode_order(order))
+        """Send an order of the operator."""
+        self._outbox.append(encode_order(order))
 
-    def send(self, *messages: list[bytes]) -> None:
-        """Messages from the planner's process."""
-        self._outbox += messages
-
-    def heal(self) -> None:
+    def clear_faults(self) -> None:
         """End every fault."""
-        self.proxy.stream = Stream.PASS
-        self.answer = answer_steadily
-        self.in_robot(self._heal_robot)
+        self.proxy.fault = StreamFault.PASS
+        self.planner = constant_plan
+        self.in_robot(self._clear_robot_faults)
 
-    def _heal_robot(self) -> None:
-        self.fake.faults = Faults()
+    def _clear_robot_faults(self) -> None:
+        self.fake.faults = InjectedFaults()
         self.fake.pressed = frozenset()
-        self.fake.tamper_state = self.fake.tamper_picture = lambda message: (message,)
+        self.fake.alter_state = self.fake.alter_image = lambda message: (message,)
 
     def observe(self, begin: Callable[[], None], over: Callable[[Observed], bool]) -> Observed:
-        """Let ``begin`` start a fault, between two steps of the robot, until ``over``."""
+        """Start a fault with ``begin``, between two steps of the robot, and observe until
+        ``over``."""
         observed = Observed()
 
         def start() -> None:

@@ -1,4 +1,4 @@
-"""The lock-step body: a control loop on its clock is the one that runs on hardware."""
+"""The simulated low-level robot in lock-step is repeatable bit for bit."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from egovcp.robot.controllers import make_controller
 from egovcp.sim.live import EpisodeOutcome, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX
-from egovcp_deploy.robots.body import MotorCommand
-from egovcp_deploy.robots.fake.stage import Schedule, Stage
-from egovcp_deploy.robots.proprioception import proprioception
-from egovcp_deploy.robots.sim_body import SimBody, SimClock
+from egovcp_deploy.robots.base import MotorCommand, proprioception
+from egovcp_deploy.robots.fake.episodes import EpisodeSchedule, EpisodeSequencer
+from tests.support.robots.sim_low_level import SimClock, SimLowLevelRobot
 
 NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
 
@@ -20,30 +19,30 @@ NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
 def play(live: LiveRobot) -> tuple[list[EpisodeOutcome], list[np.ndarray]]:
     """One ball, under a controller at 50 Hz."""
     live.start(Scenario("ball", 4, 0))
-    body = SimBody(live)
-    stage = Stage(
+    body = SimLowLevelRobot(live)
+    episodes = EpisodeSequencer(
         body,
         lambda n: Scenario("ball", 4, 0) if n == 0 else None,
-        Schedule(gantry=0.3, settle=0.3, pause=0.0),
+        EpisodeSchedule(gantry=0.3, settle=0.3, pause=0.0),
     )
-    clock = SimClock(stage.step)
+    clock = SimClock(episodes.step)
     rate = FixedRate(50, clock)
     controller = make_controller("stance")
     controller.reset(proprioception(body.read(), NEUTRAL)[None])
     rate.start()
     trace: list[np.ndarray] = []
-    while not stage.finished:
+    while not episodes.finished:
         state = body.read()
         assert state.time_ns == clock.now_ns() == body.time_ns
         target = controller.step(proprioception(state, NEUTRAL)[None])[0]
         body.write(MotorCommand(target, controller.stiffness, controller.damping, mode=state.mode))
-        picture = body.eye.read()
+        picture = body.camera.read()
         age = clock.now_ns() - picture.time_ns
         assert 0 <= age <= (25_000_000 if clock.now_ns() > 200_000_000 else 200_000_000)
         trace += [state.joint_position, picture.depth]
         rate.wait()
     assert rate.counters.overruns == 0
-    return stage.outcomes, trace
+    return episodes.outcomes, trace
 
 
 def test_a_rollout_in_lockstep_repeats_bit_for_bit(live: LiveRobot) -> None:
@@ -57,7 +56,7 @@ def test_a_rollout_in_lockstep_repeats_bit_for_bit(live: LiveRobot) -> None:
 
 def test_a_reading_is_measured_once_per_step(live: LiveRobot) -> None:
     live.start(Scenario("ball", 0, 0))
-    body = SimBody(live)
+    body = SimLowLevelRobot(live)
     first = body.read()
     assert body.read() is first
     body.step()
@@ -65,7 +64,7 @@ def test_a_reading_is_measured_once_per_step(live: LiveRobot) -> None:
     assert body.read().time_ns == 5_000_000
 
 
-def test_the_clock_lives_in_whole_steps() -> None:
+def test_sim_clock_takes_whole_steps() -> None:
     steps: list[int] = []
     clock = SimClock(lambda: steps.append(1))
     clock.sleep_until(12_000_000)

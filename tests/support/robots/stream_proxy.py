@@ -1,4 +1,4 @@
-"""A TCP proxy between a publisher and its subscriber that damages the stream of bytes."""
+"""A TCP proxy between a publisher and its subscriber that damages the byte stream."""
 
 from __future__ import annotations
 
@@ -17,22 +17,23 @@ _SLOW_BYTES: Final = 40  # per 2 ms: 20 kB/s, three states a second
 _POLL_S: Final = 0.02
 
 
-class Stream(StrEnum):
-    """What happens to the bytes on their way to the subscriber."""
+class StreamFault(StrEnum):
+    """What the proxy does to the bytes sent to the subscriber."""
 
     PASS = "pass"
+    """Forwarded unchanged."""
     SPLIT = "split"
     """Sent in pieces of 64 bytes."""
     SLOW = "slow"
     """20 kB/s."""
     STALL = "stall"
-    """Nothing is passed on; the connection stays open."""
+    """Nothing is forwarded; the connection stays open."""
     CUT = "cut"
     """The connection is reset, and new ones are refused."""
 
 
-class Proxy:
-    """Listens on a free port of the loopback and connects each client to ``upstream``.
+class StreamProxy:
+    """Listens on a free loopback port and connects each client to ``upstream``.
 
     Args:
         upstream: port of the publisher on the loopback.
@@ -40,7 +41,7 @@ class Proxy:
 
     def __init__(self, upstream: int) -> None:
         self._upstream = upstream
-        self.stream = Stream.PASS
+        self.fault = StreamFault.PASS
         """May be set at any time."""
         self._server: socket.socket | None = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._server.getsockname()[1])
@@ -50,7 +51,7 @@ class Proxy:
         self._thread.start()
 
     def close(self) -> None:
-        """End the thread and all connections."""
+        """Stop the thread and close all connections."""
         self._stop.set()
         self._thread.join()
         self._reset()
@@ -59,13 +60,13 @@ class Proxy:
 
     def _run(self) -> None:
         while not self._stop.is_set():
-            if self.stream is Stream.CUT:
+            if self.fault is StreamFault.CUT:
                 self._reset()
                 self._refuse()
                 time.sleep(0.002)
                 continue
             server = self._accepting()
-            to_client = [] if self.stream is Stream.STALL else [up for _, up in self._pairs]
+            to_client = [] if self.fault is StreamFault.STALL else [up for _, up in self._pairs]
             readable = [server, *to_client, *(down for down, _ in self._pairs)]
             ready, _, _ = select.select(readable, [], [], _POLL_S)
             for end in ready:
@@ -103,19 +104,21 @@ class Proxy:
             if end is down:
                 up.sendall(data)
             else:
-                self._pass_on(down, data)
+                self._send(down, data)
         except OSError:
             self._pairs.remove(pair)
             _close(pair)
 
-    def _pass_on(self, down: socket.socket, data: bytes) -> None:
-        size = {Stream.SPLIT: _SPLIT_BYTES, Stream.SLOW: _SLOW_BYTES}.get(self.stream, len(data))
+    def _send(self, down: socket.socket, data: bytes) -> None:
+        size = {StreamFault.SPLIT: _SPLIT_BYTES, StreamFault.SLOW: _SLOW_BYTES}.get(
+            self.fault, len(data)
+        )
         for begin in range(0, len(data), size):
             down.sendall(data[begin : begin + size])
-            if self.stream is Stream.SLOW:
+            if self.fault is StreamFault.SLOW:
                 time.sleep(0.002)
-            elif self.stream in (Stream.STALL, Stream.CUT) or self._stop.is_set():
-                return  # the rest of the piece is lost, as in a real cut
+            elif self.fault in (StreamFault.STALL, StreamFault.CUT) or self._stop.is_set():
+                return  # the rest is lost, as in a real cut
 
     def _reset(self) -> None:
         for pair in self._pairs:

@@ -1,4 +1,4 @@
-"""For tests: time for a fake robot, and patience for what comes over a wire."""
+"""Runs a fake G1 in a thread."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import time
 from collections.abc import Callable
 
 from egovcp_deploy.robots.bridge import BridgeConfig
-from egovcp_deploy.robots.fake.bridge import FakeBridge
+from egovcp_deploy.robots.fake import FakeBridge
 
-PATIENCE_S = 120.0
+TIMEOUT_S = 120.0
 
 
-def eventually(condition: Callable[[], bool], patience: float = PATIENCE_S) -> bool:
-    """Whether it becomes true before patience, s, ends."""
-    deadline = time.monotonic() + patience
+def eventually(condition: Callable[[], bool], timeout: float = TIMEOUT_S) -> bool:
+    """Whether ``condition`` becomes true within ``timeout`` s."""
+    deadline = time.monotonic() + timeout
     while not condition():
         if time.monotonic() > deadline:
             return False
@@ -22,8 +22,8 @@ def eventually(condition: Callable[[], bool], patience: float = PATIENCE_S) -> b
     return True
 
 
-class Running:
-    """Lets time pass for a fake robot, in a thread, a little slower than on the clock."""
+class FakeG1Thread:
+    """Steps a fake G1 in a thread, a little slower than in real time."""
 
     def __init__(self, fake: FakeBridge) -> None:
         self.fake = fake
@@ -36,12 +36,12 @@ class Running:
             self.fake.step()
 
     def stop(self) -> None:
-        """Let no more time pass."""
+        """Stop stepping."""
         self._stop.set()
         self._thread.join()
 
 
-def config_of(fake: FakeBridge, mode: int | None = None) -> BridgeConfig:
-    """Where ``fake`` listens."""
+def bridge_config(fake: FakeBridge, mode: int | None = None) -> BridgeConfig:
+    """Connection options for ``fake``."""
     ports = fake.ports
     return BridgeConfig(ports.host, ports.state_port, ports.command_port, mode)

@@ -1,7 +1,7 @@
-"""The control loop on a healthy simulated robot: nothing may be rejected, and nothing held.
+"""The control loop on a healthy simulated robot, to find false alarms.
 
-The robot walks where an operator steers it and plays all tasks, in lock-step and with the
-simulator's noise. Its readings pass the same checks as those that come over the wire.
+The robot walks as an operator steers it, and plays all tasks, in lock-step and with sensor noise.
+Its readings pass the same checks as those of a robot. None may be rejected, and none may hold.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.log.tick import MotorReadings
 from egovcp.plan import PolicyStep
 from egovcp.rate import LockstepClock
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import evaluation_config
 from egovcp.sim.env import privileged_state
-from egovcp.sim.live import LiveRobot, Phase, ServoCommand
+from egovcp.sim.live import LiveRobot, Phase
 from egovcp.sim.policies import Oracle
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import CONTROLLER_HZ, PHYSICS_STEPS_PER_CONTROLLER_TICK
@@ -27,13 +26,14 @@ from egovcp_deploy.live.control import ControlLoop, Wishes
 from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.pilot import Pilot
 from egovcp_deploy.pilot.states import Request, State
-from egovcp_deploy.robots.body import BodyState, MotorCommand, Picture
+from egovcp_deploy.robots.base import LowState, MotorCommand
 from egovcp_deploy.robots.fake.bridge import MODE
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
-from egovcp_deploy.robots.sim_body import STEP_NS
+
+from .sim_low_level import STEP_NS, SimLowLevelRobot
 
 _SETTLE_TICKS: Final = 50
-_FALLING: Final = 0.8  # rad; from here on anything may be measured
+_FALLING: Final = 0.8  # rad; beyond it the readings may be implausible
 _STEERED_S: Final = 20.0
 _STEERING_TICKS: Final = 100  # between new velocities of the operator, and between pushes
 _PUSH: Final = 0.3  # m/s
@@ -41,13 +41,13 @@ _PUSH: Final = 0.3  # m/s
 
 @dataclass(frozen=True)
 class Situation:
-    """What the robot does."""
+    """Controller and task."""
 
     name: str
     controller: str
     task: str
     steered: bool = False
-    """An operator steers it, and it is pushed; the task does not begin."""
+    """Whether an operator steers the robot, and it is pushed; the task does not begin."""
 
 
 SITUATIONS: Final = (
@@ -65,77 +65,58 @@ class Alarms:
     """What happened in one situation."""
 
     seconds: float = 0.0
-    """Simulated, on the robot's feet."""
+    """Simulated time on the robot's feet."""
     readings: int = 0
     rejected: list[str] = field(default_factory=list)
-    """Why, of each reading that was rejected."""
+    """Reason of each rejected reading."""
     events: list[str] = field(default_factory=list)
     """Changes of the state machine to HOLD or DAMP while the robot was upright."""
     falls: int = 0
 
 
-class _Body:
-    """Motors and sensors of a `LiveRobot` in lock-step, 200 readings a second, each checked."""
+class _CheckedRobot:
+    """`LowLevelRobot` of a `LiveRobot`, with 200 checked readings a second."""
 
     def __init__(self, robot: LiveRobot, clock: LockstepClock, alarms: Alarms) -> None:
-        self._robot, self._clock, self._alarms = robot, clock, alarms
+        self._clock, self._alarms = clock, alarms
+        self._sim = SimLowLevelRobot(robot, MODE)
         self._filter = PlausibilityFilter()
-        self._newest: BodyState | None = None
+        self._newest: LowState | None = None
+        self.camera = self._sim.camera
 
     def step(self) -> None:
-        """Let 5 ms pass, then measure."""
-        self._robot.advance()
+        """Advance by 5 ms, then measure."""
+        self._sim.step()
         self._clock.advance(STEP_NS)
-        seen = self._robot.measure()
-        reading = BodyState(
-            self._clock.now_ns(),
-            seen.joint_position,
-            seen.joint_velocity,
-            seen.quaternion_w,
-            seen.angular_velocity,
-            mode=MODE,
-            motors=MotorReadings(seen.torque),
-        )
-        problem = self._filter.judge(reading, seen.torque)
+        state = self._sim.read()
+        problem = self._filter.check(state)
         self._alarms.readings += 1
         if problem:
             self._alarms.rejected.append(problem)
         else:
-            self._newest = reading
+            self._newest = state
 
-    def read(self) -> BodyState | None:
-        """The newest reading that was not rejected."""
+    def read(self) -> LowState | None:
+        """Return the newest reading that was not rejected."""
         return self._newest
 
     def write(self, command: MotorCommand) -> None:
-        """From the next step on."""
-        self._robot.drive(ServoCommand(command.position, command.stiffness, command.damping))
+        """Apply ``command`` from the next step on."""
+        self._sim.write(command)
 
     def close(self) -> None:
-        """Nothing is held."""
-
-
-class _Eye:
-    def __init__(self, robot: LiveRobot, clock: LockstepClock) -> None:
-        self._robot, self._clock = robot, clock
-
-    def read(self) -> Picture:
-        """The newest picture."""
-        return Picture(self._clock.now_ns(), self._robot.depth_image[1])
-
-    def close(self) -> None:
-        """Nothing is held."""
+        """Do nothing."""
 
 
 class _OraclePolicy:
-    """Plays the task from the simulator's truth."""
+    """Plays the task from the simulator's privileged state."""
 
     def __init__(self, robot: LiveRobot) -> None:
         self._robot = robot
         self._oracle = Oracle().by_task
 
     def reset(self) -> None:
-        """Nothing to forget."""
+        """Do nothing: there is no memory."""
 
     def act(
         self,
@@ -143,23 +124,23 @@ class _OraclePolicy:
         state: NDArray[np.floating],
         remaining: Callable[[], float] | None = None,
     ) -> PolicyStep:
-        """One action, which is the whole plan."""
+        """A plan of one action."""
         truth = privileged_state([self._robot.instance])
         action = self._oracle[truth.task[0]].act(truth, 0).astype(np.float32)[None]
         return PolicyStep(action, action[:, None], iterations=1)
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
-        """Nothing to remember."""
+        """Do nothing."""
 
     def advance(self, sent: NDArray[np.floating]) -> None:
-        """Nothing to remember."""
+        """Do nothing."""
 
 
 class HealthyRun:
     """Plays one situation.
 
     Args:
-        situation: what the robot does.
+        situation: controller and task.
         seed: of its scenarios.
     """
 
@@ -169,18 +150,18 @@ class HealthyRun:
         self._robot = LiveRobot(replace(evaluation_config(), controller=situation.controller))
         self.alarms = Alarms()
 
-    def play(self, episode: int, most_s: float = np.inf) -> None:
-        """Play one episode, or ``most_s`` seconds of it, and add what happened to `alarms`."""
+    def play(self, episode: int, max_s: float = np.inf) -> None:
+        """Play one episode, or ``max_s`` seconds of it, and add what happened to `alarms`."""
         robot, alarms = self._robot, self.alarms
         robot.start(Scenario(self._situation.task, self._seed, episode))
         robot.release()
         clock = LockstepClock()
-        body = _Body(robot, clock, alarms)
-        body.step()
+        checked = _CheckedRobot(robot, clock, alarms)
+        checked.step()
         pilot = Pilot(InlineDesk(Thinker(_OraclePolicy(robot)), clock), state=State.ARMED)
         controller = make_controller(self._situation.controller)
-        loop = ControlLoop(body, _Eye(robot, clock), controller, pilot)
-        limit = min(most_s, _STEERED_S if self._situation.steered else np.inf)
+        loop = ControlLoop(checked, checked.camera, controller, pilot)
+        limit = min(max_s, _STEERED_S if self._situation.steered else np.inf)
         tick, events = 0, list[str]()
         while tick / CONTROLLER_HZ < limit and robot.phase is not Phase.OVER:
             if robot.robot.tilt > _FALLING or loop.state is State.DAMP:
@@ -191,7 +172,7 @@ class HealthyRun:
             loop.tick(clock.now_ns(), self._wishes(tick))
             events += pilot.events()
             for _ in range(PHYSICS_STEPS_PER_CONTROLLER_TICK):
-                body.step()
+                checked.step()
             tick += 1
         alarms.seconds += tick / CONTROLLER_HZ
         alarms.events += [

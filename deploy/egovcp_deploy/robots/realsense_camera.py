@@ -1,0 +1,248 @@
+"""A RealSense depth camera on this machine, through LeRobot's driver.
+
+`DepthResampler` converts its images to those of the policy: crop, resample, clip. Untested on
+hardware: the tests use a camera object that behaves as LeRobot's does.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+from typing import Any, Final, Protocol, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.bounds import bounded
+from egovcp.errors import EnvironmentFailure
+from egovcp.packages import require_packages
+from egovcp.robot.geometry import focal_length
+from egovcp.sim.config import CameraConfig
+from egovcp.spec import DEPTH_COLS, DEPTH_MAX_M, DEPTH_MIN_M, DEPTH_ROWS
+from egovcp_deploy.robots.base import DepthImage
+from egovcp_deploy.robots.subscriber import ArrivalMonitor
+
+_MIN_COVERAGE: Final = 0.9
+_MAX_AGE_MS: Final = 10_000  # the caller judges the age of an image
+
+_MIN_MM: Final = math.ceil(DEPTH_MIN_M * 1000)
+_MAX_MM: Final = math.floor(DEPTH_MAX_M * 1000)
+_INVALID: Final = np.uint16(65535)  # sorts after every depth
+_SAMPLE_SPACING: Final = 1 / 3  # of an output pixel
+_MIN_VALID: Final = 5  # of nine samples
+
+
+@dataclass(frozen=True)
+class RealSenseConfig:
+    """RealSense camera and its mode."""
+
+    serial: str = ""
+    """Serial number, or name if it is unique; lerobot-find-cameras realsense lists them."""
+    width: int = bounded(848, least=1, most=8192)
+    """Columns of the depth image; the stereo of a D435i is best at 848 x 480."""
+    height: int = bounded(480, least=1, most=8192)
+    """Rows of the depth image."""
+    fps: int = bounded(60, least=1, most=1000)
+    """Images per second."""
+    vertical_fov: float = bounded(CameraConfig.vertical_fov, above=0, below=math.pi)
+    """Field of view of the policy's images, rad; the camera's must not be much smaller."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """A pinhole camera without distortion, as the depth of a RealSense D400 is."""
+
+    width: int
+    height: int
+    fx: float
+    """Focal lengths, pixels."""
+    fy: float
+    cx: float
+    """Principal point, pixels; the centre of the first pixel is 0."""
+    cy: float
+
+
+class DepthResampler:
+    """Resamples images of one camera to (48, 64).
+
+    Output pixel (i, j) looks along ((j - 31.5) / f, (i - 23.5) / f, 1), right, down and forward,
+    with f = 24 / tan(fov / 2), as in the simulated camera. Depth is planar in both. Each pixel is
+    the lower median of the valid ones among nine input pixels around its ray, so it is always a
+    measured depth: surfaces are never blended. With fewer than five valid ones it is invalid.
+
+    Args:
+        camera: of the input images.
+        vertical_fov: of the output images, rad.
+    """
+
+    def __init__(self, camera: Intrinsics, vertical_fov: float) -> None:
+        focal = focal_length(vertical_fov)
+        offsets = np.array([-_SAMPLE_SPACING, 0.0, _SAMPLE_SPACING])
+        down = (np.arange(DEPTH_ROWS)[:, None] - (DEPTH_ROWS - 1) / 2 + offsets) / focal
+        right = (np.arange(DEPTH_COLS)[:, None] - (DEPTH_COLS - 1) / 2 + offsets) / focal
+        rows = np.rint(camera.fy * down + camera.cy).astype(np.intp)  # (48, 3)
+        columns = np.rint(camera.fx * right + camera.cx).astype(np.intp)  # (64, 3)
+        in_rows = (rows >= 0) & (rows < camera.height)
+        in_columns = (columns >= 0) & (columns < camera.width)
+        index = rows[:, None, :, None] * camera.width + columns[None, :, None, :]
+        inside = in_rows[:, None, :, None] & in_columns[None, :, None, :]
+        outside = camera.width * camera.height  # index of an extra pixel that is always invalid
+        self._index = np.where(inside, index, outside).reshape(-1, 9)  # (3072, 9)
+        self._shape = (camera.height, camera.width)
+        self._flat = np.full(outside + 1, _INVALID, np.uint16)
+
+    @property
+    def coverage(self) -> float:
+        """Share of the output image that the camera sees."""
+        return float((self._index < len(self._flat) - 1).mean())
+
+    def __call__(self, depth: NDArray[np.uint16]) -> NDArray[np.uint16]:
+        """(height, width) or (height, width, 1) mm, 0 invalid -> (48, 64) mm, 0 invalid.
+
+        Raises:
+            ValueError: the shape is not the camera's.
+        """
+        if depth.shape[:2] != self._shape or depth.size != self._shape[0] * self._shape[1]:
+            raise ValueError(f"a depth image of shape {depth.shape}, expected {self._shape}")
+        self._flat[:-1] = depth.reshape(-1)
+        samples = self._flat[self._index]
+        valid = (samples >= _MIN_MM) & (samples <= _MAX_MM)
+        samples[~valid] = _INVALID
+        samples.sort(axis=1)
+        count = valid.sum(axis=1)
+        median = samples[np.arange(len(samples)), np.maximum(count - 1, 0) // 2]
+        resampled = np.where(count >= _MIN_VALID, median, np.uint16(0))
+        return np.asarray(resampled.reshape(DEPTH_ROWS, DEPTH_COLS), np.uint16)
+
+
+class RealSenseDriver(Protocol):
+    """The part of LeRobot's ``RealSenseCamera`` that is used."""
+
+    def read_latest_depth(self, max_age_ms: int = 500) -> NDArray[np.uint16]:
+        """(H, W, 1) mm; raises before the first image and if the newest is too old."""
+        ...
+
+    def disconnect(self) -> None:
+        """Stop the camera."""
+        ...
+
+
+class RealSenseDepthCamera:
+    """`DepthCamera` that reads LeRobot's camera, whose own thread waits for the hardware.
+
+    Args:
+        driver: connected.
+        intrinsics: of its depth images.
+        vertical_fov: of the policy's images, rad.
+
+    Raises:
+        EnvironmentFailure: its field of view is too small.
+    """
+
+    def __init__(
+        self, driver: RealSenseDriver, intrinsics: Intrinsics, vertical_fov: float
+    ) -> None:
+        self._driver: RealSenseDriver | None = driver
+        self._resample = DepthResampler(intrinsics, vertical_fov)
+        if self._resample.coverage < _MIN_COVERAGE:
+            raise EnvironmentFailure(
+                f"the camera covers {self._resample.coverage:.0%} of the policy's field of view, "
+                f"expected at least {_MIN_COVERAGE:.0%}; choose a wider mode of it, or a policy "
+                "that was trained with its field of view"
+            )
+        self._raw: NDArray[np.uint16] | None = None
+        self._newest: DepthImage | None = None
+        self.problem = ""
+        """Why the last `read` found no new image, in the driver's words."""
+        self.arrivals = ArrivalMonitor(numbered=True)  # images between two reads are not lost
+        """Arrivals of the images that were read."""
+
+    @classmethod
+    def connect(cls, config: RealSenseConfig) -> Self:
+        """Start the camera.
+
+        Raises:
+            EnvironmentFailure: the driver is not installed, or there is no such camera.
+        """
+        driver = _start(config)
+        try:
+            return cls(driver, _intrinsics(driver), config.vertical_fov)
+        except BaseException:
+            driver.disconnect()
+            raise
+
+    def read(self) -> DepthImage | None:
+        """Return the newest image; its time is when the driver received it, if known."""
+        if self._driver is None:
+            return self._newest
+        now_ns = time.monotonic_ns()
+        captured_ns = self._captured_ns(now_ns)  # before the image: too old rather than too new
+        try:
+            raw = self._driver.read_latest_depth(max_age_ms=_MAX_AGE_MS)
+        except (RuntimeError, TimeoutError, ConnectionError) as error:
+            self.problem = str(error)
+            return self._newest
+        if raw is not self._raw:
+            self._raw = raw
+            time_ns = now_ns if captured_ns is None else captured_ns
+            self._newest = DepthImage(time_ns, self._resample(raw), captured_ns)
+            self.arrivals.record_arrival(time_ns)
+        return self._newest
+
+    def _captured_ns(self, now_ns: int) -> int | None:
+        """When the driver received its newest image, at most ``now_ns``; None if unknown. LeRobot's
+        driver gives no time of exposure."""
+        stamp: float | None = getattr(self._driver, "latest_timestamp", None)  # perf_counter, s
+        if stamp is None:
+            return None
+        return now_ns - max(0, time.perf_counter_ns() - round(stamp * 1e9))
+
+    def close(self) -> None:
+        """Stop the camera; may be called more than once."""
+        driver, self._driver = self._driver, None
+        if driver is not None:
+            driver.disconnect()
+
+
+def require_realsense() -> None:
+    """Raise `MissingPackage` if LeRobot's RealSense camera is not installed."""
+    require_packages("egovcp-deploy", "the camera", "lerobot", "pyrealsense2")
+
+
+def _start(config: RealSenseConfig) -> Any:
+    """Connect LeRobot's camera."""
+    if not config.serial:
+        raise EnvironmentFailure(
+            "no camera was named; give its serial number, which lerobot-find-cameras realsense "
+            "prints"
+        )
+    require_realsense()
+    from lerobot.cameras.realsense import RealSenseCamera, RealSenseCameraConfig
+
+    lerobot_config = RealSenseCameraConfig(
+        serial_number_or_name=config.serial,
+        fps=config.fps,
+        width=config.width,
+        height=config.height,
+        use_rgb=False,
+        use_depth=True,
+    )
+    try:
+        driver = RealSenseCamera(lerobot_config)
+        driver.connect()
+    except (ConnectionError, RuntimeError, TimeoutError, ValueError) as error:
+        raise EnvironmentFailure(
+            f"the camera {config.serial} cannot be used: {error}; see lerobot-find-cameras "
+            "realsense, and its USB 3 cable"
+        ) from error
+    return driver
+
+
+def _intrinsics(driver: Any) -> Intrinsics:
+    """Intrinsics of the camera's depth stream."""
+    import pyrealsense2 as rs
+
+    stream = driver.rs_profile.get_stream(rs.stream.depth).as_video_stream_profile()
+    found = stream.get_intrinsics()
+    return Intrinsics(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy)
