@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -35,8 +35,10 @@ from egovcp.data.destination import (
 from egovcp.data.metadata import load_hashes, verify_hashes
 from egovcp.data.parquet import data_errors, open_parquet
 from egovcp.data.provenance import SOURCES, Provenance, parse_provenance
+from egovcp.data.reader import DatasetReader
+from egovcp.data.source import Source
 from egovcp.data.staging import EncodedEpisode, StagingDir
-from egovcp.data.version import VersionContents, VersionWriter, publish, recover, shard_paths
+from egovcp.data.writer import VersionContents, VersionWriter, publish_version, recover, shard_paths
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
 
 _STAGING: Final = "sealed"  # name on disk, which unfinished collections of older versions have
@@ -130,7 +132,7 @@ class Committer:
             for encoded in (*self._tail, *episodes):
                 version.add(encoded)
             contents = version.close()
-            publish(self._next, self.root, replace=previous is not None)
+            publish_version(self._next, self.root, replace=previous is not None)
         finally:
             version.discard()
         self.committed, self.frames = version.episodes, version.frames
@@ -240,11 +242,8 @@ class AppendState:
 def load_append_state(root: Path) -> AppendState:
     """Verify a dataset and read what is needed to append to it."""
     verify_hashes(root)
-    info = metadata.load_info(root)
-    table = metadata.load_episode_table(root, info)
-    episodes = len(table.length)
-    collection = metadata.load_collection(root, table.length)
-    size, hashes = collection.get("shard_episodes"), load_hashes(root)
+    reader, hashes = DatasetReader(Source(root, "")), load_hashes(root)
+    episodes, size = len(reader), reader.provenance.get("shard_episodes")
     if not isinstance(size, int) or size < 1 or not hashes:
         raise DataError(
             f"{root} was not written in shards by egovcp and cannot be extended; "
@@ -253,38 +252,38 @@ def load_append_state(root: Path) -> AppendState:
     shards = [_episodes_table(root, number) for number in range(-(-episodes // size))]
     matrices = [stats.from_arrow(shard) for shard in shards]
     lengths = [shard["length"].to_pylist() for shard in shards]
-    records = collection["episodes"]
     full = episodes // size
     kept = full * size
-    present = {record["task"] for record in records[:kept]}
+    present = {record["task"] for record in reader.records[:kept]}
     contents = VersionContents(
         size,
-        [json.dumps(record) for record in records[:kept]],
-        {t: index for index, t in sorted(metadata.load_tasks(root).items()) if t in present},
+        [json.dumps(record) for record in reader.records[:kept]],
+        {task: index for index, task in sorted(reader.task_names.items()) if task in present},
         [(stats.aggregate(matrices[n], lengths[n]), sum(lengths[n])) for n in range(full)],
         {name: hashes[name] for number in range(full) for name in shard_paths(number)},
     )
-    tail = _read_tail(root, full, records[kept:], matrices[full]) if kept < episodes else []
-    provenance = parse_provenance(collection, root / schema.COLLECTION_PATH)
-    return AppendState(contents, tail, provenance, _next_number(root, provenance, records))
+    tail = []
+    if kept < episodes:
+        tail = _read_tail(root, full, reader.records[kept:], matrices[full])
+    return AppendState(contents, tail, reader.origin, _next_number(reader))
 
 
-def _next_number(root: Path, provenance: Provenance, records: list[dict[str, Any]]) -> int:
+def _next_number(reader: DatasetReader) -> int:
     """The highest number plus one, so that no episode is collected twice."""
-    path = root / schema.COLLECTION_PATH
+    path = reader.root / schema.COLLECTION_PATH
     elsewhere = (
-        f"{root} holds episodes of several collections and cannot be extended; collect into "
+        f"{reader.root} holds episodes of several collections and cannot be extended; collect into "
         "another folder, then join the two with `egovcp-dataset merge`"
     )
-    if SOURCES in provenance.config:
+    if SOURCES in reader.origin.config:
         raise UsageError(elsewhere)
     first: dict[int, int] = {}  # episode number -> index in the dataset
-    for index, record in enumerate(records):
-        facts = record.get("metadata", {})
+    for index in range(len(reader)):
+        facts = reader.metadata(index)
         number = facts.get("episode", index)
         if not isinstance(number, int) or isinstance(number, bool) or number < 0:
             raise DataError.at(path, f"its number is {number!r}, expected an integer", index)
-        if facts.get("seed", provenance.seed) != provenance.seed:
+        if facts.get("seed", reader.origin.seed) != reader.origin.seed:
             raise UsageError(elsewhere)
         if first.setdefault(number, index) != index:
             problem = f"is number {number} of the collection, as episode {first[number]}"
@@ -299,7 +298,7 @@ def _episodes_table(root: Path, number: int) -> pa.Table:
 
 
 def _read_tail(
-    root: Path, number: int, records: list[dict[str, Any]], matrices: list[stats.Matrix]
+    root: Path, number: int, records: Sequence[Mapping[str, Any]], matrices: list[stats.Matrix]
 ) -> list[EncodedEpisode]:
     path = root / shard_paths(number)[0]
     ordered = schema.episode_schema()

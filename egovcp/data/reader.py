@@ -34,8 +34,7 @@ from egovcp.data.episode import Episode
 from egovcp.data.parquet import EPISODE_FEATURES, Columns, data_errors, open_data_file, to_numpy
 from egovcp.data.paths import require_file
 from egovcp.data.provenance import ScenarioKey, ScenarioKeys, parse_provenance
-from egovcp.data.selection import select_episodes
-from egovcp.data.source import Source, is_local, locate, open_file_cache
+from egovcp.data.source import Source, is_local, locate, open_file_cache, select_episodes
 from egovcp.errors import DataError, suggest
 from egovcp.hub import HubFileCache, RetryPolicy, is_local_path
 
@@ -70,7 +69,8 @@ class DatasetReader:
         self.lengths = self._table.length
         """(E,) frames of each episode."""
         self._collection = metadata.load_collection(source.root, self.lengths)
-        self._records: list[Mapping[str, Any]] = self._collection["episodes"]
+        self.records: list[Mapping[str, Any]] = self._collection["episodes"]
+        """Record of each episode in ``meta/collection.json``."""
         self.origin = parse_provenance(self._collection, source.root / schema.COLLECTION_PATH)
         """How the dataset was collected."""
         try:
@@ -169,20 +169,20 @@ class DatasetReader:
 
     def task(self, index: int) -> str:
         """Task of an episode."""
-        return str(self._records[index]["task"])
+        return str(self.records[index]["task"])
 
     def metadata(self, index: int) -> Mapping[str, Any]:
         """Scenario seed and parameters of an episode."""
-        found: Mapping[str, Any] = self._records[index].get("metadata", {})
+        found: Mapping[str, Any] = self.records[index].get("metadata", {})
         return found
 
     def time_limit(self, index: int) -> int:
         """Planned length of an episode, ticks."""
-        return int(self._records[index]["time_limit"])
+        return int(self.records[index]["time_limit"])
 
     def digest(self, index: int) -> str:
         """Recorded `Episode.digest` of an episode; empty if not recorded."""
-        return str(self._records[index].get("sha256", ""))
+        return str(self.records[index].get("sha256", ""))
 
     def identity(self, index: int) -> str:
         """Task, seed and episode number, the same in every dataset that holds the episode."""

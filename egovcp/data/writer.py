@@ -1,27 +1,326 @@
-"""Writes whole episodes as a LeRobot v3.0 dataset, straight to parquet.
+"""Writes LeRobot v3.0 datasets straight to parquet: `DatasetWriter` at once, versions in steps.
 
-Files are written to a temporary folder beside the destination, which is renamed when it is
-complete: an interrupted run leaves no incomplete dataset. A collection that must survive a crash
-uses `egovcp.data.committer` instead.
+A published folder never changes; it is replaced by its next version, which shares the files of
+complete shards with the one before (hard links) and adds new shards and a new ``meta``. Its content
+depends on its episodes and provenance alone, not on the number of versions before it. A shard is
+one data file and its part of the episodes table. A collection that must survive a crash uses
+`egovcp.data.committer`.
 """
 
 from __future__ import annotations
 
+import errno
+import json
 import secrets
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Self
+from typing import IO, Any, Final, Self
 
-from egovcp.data import schema
-from egovcp.data.destination import make_parent, require_new, resolve_root
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from egovcp import spec
+from egovcp.atomic import removed_on_error
+from egovcp.data import files, schema, stats
+from egovcp.data.destination import is_vacant, make_parent, require_new, resolve_root
 from egovcp.data.episode import Episode
 from egovcp.data.provenance import Provenance
-from egovcp.data.staging import encode
-from egovcp.data.version import VersionContents, VersionWriter, publish
-from egovcp.errors import UsageError
+from egovcp.data.staging import EncodedEpisode, encode, with_index
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.safe_files import sha256
+
+#: A file system or kernel that cannot exchange two folders.
+_NO_EXCHANGE: Final = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)
+#: A mount point, or a folder of a lower layer of an overlay file system (a container's image).
+_NO_RENAME: Final = (errno.EBUSY, errno.EXDEV)
+_OCCUPIED: Final = (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR)
+
+
+def shard_paths(number: int) -> tuple[str, str]:
+    """Relative paths of a shard's data file and of its file of the episodes table."""
+    place = _place(number)
+    return schema.DATA_PATH.format(**place), schema.EPISODES_PATH.format(**place)
+
+
+def _place(number: int) -> dict[str, int]:
+    chunk, file = divmod(number, schema.CHUNK_FILES)
+    return {"chunk_index": chunk, "file_index": file}
+
+
+class ShardWriter:
+    """Writes the files of shard ``number``, one row group per episode.
+
+    Both files are complete and flushed after `close`.
+    """
+
+    def __init__(self, folder: Path, number: int) -> None:
+        self._folder = folder
+        self._place = _place(number)
+        self._data_path, self._episodes_path = shard_paths(number)
+        self._file: IO[bytes] = files.create(folder / self._data_path)
+        # A dictionary does not compress depth; snappy halves it at little cost.
+        self._writer = pq.ParquetWriter(
+            self._file, schema.arrow_schema(), compression="snappy", use_dictionary=False
+        )
+        self._rows: list[dict[str, Any]] = []
+        self._stats: list[stats.Matrix] = []
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(
+        self, encoded: EncodedEpisode, episode_index: int, first_frame: int, task_index: int
+    ) -> None:
+        """Append an episode at its position in the dataset."""
+        table, matrix = with_index(encoded, episode_index, first_frame, task_index)
+        self._writer.write_table(table, row_group_size=table.num_rows)
+        self._rows.append(
+            {
+                "episode_index": episode_index,
+                "tasks": [encoded.record["task"]],
+                "length": len(encoded),
+                **{f"data/{name}": value for name, value in self._place.items()},
+                "dataset_from_index": first_frame,
+                "dataset_to_index": first_frame + len(encoded),
+            }
+        )
+        self._stats.append(matrix)
+
+    def close(self) -> tuple[stats.Matrix, int]:
+        """Complete both files; returns the statistics and the number of all frames."""
+        self._writer.close()
+        self._file.close()
+        counts = [row["length"] for row in self._rows]
+        table = pa.Table.from_pylist(self._rows)
+        columns = stats.to_arrow(self._stats, counts)
+        for name, value in self._place.items():
+            columns[f"meta/episodes/{name}"] = pa.array([value] * len(counts))
+        for name, column in columns.items():
+            table = table.append_column(name, column)
+        with files.create(self._folder / self._episodes_path) as file:
+            pq.write_table(table, file)
+        for path in (self._data_path, self._episodes_path):
+            files.sync(self._folder / path)
+        return stats.aggregate(self._stats, counts), sum(counts)
+
+    def discard(self) -> None:
+        """Close the open files after an error."""
+        with suppress(OSError, pa.ArrowException):
+            self._writer.close()
+        with suppress(OSError):
+            self._file.close()
+
+
+@dataclass(frozen=True)
+class VersionContents:
+    """Content of complete shards, from which the next version is built."""
+
+    shard_episodes: int = schema.SHARD_EPISODES
+    """Episodes per shard."""
+    records: Sequence[str] = ()
+    """The JSON record of each episode in ``meta/collection.json``."""
+    tasks: Mapping[str, int] = field(default_factory=dict)
+    """Task -> task index, in order of appearance."""
+    totals: Sequence[tuple[stats.Matrix, int]] = ()
+    """Statistics and number of frames of each shard."""
+    hashes: Mapping[str, str] = field(default_factory=dict)
+    """SHA-256 of each file of a shard."""
+
+    @property
+    def frames(self) -> int:
+        """Frames of all episodes."""
+        return sum(count for _, count in self.totals)
+
+
+class VersionWriter:
+    """Writes the next version to a new folder: `add` episodes, then `close`."""
+
+    def __init__(
+        self,
+        folder: Path,
+        provenance: Provenance,
+        contents: VersionContents | None = None,
+        previous: Path | None = None,
+    ) -> None:
+        """Create ``folder`` with the complete shards, ``contents``, of the previous version, which
+        is on the same file system."""
+        self.folder = folder
+        self.provenance = provenance
+        self._complete = contents or VersionContents()
+        self.frames = self._complete.frames
+        """Number of frames so far."""
+        self._records = list(self._complete.records)
+        self._tasks = dict(self._complete.tasks)
+        self._totals = list(self._complete.totals)
+        self._hashes = dict(self._complete.hashes)
+        self._shard: ShardWriter | None = None
+        folder.mkdir(parents=True)
+        if previous is not None:
+            with removed_on_error(folder):
+                self._link_files(previous)
+
+    def _link_files(self, previous: Path) -> None:
+        """Link the files of the shards, and other files beside ``data`` and ``meta``: a card."""
+        for name in self._hashes:
+            files.link(previous / name, self.folder / name)
+        for path in previous.iterdir():
+            if path.is_file():
+                files.link(path, self.folder / path.name)
+            elif path.name not in ("data", "meta"):
+                shutil.copytree(path, self.folder / path.name)
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes so far."""
+        return len(self._records)
+
+    def add(self, encoded: EncodedEpisode) -> None:
+        """Append an episode."""
+        record = json.dumps(dict(encoded.record), allow_nan=False)
+        task = self._tasks.setdefault(encoded.record["task"], len(self._tasks))
+        if self._shard is None:
+            self._shard = ShardWriter(self.folder, len(self._totals))
+        self._shard.add(encoded, self.episodes, self.frames, task)
+        self._records.append(record)
+        self.frames += len(encoded)
+        if len(self._shard) == self._complete.shard_episodes:
+            self._complete = self._close_shard(self._shard)
+
+    def _close_shard(self, shard: ShardWriter) -> VersionContents:
+        """Close the current shard; returns the content with it."""
+        paths = shard_paths(len(self._totals))
+        self._totals.append(shard.close())
+        self._shard = None
+        self._hashes |= {path: sha256(self.folder / path) for path in paths}
+        return replace(
+            self._complete,
+            records=tuple(self._records),
+            tasks=dict(self._tasks),
+            totals=tuple(self._totals),
+            hashes=dict(self._hashes),
+        )
+
+    def close(self) -> VersionContents:
+        """Write ``meta`` and flush everything; returns the content of the complete shards."""
+        if self._shard is not None:
+            self._close_shard(self._shard)
+        matrices, counts = zip(*self._totals, strict=True)
+        total = stats.to_json(stats.aggregate(matrices, counts), self.frames)
+        self._write_tasks()
+        files.write_json(self.folder / schema.INFO_PATH, self._info())
+        files.write_json(self.folder / schema.STATS_PATH, total)
+        files.write_bytes(self.folder / schema.COLLECTION_PATH, self._collection())
+        meta = (schema.INFO_PATH, schema.STATS_PATH, schema.TASKS_PATH, schema.COLLECTION_PATH)
+        hashes = self._hashes | {path: sha256(self.folder / path) for path in meta}
+        files.write_json(self.folder / schema.HASHES_PATH, hashes)
+        for path in (*(self.folder / "meta").glob("*.*"), *self.folder.rglob("*/"), self.folder):
+            files.sync(path)
+        return self._complete
+
+    def discard(self) -> None:
+        """Remove the folder."""
+        if self._shard is not None:
+            self._shard.discard()
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _write_tasks(self) -> None:
+        import pandas as pd  # LeRobot reads the task names from a pandas index
+
+        names = pd.Index(list(self._tasks), name="task")
+        frame = pd.DataFrame({"task_index": list(self._tasks.values())}, index=names)
+        with files.create(self.folder / schema.TASKS_PATH) as file:
+            frame.to_parquet(file)
+
+    def _info(self) -> dict[str, Any]:
+        return {
+            "codebase_version": schema.CODEBASE_VERSION,
+            "fps": spec.PLANNER_HZ,
+            "features": schema.info_features(self.provenance.controller_id),
+            "total_episodes": self.episodes,
+            "total_frames": self.frames,
+            "total_tasks": len(self._tasks),
+            "chunks_size": schema.CHUNK_FILES,
+            "data_files_size_in_mb": schema.FILE_MB,
+            "video_files_size_in_mb": 200,
+            "data_path": schema.DATA_PATH,
+            "video_path": None,
+            "robot_type": schema.ROBOT_TYPE,
+            "splits": {"train": f"0:{self.episodes}"},
+        }
+
+    def _collection(self) -> bytes:
+        """``meta/collection.json``, one line per episode."""
+        head = {
+            "collection_version": schema.COLLECTION_VERSION,
+            "spec_version": spec.SPEC_VERSION,
+            **asdict(self.provenance),
+            "shard_episodes": self._complete.shard_episodes,
+        }
+        text = json.dumps(head, indent=1, allow_nan=False).removesuffix("\n}")
+        records = ",\n  ".join(self._records)
+        return f'{text},\n "episodes": [\n  {records}\n ]\n}}\n'.encode()
+
+
+def publish_version(folder: Path, root: Path, replace: bool = False) -> None:
+    """Make the complete version ``folder`` the dataset at ``root``, atomically.
+
+    If ``replace``, ``root`` is the previous version, which is moved to ``folder``. Otherwise
+    ``root`` must be absent or an empty folder.
+
+    Raises:
+        UsageError: ``root`` is occupied.
+        EnvironmentFailure: ``root`` cannot be renamed.
+    """
+    try:
+        if replace:
+            _exchange(folder, root)
+        else:
+            files.rename(folder, root)  # replaces an empty folder only
+    except OSError as error:
+        if error.errno in _OCCUPIED:
+            raise UsageError(
+                f"output folder {root} is no longer empty: another program has written to it"
+            ) from error
+        if error.errno in _NO_RENAME:
+            raise EnvironmentFailure(
+                f"{root} cannot be renamed ({error.strerror}): it is a mount point, or part of a "
+                "container image; copy it to a folder inside a volume and use that"
+            ) from error
+        raise
+    files.sync(root.parent)
+
+
+def _exchange(folder: Path, root: Path) -> None:
+    try:
+        files.exchange(folder, root)
+    except OSError as error:
+        if error.errno not in _NO_EXCHANGE:
+            raise
+        aside = _aside(folder)  # `recover` completes the three renames after a crash
+        files.rename(root, aside)
+        files.rename(folder, root)
+        files.rename(aside, folder)
+
+
+def recover(folder: Path, root: Path) -> None:
+    """Restore the version that a crash within `publish_version` left aside."""
+    aside = _aside(folder)
+    if aside.exists():
+        if is_vacant(root):
+            files.rename(aside, root)
+        else:
+            shutil.rmtree(aside)
+
+
+def _aside(folder: Path) -> Path:
+    return folder.with_name(f"{folder.name}.before")
 
 
 class DatasetWriter:
-    """Adds episodes one by one; `finalize` moves the dataset to ``root``.
+    """Adds episodes one by one to a temporary folder; `finalize` moves it to ``root``.
 
     As a context manager it finalizes on success and discards everything on an error.
     """
@@ -65,7 +364,7 @@ class DatasetWriter:
             if self.num_episodes == 0:
                 raise UsageError(f"no episode was written to {self.root}")
             self._version.close()
-            publish(self._version.folder, self.root)
+            publish_version(self._version.folder, self.root)
         except BaseException:
             self.discard()
             raise

@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 from egovcp.bounds import bounded
 from egovcp.data import DatasetConfig, DatasetReader
-from egovcp.data.selection import select_episodes
+from egovcp.data.source import select_episodes
 from egovcp.errors import DataError
 from egovcp.outputs import output_file, write_report
 from egovcp.terminal import echo

@@ -11,7 +11,7 @@ from egovcp.data.destination import require_new, resolve_root, writer_lock
 from egovcp.data.files import sync_tree
 from egovcp.data.metadata import verify_hashes
 from egovcp.data.source import Source, read_source, write_source
-from egovcp.data.version import publish
+from egovcp.data.writer import publish_version
 from egovcp.errors import DataError, UsageError
 from egovcp.hub import RetryPolicy, fetch, is_repo_id, resolve
 from egovcp.outputs import output_file, write_report
@@ -94,7 +94,7 @@ def _bring(source: Source, retry: RetryPolicy) -> None:
             raise
         write_source(Source(files, source.repo_id, source.commit))
         sync_tree(files)
-        publish(files, source.root)
+        publish_version(files, source.root)
     shutil.rmtree(aside, ignore_errors=True)
 
 

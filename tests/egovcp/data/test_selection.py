@@ -7,7 +7,7 @@ import pytest
 
 from egovcp.cli import SelectedDatasetConfig
 from egovcp.data import DatasetReader, EpisodeIndex
-from egovcp.data.selection import select_episodes
+from egovcp.data.source import select_episodes
 from egovcp.errors import UsageError
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from egovcp import spec
 from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode, Provenance
-from egovcp.data.version import VersionWriter
+from egovcp.data.writer import VersionWriter
 from egovcp.errors import DataError, UsageError
 
 _ARRAYS = ("depth", "state", "action", "reward", "done", "success", "truncated")
