@@ -1,9 +1,11 @@
-"""What the artifact says of the episodes that it was not trained on."""
+"""Splits of datasets, selected episodes, and the description of the held-out ones."""
 
 import json
+from pathlib import Path
 
 import pytest
 
+from egovcp.cli import SelectedDatasetConfig
 from egovcp.data import DatasetReader, EpisodeIndex, describe_heldout
 from egovcp.data import index as index_module
 
@@ -20,3 +22,26 @@ def test_the_held_out_episodes_are_named(
 
     monkeypatch.setattr(index_module, "LISTED", found["count"] - 1)
     assert describe_heldout([reader, reader], 0.4) == found | {"numbers": None}
+
+
+def test_only_selected_episodes_are_in_a_split(dataset_root: Path) -> None:
+    everything = EpisodeIndex.of(
+        [DatasetReader.open(SelectedDatasetConfig(root=str(dataset_root)))]
+    )
+    config = SelectedDatasetConfig(root=str(dataset_root), episodes="[1:3, 5]")
+    reader = DatasetReader.open(config)
+    assert EpisodeIndex.of([reader]).number.tolist() == [1, 2, 5]
+    parts = [EpisodeIndex.of([reader], split, 0.4) for split in ("train", "heldout")]
+    assert sorted(n for part in parts for n in part.number.tolist()) == [1, 2, 5]
+    assert len(everything) == 6
+
+
+@pytest.mark.parametrize("chosen", ["0:6", "0:3", "[1, 4]", "2:"])
+def test_no_selection_trains_on_held_out_episodes(dataset_root: Path, chosen: str) -> None:
+    """Neither those whose hash says so, nor the one that stands in for them."""
+
+    def split(text: str, name: str) -> set[str]:
+        config = SelectedDatasetConfig(root=str(dataset_root), episodes=text)
+        return set(EpisodeIndex.of([DatasetReader.open(config)], name, 0.3).identities)
+
+    assert not split(chosen, "train") & split("", "heldout")

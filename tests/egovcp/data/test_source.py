@@ -1,4 +1,4 @@
-"""Datasets by id: LeRobot's local folder, a fake Hub on the loopback, and no network at all."""
+"""Datasets by id on disk, on a fake Hub and without a network; selections of episodes."""
 
 import logging
 from pathlib import Path
@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from egovcp.data import DatasetConfig, DatasetReader, source
-from egovcp.errors import DataError, EnvironmentFailure
+from egovcp.data.source import select_episodes
+from egovcp.errors import DataError, EnvironmentFailure, UsageError
 from egovcp.hub import Content, Publication, RetryPolicy, publish
 from tests.support.hub import FakeHub
 from tests.support.hub.faults import Trouble
@@ -109,3 +110,44 @@ def test_the_source_of_a_downloaded_folder_is_stored_in_it(tmp_path: Path) -> No
     (tmp_path / "meta/source.json").write_text("[]")
     with pytest.raises(DataError, match=r"source\.json is damaged"):
         source.read_source(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"),
+    [
+        ("", range(10)),
+        ("[3]", [3]),
+        ("[5, 0, 7, 5]", [0, 5, 7]),
+        ("5,0", [0, 5]),
+        ("2:5", [2, 3, 4]),
+        (":2", [0, 1]),
+        ("8:", [8, 9]),
+        ("[0:2, 9, 4:6]", [0, 1, 4, 5, 9]),
+        ("(0:2, 9)", [0, 1, 9]),
+    ],
+)
+def test_numbers_and_ranges(text: str, numbers: list[int]) -> None:
+    np.testing.assert_array_equal(select_episodes(text, 10), numbers)
+
+
+@pytest.mark.parametrize("text", ["0:11", "[3, 10]", "20:30", "0:999999999999"])
+def test_episodes_out_of_range_are_refused_with_the_count(text: str) -> None:
+    with pytest.raises(UsageError, match=r"the dataset has 10 episodes, 0 to 9"):
+        select_episodes(text, 10)
+
+
+@pytest.mark.parametrize("text", ["a", "[1, x]", "-1", "[]", "1:2:3", "1.5", f"[{'9' * 5000}]"])
+def test_a_malformed_selection_is_refused(text: str) -> None:
+    with pytest.raises(UsageError, match=r"is not an episode; expected numbers, \[0, 5, 7\]"):
+        select_episodes(text, 10)
+
+
+def test_an_empty_range_is_refused() -> None:
+    with pytest.raises(UsageError, match="selects no episode; there are 10"):
+        select_episodes("5:5", 10)
+
+
+def test_a_number_that_may_be_a_yaml_range_is_refused() -> None:
+    """Unquoted, 1:30 is one minute and a half."""
+    with pytest.raises(UsageError, match=r"write \[90\].*quote a range"):
+        select_episodes("90", 100)
