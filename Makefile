@@ -42,7 +42,7 @@ quickstart: install
 	egovcp-collect --task=ball --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
 	  --episodes=5000 --seed=0 $(WALK) $(SCENES)
 	egovcp-train --dataset.repo_id=me/egovcp-ball --dataset.root=$(OUT)/dataset \
-	  --output_dir=$(OUT)/policy --max_minutes=9.5 --seed=0
+	  --output_dir=$(OUT)/policy --preset=laptop --seed=0
 	egovcp-eval --policy.path=$(POLICY) --task=ball --episodes=80 \
 	  --output_dir=$(OUT)/eval $(SCENES) --env.ball_episode.empty_probability=0 | tee $(OUT)/table.txt
 	egovcp-deploy --policy.path=$(POLICY) --robot.type=sim --task=ball --episodes=1 \

@@ -24,7 +24,7 @@ import draccus
 from egovcp.atomic import write_text
 from egovcp.bounds import bounded, check_bounds, check_cores
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
-from egovcp.flags import HELP, flag_values, flags_of, merged, split_flags
+from egovcp.flags import HELP, flag_values, merged, split_flags
 from egovcp.help_text import print_help
 from egovcp.interrupts import EXIT_CODE as INTERRUPTED
 from egovcp.interrupts import raise_on_sigint
@@ -81,14 +81,13 @@ def parse_config[C](
         EgovcpError: a value is not allowed; the message names the flag.
         SystemExit: after ``--help``.
     """
-    flags = flags_of(config_class)
     try:
-        args = split_flags(argv, flags)
+        args = split_flags(argv, config_class)
         topics = [arg.partition("=")[2] for arg in args if arg.partition("=")[0] in HELP]
         if topics:
             print_help(config_class, prog, epilog, topics[-1])
         beneath = defaults(args) if defaults else {}
-        config = build(config_class, merged(beneath, flag_values(args, flags)), "--")
+        config = build(config_class, merged(beneath, flag_values(args, config_class)), "--")
     except WrongValue as error:
         raise UsageError(f"{error}; see {prog} --help") from None
     check_bounds(config, "--")

@@ -1,4 +1,9 @@
-"""Command-line flags of a configuration dataclass: ``--group.option=value``."""
+"""Command-line flags of a configuration dataclass: ``--group.option=value``.
+
+A dataclass may limit its flags with a class attribute ``cli_options``, which maps a group, such as
+``"policy.loss"``, to the names of its options that are flags. Only a configuration file or Python
+can set the other options of the group.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +16,11 @@ from typing import Any, Final
 from draccus.utils import CONFIG_ARG
 
 from egovcp.errors import UsageError, did_you_mean
-from egovcp.removed_options import refuse_removed_flag, refuse_removed_options
+from egovcp.removed_options import (
+    refuse_preset_flag,
+    refuse_removed_flag,
+    refuse_removed_options,
+)
 from egovcp.safe_files import UnsafeFileError, read_text, require_bounded
 from egovcp.values import (
     WrongValue,
@@ -24,6 +33,8 @@ from egovcp.values import (
 
 CONFIG_FILE: Final = f"--{CONFIG_ARG}"
 HELP: Final = ("-h", "--help")
+#: In the place of a flag's type: an option that only a configuration file or Python can set.
+NOT_A_FLAG: Final = object()
 #: LeRobot's name of an option -> its name here, where both mean the same.
 LEROBOT_NAMES: Final[Mapping[str, str]] = {
     "env.task": "task",
@@ -38,19 +49,29 @@ _FILE_LIMIT_BYTES: Final = 64 << 10  # YAML is parsed at about 50 kB/s
 
 def flags_of(config_class: type) -> dict[str, Any]:
     """Flag -> type, of all options and groups of options of a dataclass."""
-    return {CONFIG_FILE: str, **dict(_flags(config_class, "--"))}
+    found = options_of(config_class)
+    return {flag: kind for flag, kind in found.items() if kind is not NOT_A_FLAG}
 
 
-def _flags(config_class: type, prefix: str) -> Iterator[tuple[str, Any]]:
+def options_of(config_class: type) -> dict[str, Any]:
+    """As `flags_of`, and `NOT_A_FLAG` for each option that is not one of ``cli_options``."""
+    limits: Mapping[str, Sequence[str]] = getattr(config_class, "cli_options", {})
+    return {CONFIG_FILE: str, **dict(_flags(config_class, "", limits))}
+
+
+def _flags(
+    config_class: type, group: str, limits: Mapping[str, Sequence[str]], hidden: bool = False
+) -> Iterator[tuple[str, Any]]:
     kinds = option_types(config_class)
     for field in dataclasses.fields(config_class):
-        kind = kinds[field.name]
-        yield f"{prefix}{field.name}", kind
+        kind, name = kinds[field.name], f"{group}.{field.name}".removeprefix(".")
+        hides = hidden or field.name not in limits.get(group, (field.name,))
+        yield f"--{name}", NOT_A_FLAG if hides else kind
         if is_dataclass_type(kind):
-            yield from _flags(kind, f"{prefix}{field.name}.")
+            yield from _flags(kind, name, limits, hides)
 
 
-def split_flags(argv: Sequence[str], flags: Mapping[str, Any]) -> list[str]:
+def split_flags(argv: Sequence[str], config_class: type) -> list[str]:
     """The arguments as ``--name=value`` each: ``--a b`` is ``--a=b``, a switch alone is true.
 
     Raises:
@@ -63,6 +84,7 @@ def split_flags(argv: Sequence[str], flags: Mapping[str, Any]) -> list[str]:
             joined[-1] += f"={arg}"
         else:
             joined.append(arg)
+    flags = options_of(config_class)
     return [_checked(arg, flags) for arg in joined]
 
 
@@ -77,23 +99,27 @@ def _checked(arg: str, flags: Mapping[str, Any]) -> str:
         raise UsageError(f"unexpected argument {arg!r}; options are written --name=value")
     if flag not in flags:
         refuse_removed_flag(flag)
-        raise WrongValue(f"unknown option {flag}{did_you_mean(flag, flags)}")
+        known = [name for name, kind in flags.items() if kind is not NOT_A_FLAG]
+        raise WrongValue(f"unknown option {flag}{did_you_mean(flag, known)}")
+    if flags[flag] is NOT_A_FLAG:
+        refuse_preset_flag(flag)
     if not equals and flags[flag] is not bool:
         raise WrongValue(f"option {flag} needs a value, {flag}=...")
     return arg if equals else f"{arg}=true"
 
 
-def flag_values(args: Sequence[str], flags: Mapping[str, Any]) -> dict[str, Any]:
+def flag_values(args: Sequence[str], config_class: type) -> dict[str, Any]:
     """The values of all flags and of the config file, nested by group; the last flag decides.
 
     Args:
         args: as `split_flags` returns them.
-        flags: as `flags_of` returns them.
+        config_class: the dataclass of the options.
 
     Raises:
         UsageError: a value is not of the type of its option, or the file cannot be read or has
             options that were removed.
     """
+    flags = options_of(config_class)
     given: dict[str, Any] = {}
     file = ""
     for arg in args:
@@ -104,6 +130,7 @@ def flag_values(args: Sequence[str], flags: Mapping[str, Any]) -> dict[str, Any]
                 raise WrongValue(f"option {CONFIG_FILE} needs a file, {CONFIG_FILE}=...")
         else:
             value: Any = _value(flag, text, flags[flag])
+            _refuse_preset_options(flag, value, flags)
             for part in reversed(flag.removeprefix("--").split(".")):
                 value = {part: value}
             given = merged(given, value)
@@ -122,6 +149,15 @@ def _value(flag: str, text: str, kind: Any) -> Any:
         return value
     convert(kind, value, flag)
     return value
+
+
+def _refuse_preset_options(flag: str, value: Any, flags: Mapping[str, Any]) -> None:
+    """Refuse an option within the value of a group that is not a flag itself."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if flags.get(f"{flag}.{key}") is NOT_A_FLAG:
+                refuse_preset_flag(f"{flag}.{key}")
+            _refuse_preset_options(f"{flag}.{key}", item, flags)
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:

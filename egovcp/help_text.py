@@ -17,7 +17,7 @@ from typing import Any, Final, NoReturn
 
 from egovcp.bounds import as_flag_value, bounds_of
 from egovcp.errors import UsageError, did_you_mean
-from egovcp.flags import CONFIG_FILE
+from egovcp.flags import CONFIG_FILE, flags_of
 from egovcp.terminal import echo
 from egovcp.values import default_of, is_dataclass_type, option_types, type_name
 
@@ -74,7 +74,12 @@ def print_help(config_class: type, prog: str, epilog: str, topic: str = "") -> N
         SystemExit: always, except for an unknown topic.
         UsageError: there is no such group.
     """
-    groups = list(_groups(config_class, None, ""))
+    flags = flags_of(config_class)
+    groups = [
+        dataclasses.replace(group, options=tuple(o for o in group.options if o.flag in flags))
+        for group in _groups(config_class, None, "")
+        if not group.name or f"--{group.name}" in flags
+    ]
     if not topic:
         lines = [f"{prog}: {_first_paragraph(config_class)}", *_overview(groups), ""]
         lines += textwrap.wrap(f"{_SYNTAX} {epilog}".strip(), _WIDTH)

@@ -17,8 +17,7 @@ _HEADS: Final = "Q has one head, which reads the whole state: leave it out"
 REMOVED_OPTIONS: Final[Mapping[str, str]] = {
     # egovcp-train
     "value_fit": (
-        "Q is trained with the world model and not fitted again afterwards: leave it out; "
-        "--policy.loss.value is the weight of Q"
+        "Q is trained with the world model and not fitted again afterwards: leave it out"
     ),
     "passing": _TRACKER,
     "policy.motion_ahead": _TRACKER,
@@ -65,6 +64,14 @@ def refuse_removed_flag(flag: str) -> None:
         raise RemovedOptionError(f"option {flag} was removed: {reason}")
 
 
+def refuse_preset_flag(flag: str) -> None:
+    """Raise `RemovedOptionError` for an option that only a configuration can set."""
+    raise RemovedOptionError(
+        f"option {flag} was removed from the command line: it is a constant of --preset; set it in "
+        "a file, --config_path, or in Python"
+    )
+
+
 def refuse_removed_options(options: Mapping[str, Any], file: str) -> None:
     """Raise `RemovedOptionError`, which names all removed options of a configuration file.
 
@@ -97,6 +104,6 @@ def _reason(name: str) -> str | None:
     parts = _INDEX.sub("", name).split(".")
     prefixes = (".".join(parts[:end]) for end in range(1, len(parts) + 1))
     known = dict(REMOVED_OPTIONS) | {
-        old: f"it is now --{new}" for old, new in RENAMED_OPTIONS.items()
+        old: f"its name is now {new}" for old, new in RENAMED_OPTIONS.items()
     }
     return next((known[p] for p in prefixes if p in known), None)

@@ -40,8 +40,7 @@ def smoke() -> ExperimentConfig:
             compared_steps=4,
             flags=(
                 "--batch_size=4",
-                "--sampling.length=8",
-                "--policy.loss.autoregressive_steps=4",
+                "--sampling.length=9",
                 "--returns.steps=6",
                 "--planner.samples=32",
                 "--planner.elites=8",

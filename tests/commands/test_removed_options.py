@@ -2,14 +2,14 @@
 
 import pytest
 
-from egovcp.flags import flags_of
+from egovcp.flags import options_of
 from egovcp.removed_options import REMOVED_OPTIONS, RENAMED_OPTIONS
 
 from .listing import all_commands
 
 
 def test_no_option_of_a_command_is_listed_as_removed() -> None:
-    flags = {flag for command in all_commands() for flag in flags_of(command.config_class)}
+    flags = {flag for command in all_commands() for flag in options_of(command.config_class)}
     assert not {f"--{name}" for name in (*REMOVED_OPTIONS, *RENAMED_OPTIONS)} & flags
     assert {f"--{name}" for name in RENAMED_OPTIONS.values()} <= flags
 
@@ -17,13 +17,15 @@ def test_no_option_of_a_command_is_listed_as_removed() -> None:
 @pytest.mark.parametrize(
     ("prog", "flag", "remedy"),
     [
-        ("egovcp-train", "--value_fit.steps=0", "--policy.loss.value"),
+        ("egovcp-train", "--value_fit.steps=0", "leave it out"),
         ("egovcp-train", "--policy.flight.enabled=false", "leave it out"),
         ("egovcp-train", "--datasets=[{root: x, return_steps: 9}]", "--returns.steps"),
         ("egovcp-train", "--planner.ensemble=min", "leave it out"),
         ("egovcp-eval", "--planner.ensemble=min", "leave it out"),
-        ("egovcp-eval", "--planner.process=ramp", "--planner.action_parameterization"),
-        ("egovcp-train", "--policy.loss.near=0", "--policy.loss.proximity_weight"),
+        ("egovcp-eval", "--planner.process=ramp", "planner.action_parameterization"),
+        ("egovcp-train", "--policy.loss.near=0", "policy.loss.proximity_weight"),
+        ("egovcp-train", "--policy.loss.depth=1", "--config_path"),
+        ("egovcp-train", "--planner={latent: sample}", "--config_path"),
         ("egovcp-eval-model", "--return_steps=16", "leave it out"),
     ],
 )
@@ -34,5 +36,5 @@ def test_command_refuses_a_removed_option_in_one_line(
     assert command.main([*command.arguments, "--output_dir=x", flag]) == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith(f"{prog}: error: option --")
-    assert " was removed: " in line
+    assert " was removed" in line
     assert remedy in line

@@ -2,12 +2,17 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import draccus
 import numpy as np
 import pytest
+import yaml
 
 from egovcp import spec
 from egovcp.data import DatasetWriter, Episode, Provenance
+from egovcp.flags import flags_of, merged, options_of
+from egovcp_train.config import PRESETS, TrainConfig
 
 type Arguments = Callable[..., list[str]]
 
@@ -48,7 +53,11 @@ def dataset_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="session")
 def arguments(dataset_root: Path) -> Arguments:
-    """Flags of a run that takes a second; keyword ``a__b`` stands for ``--a.b``."""
+    """Flags of a run that takes a second; keyword ``a__b`` stands for ``--a.b``.
+
+    Options that are not flags go to a configuration file beside the output folder.
+    """
+    not_flags = options_of(TrainConfig).keys() - flags_of(TrainConfig).keys()
 
     def build(output: Path, *flags: str, **options: object) -> list[str]:
         values: dict[str, object] = {
@@ -70,7 +79,24 @@ def arguments(dataset_root: Path) -> Arguments:
             "mixed_precision": "no",
             **options,
         }
-        named = [f"--{k.replace('__', '.')}={v}" for k, v in values.items() if v is not None]
-        return [*named, *flags]
+        named = {f"--{k.replace('__', '.')}": v for k, v in values.items() if v is not None}
+        constants = {flag: named.pop(flag) for flag in not_flags & named.keys()}
+        if constants:
+            preset = PRESETS[str(named.pop("--preset"))]()
+            named["--config_path"] = _config_file(output, preset, constants)
+        return [*(f"{flag}={value}" for flag, value in named.items()), *flags]
 
     return build
+
+
+def _config_file(output: Path, preset: TrainConfig, constants: dict[str, object]) -> Path:
+    """A file with all options of a preset and some other constants."""
+    options: dict[str, Any] = draccus.encode(preset)
+    for flag, value in constants.items():
+        nested: Any = value
+        for part in reversed(flag.removeprefix("--").split(".")):
+            nested = {part: nested}
+        options = merged(options, nested)
+    path = output.with_name(f"{output.name}.yaml")
+    path.write_text(yaml.safe_dump(options), encoding="utf-8")
+    return path

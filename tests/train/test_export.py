@@ -254,5 +254,5 @@ def test_a_planner_that_draws_latents_is_refused(
     save_artifact(tmp_path / "policy", model, PlannerConfig(latent="sample"), provenance)
     argv = [f"--policy.path={tmp_path / 'policy'}", f"--output_dir={tmp_path / 'onnx'}"]
     assert main(argv) == 4
-    assert "--planner.latent=mean" in capsys.readouterr().err
+    assert "latent=mean" in capsys.readouterr().err
     assert not (tmp_path / "onnx").exists()

@@ -1,5 +1,6 @@
 """egovcp-train from its command line: what it writes, what it refuses."""
 
+import dataclasses
 import os
 import pwd
 import re
@@ -19,10 +20,11 @@ from egovcp.cli import parse_config
 from egovcp.data import DatasetWriter, Episode, Provenance
 from egovcp.entry_point import prepare_process
 from egovcp.manifest import MANIFEST
-from egovcp.model import PRESETS, Batch
+from egovcp.model import PRESETS as MODELS
+from egovcp.model import Batch
 from egovcp_train import device
 from egovcp_train.checkpoint import load_training_state
-from egovcp_train.config import TrainConfig
+from egovcp_train.config import ABLATIONS, PRESETS, OptimizerConfig, TrainConfig
 from egovcp_train.device import choose_bf16
 from egovcp_train.loop import Learner
 from egovcp_train.train import main, option_defaults
@@ -123,9 +125,9 @@ def test_the_statistics_are_those_of_the_training_episodes(
 
 
 def test_a_preset_is_where_the_policy_options_start(arguments: Arguments, tmp_path: Path) -> None:
-    assert main(arguments(tmp_path / "run", "--policy.latent=5", "--policy.loss.value=2.5")) == 0
+    assert main(arguments(tmp_path / "run", "--policy.latent=5", "--policy.loss.reward=2.5")) == 0
     config = load_artifact(str(_last(tmp_path / "run") / "pretrained_model")).world_model.config
-    assert (config.hidden, config.latent, config.loss.value) == (32, 5, 2.5)
+    assert (config.hidden, config.latent, config.loss.reward) == (32, 5, 2.5)
 
 
 def test_a_run_under_a_clock_ends_early_and_whole(arguments: Arguments, tmp_path: Path) -> None:
@@ -226,7 +228,7 @@ def test_a_place_that_cannot_be_written_is_a_matter_of_the_surroundings(
         ({"save_freq": 0}, "--save_freq"),
         ({"device": "abacus"}, "--device"),
         ({"mixed_precision": "fp8"}, "--mixed_precision=fp8; expected no or bf16"),
-        ({"preset": "huge"}, "preset"),
+        ({"preset": "huge"}, "unknown --preset=huge"),
         ({"planner__elites": 99}, "elites"),
         ({"sampling__length": 0}, "length"),
         ({"stpes": 3}, "did you mean '--steps'"),
@@ -366,10 +368,36 @@ def test_the_controller_of_the_data_goes_into_the_artifact(
 
 def test_paper_preset_sets_the_options_of_the_paper_outside_the_world_model_too() -> None:
     """A single flag still overrides it."""
-    argv = ["--output_dir=x", "--preset=paper", "--planner.samples=64", "--optimizer.ema=0.9"]
-    config = parse_config(TrainConfig, argv, "egovcp-train", "", option_defaults)
-    assert config.policy.world_model() == PRESETS["paper"]
+    config = _parsed("--preset=paper", "--planner.samples=64", "--optimizer.lr=0.01")
+    assert config.policy.world_model() == MODELS["paper"]
     assert not config.sampling.mirror
     assert config.returns.keep_truncated
     assert config.planner.termination_rule == "paper"
-    assert (config.planner.samples, config.optimizer.ema) == (64, 0.9)
+    assert (config.planner.samples, config.planner.elites) == (64, 64)
+    assert config.optimizer == OptimizerConfig(lr=0.01, ema=0.0)
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_preset_is_the_configuration_that_its_function_returns(name: str) -> None:
+    assert _parsed(f"--preset={name}") == dataclasses.replace(PRESETS[name](), output_dir="x")
+
+
+def test_ablations_differ_from_the_default_in_the_loss_alone() -> None:
+    default = _parsed()
+    for name in ABLATIONS:
+        config = _parsed(f"--preset={name}")
+        assert config.policy.loss != default.policy.loss
+        policy = dataclasses.replace(config.policy, loss=default.policy.loss)
+        assert dataclasses.replace(config, preset="default", policy=policy) == default
+
+
+def test_command_has_at_most_70_options(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    assert len(re.findall(r"^ +(?:-h, )?--", capsys.readouterr().out, re.MULTILINE)) <= 70
+
+
+def _parsed(*flags: str) -> TrainConfig:
+    return parse_config(
+        TrainConfig, ["--output_dir=x", *flags], "egovcp-train", "", option_defaults
+    )

@@ -56,14 +56,14 @@ def streamed(arguments: Arguments, commit: str) -> Arguments:
     def build(output: Path, *flags: str, **options: object) -> list[str]:
         return arguments(
             output,
-            "--loading.network.attempts=2",
-            "--loading.network.wait_s=0.01",
             *flags,
             dataset__root=None,
             dataset__repo_id="me/ball",
             loading__mode="stream",
             loading__shuffle__episodes=2,
             loading__sample_files=1,
+            loading__network__attempts=2,
+            loading__network__wait_s=0.01,
             **options,
         )
 

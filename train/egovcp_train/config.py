@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
-from typing import Any, Literal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar, Final, Literal
 
+from egovcp import spec
 from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
 from egovcp.data import ReturnConfig, ShuffleConfig
-from egovcp.errors import UsageError
+from egovcp.errors import UsageError, suggest
 from egovcp.hub import RetryPolicy, is_repo_id
+from egovcp.model import PRESETS as MODELS
 from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_compatible
@@ -104,6 +107,23 @@ class TrainConfig:
     OUTPUT_DIR/checkpoints/last/pretrained_model is the artifact for egovcp-deploy.
     """
 
+    cli_options: ClassVar[Mapping[str, tuple[str, ...]]] = {
+        "policy": (
+            *("hidden", "latent", "units", "channels", "dynamics", "value_loss", "loss"),
+            *("push_to_hub", "repo_id", "private"),
+        ),
+        "policy.loss": ("q_target", "reward"),
+        "planner": (
+            *("samples", "horizon", "iterations", "elites", "objective", "optimiser"),
+            *("action_parameterization", "hands_cost", "step_cost"),
+        ),
+        "returns": ("gamma", "steps", "scale"),
+        "sampling": ("length", "mirror", "tasks"),
+        "loading": ("mode", "shuffle"),
+        "loading.shuffle": ("episodes",),
+        "optimizer": ("lr",),
+    }
+    """Flags of these groups (see `egovcp.flags`); the other options are constants of `PRESETS`."""
     output_dir: str
     """Folder of the run; must not exist unless --resume."""
     dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
@@ -111,8 +131,10 @@ class TrainConfig:
     datasets: tuple[WeightedDatasetConfig, ...] = ()
     """Several datasets to train on instead, '[{root: data/ball, weight: 2}, {repo_id: me/wall,
     weight: 1}]'; without weights every frame counts alike."""
-    preset: Literal["default", "paper", "debug"] = "default"
-    """Starting point of all options; paper: equal weights, nothing added to the paper."""
+    preset: str = "default"
+    """Starting point of all options: default; laptop (ends after 9.5 minutes); paper (the paper's
+    losses, returns and planner); debug (tiny networks); or an ablation of the default, such as
+    no_multistep."""
     policy: PolicyConfig = field(default_factory=PolicyConfig)
     """World model, losses, and where to publish."""
     planner: PlannerConfig = field(default_factory=PlannerConfig)
@@ -159,6 +181,8 @@ class TrainConfig:
     """Weights & Biases."""
 
     def __post_init__(self) -> None:
+        if self.preset not in PRESETS:
+            raise UsageError(f"unknown --preset={self.preset}{suggest(self.preset, PRESETS)}")
         require_compatible(self.policy, self.planner)
         require_affordable(self.policy, self.planner)
         loss = self.policy.loss
@@ -171,14 +195,75 @@ class TrainConfig:
             require_longer(self.sampling.length, loss.autoregressive_steps, "--sampling.length")
 
 
-#: Options of a preset beside the world model itself (`egovcp.model.PRESETS`). The paper mirrors no
-#: episodes and averages no weights, keeps returns that the time limit cuts short (their bias is
-#: that of its section III-D), and sets the values after a termination to zero.
-TRAINING_PRESETS: dict[str, dict[str, Any]] = {
-    "paper": {
-        "sampling": {"mirror": False},
-        "optimizer": {"ema": 0.0},
-        "returns": {"keep_truncated": True, "steps": 50},
-        "planner": asdict(PAPER_PLANNER),
-    },
+def default() -> TrainConfig:
+    """The best known recipe for all tasks."""
+    return TrainConfig(output_dir="")
+
+
+def laptop() -> TrainConfig:
+    """The default, ended by the clock; the recipe of `make quickstart`."""
+    return replace(default(), preset="laptop", max_minutes=9.5)
+
+
+def debug() -> TrainConfig:
+    """Networks that train in seconds and learn nothing."""
+    return replace(default(), preset="debug", policy=_policy(MODELS["debug"]))
+
+
+def paper() -> TrainConfig:
+    """The paper's losses, returns and planner; no mirrored episodes, no averaged weights.
+
+    Returns that the time limit cuts short count (section III-D), and values after a termination
+    are zero.
+    """
+    return replace(
+        default(),
+        preset="paper",
+        policy=_policy(MODELS["paper"]),
+        planner=PAPER_PLANNER,
+        returns=ReturnConfig(keep_truncated=True, steps=50),
+        sampling=SamplingConfig(mirror=False),
+        optimizer=OptimizerConfig(ema=0.0),
+    )
+
+
+def _policy(model: WorldModelConfig) -> PolicyConfig:
+    return PolicyConfig(**{f.name: getattr(model, f.name) for f in fields(model)})
+
+
+def _ablation(name: str, **loss: Any) -> Callable[[], TrainConfig]:
+    """The default with other loss options."""
+
+    def build() -> TrainConfig:
+        policy = PolicyConfig(loss=replace(PolicyConfig().loss, **loss))
+        return replace(default(), preset=name, policy=policy)
+
+    return build
+
+
+#: Ablations of the loss, as `egovcp-experiment ablations` compares them.
+ABLATIONS: Final[Mapping[str, Callable[[], TrainConfig]]] = {
+    name: _ablation(name, **loss)
+    for name, loss in {
+        "kl_equal": {"kl_posterior": 0.1},
+        "kl_tenfold": {"kl_prior": 1.0, "kl_posterior": 0.1},
+        "no_free_nats": {"free_nats": 0.0},
+        "free_nats_per_dimension": {"free_nats_per": "dimension"},
+        "pixels_summed": {"depth": float(spec.DEPTH_ROWS * spec.DEPTH_COLS)},
+        "state_summed": {"state": float(spec.STATE_DIM)},
+        "state_1": {"state": 1.0, "multistep_state": 1.0},
+        "no_moving": {"motion_weight": 0.0},
+        "no_multistep": {"multistep_depth": 0.0, "multistep_state": 0.0},
+        "no_near": {"proximity_weight": 0.0},
+        "value_weight_1": {"value": 1.0, "imagined_value": 1.0},
+        "q_of_posterior_only": {"imagined_steps": 0},
+    }.items()
+}
+#: Name -> function that returns the complete configuration.
+PRESETS: Final[Mapping[str, Callable[[], TrainConfig]]] = {
+    "default": default,
+    "laptop": laptop,
+    "paper": paper,
+    "debug": debug,
+    **ABLATIONS,
 }

@@ -37,7 +37,7 @@ from egovcp_train.output import CONFIG_FILE
 from egovcp_train.ranks import ALONE, Ranks
 from egovcp_train.return_scale import ReturnScale, on_task_scales, task_scales
 
-EVALUATION_EPISODES = 64  # of each task
+EVALUATION_EPISODES = 512  # of each task; R2 of Q needs the rows of hundreds
 FRAME_BYTES = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (spec.STATE_DIM + 2 * spec.ACTION_DIM + 8)
 
 type Built = tuple[PrefetchIterator, EpisodeStore, Mapping[str, ReturnScale]]

@@ -121,7 +121,7 @@ def _require_exportable(artifact: Artifact) -> None:
     if planner.latent != "mean":
         raise ArtifactError(
             f"{artifact.path}: its planner has latent={planner.latent}; the networks written here "
-            "give the mean, and another plan: train with --planner.latent=mean"
+            "give the mean, and another plan: train a policy with latent=mean, the default"
         )
 
 

@@ -18,7 +18,7 @@ from egovcp.data import EpisodeIndex, describe_heldout
 from egovcp.errors import UsageError
 from egovcp.hardware import require_memory
 from egovcp.manifest import finite_or_null
-from egovcp.model import PRESETS, WorldModel
+from egovcp.model import WorldModel
 from egovcp.model.weights import tensor_shapes
 from egovcp.plan.backends import make_evaluator
 from egovcp.stop_signals import stop_on_signal
@@ -33,7 +33,7 @@ from egovcp_train.checkpoint import (
     restoring,
 )
 from egovcp_train.closed_loop import ClosedLoop, require_simulator
-from egovcp_train.config import TRAINING_PRESETS, TrainConfig
+from egovcp_train.config import PRESETS, TrainConfig
 from egovcp_train.datasets import (
     EVALUATION_EPISODES,
     FRAME_BYTES,
@@ -75,23 +75,25 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
-    """What stands where no flag says otherwise: the options of the run that is resumed, or those
-    that --preset stands for.
+    """The defaults of the options: those of the run that is resumed, or of --preset.
 
     Raises:
-        UsageError: a config file, which says everything itself, would hide the preset.
+        UsageError: a config file, which has all options, would hide the preset.
     """
     if options := resumed_options(TrainConfig, argv):
         return options
     given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
     if "preset" in given and "config_path" in given:
         raise UsageError(
-            f"--preset={given['preset']} and --config_path={given['config_path']} both say what "
-            "the other options are; give one of them, and single options as flags of their own"
+            f"--preset={given['preset']} and --config_path={given['config_path']} both set "
+            "all options; give one of them, and single options as flags"
         )
     name = given.get("preset", "")
-    policy = {"policy": draccus.encode(PRESETS[name])} if name in PRESETS else {}
-    return policy | TRAINING_PRESETS.get(name, {})
+    if name not in PRESETS:
+        return {}
+    options: dict[str, Any] = draccus.encode(PRESETS[name]())
+    del options["output_dir"]
+    return options
 
 
 def train(config: TrainConfig) -> None:

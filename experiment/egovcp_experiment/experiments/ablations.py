@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from egovcp import spec
 from egovcp_experiment.cell import Cell, Flags
 from egovcp_experiment.config import ExperimentConfig
 from egovcp_experiment.experiment import Experiment
@@ -17,30 +16,21 @@ from egovcp_experiment.report.document import Report, Table
 from egovcp_experiment.report.heldout import COLUMNS, OVER_SEEDS, measured, over_seeds
 from egovcp_experiment.store import Record
 
-_PIXELS: Final = spec.DEPTH_ROWS * spec.DEPTH_COLS
-
+#: Ablations that are presets of egovcp-train.
+_PRESETS: Final = (
+    *("paper", "kl_equal", "kl_tenfold", "no_free_nats", "free_nats_per_dimension"),
+    *("pixels_summed", "state_summed", "state_1", "no_moving", "no_multistep", "no_near"),
+    *("value_weight_1", "q_of_posterior_only"),
+)
 #: Choice -> flags of egovcp-train in which it differs from the default.
 CHOICES: Final[dict[str, Flags]] = {
     "default": {},
-    "paper": {"preset": "paper"},
-    "kl_equal": {"policy.loss.kl_posterior": 0.1},
-    "kl_tenfold": {"policy.loss.kl_prior": 1, "policy.loss.kl_posterior": 0.1},
-    "no_free_nats": {"policy.loss.free_nats": 0},
-    "free_nats_per_dimension": {"policy.loss.free_nats_per": "dimension"},
-    "pixels_summed": {"policy.loss.depth": _PIXELS},
-    "state_summed": {"policy.loss.state": spec.STATE_DIM},
-    "state_1": {"policy.loss.state": 1, "policy.loss.multistep_state": 1},
-    "no_moving": {"policy.loss.motion_weight": 0},
-    "no_multistep": {"policy.loss.multistep_depth": 0, "policy.loss.multistep_state": 0},
-    "no_near": {"policy.loss.proximity_weight": 0},
+    **{name: {"preset": name} for name in _PRESETS},
     "raw_returns": {"returns.scale": "none"},
     "value_mse": {"policy.value_loss": "mse"},
-    "value_weight_1": {"policy.loss.value": 1, "policy.loss.imagined_value": 1},
-    "q_of_posterior_only": {"policy.loss.imagined_steps": 0},
     "reward_head": {"policy.loss.reward": 1},
     "arwm": {"policy.dynamics": "autoregressive"},
     "td": {"policy.loss.q_target": "td"},
-    "burn_in": {"sampling.burn_in": 8},
     "long_windows": {"sampling.length": 40, "batch_size": 8},  # as many rows per step
     "per_task_returns": {"returns.scale": "per_task"},
 }

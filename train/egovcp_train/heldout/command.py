@@ -52,7 +52,7 @@ class HeldoutConfig:
     """Dataset with the episodes."""
     split: str = "heldout"
     """heldout, train or all; episodes are held out by a hash, the same ones in each training."""
-    episodes: int = bounded(64, least=0, most=1_000_000)
+    episodes: int = bounded(512, least=0, most=1_000_000)
     """At most this many episodes of each task, evenly spread over the split; 0: all."""
     stride: int = bounded(4, least=1)
     """Rows between the starts of open-loop predictions; 1: from each row."""
