@@ -19,11 +19,11 @@ from egovcp.sim.robot import noise_std
 from egovcp.spec import CONTROLLER_HZ, JOINT_NAMES, STATE_SLICES
 from egovcp_deploy.pilot.motor_watch import MotorWatch
 from egovcp_deploy.robots.base import LowState, MotorCommand
-from egovcp_train.lowlevel import events
-from egovcp_train.lowlevel.physics import Physics
+from egovcp_train.lowlevel.commands import horizontal
+from egovcp_train.lowlevel.config import DisturbanceConfig
+from egovcp_train.lowlevel.physics import BatchPhysics, neutral_qpos, random_delays
 from egovcp_train.lowlevel.sensing import measure
 from egovcp_train.lowlevel.skills import SKILLS, Skill
-from egovcp_train.lowlevel.task import DisturbanceConfig
 
 _FALLEN_TILT = 0.8  # rad
 _KNEE = JOINT_NAMES.index("left_knee_joint")
@@ -37,12 +37,12 @@ def play(
     """Seconds of robots that stood, what the watch said of them, and s until it noticed."""
     rng = np.random.default_rng([seed, 1])
     config = DisturbanceConfig()
-    physics = Physics(robots, "stock", config, 1, seed)
+    physics = BatchPhysics(robots, "stock", config, 1, seed)
     controller = make_controller(controller_name)
     commands = skill.script(skill.ticks, robots, rng)
-    qpos = events.neutral(robots)
+    qpos = neutral_qpos(robots)
     physics.place(np.arange(robots), qpos, qpos[:, 7:])
-    delay = events.delays(robots, config, rng)
+    delay = random_delays(robots, config, rng)
     std = noise_std(SensorConfig())
     x = physics.snapshot()
     controller.reset(measure(x, commands[0], std, rng))
@@ -51,7 +51,7 @@ def play(
     seconds, alarms, noticed = 0.0, list[str](), list[float]()
     for tick, command in enumerate(commands):
         if skill.push and tick % CONTROLLER_HZ == CONTROLLER_HZ // 2:
-            physics.qvel[:, :2] += events.kick(skill.push, events.directions(robots, rng))
+            physics.qvel[:, :2] += horizontal(skill.push, rng.uniform(-np.pi, np.pi, robots))
         target = controller.step(measure(x, command, std, rng))
         sent = target.copy()
         if dropped and tick >= _DROPPED_TICK:

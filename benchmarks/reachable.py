@@ -38,9 +38,9 @@ from egovcp.errors import DataError, UsageError
 from egovcp.model.losses import filter_sequence
 from egovcp.policy_options import PolicyOptions
 from egovcp.trained import returns_of
-from egovcp_train.batches import to_tensors
-from egovcp_train.heldout.calibration import calibration
+from egovcp_train.datasets import to_tensors
 from egovcp_train.heldout.command import require_same_controller
+from egovcp_train.heldout.report import calibration
 
 PROG = "reachable.py"
 VALIDATION = 0.16  # hashes below it are not learned from; held out are those below 0.05

@@ -23,9 +23,9 @@ from egovcp.intervals import Interval, bootstrap
 from egovcp.robot.controllers import make_controller
 from egovcp.robot.mjcf import FootModel
 from egovcp.sim.config import SensorConfig
+from egovcp_train.lowlevel.config import DisturbanceConfig
 from egovcp_train.lowlevel.physics import PhysicsOptions
 from egovcp_train.lowlevel.skills import SKILLS, Skill
-from egovcp_train.lowlevel.task import DisturbanceConfig
 from egovcp_train.lowlevel.trial import play
 
 type Survived = NDArray[np.bool_]

@@ -44,10 +44,9 @@ from egovcp.data import (
     open_dataset,
 )
 from egovcp.model import Batch, WorldModel, WorldModelConfig
-from egovcp_train.allocation import keep_freed_memory
-from egovcp_train.batches import set_normalisation, to_tensors
 from egovcp_train.config import OptimizerConfig, SamplingConfig
-from egovcp_train.device import choose_bf16
+from egovcp_train.datasets import set_normalisation, to_tensors
+from egovcp_train.device import choose_bf16, keep_freed_memory
 from egovcp_train.loop import Learner
 
 TOLERANCE = 1e-4  # of the loss, relative: sums of some million fp32 numbers in another order

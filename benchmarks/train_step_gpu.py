@@ -34,8 +34,8 @@ from egovcp.data import (
     open_dataset,
 )
 from egovcp.model import Batch, WorldModel, WorldModelConfig
-from egovcp_train.batches import set_normalisation, to_tensors
 from egovcp_train.config import OptimizerConfig, SamplingConfig
+from egovcp_train.datasets import set_normalisation, to_tensors
 from egovcp_train.device import choose_bf16
 from egovcp_train.loop import Learner
 

@@ -11,7 +11,7 @@ import egovcp_deploy.deploy
 import egovcp_deploy.evaluate
 import egovcp_train.export
 import egovcp_train.heldout.command
-import egovcp_train.push
+import egovcp_train.publish
 from egovcp.artifact import CONFIG, save_artifact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.errors import ArtifactError
@@ -25,7 +25,7 @@ COMMANDS: dict[str, RunCommand] = {
     "eval": lambda policy, out: egovcp_deploy.evaluate.main([policy, "--task=ball", out]),
     "deploy": lambda policy, out: egovcp_deploy.deploy.main([policy, "--task=ball", out]),
     "export": lambda policy, out: egovcp_train.export.main([policy, out]),
-    "push": lambda policy, _: egovcp_train.push.main([policy, "--repo_id=me/policy"]),
+    "push": lambda policy, _: egovcp_train.publish.main([policy, "--repo_id=me/policy"]),
     "eval-model": lambda policy, out: egovcp_train.heldout.command.main(
         [policy, out, f"--dataset.root={Path(out.partition('=')[2]).parent / 'data'}"]
     ),

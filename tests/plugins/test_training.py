@@ -20,7 +20,7 @@ from egovcp.data.store import mirror_windows
 from egovcp.errors import ArtifactError, DataError, UsageError
 from egovcp.model import Batch
 from egovcp.robot.stance import StanceController
-from egovcp_train.batches import set_normalisation
+from egovcp_train.datasets import set_normalisation
 from lerobot_policy_egovcp import (
     EgovcpConfig,
     EgovcpPolicy,

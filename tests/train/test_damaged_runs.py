@@ -10,12 +10,12 @@ import torch
 
 from egovcp.errors import ArtifactError
 from egovcp_train.checkpoint import (
+    CONFIG_FILE,
     DIGEST_FILE,
     STATE_FILE,
     load_training_state,
     new_checkpoint,
 )
-from egovcp_train.output import CONFIG_FILE
 from egovcp_train.train import main
 
 

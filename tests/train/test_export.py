@@ -21,8 +21,16 @@ from egovcp.model import PRESETS, Carry, WorldModel
 from egovcp.model.depth import nearness
 from egovcp.plan import PlannerConfig
 from egovcp_train import export as module
-from egovcp_train.export import GOLDEN, REPORT, TOLERANCE, main, verify
-from egovcp_train.onnx_networks import NETWORKS, golden_inputs, pooled_nearness
+from egovcp_train.export import (
+    GOLDEN,
+    NETWORKS,
+    REPORT,
+    TOLERANCE,
+    golden_inputs,
+    main,
+    pooled_nearness,
+    verify,
+)
 
 type Run = Callable[..., list[Any]]
 

@@ -104,7 +104,7 @@ def test_recorded_steps_learn_the_same_bit_for_bit(
     config = dataclasses.replace(PRESETS["debug"], dynamics=dynamics, loss=loss)
     plain, recorded = (Learner(toy_model(config), CONFIG, seed=0) for _ in range(2))
     recorder = RecomputingRecorder()
-    recorded._gradients = Recorded(recorded._find, recorder, most=64, copies=False)
+    recorded._gradients = Recorded(recorded._compute_gradients, recorder, most=64, copies=False)
     for seed in range(12):
         expected = plain.update(random_batch(2, 6, seed), 0.0)
         found = recorded.update(random_batch(2, 6, seed), 0.0)
@@ -121,7 +121,7 @@ def test_a_step_that_cannot_be_recorded_is_made_and_says_why() -> None:
 
     learner, plain = _learner(), _learner()
     assert not learner.unrecorded
-    learner._gradients = Recorded(learner._find, refuse, copies=False)
+    learner._gradients = Recorded(learner._compute_gradients, refuse, copies=False)
     for seed in range(3):
         learner.update(random_batch(2, 3, seed), 0.0)
         plain.update(random_batch(2, 3, seed), 0.0)
@@ -135,7 +135,7 @@ def test_a_step_that_cannot_be_recorded_is_made_and_says_why() -> None:
 def test_on_a_gpu_steps_are_recorded_and_the_same(bf16: bool) -> None:
     recorded, plain = (Learner(toy_model().cuda(), CONFIG, seed=0, bf16=bf16) for _ in range(2))
     assert isinstance(recorded._gradients, Recorded)
-    plain._gradients = plain._find
+    plain._gradients = plain._compute_gradients
     for seed in range(24):
         batch = Batch(*(x.cuda() for x in random_batch(4, 8, seed)))
         found, expected = (x.update(batch, 0.0) for x in (recorded, plain))

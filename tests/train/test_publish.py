@@ -17,7 +17,7 @@ from egovcp.plan import PlannerConfig
 from egovcp.processors import PROCESSORS
 from egovcp.testing import toy_model
 from egovcp_train import publish as publishing
-from egovcp_train.push import main as push
+from egovcp_train.publish import main as push
 from egovcp_train.train import main as train
 from tests.support.hub import FakeHub, in_this_process
 

@@ -1,7 +1,8 @@
-"""Checkpoints in LeRobot's layout, complete or absent, never half-written.
+"""The output folder of a run: its options, and checkpoints that are complete or absent.
 
-checkpoints/000500/pretrained_model/   the policy artifact (averaged weights)
-checkpoints/000500/training_state/     raw weights, optimiser, random streams, data position, and
+train_config.yaml                      the options of the run
+checkpoints/000500/pretrained_model/   the policy (averaged weights), in LeRobot's layout
+checkpoints/000500/training_state/     weights, optimiser, random streams, data position, and
                                        their SHA-256
 checkpoints/last -> 000500
 """
@@ -11,7 +12,7 @@ from __future__ import annotations
 import os
 import shutil
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any, Final
@@ -20,16 +21,94 @@ import torch
 
 from egovcp.atomic import removed_on_error
 from egovcp.data.files import sync, sync_tree
-from egovcp.errors import ArtifactError
+from egovcp.errors import ArtifactError, UsageError
+from egovcp.flags import read_config
 from egovcp.model.weights import MAX_WEIGHT_BYTES
+from egovcp.outputs import require_writable
+from egovcp.removed_options import RemovedOptionError, refuse_removed_options
 from egovcp.safe_files import UnsafeFileError, open_regular, read_text, sha256
+from egovcp.values import build
 
-STATE_FILE = "state.pt"
-DIGEST_FILE = f"{STATE_FILE}.sha256"
-"""As ``sha256sum`` writes it; checkpoints of earlier versions have none."""
+CONFIG_FILE: Final = "train_config.yaml"
+STATE_FILE: Final = "state.pt"
+DIGEST_FILE: Final = f"{STATE_FILE}.sha256"
+"""In the format of ``sha256sum``; checkpoints of earlier versions have none."""
 _LIMIT_BYTES: Final = 5 * MAX_WEIGHT_BYTES + (1 << 30)  # weights, averages and moments; positions
+_REMEDY: Final = "restore this file, or remove it and give all options of the run as flags"
 
 
+# --- options -------------------------------------------------------------------------
+def resumed_options(config_class: type, argv: Sequence[str]) -> dict[str, Any]:
+    """The stored options of the run that is resumed; empty without ``--resume``.
+
+    Args:
+        config_class: dataclass of the command's options.
+        argv: its flags, ``--name=value`` each.
+
+    Raises:
+        UsageError: a config file is given as well.
+        ArtifactError: the stored options cannot be read.
+    """
+    given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
+    if "--resume" not in argv and given.get("resume", "").lower() != "true":
+        return {}
+    if "config_path" in given:
+        raise UsageError(
+            f"--resume uses the options stored in --output_dir, and "
+            f"--config_path={given['config_path']} gives others; drop it, and give changes as flags"
+        )
+    return saved_options(config_class, Path(given.get("output_dir", "")))
+
+
+def saved_options(config_class: type, output: Path) -> dict[str, Any]:
+    """The options that a run has stored in its folder; empty if it has stored none.
+
+    Raises:
+        ArtifactError: they cannot be read, or are not those of ``config_class``.
+    """
+    saved = output / CONFIG_FILE
+    if not os.path.lexists(saved):
+        return {}
+    try:
+        options = read_config(saved)
+        refuse_removed_options(options, str(saved))
+        build(config_class, options, "--")
+    except OSError as error:
+        raise ArtifactError(f"{saved}: cannot be read: {error.strerror}; {_REMEDY}") from error
+    except RemovedOptionError as error:
+        raise ArtifactError(
+            f"{error}; a run of an older version cannot be resumed: start a new one"
+        ) from error
+    except (UsageError, ValueError) as error:
+        raise ArtifactError(f"{saved}: {error}; {_REMEDY}") from error
+    return options
+
+
+def prepare_output(output_dir: str, resume: bool, resumable: bool = True) -> Path:
+    """Check the output folder before any work starts.
+
+    Args:
+        output_dir: the folder, which need not exist.
+        resume: continue the run in it.
+        resumable: whether the command has the option ``--resume``.
+
+    Raises:
+        ArtifactError: there is nothing to resume.
+        UsageError: the folder exists and is not empty.
+        EnvironmentFailure: it is not writable.
+    """
+    output = Path(output_dir)
+    if resume:
+        load_training_state(output)
+        return output
+    if output.exists() and (not output.is_dir() or any(output.iterdir())):
+        remedy = ", or continue the run in it with --resume" if resumable else ""
+        raise UsageError(f"output folder {output} exists and is not empty; choose another{remedy}")
+    require_writable(output)
+    return output
+
+
+# --- checkpoints ---------------------------------------------------------------------
 def checkpoint_dir(output_dir: Path, step: int) -> Path:
     return output_dir / "checkpoints" / f"{step:06d}"
 
@@ -38,8 +117,8 @@ def checkpoint_dir(output_dir: Path, step: int) -> Path:
 def new_checkpoint(output_dir: Path, step: int, state: dict[str, Any]) -> Iterator[Path]:
     """Write a checkpoint: the block fills ``pretrained_model``, an empty folder.
 
-    Then the training state is added, and the checkpoint appears under its name. If anything fails
-    nothing is left, and ``last`` is the checkpoint before.
+    Then the training state is added and the checkpoint gets its name. If anything fails, nothing
+    is left, and ``last`` is the previous checkpoint.
 
     Args:
         output_dir: folder of the run.
@@ -52,16 +131,16 @@ def new_checkpoint(output_dir: Path, step: int, state: dict[str, Any]) -> Iterat
         model = partial / "pretrained_model"
         model.mkdir(parents=True)
         yield model
-        _finish(partial, state)
+        folder = partial / "training_state"
+        folder.mkdir(parents=True)
+        with (folder / STATE_FILE).open("wb") as file:
+            torch.save(state, file)
+        (folder / DIGEST_FILE).write_text(f"{sha256(folder / STATE_FILE)}  {STATE_FILE}\n")
+        _publish(partial)
 
 
-def _finish(partial: Path, state: dict[str, Any]) -> None:
-    """Add the training state to NNNNNN.partial, publish it, point ``last`` at it."""
-    folder = partial / "training_state"
-    folder.mkdir(parents=True)
-    with (folder / STATE_FILE).open("wb") as file:
-        torch.save(state, file)
-    (folder / DIGEST_FILE).write_text(f"{sha256(folder / STATE_FILE)}  {STATE_FILE}\n")
+def _publish(partial: Path) -> None:
+    """Rename NNNNNN.partial and point ``last`` at it."""
     sync_tree(partial)  # on the disk before it gets its name
     final = partial.with_suffix("")
     shutil.rmtree(final, ignore_errors=True)
@@ -88,8 +167,7 @@ def load_training_state(output_dir: Path) -> dict[str, Any]:
     try:
         _require_digest(path)
         with open_regular(path, _LIMIT_BYTES) as file:
-            state: dict[str, Any] = _load(file)
-        return state
+            return _load(file)
     except (OSError, UnsafeFileError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise ArtifactError(
@@ -100,10 +178,10 @@ def load_training_state(output_dir: Path) -> dict[str, Any]:
 
 @contextmanager
 def restoring(output_dir: Path) -> Iterator[None]:
-    """Around the code that takes a training state.
+    """Around the code that restores a training state.
 
     Raises:
-        ArtifactError: the state is not that of the options.
+        ArtifactError: the state does not fit the options.
     """
     try:
         yield
@@ -116,13 +194,12 @@ def restoring(output_dir: Path) -> Iterator[None]:
 
 
 def _require_digest(path: Path) -> None:
-    """Raise unless the SHA-256 of the state is the one beside it."""
-    beside = path.with_name(DIGEST_FILE)
-    if not os.path.lexists(beside):
+    """Raise `UnsafeFileError` unless the SHA-256 of the state is the stored one."""
+    digest = path.with_name(DIGEST_FILE)
+    if not os.path.lexists(digest):
         return
-    expected = read_text(beside, 1024).split(" ")[0]
-    found = sha256(path, _LIMIT_BYTES)
-    if found != expected:
+    expected = read_text(digest, 1024).split(" ")[0]
+    if sha256(path, _LIMIT_BYTES) != expected:
         raise UnsafeFileError(f"its SHA-256 is not the one in {DIGEST_FILE}; it is damaged")
 
 
@@ -132,7 +209,7 @@ def _load(file: IO[bytes]) -> dict[str, Any]:
             state = torch.load(file, map_location="cpu", weights_only=True)
     except MemoryError:
         raise
-    except Exception as error:  # the unpickler raises whatever the bytes make it do
+    except Exception as error:  # the unpickler raises any exception on damaged bytes
         raise UnsafeFileError("not a training state") from error
     if not isinstance(state, dict):
         raise UnsafeFileError("not a training state")

@@ -3,7 +3,7 @@
 from egovcp.entry_point import EntryPoint
 
 train = EntryPoint("egovcp-train", "egovcp_train.train")
-push = EntryPoint("egovcp-push", "egovcp_train.push")
+push = EntryPoint("egovcp-push", "egovcp_train.publish")
 export = EntryPoint("egovcp-export", "egovcp_train.export")
 eval_model = EntryPoint("egovcp-eval-model", "egovcp_train.heldout.command")
 train_lowlevel = EntryPoint("egovcp-train-lowlevel", "egovcp_train.lowlevel.train")

@@ -17,7 +17,7 @@ from egovcp.model import WorldModelConfig
 from egovcp.model.config import require_longer
 from egovcp.plan import PlannerConfig, require_compatible
 from egovcp.plan.config import PAPER_PLANNER, require_affordable
-from egovcp_train.wandb_records import WandbConfig
+from egovcp_train.records import WandbConfig
 
 
 @dataclass(frozen=True)
@@ -162,7 +162,7 @@ class TrainConfig:
     """Continue the run in output_dir from its last checkpoint, with its options unless given."""
     log_freq: int = bounded(50, least=1)
     """Steps between TensorBoard records."""
-    eval_freq: int = bounded(500, least=0)
+    eval_freq: int = bounded(1000, least=0)
     """Steps between evaluations on held-out episodes; 0: only at the end."""
     eval_closed_loop: int = bounded(0, least=0, most=1_000_000)
     """Scenarios of each task that are played in simulation at every evaluation; 0: none."""
@@ -241,23 +241,23 @@ def _ablation(name: str, **loss: Any) -> Callable[[], TrainConfig]:
     return build
 
 
+_ABLATED_LOSSES: Final[Mapping[str, Mapping[str, Any]]] = {
+    "kl_equal": {"kl_posterior": 0.1},
+    "kl_tenfold": {"kl_prior": 1.0, "kl_posterior": 0.1},
+    "no_free_nats": {"free_nats": 0.0},
+    "free_nats_per_dimension": {"free_nats_per": "dimension"},
+    "pixels_summed": {"depth": float(spec.DEPTH_ROWS * spec.DEPTH_COLS)},
+    "state_summed": {"state": float(spec.STATE_DIM)},
+    "state_1": {"state": 1.0, "multistep_state": 1.0},
+    "no_moving": {"motion_weight": 0.0},
+    "no_multistep": {"multistep_depth": 0.0, "multistep_state": 0.0},
+    "no_near": {"proximity_weight": 0.0},
+    "value_weight_1": {"value": 1.0, "imagined_value": 1.0},
+    "q_of_posterior_only": {"imagined_steps": 0},
+}
 #: Ablations of the loss, as `egovcp-experiment ablations` compares them.
 ABLATIONS: Final[Mapping[str, Callable[[], TrainConfig]]] = {
-    name: _ablation(name, **loss)
-    for name, loss in {
-        "kl_equal": {"kl_posterior": 0.1},
-        "kl_tenfold": {"kl_prior": 1.0, "kl_posterior": 0.1},
-        "no_free_nats": {"free_nats": 0.0},
-        "free_nats_per_dimension": {"free_nats_per": "dimension"},
-        "pixels_summed": {"depth": float(spec.DEPTH_ROWS * spec.DEPTH_COLS)},
-        "state_summed": {"state": float(spec.STATE_DIM)},
-        "state_1": {"state": 1.0, "multistep_state": 1.0},
-        "no_moving": {"motion_weight": 0.0},
-        "no_multistep": {"multistep_depth": 0.0, "multistep_state": 0.0},
-        "no_near": {"proximity_weight": 0.0},
-        "value_weight_1": {"value": 1.0, "imagined_value": 1.0},
-        "q_of_posterior_only": {"imagined_steps": 0},
-    }.items()
+    name: _ablation(name, **loss) for name, loss in _ABLATED_LOSSES.items()
 }
 #: Name -> function that returns the complete configuration.
 PRESETS: Final[Mapping[str, Callable[[], TrainConfig]]] = {

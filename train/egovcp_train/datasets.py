@@ -1,4 +1,4 @@
-"""What a run trains on: which datasets, how often each is drawn, in memory or from the disk."""
+"""Training data of a run: datasets and their weights, batches, normalisation, held-out episodes."""
 
 from __future__ import annotations
 
@@ -6,9 +6,10 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from egovcp import spec
@@ -19,6 +20,7 @@ from egovcp.data import (
     EpisodeStore,
     InMemorySampler,
     Mix,
+    ReturnConfig,
     SamplerConfig,
     StreamingSampler,
     compute_training_stats,
@@ -30,15 +32,19 @@ from egovcp.data.schema import INFO_PATH
 from egovcp.data.source import is_local, local_root
 from egovcp.errors import DataError, UsageError
 from egovcp.hardware import available_bytes
-from egovcp.model import WorldModel
-from egovcp_train.batches import fix_normalisation, set_normalisation
+from egovcp.model import Batch, WorldModel
+from egovcp_train.checkpoint import CONFIG_FILE
 from egovcp_train.config import TrainConfig
-from egovcp_train.output import CONFIG_FILE
-from egovcp_train.ranks import ALONE, Ranks
-from egovcp_train.return_scale import ReturnScale, on_task_scales, task_scales
+from egovcp_train.distributed import SINGLE, ProcessGroup
 
-EVALUATION_EPISODES = 512  # of each task; R2 of Q needs the rows of hundreds
-FRAME_BYTES = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (spec.STATE_DIM + 2 * spec.ACTION_DIM + 8)
+EVALUATION_EPISODES: Final = 512
+"""Held-out episodes of each task; with fewer, R2 of Q depends on which ones they are."""
+FRAME_BYTES: Final = spec.DEPTH_ROWS * spec.DEPTH_COLS * 2 + 4 * (
+    spec.STATE_DIM + 2 * spec.ACTION_DIM + 8
+)
+
+_RETURNS: Final = ReturnConfig()
+_MIN_STD: Final = 1e-6
 
 type Built = tuple[PrefetchIterator, EpisodeStore, Mapping[str, ReturnScale]]
 
@@ -59,38 +65,36 @@ class TrainingData:
     """Task -> the scale that its returns are on, under `returns.scale=per_task`; else empty."""
 
 
-def prepare(config: TrainConfig, model: WorldModel, ranks: Ranks = ALONE) -> TrainingData:
+def prepare(config: TrainConfig, model: WorldModel, group: ProcessGroup = SINGLE) -> TrainingData:
     """Open the datasets and fix the model's statistics.
 
-    What is on disk is read and checked as a whole; of a dataset that is streamed from the Hub a
-    sample of its files.
-
-    The first process goes ahead: it alone downloads, refuses what is wrong, and decides.
+    Local datasets are read and checked completely, of datasets that are streamed from the Hub a
+    sample of the files. The first process downloads and checks before the others start.
 
     Raises:
-        UsageError: the options make no sense.
-        DataError: a dataset is missing, damaged, not a number, or of another specification.
+        UsageError: the options contradict each other.
+        DataError: a dataset is missing, damaged, not finite, or of another specification.
         EnvironmentFailure: the Hub cannot be reached.
     """
-    if ranks.is_first:
-        material = _prepare(config, model, ranks)
-        ranks.decided(material.config.loading)
-        return material
-    loading = ranks.decided(config.loading)
-    return _prepare(dataclasses.replace(config, loading=loading), model, ranks)
+    if group.is_first:
+        data = _prepare(config, model, group)
+        group.broadcast(data.config.loading)
+        return data
+    loading = group.broadcast(config.loading)
+    return _prepare(dataclasses.replace(config, loading=loading), model, group)
 
 
-def _prepare(config: TrainConfig, model: WorldModel, ranks: Ranks) -> TrainingData:
+def _prepare(config: TrainConfig, model: WorldModel, group: ProcessGroup) -> TrainingData:
     mix, sampling = mix_of(config), stream_config(config)
     sampling.check()
     config.loading.shuffle.check()
     config.returns.check()
     readers = open_readers(config)
-    config = pinned(_decided(config, readers, ranks), readers)
+    config = pinned(_resolved(config, readers, group), readers)
     if config.loading.mode == "ram" and any(reader.is_remote for reader in readers):
         readers = open_readers(config)
     build = _in_memory if config.loading.mode == "ram" else _on_disk
-    return TrainingData(readers, config, *build(readers, config, sampling, mix, model, ranks))
+    return TrainingData(readers, config, *build(readers, config, sampling, mix, model, group))
 
 
 def open_readers(config: TrainConfig) -> tuple[DatasetReader, ...]:
@@ -115,9 +119,8 @@ def _open(dataset: DatasetConfig, config: TrainConfig) -> DatasetReader:
 
 
 def pinned(config: TrainConfig, readers: Sequence[DatasetReader]) -> TrainConfig:
-    """The options with the absolute path of each folder, and the commit of each dataset of the
-    Hub, so that a resumed run finds the same data from any working directory, whatever is pushed
-    meanwhile."""
+    """The options with absolute paths of folders and commits of datasets on the Hub, so that a
+    resumed run finds the same data."""
     if not config.datasets:
         return dataclasses.replace(config, dataset=_pinned(config.dataset, readers[0]))
     both = zip(config.datasets, readers, strict=True)
@@ -133,15 +136,11 @@ def _pinned[D: DatasetConfig](config: D, reader: DatasetReader) -> D:
 
 
 def require_datasets(config: TrainConfig, saved: Mapping[str, Any]) -> None:
-    """See that the dataset folders of a resumed run are there.
+    """Raise `DataError`, with a remedy, if a dataset folder of a resumed run is missing.
 
     Args:
         config: the options.
-        saved: those that the run has kept.
-
-    Raises:
-        DataError: one is not; the message says where the run had it and which flag says where it
-            is now.
+        saved: those that the run has stored.
     """
     folders = [d for d in config.datasets or (config.dataset,) if d.root]
     missing = [local_root(d) for d in folders if not (local_root(d) / INFO_PATH).is_file()]
@@ -162,14 +161,11 @@ def require_datasets(config: TrainConfig, saved: Mapping[str, Any]) -> None:
 
 
 def require_same_content(readers: Sequence[DatasetReader], digests: Sequence[str]) -> None:
-    """See that a resumed run goes on with its own data, wherever that lies now.
+    """Raise `DataError` unless a resumed run continues with the same data, in any location.
 
     Args:
         readers: the datasets.
         digests: `DatasetReader.content_digest` of those that the run was started with.
-
-    Raises:
-        DataError: a dataset is another one.
     """
     found = [reader.content_digest for reader in readers]
     if len(found) != len(digests):
@@ -188,7 +184,7 @@ def mix_of(config: TrainConfig) -> Mix:
     """The weights of datasets and tasks.
 
     Raises:
-        UsageError: some datasets have a weight and others none, or a weight makes no sense.
+        UsageError: some datasets have a weight and others none, or a weight is invalid.
     """
     weights = [d.weight for d in config.datasets if d.weight is not None]
     if len(weights) not in (0, len(config.datasets)):
@@ -210,11 +206,13 @@ def stream_config(config: TrainConfig) -> SamplerConfig:
     )
 
 
-def _decided(config: TrainConfig, readers: Sequence[DatasetReader], ranks: Ranks) -> TrainConfig:
-    """The options with the mode that auto stands for here, so that a resumed run keeps it."""
+def _resolved(
+    config: TrainConfig, readers: Sequence[DatasetReader], group: ProcessGroup
+) -> TrainConfig:
+    """The options with the mode that auto selects here, so that a resumed run keeps it."""
     if config.loading.mode != "auto":
         return config
-    needed = EpisodeIndex.of(readers).num_frames * FRAME_BYTES * ranks.local
+    needed = EpisodeIndex.of(readers).num_frames * FRAME_BYTES * group.local
     mode: Literal["ram", "stream"] = "ram" if 2 * needed <= available_bytes() else "stream"
     return dataclasses.replace(config, loading=dataclasses.replace(config.loading, mode=mode))
 
@@ -225,7 +223,7 @@ def _in_memory(
     sampling: SamplerConfig,
     mix: Mix,
     model: WorldModel,
-    ranks: Ranks,
+    group: ProcessGroup,
 ) -> Built:
     learning, heldout = (
         EpisodeStore.load(readers, split, config.returns) for split in ("train", "heldout")
@@ -237,8 +235,8 @@ def _in_memory(
     complete = np.bincount(np.repeat(learning.dataset, learning.length), weights=learning.mc_valid)
     _require_returns(readers, learning.dataset, complete)
     set_normalisation(model, learning, config.returns)
-    rows = ranks.rows(sampling.batch_size)
-    sampling = dataclasses.replace(sampling, batch_size=ranks.count * sampling.batch_size)
+    rows = group.rows(sampling.batch_size)
+    sampling = dataclasses.replace(sampling, batch_size=group.count * sampling.batch_size)
     stream = PrefetchIterator(InMemorySampler(learning, sampling, mix, rows))
     return stream, heldout, scales
 
@@ -249,7 +247,7 @@ def _on_disk(
     sampling: SamplerConfig,
     mix: Mix,
     model: WorldModel,
-    ranks: Ranks,
+    group: ProcessGroup,
 ) -> Built:
     if config.returns.scale == "per_task":
         raise UsageError(
@@ -270,16 +268,16 @@ def _on_disk(
     _require_returns(readers, sample.dataset, facts.complete)
     longest = int(learning.length.max())
     state = facts.state_mean, facts.state_std
-    fix_normalisation(model, *state, facts.returns, longest, config.returns)
+    _set_statistics(model, *state, facts.returns, longest, config.returns)
     stream = StreamingSampler(
         learning,
         sampling,
         mix,
         config.loading.shuffle,
+        rank=group.rank,
+        ranks=group.count,
         returns=config.returns,
         checked=not learning.is_remote,
-        rank=ranks.rank,
-        ranks=ranks.count,
     )
     return PrefetchIterator(stream), heldout, {}
 
@@ -287,12 +285,12 @@ def _on_disk(
 def _require_returns(
     readers: Sequence[DatasetReader], dataset: NDArray[np.int64], complete: NDArray[Any]
 ) -> None:
-    """Raise `DataError` for one of several datasets that would teach Q nothing.
+    """Raise `DataError` for one of several datasets without a return that Q can learn.
 
     Args:
         readers: the datasets.
-        dataset: (E,) which of them each episode is of.
-        complete: (D,) rows of each that have a complete return.
+        dataset: (E,) number of the dataset of each episode.
+        complete: (D,) rows of each dataset with a complete return.
     """
     without = [number for number in np.unique(dataset).tolist() if not complete[number]]
     if without and complete.any():
@@ -301,3 +299,85 @@ def _require_returns(
             "other datasets have: its episodes are not longer than --returns.steps; lower it, "
             "or leave the dataset out"
         )
+
+
+# --- batches and normalisation -------------------------------------------------------
+def to_tensors(arrays: Mapping[str, NDArray[Any]], device: torch.device) -> Batch:
+    """A batch of `InMemorySampler` as the tensors that the losses read."""
+    depth = torch.from_numpy(arrays["depth"].astype(np.int32))
+    rest = {k: torch.from_numpy(arrays[k]) for k in Batch._fields if k != "depth"}
+    tensors = {"depth": depth, **rest}
+    return Batch(**{k: v.to(device, non_blocking=True) for k, v in tensors.items()})
+
+
+def set_normalisation(
+    model: WorldModel, store: EpisodeStore, config: ReturnConfig = _RETURNS
+) -> None:
+    """Set the model's statistics from the training episodes.
+
+    Args:
+        model: whose statistics are set.
+        store: the episodes.
+        config: definition of their returns.
+
+    Raises:
+        DataError: no return is complete, because the episodes are too short.
+    """
+    state = store.state.astype(np.float64)
+    returns = store.mc_return[store.mc_valid]
+    _set_statistics(model, state.mean(0), state.std(0), returns, int(store.length.max()), config)
+
+
+def _set_statistics(
+    model: WorldModel,
+    state_mean: NDArray[np.float64],
+    state_std: NDArray[np.float64],
+    returns: NDArray[np.float32],
+    longest: int,
+    config: ReturnConfig,
+) -> None:
+    """As `set_normalisation`: state (74,) each, complete returns (N,), longest episode, ticks."""
+    if len(returns) == 0:
+        raise DataError(
+            f"no row has a complete Monte Carlo return: the episodes (at most {longest} ticks) "
+            "are not longer than --returns.steps; lower it, or collect longer episodes"
+        )
+    model.set_statistics(state_mean, state_std, returns, config.scale != "none", config.gamma)
+
+
+# --- the ablation `returns.scale=per_task` --------------------------------------------
+class ReturnScale(NamedTuple):
+    """Mean and standard deviation of the complete returns of a task."""
+
+    mean: float
+    std: float
+
+
+def task_scales(store: EpisodeStore) -> dict[str, ReturnScale]:
+    """Task -> scale of its returns; without the tasks that have no complete return."""
+    tasks = np.repeat(np.array(store.tasks), store.length)
+    found: dict[str, ReturnScale] = {}
+    for task in sorted(set(store.tasks)):
+        returns = store.mc_return[store.mc_valid & (tasks == task)].astype(np.float64)
+        if len(returns):
+            found[task] = ReturnScale(float(returns.mean()), max(float(returns.std()), _MIN_STD))
+    return found
+
+
+def on_task_scales(store: EpisodeStore, scales: Mapping[str, ReturnScale]) -> EpisodeStore:
+    """The store with the returns of each task standardised by its scale.
+
+    Raises:
+        DataError: the scale of a task is unknown.
+    """
+    unknown = sorted(set(store.tasks) - scales.keys())
+    if unknown:
+        raise DataError(
+            f"no scale of returns is known for task {unknown[0]!r}, only for "
+            f"{', '.join(sorted(scales)) or 'none'}; use --returns.scale=dataset, or other data"
+        )
+    mean, std = (
+        np.repeat([getattr(scales[task], name) for task in store.tasks], store.length)
+        for name in ReturnScale._fields
+    )
+    return dataclasses.replace(store, mc_return=((store.mc_return - mean) / std).astype(np.float32))

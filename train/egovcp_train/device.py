@@ -1,13 +1,21 @@
-"""Where the arithmetic happens."""
+"""Device and precision of the arithmetic, and the memory allocator of the process."""
 
 from __future__ import annotations
 
+import ctypes
 import os
 from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import Final
 
 import torch
 
 from egovcp.errors import EnvironmentFailure, UsageError
+
+_TRIM_THRESHOLD, _TOP_PAD, _MMAP_THRESHOLD = -1, -2, -3  # of mallopt(3)
+_HUGEPAGE: Final = 14  # of madvise(2)
+_LARGEST_BYTES: Final = 32 << 20  # of an intermediate tensor of a step
+_HEAP_BYTES: Final = 512 << 20  # address space for all of them
 
 
 def choose_device(name: str) -> torch.device:
@@ -29,22 +37,22 @@ def choose_device(name: str) -> torch.device:
 
 
 def choose_bf16(name: str, device: torch.device) -> bool:
-    """Whether matrix products are in bfloat16, as ``--mixed_precision`` asks.
+    """Whether matrix products are in bfloat16, for a value of ``--mixed_precision``.
 
-    auto: as ``accelerate launch`` was told, else if the device computes in it: where bfloat16 is
-    emulated it is slower than float32.
+    auto: as ``accelerate launch`` was told, else if the device computes in it; emulated bfloat16
+    is slower than float32.
 
     Raises:
-        UsageError: it asks for something else.
+        UsageError: the value is neither no nor bf16.
     """
-    said = name
+    chosen = name
     if name == "auto":
         own = "bf16" if _computes_in_bf16(device) else "no"
-        said = os.environ.get("ACCELERATE_MIXED_PRECISION", own)
-    if said not in ("no", "bf16"):
+        chosen = os.environ.get("ACCELERATE_MIXED_PRECISION", own)
+    if chosen not in ("no", "bf16"):
         source = "accelerate launch " if name == "auto" else ""
-        raise UsageError(f"{source}--mixed_precision={said}; expected no or bf16")
-    return said == "bf16"
+        raise UsageError(f"{source}--mixed_precision={chosen}; expected no or bf16")
+    return chosen == "bf16"
 
 
 def _computes_in_bf16(device: torch.device) -> bool:
@@ -55,5 +63,39 @@ def _computes_in_bf16(device: torch.device) -> bool:
 
 
 def precision(device: torch.device, bf16: bool) -> AbstractContextManager[object]:
-    """Matrix products within are in bfloat16, if so; weights and sums stay in float32."""
+    """Context in which matrix products are in bfloat16, if so; weights and sums are float32."""
     return torch.autocast(device.type, torch.bfloat16, enabled=bf16)
+
+
+def keep_freed_memory() -> bool:
+    """Make the C library reuse freed memory, in large pages; False where it is not glibc.
+
+    A gradient step on the CPU allocates and frees hundreds of tensors of a few MB. By default each
+    of them is returned to the system and costs page faults when it is allocated again.
+    """
+    try:
+        libc = ctypes.CDLL(None)
+        mallopt = libc.mallopt
+    except (AttributeError, OSError, TypeError):
+        return False
+    kept = mallopt(_MMAP_THRESHOLD, _LARGEST_BYTES) and mallopt(_TRIM_THRESHOLD, 2**31 - 1)
+    if kept and mallopt(_TOP_PAD, _HEAP_BYTES):
+        _reserve(libc)
+        mallopt(_TOP_PAD, 128 << 10)  # the default
+    return bool(kept)
+
+
+def _reserve(libc: ctypes.CDLL) -> None:
+    """Grow the heap, and request large pages for it."""
+    libc.malloc.restype, libc.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]
+    libc.free.argtypes = [ctypes.c_void_p]
+    libc.madvise.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+    libc.free(libc.malloc(_LARGEST_BYTES - (1 << 20)))
+    try:
+        lines = Path("/proc/self/maps").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return
+    for line in lines:
+        if line.endswith("[heap]"):
+            start, end = (int(address, 16) for address in line.split()[0].split("-"))
+            libc.madvise(start, end - start, _HUGEPAGE)  # if refused, the pages stay small

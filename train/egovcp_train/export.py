@@ -1,16 +1,25 @@
-"""``egovcp-export``: the planner's networks as ONNX, with vectors that prove them.
+"""``egovcp-export``: the planner's networks as ONNX, with test vectors.
 
-observe.onnx ... termination.onnx   see `egovcp_train.onnx_networks`
-golden.safetensors                  inputs/NAME and outputs/NETWORK/NAME, from the original
-export.json                         features, controller, planner, SHA-256 and shapes
+golden.safetensors   inputs/NAME and outputs/NETWORK/NAME, from the original
+export.json          features, controller, planner, SHA-256 and shapes
+observe.onnx         h, z, action, depth, state, is_first  ->  h_next, z_next
+imagine.onnx         h, z, action                          ->  h_next, z_next
+value.onnx           h, z, action                          ->  value
+termination.onnx     h, z                                  ->  termination
+reward.onnx          h, z, action                          ->  reward         if it is predicted
+
+A graph is one tick of a batch of independent rows. It contains the normalisation: depth is in
+millimetres, proprioception in SI units, values in units of return. A planner repeats the row of a
+robot for each of its candidates.
 """
 
 from __future__ import annotations
 
-import hashlib
 import json
+import math
 import os
 import shutil
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,29 +28,26 @@ from typing import Any, Final
 import draccus
 import numpy as np
 import torch
+import torch.nn.functional as F
 from safetensors.torch import load_file, save
+from torch import Tensor, nn
 
+from egovcp import spec
 from egovcp.artifact import WEIGHTS, Artifact, load_artifact
 from egovcp.atomic import removed_on_error, write_bytes
 from egovcp.cli import run_command
 from egovcp.errors import ArtifactError, UsageError
 from egovcp.manifest import MANIFEST
+from egovcp.model import Carry, WorldModel
 from egovcp.packages import require_packages
 from egovcp.policy_options import PolicyOptions
+from egovcp.safe_files import sha256
 from egovcp.terminal import echo
-from egovcp_train.onnx_networks import (
-    NETWORKS,
-    OPSET,
-    REWARD,
-    golden_inputs,
-    networks_of,
-    reference,
-    write_graph,
-)
-from egovcp_train.output import prepare_output
+from egovcp_train.checkpoint import prepare_output
 
 PROG = "egovcp-export"
 SCHEMA: Final = "egovcp-onnx-1"
+OPSET: Final = 17
 GOLDEN, REPORT = "golden.safetensors", "export.json"
 TOLERANCE: Final = 1e-4  # of the reference's magnitude where that exceeds 1
 _ROWS: Final = 7  # of the golden vectors; other than what is traced
@@ -50,10 +56,9 @@ _TRACED_ROWS: Final = 2
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """Write the networks that the planner calls as ONNX, and prove them with onnxruntime.
+    """Write the networks that the planner calls as ONNX, and verify them with onnxruntime.
 
-    Beside them lie golden vectors, inputs and the outputs of the original, by which any other
-    runtime can be proved as well.
+    golden.safetensors has inputs and the outputs of the original, to verify other runtimes.
     """
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
@@ -68,18 +73,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def export(config: ExportConfig) -> None:
-    """Write, prove, and say how far the networks are from the original.
+    """Write the networks, verify them, and print their largest errors.
 
     Raises:
-        UsageError: artifact or folder are not named, or the folder holds something.
-        ArtifactError: the artifact is damaged, or a network does not say what the original says.
+        UsageError: artifact or folder are missing, or the folder is not empty.
+        ArtifactError: the artifact is damaged, or a network differs from the original.
         EnvironmentFailure: onnx or onnxruntime is missing, or the folder cannot be written.
     """
     if not config.policy.path or not config.output_dir:
         raise UsageError(
             "--policy.path and --output_dir are needed: the artifact, and a new folder"
         )
-    _require_packages()
+    require_packages("egovcp-train", PROG, "onnx", "onnxruntime")
     output = prepare_output(config.output_dir, resume=False, resumable=False)
     artifact = load_artifact(config.policy.path, config.policy.revision)
     with removed_on_error(output.with_name(output.name + ".partial")) as work:
@@ -96,8 +101,7 @@ def write_export(artifact: Artifact, folder: Path) -> dict[str, float]:
     """Write everything to the existing ``folder``; network -> its largest error.
 
     Raises:
-        ArtifactError: a network does not say what the original says, or the planner would ask for
-            more than they say.
+        ArtifactError: a network differs from the original, or the planner needs other outputs.
     """
     model = artifact.world_model
     _require_exportable(artifact)
@@ -116,7 +120,7 @@ def write_export(artifact: Artifact, folder: Path) -> dict[str, float]:
 
 
 def _require_exportable(artifact: Artifact) -> None:
-    """Raise `ArtifactError` for a planner that asks what the networks do not answer."""
+    """Raise `ArtifactError` for a planner that needs other outputs than the networks have."""
     planner = artifact.planner
     if planner.latent != "mean":
         raise ArtifactError(
@@ -134,7 +138,7 @@ def verify(folder: Path) -> dict[str, float]:
         ArtifactError: one exceeds `TOLERANCE`.
         EnvironmentFailure: onnxruntime is missing.
     """
-    _require_packages()
+    require_packages("egovcp-train", PROG, "onnx", "onnxruntime")
     golden = load_file(folder / GOLDEN)
     errors: dict[str, float] = {}
     present = REWARD if (folder / "reward.onnx").exists() else {}
@@ -175,7 +179,7 @@ def _largest_error(folder: Path, name: str, golden: Mapping[str, torch.Tensor]) 
 
 
 def _report(artifact: Artifact, folder: Path, golden: dict[str, torch.Tensor]) -> dict[str, Any]:
-    """What another runtime must know besides the graphs."""
+    """What another runtime needs besides the graphs."""
 
     model = artifact.world_model
     networks = {name: network(model) for name, network in networks_of(model).items()}
@@ -191,30 +195,189 @@ def _report(artifact: Artifact, folder: Path, golden: dict[str, torch.Tensor]) -
         "networks": {
             name: {
                 "file": f"{name}.onnx",
-                "sha256": _sha256(folder / f"{name}.onnx"),
+                "sha256": sha256(folder / f"{name}.onnx"),
                 "inputs": {key: described(f"inputs/{key}") for key in network.inputs},
                 "outputs": {key: described(f"outputs/{name}/{key}") for key in network.outputs},
             }
             for name, network in networks.items()
         },
-        "golden": {"file": GOLDEN, "sha256": _sha256(folder / GOLDEN), "tolerance": TOLERANCE},
+        "golden": {"file": GOLDEN, "sha256": sha256(folder / GOLDEN), "tolerance": TOLERANCE},
         "min_return": float(artifact.world_model.min_return),
         "discount": float(artifact.world_model.discount),
         "planner": draccus.encode(artifact.planner),
         "controller_id": artifact.controller_id,
         "features": artifact.manifest["features"],
         "artifact": {
-            "manifest_sha256": _sha256(artifact.path / MANIFEST),
+            "manifest_sha256": sha256(artifact.path / MANIFEST),
             "weights_sha256": artifact.manifest["files"][WEIGHTS],
             "datasets": artifact.manifest.get("datasets", []),
         },
     }
 
 
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+# --- networks ------------------------------------------------------------------------
+type Tensors = dict[str, Tensor]
 
 
-def _require_packages() -> None:
-    require_packages("egovcp-train", PROG, "onnx", "onnxruntime")
+class ExportedNetwork(nn.Module):
+    """A network as a graph, with inputs and outputs in the order of the names."""
+
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+
+    def __init__(self, model: WorldModel) -> None:
+        super().__init__()
+        self.model = model
+
+
+class Observe(ExportedNetwork):
+    """`WorldModel.observe`: depth (B, 48, 64) mm as float32, whole numbers, 0 = not measured."""
+
+    inputs = ("h", "z", "action", "depth", "state", "is_first")
+    outputs = ("h_next", "z_next")
+
+    def forward(
+        self, h: Tensor, z: Tensor, action: Tensor, depth: Tensor, state: Tensor, is_first: Tensor
+    ) -> Carry:
+        near = pooled_nearness(depth, self.model.config.depth_max_m)
+        return self.model.observe_near(Carry(h, z), action, near, state, is_first)
+
+
+class Imagine(ExportedNetwork):
+    """`WorldModel.imagine`."""
+
+    inputs = ("h", "z", "action")
+    outputs = ("h_next", "z_next")
+
+    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Carry:
+        return self.model.imagine(Carry(h, z), action)
+
+
+class Value(ExportedNetwork):
+    """`WorldModel.value`, (B,)."""
+
+    inputs = ("h", "z", "action")
+    outputs = ("value",)
+
+    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
+        return self.model.value(Carry(h, z), action)
+
+
+class Termination(ExportedNetwork):
+    """`WorldModel.termination`, (B,)."""
+
+    inputs = ("h", "z")
+    outputs = ("termination",)
+
+    def forward(self, h: Tensor, z: Tensor) -> Tensor:
+        return self.model.termination(Carry(h, z))
+
+
+class Reward(ExportedNetwork):
+    """`WorldModel.reward`, (B,)."""
+
+    inputs = ("h", "z", "action")
+    outputs = ("reward",)
+
+    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
+        return self.model.reward(Carry(h, z), action)
+
+
+NETWORKS: Final[Mapping[str, type[ExportedNetwork]]] = {
+    "observe": Observe,
+    "imagine": Imagine,
+    "value": Value,
+    "termination": Termination,
+}
+REWARD: Final[Mapping[str, type[ExportedNetwork]]] = {"reward": Reward}
+
+
+def networks_of(model: WorldModel) -> Mapping[str, type[ExportedNetwork]]:
+    """The networks of this model, by name."""
+    return {**NETWORKS, **({} if model.reward_head is None else REWARD)}
+
+
+def pooled_nearness(depth_mm: Tensor, max_m: float) -> Tensor:
+    """`egovcp.model.depth.nearness` in operations of ONNX: 3 x 3 pooling."""
+    far = float(math.ceil(1e3 * max_m))
+    depth = torch.where(depth_mm == 0, far, depth_mm.clamp(0.0, far)).floor()[:, None]
+    nearest = -F.max_pool2d(-depth, 3, stride=1, padding=1)
+    closed = F.max_pool2d(nearest, 3, stride=1, padding=1)[:, 0]
+    return (1.0 - closed * (1e-3 / max_m)).clamp(0.0, 1.0)
+
+
+def golden_inputs(model: WorldModel, batch: int, seed: int = 0) -> Tensors:
+    """Inputs that reach every branch: holes, near and far pixels, first rows of episodes."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(batch, *shape, generator=generator)
+
+    def uniform(*shape: int) -> Tensor:
+        return torch.rand(batch, *shape, generator=generator)
+
+    image = (spec.DEPTH_ROWS, spec.DEPTH_COLS)
+    depth = (uniform(*image) * 1.2e3 * model.config.depth_max_m).floor()
+    return {
+        "h": normal(model.config.hidden).tanh(),
+        "z": normal(model.config.latent),
+        "action": 2.0 * uniform(spec.ACTION_DIM) - 1.0,
+        "depth": depth.masked_fill(uniform(*image) < 0.1, 0.0),
+        "state": model.state_mean + 3.0 * model.state_std * normal(spec.STATE_DIM),
+        "is_first": torch.arange(batch) % 3 == 0,
+    }
+
+
+@torch.no_grad()
+def reference(model: WorldModel, inputs: Tensors) -> dict[str, Tensors]:
+    """Network -> its outputs, computed by the world model and not by the exported modules."""
+    carry = Carry(inputs["h"], inputs["z"])
+    depth = inputs["depth"].to(torch.int32)  # as on the robot
+    action, state, is_first = inputs["action"], inputs["state"], inputs["is_first"]
+    observed = model.observe(carry, action, depth, state, is_first)
+    imagined = model.imagine(carry, action)
+    answers = {
+        "observe": _named(observed),
+        "imagine": _named(imagined),
+        "value": {"value": model.value(carry, action)},
+        "termination": {"termination": model.termination(carry)},
+    }
+    if model.reward_head is not None:
+        answers["reward"] = {"reward": model.reward(carry, action)}
+    return answers
+
+
+def _named(carry: Carry) -> Tensors:
+    return {"h_next": carry.h, "z_next": carry.z}
+
+
+def write_graph(network: ExportedNetwork, inputs: Tensors, path: Path) -> None:
+    """Trace ``network`` and write it to ``path``; its first axis, `batch`, is dynamic."""
+    import onnx
+
+    arguments = tuple(inputs[name] for name in network.inputs)
+    with warnings.catch_warnings():
+        # The newer exporter needs another package and half a minute.
+        warnings.simplefilter("ignore", DeprecationWarning)
+        torch.onnx.export(
+            network.eval(),
+            arguments,
+            str(path),
+            dynamo=False,
+            opset_version=OPSET,
+            input_names=list(network.inputs),
+            output_names=list(network.outputs),
+            dynamic_axes={name: {0: "batch"} for name in (*network.inputs, *network.outputs)},
+        )
+    made = onnx.load(str(path))
+    with torch.no_grad():
+        outputs = network(*arguments)
+    outputs = outputs if isinstance(outputs, tuple) else (outputs,)
+    for described, tensor in zip(made.graph.output, outputs, strict=True):
+        # The trace lacks fixed sizes.
+        for axis, size in zip(
+            described.type.tensor_type.shape.dim[1:], tensor.shape[1:], strict=True
+        ):
+            axis.dim_value = size
+    onnx.checker.check_model(made, full_check=True)
+    onnx.save(made, str(path))

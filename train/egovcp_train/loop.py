@@ -1,4 +1,4 @@
-"""The training loop: one optimiser step, averaging of weights, schedule, bookkeeping."""
+"""A gradient step of the world model, the averaging of weights, and the budget of a run."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 import torch
 from torch import Tensor
@@ -19,12 +19,13 @@ from egovcp.model.parallel import data_parallel
 from egovcp.model.value_losses import TargetNetwork
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.device import precision
-from egovcp_train.ranks import ALONE, Ranks
+from egovcp_train.distributed import SINGLE, ProcessGroup
 
 _MOST_GRAPHS: Final = 64
 """One for each row or image that may be the first (`egovcp.model.StepNoise`): 8 of the default."""
+_MAX_SKIPPED: Final = 3  # steps in a row whose loss or gradient is not finite
 
-type Found = tuple[tuple[str, ...], Tensor, tuple[Tensor | None, ...]]
+type Gradients = tuple[tuple[str, ...], Tensor, tuple[Tensor | None, ...]]
 """Names and values (n,) of the terms, and the gradients of all parameters."""
 
 
@@ -32,8 +33,8 @@ class Learner:
     """Model, averaged model, optimiser, the random stream of the latent noise, and under
     ``q_target=td`` the target network of Q.
 
-    A step is some thousand small kernels. On a GPU calling them takes longer than they do, so that
-    there its gradient is recorded and replayed (`egovcp.cuda_graphs`).
+    A step has about a thousand small kernels. On a GPU it is launch-bound, so its gradient is
+    captured as a CUDA graph (`egovcp.cuda_graphs`).
     """
 
     def __init__(
@@ -41,13 +42,13 @@ class Learner:
         model: WorldModel,
         config: OptimizerConfig,
         seed: int,
-        ranks: Ranks = ALONE,
+        group: ProcessGroup = SINGLE,
         bf16: bool = False,
     ) -> None:
-        """All processes of ``ranks`` start from the same ``model`` and ``seed``, and stay alike."""
+        """All processes of ``group`` start from the same ``model`` and ``seed``."""
         self.model = model
         self.config = config
-        self.ranks = ranks
+        self.group = group
         self.bf16 = bf16
         self.averaged = copy.deepcopy(model).requires_grad_(False)
         self.target = TargetNetwork(model) if model.config.loss.q_target == "td" else None
@@ -57,15 +58,15 @@ class Learner:
         device = model.state_mean.device
         self.generator = torch.Generator(device=device).manual_seed(seed)
         self.step = 0
-        self._not_finite = 0
+        self._skipped = 0
         self._parameters = list(model.parameters())
-        self._gradients: Callable[[Batch, StepNoise], Found] = self._find
-        if device.type == "cuda" and ranks.count == 1:
-            self._gradients = Recorded(self._find, most=_MOST_GRAPHS, copies=False)
+        self._gradients: Callable[[Batch, StepNoise], Gradients] = self._compute_gradients
+        if device.type == "cuda" and group.count == 1:
+            self._gradients = Recorded(self._compute_gradients, most=_MOST_GRAPHS, copies=False)
 
     @property
     def unrecorded(self) -> str:
-        """Why a step could not be recorded on this GPU, if so; it is right, but slow."""
+        """Why a step could not be captured on this GPU; empty if it was."""
         return self._gradients.refused if isinstance(self._gradients, Recorded) else ""
 
     def update(self, batch: Batch, progress: float) -> dict[str, Tensor]:
@@ -73,15 +74,15 @@ class Learner:
         self.model.train()
         for group in self.optimizer.param_groups:
             group["lr"] = self.learning_rate(progress)
-        with data_parallel(self.ranks.share):
-            draws = sample_step_noise(self.model, batch, self.generator)
-            names, values, gradients = self._gradients(batch, draws)
+        with data_parallel(self.group.share):
+            noise = sample_step_noise(self.model, batch, self.generator)
+            names, values, gradients = self._gradients(batch, noise)
         for parameter, gradient in zip(self._parameters, gradients, strict=True):
             parameter.grad = gradient
         terms = dict(zip(names, values.clone(), strict=True))
-        terms = self.ranks.add_up(self._parameters, terms)
+        terms = self.group.sum_gradients(self._parameters, terms)
         norm = torch.nn.utils.clip_grad_norm_(self._parameters, self.config.grad_clip)
-        if self._finite(norm + terms["loss/total"]):
+        if self._is_finite(norm + terms["loss/total"]):
             self.optimizer.step()
             self._average()
             if self.target:
@@ -89,11 +90,11 @@ class Learner:
         self.step += 1
         return {**terms, "grad_norm": norm}
 
-    def _find(self, batch: Batch, draws: StepNoise) -> Found:
+    def _compute_gradients(self, batch: Batch, noise: StepNoise) -> Gradients:
         head = self.target.head if self.target else None
         in_precision = partial(precision, batch.state.device, self.bf16)
         with torch.enable_grad():
-            loss, terms = world_model_gradients(self.model, batch, draws, head, in_precision)
+            loss, terms = world_model_gradients(self.model, batch, noise, head, in_precision)
         terms = {**terms, "loss/total": loss}
         gradients = tuple(parameter.grad for parameter in self._parameters)
         return tuple(terms), torch.stack(list(terms.values())), gradients
@@ -105,7 +106,7 @@ class Learner:
         return self.config.lr * warm * (0.1 + 0.9 * cosine)
 
     def require_finite(self) -> None:
-        """Raise `DataError` where a step, finite itself, has led to weights that are not."""
+        """Raise `DataError` if the weights are not finite."""
         values = [*self.model.parameters(), *self.averaged.parameters()]
         if not all(bool(x.isfinite().all()) for x in values):
             raise DataError(
@@ -113,13 +114,13 @@ class Learner:
                 "last good checkpoint, if there is one, is kept: lower --optimizer.lr"
             )
 
-    def _finite(self, sums: Tensor) -> bool:
-        """Skip a step whose loss or gradient is not finite; give up at the third in a row."""
+    def _is_finite(self, sums: Tensor) -> bool:
+        """Whether the step is taken; raises `DataError` at the third in a row that is not."""
         if torch.isfinite(sums):
-            self._not_finite = 0
+            self._skipped = 0
             return True
-        self._not_finite += 1
-        if self._not_finite >= 3:
+        self._skipped += 1
+        if self._skipped >= _MAX_SKIPPED:
             raise DataError(
                 f"the loss was not finite for 3 steps in a row (step {self.step + 1}); the last "
                 "good checkpoint, if there is one, is kept: check the dataset, or lower "
@@ -134,7 +135,7 @@ class Learner:
         values: list[Tensor] = list(self.model.parameters())
         torch._foreach_lerp_(means, values, 1 - decay)
 
-    def state_dict(self) -> dict[str, object]:
+    def state_dict(self) -> dict[str, Any]:
         return {
             "step": self.step,
             "model": self.model.state_dict(),
@@ -144,18 +145,18 @@ class Learner:
             **({"target": self.target.state_dict()} if self.target else {}),
         }
 
-    def load_state_dict(self, state: dict[str, object]) -> None:
-        self.step = state["step"]  # type: ignore[assignment]
-        self.model.load_state_dict(state["model"])  # type: ignore[arg-type]
-        self.averaged.load_state_dict(state["averaged"])  # type: ignore[arg-type]
-        self.optimizer.load_state_dict(state["optimizer"])  # type: ignore[arg-type]
-        self.generator.set_state(state["generator"])  # type: ignore[arg-type]
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        self.step = state["step"]
+        self.model.load_state_dict(state["model"])
+        self.averaged.load_state_dict(state["averaged"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"])
         if self.target:
-            self.target.load_state_dict(state["target"])  # type: ignore[arg-type]
+            self.target.load_state_dict(state["target"])
 
 
 class Budget:
-    """How far the run has come: by steps, or by the clock where that ends first."""
+    """Progress of a run towards its number of steps or its time limit."""
 
     def __init__(
         self,
@@ -164,13 +165,13 @@ class Budget:
         clock: Callable[[], float] = time.monotonic,
         spent: float = 0.0,
     ) -> None:
-        """``spent``: seconds that a run took before it was resumed."""
+        """``spent``: seconds that the run took before it was resumed."""
         self.steps, self.seconds, self._clock = steps, 60 * max_minutes, clock
         self._start = clock() - spent
 
     @property
     def spent(self) -> float:
-        """Seconds since the run began, without those between a stop and a resume."""
+        """Seconds of the run, without pauses between a stop and a resume."""
         return self._clock() - self._start
 
     def progress(self, step: int) -> float:

@@ -1,27 +1,120 @@
-"""A policy to the Hub: the repository before training, the artifact and its card after."""
+"""Publication of a policy on the Hub: ``egovcp-push``, the policy's card, its training curves."""
 
 from __future__ import annotations
 
+import platform
 import shlex
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from importlib.metadata import version
+from importlib.resources import files
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 from egovcp.artifact import FILES, Artifact, load_artifact
-from egovcp.errors import EgovcpError, EnvironmentFailure
-from egovcp.hub import Content, Publication, Published, RetryPolicy, ensure_repository, publish
+from egovcp.atomic import write_text
+from egovcp.cli import run_command
+from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
+from egovcp.hub import (
+    Content,
+    Publication,
+    PublishConfig,
+    Published,
+    RetryPolicy,
+    ensure_repository,
+    is_repo_id,
+    publish,
+)
+from egovcp.outputs import write_report
 from egovcp.terminal import echo
-from egovcp_train.card import ASSETS, CARD, CURVES, card_text
 from egovcp_train.config import PolicyConfig
 
+PROG: Final = "egovcp-push"
 RETRY_POLICY: Final = RetryPolicy()
+CARD: Final = "README.md"
+ASSETS: Final = "assets"
+CURVES: Final = f"{ASSETS}/training.png"
+_PACKAGES: Final = ("egovcp", "egovcp-train", "torch", "lerobot", "numpy")
+_TASKS: Final = {
+    "ball": "block a thrown ball with hand or wrist before it meets the body",
+    "wall": "brace with the hands on a wall that one is pushed towards",
+    "arch": "walk up to an arch that is too low for an upright robot, and duck under it",
+}
+#: Prefix of a metric's name -> its meaning; the longest prefix applies.
+_METRICS: Final = {
+    "value/r2": "share of the variance of the Monte Carlo return that Q explains",
+    "value/slope": "regression of the return on Q; 1 is calibrated",
+    "latent/active": "dimensions of z that carry information",
+    "latent/kl": "KL divergence of posterior and prior, nats per step",
+}
+#: Title of a panel -> label of a curve -> scalar.
+_PANELS: Final[Mapping[str, Mapping[str, str]]] = {
+    "loss": {"total": "loss/total"},
+    "Q on held-out episodes": {"R²": "heldout/value/r2", "slope": "heldout/value/slope"},
+}
+
+type Series = tuple[list[int], list[float]]
 
 
-def reserve_policy(policy: PolicyConfig) -> None:
-    """See before training that the policy can be published, where that is asked for.
+# --- egovcp-push ---------------------------------------------------------------------
+@dataclass(frozen=True)
+class FolderConfig:
+    """Which policy."""
+
+    path: str = ""
+    """Folder of the artifact, OUTPUT_DIR/checkpoints/last/pretrained_model of a run."""
+
+
+@dataclass(frozen=True)
+class PolicyPushConfig(PublishConfig):
+    """Publish a policy artifact and its card on the Hub in one commit.
+
+    The artifact is checked first. A push that failed can be repeated: it completes what is
+    missing, and commits nothing if nothing differs.
+    """
+
+    policy: FolderConfig = field(default_factory=FolderConfig)
+    """The artifact."""
+    message: str = ""
+    """Title of the commit; empty: how long it was trained."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run_command(PolicyPushConfig, push, argv, prog=PROG)
+
+
+def push(config: PolicyPushConfig) -> None:
+    """Check and publish.
 
     Raises:
-        UsageError: the repository is public and a private one is asked for.
-        EnvironmentFailure: nobody is logged in, the Hub refuses, or cannot be reached.
+        UsageError: the folder or the id is missing or wrong.
+        ArtifactError: the artifact is damaged.
+        EnvironmentFailure: the Hub cannot be reached, or refuses.
+    """
+    if not Path(config.policy.path).is_dir() or not config.policy.path:
+        raise UsageError(
+            f"--policy.path={config.policy.path!r}: expected the folder of an artifact, such as "
+            "runs/ball/checkpoints/last/pretrained_model"
+        )
+    if not is_repo_id(config.repo_id):
+        raise UsageError(f"--repo_id={config.repo_id!r}: expected user/name, where to publish")
+    artifact = load_artifact(config.policy.path)
+    plain = publication(artifact, config.repo_id, config.private, config.message)
+    target = replace(plain, branch=config.branch, tag=config.tag)
+    published = publish(target, config.network)
+    report(target, published)
+    facts = {"repo_id": config.repo_id, "branch": config.branch, "tag": config.tag}
+    write_report(config.json, {**facts, **asdict(published)})
+
+
+# --- publication of a run ------------------------------------------------------------
+def reserve_policy(policy: PolicyConfig) -> None:
+    """Check before training that the policy can be published, if that is requested.
+
+    Raises:
+        UsageError: the repository is public and a private one is requested.
+        EnvironmentFailure: the user is not logged in, or the Hub refuses or cannot be reached.
     """
     if policy.push_to_hub:
         target = Publication(policy.repo_id, {}, "", private=policy.private, repo_type="model")
@@ -31,7 +124,7 @@ def reserve_policy(policy: PolicyConfig) -> None:
 def publication(
     artifact: Artifact, repo_id: str, private: bool = False, message: str = ""
 ) -> Publication:
-    """The artifact with a card of its own, as one commit; nothing else that lies beside it."""
+    """The artifact and its card as one commit, without other files of the folder."""
     folder = artifact.path
     names = [name for name in (*FILES, CURVES) if (folder / name).is_file()]
     contents = {name: Content(folder / name) for name in names}
@@ -47,10 +140,10 @@ def publication(
 
 
 def publish_trained(folder: Path, policy: PolicyConfig) -> None:
-    """Publish what a run has written, and say where it is.
+    """Publish the policy of a run and print its address.
 
     Raises:
-        EnvironmentFailure: it could not be published; the message says how to try again.
+        EnvironmentFailure: it could not be published; the message has the command to repeat it.
     """
     try:
         target = publication(load_artifact(str(folder)), policy.repo_id, policy.private)
@@ -65,7 +158,139 @@ def publish_trained(folder: Path, policy: PolicyConfig) -> None:
 
 
 def report(target: Publication, published: Published) -> None:
-    """Say where the policy is and how to use it."""
+    """Print the commit and how to use it."""
     name, commit = target.repo_id, published.commit
     echo(f"{name}@{target.branch} {'is now' if published.new else 'was already'} {commit}")
     echo(f"egovcp-eval --policy.path={name} --policy.revision={commit} --task=... --output_dir=...")
+
+
+# --- card ----------------------------------------------------------------------------
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that training depends on."""
+    return {"python": platform.python_version(), **{name: version(name) for name in _PACKAGES}}
+
+
+def write_card(folder: Path, run: Path, repo_id: str) -> None:
+    """Write card and training curves to the folder of an artifact.
+
+    Args:
+        folder: the artifact.
+        run: output folder of the run, whose records the curves show.
+        repo_id: id on the Hub for the examples; empty: they name the folder.
+    """
+    draw_curves(run, folder / CURVES)
+    write_text(folder / CARD, card_text(load_artifact(str(folder)), repo_id))
+
+
+def card_text(artifact: Artifact, repo_id: str) -> str:
+    """The card of a policy, from its manifest.
+
+    Args:
+        artifact: the policy.
+        repo_id: id on the Hub, `user/name`, for the examples; empty: they name the folder.
+    """
+    from huggingface_hub import ModelCard
+
+    manifest = artifact.manifest
+    command = manifest.get("command")
+    found_versions = manifest.get("versions") or {"egovcp": manifest["egovcp_version"]}
+    title = repo_id.partition("/")[2] or "egovcp policy"
+    card = ModelCard.from_template(
+        _front_matter(manifest, title),
+        template_str=(files(__package__) / "model_card.md").read_text(encoding="utf-8"),
+        title=title,
+        name=repo_id or str(artifact.path),
+        on_hub=bool(repo_id),
+        tasks=[(task, _TASKS.get(task, "")) for task in manifest.get("tasks", [])],
+        datasets=[_dataset(d, manifest) for d in manifest.get("datasets", [])],
+        controller_id=artifact.controller_id,
+        step=manifest.get("step", "an unknown number of"),
+        command=shlex.join(command) if command else "not recorded",
+        versions=", ".join(f"{name} {number}" for name, number in found_versions.items()),
+        metrics=[
+            (k, f"{v:.4g}", _METRICS.get(k, "")) for k, v in sorted(_metrics(manifest).items())
+        ],
+        curves=CURVES if (artifact.path / CURVES).is_file() else "",
+        parameters=f"{sum(p.numel() for p in artifact.world_model.parameters()):,}",
+        sizes=artifact.world_model.config,
+        planner=artifact.planner,
+        features=manifest["features"],
+    )
+    return f"{str(card).rstrip()}\n"
+
+
+def _front_matter(manifest: Mapping[str, Any], title: str) -> Any:
+    from huggingface_hub import EvalResult, ModelCardData
+
+    datasets = [d for d in manifest.get("datasets", []) if d.get("repo_id")]
+    results = [
+        EvalResult(
+            task_type="robotics",
+            dataset_type=datasets[0]["repo_id"],
+            dataset_name=datasets[0]["repo_id"],
+            dataset_split="held-out episodes",
+            dataset_revision=datasets[0].get("revision") or None,
+            metric_type=name,
+            metric_value=value,
+        )
+        for name, value in sorted(_metrics(manifest).items())
+        if datasets
+    ]
+    return ModelCardData(
+        license="apache-2.0",
+        library_name="egovcp",
+        pipeline_tag="robotics",
+        tags=["egovcp", "LeRobot", "unitree_g1", "humanoid", "depth", "world-model"],
+        datasets=[d["repo_id"] for d in datasets] or None,
+        model_name=title if results else None,
+        eval_results=results or None,
+    )
+
+
+def _metrics(manifest: Mapping[str, Any]) -> dict[str, float]:
+    """The held-out metrics; null stands for one that was not finite."""
+    return {k: float(v) for k, v in manifest.get("heldout", {}).items() if v is not None}
+
+
+def _dataset(entry: Mapping[str, Any], manifest: Mapping[str, Any]) -> dict[str, str]:
+    root = manifest.get("train_config", {}).get("dataset", {}).get("root", "")
+    names = ("repo_id", "revision", "episodes")
+    return {**{name: entry.get(name) or "" for name in names}, "root": Path(root).name}
+
+
+# --- training curves -----------------------------------------------------------------
+def draw_curves(run: Path, path: Path) -> bool:
+    """Draw the curves of the run in folder ``run``; returns whether it has recorded any."""
+    known = recorded_scalars(run / "tensorboard")
+    panels = {
+        title: {label: known[name] for label, name in names.items() if name in known}
+        for title, names in _PANELS.items()
+    }
+    panels = {title: curves for title, curves in panels.items() if curves}
+    if not panels:
+        return False
+    from matplotlib.figure import Figure  # takes half a second
+
+    figure = Figure(figsize=(4.0 * len(panels), 3.0), layout="constrained")
+    for axes, (title, curves) in zip(
+        figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
+    ):
+        for label, (steps, values) in curves.items():
+            axes.plot(steps, values, label=label, marker="." if len(steps) < 20 else "")
+        axes.set(title=title, xlabel="step")
+        axes.grid(alpha=0.3)
+        axes.legend()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=100, metadata={"Software": None})
+    return True
+
+
+def recorded_scalars(folder: Path) -> dict[str, Series]:
+    """Scalar -> its steps and values, over all parts of a resumed run."""
+    if not folder.is_dir():
+        return {}
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    found = EventAccumulator(str(folder), size_guidance={"scalars": 10_000}).Reload()
+    events = {name: found.Scalars(name) for name in found.Tags()["scalars"]}
+    return {name: ([e.step for e in es], [e.value for e in es]) for name, es in events.items()}

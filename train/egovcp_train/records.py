@@ -1,42 +1,54 @@
-"""Scalars and pictures of a run to TensorBoard, and to whatever else is asked for."""
+"""Scalars, images and the policy of a run, recorded to TensorBoard and Weights & Biases."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from egovcp.errors import EnvironmentFailure
+from egovcp.packages import require_packages
 
-class Records(Protocol):
-    """Where the course of a training is kept."""
-
-    def scalars(self, step: int, values: Mapping[str, float]) -> None:
-        """Record one value per name at ``step``."""
-        ...
-
-    def picture(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
-        """Record a picture (height, width, 3) at ``step``."""
-        ...
-
-    def artifact(self, step: int, folder: Path) -> None:
-        """Take the finished policy."""
-        ...
-
-    def close(self) -> None:
-        """Everything is written."""
-        ...
+RUN_ID: Final = "wandb/run_id.txt"
 
 
-class Recorder:
-    """Writes below OUTPUT_DIR/tensorboard; does nothing where disabled."""
+@dataclass(frozen=True)
+class WandbConfig:
+    """Records to Weights & Biases, beside TensorBoard."""
+
+    enable: bool = False
+    """Record there; needs the package wandb."""
+    project: str = "egovcp"
+    """Project of the run."""
+    entity: str = ""
+    """User or team; empty: your default."""
+    notes: str = ""
+    """Description of the run."""
+    run_id: str = ""
+    """Id of the run; empty: a new one, or that of the run that is resumed."""
+    mode: Literal["online", "offline", "disabled"] = "online"
+    """offline: keep the records below OUTPUT_DIR/wandb for `wandb sync`."""
+    disable_artifact: bool = False
+    """Do not upload the finished policy."""
+
+
+def require_wandb(config: WandbConfig) -> None:
+    """Raise `MissingPackage` if the package is needed and not installed."""
+    if config.enable:
+        require_packages("egovcp-train", "--wandb.enable", "wandb")
+
+
+class TensorBoardRecorder:
+    """Writes below OUTPUT_DIR/tensorboard; does nothing unless enabled."""
 
     def __init__(self, output: Path, *, enabled: bool) -> None:
         self._writer = None
         if enabled:
-            # Imported here: it takes a second that --help and refused input should not.
+            # Imported here: it takes a second.
             from torch.utils.tensorboard import SummaryWriter
 
             self._writer = SummaryWriter(str(output / "tensorboard"))
@@ -47,13 +59,13 @@ class Recorder:
             for name, value in values.items():
                 self._writer.add_scalar(name, value, step)
 
-    def picture(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
-        """Record a picture (height, width, 3) at ``step``."""
+    def image(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
+        """Record an image (height, width, 3) at ``step``."""
         if self._writer is not None:
             self._writer.add_image(name, pixels, step, dataformats="HWC")
 
-    def artifact(self, step: int, folder: Path) -> None:
-        """TensorBoard keeps no files."""
+    def policy(self, step: int, folder: Path) -> None:
+        """Nothing: TensorBoard keeps no files."""
 
     def close(self) -> None:
         """Flush to disk."""
@@ -61,31 +73,91 @@ class Recorder:
             self._writer.close()
 
 
-class Everywhere:
-    """To all of several records; to none, where there are none."""
+class WandbRecorder:
+    """Records to one run of Weights & Biases; a resumed training continues it."""
 
-    def __init__(self, records: Sequence[Records]) -> None:
-        self._records = tuple(records)
+    def __init__(self, output: Path, config: WandbConfig, options: Mapping[str, Any]) -> None:
+        """Start or continue the run.
 
-    def __len__(self) -> int:
-        return len(self._records)
+        Args:
+            output: folder of the training, which stores the id of the run.
+            config: project and user.
+            options: those of the training, to be recorded.
+
+        Raises:
+            EnvironmentFailure: the user is not logged in, or the server cannot be reached.
+        """
+        import wandb  # an optional package
+
+        stored = output / RUN_ID
+        try:
+            self._run = wandb.init(
+                id=config.run_id or (stored.read_text("utf-8") if stored.is_file() else None),
+                project=config.project,
+                entity=config.entity or None,
+                notes=config.notes or None,
+                name=output.name,
+                dir=str(output),
+                config=dict(options),
+                job_type="train",
+                resume="allow",
+                mode=config.mode,
+            )
+        except wandb.Error as error:
+            raise EnvironmentFailure(
+                f"wandb: {' '.join(str(error).split())[:200]}; see `wandb login`, or choose "
+                "--wandb.mode=offline"
+            ) from error
+        self._wandb, self._config = wandb, config
+        stored.parent.mkdir(parents=True, exist_ok=True)
+        stored.write_text(self._run.id, encoding="utf-8")
 
     def scalars(self, step: int, values: Mapping[str, float]) -> None:
         """Record one value per name at ``step``."""
-        for records in self._records:
-            records.scalars(step, values)
+        self._run.log(dict(values), step=step)
 
-    def picture(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
-        """Record a picture (height, width, 3) at ``step``."""
-        for records in self._records:
-            records.picture(step, name, pixels)
+    def image(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
+        """Record an image (height, width, 3) at ``step``."""
+        self._run.log({name: self._wandb.Image(pixels)}, step=step)
 
-    def artifact(self, step: int, folder: Path) -> None:
-        """Hand on the finished policy."""
-        for records in self._records:
-            records.artifact(step, folder)
+    def policy(self, step: int, folder: Path) -> None:
+        """Upload the finished policy, unless that is disabled."""
+        if self._config.disable_artifact:
+            return
+        artifact = self._wandb.Artifact(f"egovcp-{self._run.id}-{step:06d}", type="model")
+        artifact.add_dir(str(folder))
+        self._run.log_artifact(artifact)
 
     def close(self) -> None:
-        """Everything is written."""
-        for records in self._records:
-            records.close()
+        """Send the remaining records."""
+        self._run.finish()
+
+
+class Records:
+    """All recorders of a run."""
+
+    def __init__(self, recorders: Sequence[TensorBoardRecorder | WandbRecorder]) -> None:
+        self._recorders = tuple(recorders)
+
+    def __bool__(self) -> bool:
+        return bool(self._recorders)
+
+    def scalars(self, step: int, values: Mapping[str, float]) -> None:
+        """Record one value per name at ``step``."""
+        for recorder in self._recorders:
+            recorder.scalars(step, values)
+
+    def image(self, step: int, name: str, pixels: NDArray[np.uint8]) -> None:
+        """Record an image (height, width, 3) at ``step``."""
+        for recorder in self._recorders:
+            recorder.image(step, name, pixels)
+
+    def policy(self, step: int, folder: Path) -> None:
+        """Record the finished policy."""
+        for recorder in self._recorders:
+            recorder.policy(step, folder)
+
+    def close(self) -> None:
+        """Finish all records."""
+        for recorder in self._recorders:
+            recorder.close()

@@ -1,4 +1,4 @@
-"""``egovcp-train``: dataset in, policy artifact out."""
+"""``egovcp-train``: trains a world model from a dataset and writes a policy."""
 
 from __future__ import annotations
 
@@ -23,14 +23,15 @@ from egovcp.model.weights import tensor_shapes
 from egovcp.plan.backends import make_evaluator
 from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo, one_line
-from egovcp_train.allocation import keep_freed_memory
-from egovcp_train.batches import to_tensors
-from egovcp_train.card import versions, write_card
 from egovcp_train.checkpoint import (
+    CONFIG_FILE,
     checkpoint_dir,
     load_training_state,
     new_checkpoint,
+    prepare_output,
     restoring,
+    resumed_options,
+    saved_options,
 )
 from egovcp_train.closed_loop import ClosedLoop, require_simulator
 from egovcp_train.config import PRESETS, TrainConfig
@@ -41,30 +42,21 @@ from egovcp_train.datasets import (
     prepare,
     require_datasets,
     require_same_content,
+    to_tensors,
 )
-from egovcp_train.device import choose_bf16, choose_device
-from egovcp_train.heldout.episodes import recorded
-from egovcp_train.heldout.pictures import draw
-from egovcp_train.heldout.recording import record
-from egovcp_train.heldout.report import Report, measure, scalars
-from egovcp_train.heldout.table import table
+from egovcp_train.device import choose_bf16, choose_device, keep_freed_memory
+from egovcp_train.distributed import ProcessGroup, join_processes
+from egovcp_train.heldout.pictures import draw, record, table
+from egovcp_train.heldout.report import HeldoutReport, episode_batches, measure, scalars
 from egovcp_train.loop import Budget, Learner
-from egovcp_train.output import (
-    CONFIG_FILE,
-    prepare_output,
-    resumed_options,
-    saved_options,
-)
-from egovcp_train.publish import publish_trained, reserve_policy
-from egovcp_train.ranks import Ranks, join
-from egovcp_train.records import Everywhere, Recorder, Records
-from egovcp_train.wandb_records import WandbRecorder, require_wandb
+from egovcp_train.publish import publish_trained, reserve_policy, versions, write_card
+from egovcp_train.records import Records, TensorBoardRecorder, WandbRecorder, require_wandb
 
 PROG = "egovcp-train"
 LAUNCHER_ECHO_S = 5.0
-_BATCH_COPIES: Final = 4  # of a batch on a CPU: float32, and what gradients need
+_BATCH_COPIES: Final = 4  # of a batch on a CPU: float32, and intermediate results of gradients
 _UNRECORDED = (
-    f"{PROG}: steps are right but many times slower than this GPU could make them, because they "
+    f"{PROG}: steps are correct but many times slower than possible on this GPU, because they "
     "cannot be recorded as a CUDA graph ({reason}); --device=cpu may be as fast; please report it"
 )
 
@@ -91,51 +83,51 @@ def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
     name = given.get("preset", "")
     if name not in PRESETS:
         return {}
-    options: dict[str, Any] = draccus.encode(PRESETS[name]())
-    del options["output_dir"]
-    return options
+    defaults: dict[str, Any] = draccus.encode(PRESETS[name]())
+    del defaults["output_dir"]
+    return defaults
 
 
 def train(config: TrainConfig) -> None:
     """Run training to its end, or to the first SIGINT or SIGTERM, and write the artifact.
 
     Raises:
-        KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
+        KeyboardInterrupt: a signal ended it early; the checkpoint is written.
     """
-    ranks = join(cpu=config.device == "cpu")  # first: it says which GPU is this process' own
+    group = join_processes(cpu=config.device == "cpu")  # first: it selects this process' GPU
     device = choose_device(config.device)
     bf16 = choose_bf16(config.mixed_precision, device)
-    _require_batch_memory(config, ranks, device)
-    output = _prepare_output(config, ranks)
+    _require_batch_memory(config, group, device)
+    output = _prepare_output(config, group)
     keep_freed_memory()
     torch.set_num_threads(config.threads or torch.get_num_threads())
     torch.manual_seed(config.seed)
     model = WorldModel(config.policy.world_model())
-    material = prepare(config, model, ranks)
-    config = material.config
-    learner = Learner(model.to(device), config.optimizer, config.seed, ranks, bf16)
-    spent = _restore(output, learner, material) if config.resume else 0.0
-    provenance = _provenance(material)
-    if ranks.is_first:
+    data = prepare(config, model, group)
+    config = data.config
+    learner = Learner(model.to(device), config.optimizer, config.seed, group, bf16)
+    spent = _restore(output, learner, data) if config.resume else 0.0
+    provenance = _provenance(data)
+    if group.is_first:
         simulation = _simulation(config, provenance, learner.model)
         reserve_policy(config.policy)
         output.mkdir(parents=True, exist_ok=True)
         save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
     else:
         simulation = None
-    run = Run(config, output, learner, material, device, provenance, simulation, spent)
+    run = TrainingRun(config, output, learner, data, device, provenance, simulation, spent)
     run.execute()
 
 
-def _require_batch_memory(config: TrainConfig, ranks: Ranks, device: torch.device) -> None:
+def _require_batch_memory(config: TrainConfig, group: ProcessGroup, device: torch.device) -> None:
     """Raise `UsageError` for a batch that is too large for this machine."""
     size, length = config.batch_size, config.sampling.length
     option = f"--batch_size={size} with --sampling.length={length}"
     copies = _BATCH_COPIES if device.type == "cpu" else 1
-    require_memory(option, size * length * ranks.local * copies * FRAME_BYTES)
+    require_memory(option, size * length * group.local * copies * FRAME_BYTES)
 
 
-class Run:
+class TrainingRun:
     """One training run: steps, evaluations, checkpoints."""
 
     def __init__(
@@ -143,20 +135,20 @@ class Run:
         config: TrainConfig,
         output: Path,
         learner: Learner,
-        material: TrainingData,
+        data: TrainingData,
         device: torch.device,
         provenance: dict[str, Any],
         simulation: ClosedLoop | None = None,
         spent: float = 0.0,
     ) -> None:
-        self.config, self.output, self.learner, self.material = config, output, learner, material
+        self.config, self.output, self.learner, self.data = config, output, learner, data
         self.device, self.provenance, self.simulation = device, provenance, simulation
-        self.ranks = learner.ranks
+        self.group = learner.group
         self.budget = Budget(config.steps, config.max_minutes, spent=spent)
         self.metrics: dict[str, float] = {}
         self.tasks: dict[str, dict[str, Any]] = {}
         self.played: dict[str, float] = {}
-        self.recorder = _records(config, output) if self.ranks.is_first else Everywhere([])
+        self.recorder = _records(config, output) if self.group.is_first else Records([])
 
     def execute(self) -> None:
         """Train until the budget or a signal ends it; the last state is always saved.
@@ -166,16 +158,16 @@ class Run:
         """
         learner = self.learner
         start = learner.step
-        with stop_on_signal(LAUNCHER_ECHO_S if self.ranks.count > 1 else 0.0) as stopped:
+        with stop_on_signal(LAUNCHER_ECHO_S if self.group.count > 1 else 0.0) as stopped:
             finished = self._learn(stopped)
             final = checkpoint_dir(self.output, learner.step)
-            if learner.step > start or not self.ranks.decided(final.exists()):
+            if learner.step > start or not self.group.broadcast(final.exists()):
                 self.finish(finished)
-        if self.ranks.is_first:
+        if self.group.is_first:
             self._conclude(final, finished)
-        self.ranks.close()
+        self.group.close()
         if not finished:
-            raise KeyboardInterrupt if self.ranks.is_first else SystemExit(130)
+            raise KeyboardInterrupt if self.group.is_first else SystemExit(130)
 
     def _conclude(self, final: Path, finished: bool) -> None:
         """Say where everything is, and publish what is finished."""
@@ -183,7 +175,7 @@ class Run:
         echo(self._last_words(final, stopped=not finished))
         write_card(artifact, self.output, self.config.policy.repo_id)
         if finished:
-            self.recorder.artifact(self.learner.step, artifact)
+            self.recorder.policy(self.learner.step, artifact)
         self.recorder.close()
         if finished and self.config.policy.push_to_hub:
             publish_trained(artifact, self.config.policy)
@@ -193,7 +185,7 @@ class Run:
         whether the budget is spent."""
         config, learner, start = self.config, self.learner, self.learner.step
         ticks = config.sampling.length + config.sampling.burn_in
-        frames = self.ranks.count * config.batch_size * ticks
+        frames = self.group.count * config.batch_size * ticks
         warned = False
         with tqdm(
             total=config.steps,
@@ -201,19 +193,19 @@ class Run:
             unit="step",
             desc="train",
             mininterval=1.0,
-            disable=not self.ranks.is_first,
+            disable=not self.group.is_first,
         ) as bar:
             while True:
                 progress = self.budget.progress(learner.step)
-                progress, stop = self.ranks.agreed(progress, bool(stopped))
+                progress, stop = self.group.all_reduce(progress, bool(stopped))
                 if progress >= 1.0 or stop:
                     return progress >= 1.0
                 if learner.step > start:
                     self._pause()
-                batch = to_tensors(next(self.material.stream), self.device)
+                batch = to_tensors(next(self.data.stream), self.device)
                 terms = learner.update(batch, progress)
                 bar.update()
-                if not self.ranks.is_first:
+                if not self.group.is_first:
                     continue
                 if learner.step % config.log_freq == 0:
                     self.recorder.scalars(learner.step, {k: float(v) for k, v in terms.items()})
@@ -225,7 +217,7 @@ class Run:
     def _pause(self) -> None:
         """Between two steps: measure, save and show, in this order, what is due after the first."""
         config, learner, report = self.config, self.learner, None
-        if self.ranks.is_first and config.eval_freq and learner.step % config.eval_freq == 0:
+        if self.group.is_first and config.eval_freq and learner.step % config.eval_freq == 0:
             report = self.measure(learner.averaged)
         if learner.step % config.save_freq == 0:
             self.save(learner.averaged)
@@ -238,30 +230,30 @@ class Run:
         A launcher leaves its processes 30 s to stop: there an unfinished model is only saved.
         """
         shipped, report = self.learner.averaged, None
-        if self.ranks.is_first and (finished or self.ranks.count == 1):
+        if self.group.is_first and (finished or self.group.count == 1):
             report = self.measure(shipped)
         self.save(shipped)
         if report is not None:  # after the model is safe: pictures may fail, of a full disk or else
             self.show(report)
             record(report, self.output, shipped.config.depth_max_m)
 
-    def measure(self, model: WorldModel) -> Report:
+    def measure(self, model: WorldModel) -> HeldoutReport:
         """Measure a model on held-out episodes, and in simulation if that is asked for."""
-        heldout = self.material.heldout
-        report = measure(model, recorded(heldout, self.device, EVALUATION_EPISODES))
+        heldout = self.data.heldout
+        report = measure(model, episode_batches(heldout, self.device, EVALUATION_EPISODES))
         self.metrics, self.tasks = report.metrics, report.tasks
         if self.simulation is not None:
             self.played = self.simulation.play(model, self.config.planner)
         return report
 
-    def show(self, report: Report) -> None:
+    def show(self, report: HeldoutReport) -> None:
         """Record what the last measurement found, and draw it where something takes pictures."""
         step, heldout = self.learner.step, self.metrics | scalars(self.tasks)
         found = {f"heldout/{k}": v for k, v in heldout.items()}
         self.recorder.scalars(step, found | {f"closed_loop/{k}": v for k, v in self.played.items()})
-        if len(self.recorder):
+        if self.recorder:
             for name, picture in draw(report).items():
-                self.recorder.picture(step, f"heldout/{name}", picture)
+                self.recorder.image(step, f"heldout/{name}", picture)
 
     def save(self, model: WorldModel) -> None:
         """Write a checkpoint: the model as artifact, and the training state of all processes.
@@ -269,14 +261,14 @@ class Run:
         Raises:
             DataError: the model is not finite.
         """
-        streams = self.ranks.collected(self.material.stream.state_dict())
+        streams = self.group.gather(self.data.stream.state_dict())
         self.learner.require_finite()
-        if not self.ranks.is_first:
+        if not self.group.is_first:
             return
         found = {"heldout": self.metrics, "heldout_tasks": self.tasks, "closed_loop": self.played}
         provenance = self.provenance | {"step": self.learner.step, **finite_or_null(found)}
         spent = {"seconds": self.budget.spent}
-        digests = [reader.content_digest for reader in self.material.readers]
+        digests = [reader.content_digest for reader in self.data.readers]
         learned = {"learner": self.learner.state_dict(), "streams": streams}
         state = {**learned, "datasets": digests, **spent}
         with new_checkpoint(self.output, self.learner.step, state) as folder:
@@ -316,13 +308,13 @@ def _require_loadable(config: TrainConfig) -> None:
         raise UsageError(f"--policy: {error}; make the networks smaller") from error
 
 
-def _prepare_output(config: TrainConfig, ranks: Ranks) -> Path:
+def _prepare_output(config: TrainConfig, group: ProcessGroup) -> Path:
     """Refuse what makes no sense, or cannot be done here, before any work starts."""
     require_wandb(config.wandb)
     _require_loadable(config)
     if config.eval_closed_loop:
         require_simulator()
-    if not ranks.is_first:
+    if not group.is_first:
         return Path(config.output_dir)
     output = prepare_output(config.output_dir, config.resume)
     if config.resume:
@@ -340,16 +332,16 @@ def _simulation(
     return ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
 
 
-def _records(config: TrainConfig, output: Path) -> Everywhere:
-    found: list[Records] = []
+def _records(config: TrainConfig, output: Path) -> Records:
+    found: list[TensorBoardRecorder | WandbRecorder] = []
     if config.tensorboard:
-        found.append(Recorder(output, enabled=True))
+        found.append(TensorBoardRecorder(output, enabled=True))
     if config.wandb.enable:
         found.append(WandbRecorder(output, config.wandb, draccus.encode(config)))
-    return Everywhere(found)
+    return Records(found)
 
 
-def _restore(output: Path, learner: Learner, material: TrainingData) -> float:
+def _restore(output: Path, learner: Learner, data: TrainingData) -> float:
     """Continue from the last checkpoint; returns the seconds that the run has taken so far.
 
     Raises:
@@ -357,18 +349,18 @@ def _restore(output: Path, learner: Learner, material: TrainingData) -> float:
         DataError: the dataset is another one.
         UsageError: the windows or the processes are others.
     """
-    state, stream = load_training_state(output), material.stream
+    state, stream = load_training_state(output), data.stream
     if "datasets" in state:  # not in checkpoints of earlier versions
-        require_same_content(material.readers, state["datasets"])
+        require_same_content(data.readers, state["datasets"])
     with restoring(output):
         learner.load_state_dict(state["learner"])
         streams = state.get("streams") or [state["stream"]]
-        stream.load_state_dict(streams[min(learner.ranks.rank, len(streams) - 1)])
+        stream.load_state_dict(streams[min(learner.group.rank, len(streams) - 1)])
         return float(state.get("seconds", 0.0))
 
 
-def _provenance(material: TrainingData) -> dict[str, Any]:
-    readers = material.readers
+def _provenance(data: TrainingData) -> dict[str, Any]:
+    readers = data.readers
     return {
         "controller_id": readers[0].controller_id,
         "tasks": sorted(set(EpisodeIndex.of(readers).tasks)),
@@ -378,8 +370,8 @@ def _provenance(material: TrainingData) -> dict[str, Any]:
             for r in readers
         ],
         "heldout_episodes": describe_heldout(readers),
-        "return_scales": {task: list(scale) for task, scale in material.return_scales.items()},
-        "train_config": draccus.encode(material.config),
+        "return_scales": {task: list(scale) for task, scale in data.return_scales.items()},
+        "train_config": draccus.encode(data.config),
         "command": [PROG, *sys.argv[1:]],
     }
 

@@ -14,9 +14,9 @@ from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader
 from egovcp.plan import PlannerConfig
 from egovcp.testing import toy_model
-from egovcp_train.heldout import command, episodes
+from egovcp_train.heldout import command, report
 from egovcp_train.heldout.command import main
-from egovcp_train.heldout.episodes import Recorded
+from egovcp_train.heldout.report import EpisodeBatch
 from egovcp_train.train import main as train
 
 type Arguments = Callable[..., list[str]]
@@ -65,13 +65,13 @@ def test_an_interrupted_evaluation_keeps_what_was_measured(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    def interrupted(*args: Any) -> Iterator[Recorded]:
-        for group in episodes.recorded(*args):
+    def interrupted(*args: Any) -> Iterator[EpisodeBatch]:
+        for group in report.episode_batches(*args):
             yield group
             signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(episodes, "EPISODES_AT_ONCE", 3)
-    monkeypatch.setattr(command, "recorded", interrupted)
+    monkeypatch.setattr(report, "EPISODES_AT_ONCE", 3)
+    monkeypatch.setattr(command, "episode_batches", interrupted)
     assert main(_argv(policy, dataset_root, tmp_path / "out", "--split=all")) == 130
     assert {p.name for p in (tmp_path / "out").iterdir()} == {"heldout.json"}
     content = json.loads((tmp_path / "out" / "heldout.json").read_text("utf-8"))

@@ -11,13 +11,12 @@ from egovcp.errors import UsageError
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import ACTION_BOX, STATE_SLICES
-from egovcp_train.lowlevel import events, rewards
-from egovcp_train.lowlevel.camera import TorsoMotion
+from egovcp_train.lowlevel import rewards
 from egovcp_train.lowlevel.commands import Commands, between
+from egovcp_train.lowlevel.config import CommandConfig, DisturbanceConfig, LowLevelTask
 from egovcp_train.lowlevel.env import LowLevelEnv, mirrored
-from egovcp_train.lowlevel.physics import Physics, PhysicsOptions
-from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
-from egovcp_train.lowlevel.task import CommandConfig, DisturbanceConfig, LowLevelTask
+from egovcp_train.lowlevel.physics import BatchPhysics, PhysicsOptions, neutral_qpos
+from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM, TorsoMotion
 
 SILENT = SensorConfig(0.0, 0.0, 0.0, 0.0)
 STANDING = CommandConfig(standing=1.0, still_hands=1.0)
@@ -63,7 +62,7 @@ def test_told_to_walk_without_a_trained_residual_it_falls_and_starts_again():
         for row in torch.nonzero(done):
             assert float(reward[row]) < -1
             assert int(env.episode_length_buf[row]) == 0
-            assert env.loop.walk.gait.amount[row] == 0
+            assert env.logic.walk.gait.amount[row] == 0
             assert not extras["time_outs"][row]
         fell += int(done.sum())
     assert fell >= 8
@@ -82,7 +81,7 @@ def test_the_same_seed_gives_the_same_run_whatever_the_threads():
         env = LowLevelEnv(
             4, LowLevelTask(), WalkConfig(), SensorConfig(), threads=threads, seed=seed
         )
-        env.loop.difficulty = 1.0
+        env.logic.difficulty = 1.0
         for _ in range(40):
             obs, *_ = env.step(_zero(env))
         env.close()
@@ -104,8 +103,8 @@ def test_new_targets_act_after_the_delay():
 
 def test_a_delay_may_be_longer_than_a_tick():
     """Targets of 1, 2, 3 in turn; 30 ms late, 2 acts from the middle of the third tick on."""
-    physics = Physics(1, "points", PLAIN, 1, 0)
-    qpos = events.neutral(1)
+    physics = BatchPhysics(1, "points", PLAIN, 1, 0)
+    qpos = neutral_qpos(1)
     physics.place(np.arange(1), qpos, np.zeros((1, 29)))
     acting = []
     for target in (1.0, 2.0, 3.0):
@@ -119,12 +118,12 @@ def test_a_delay_may_be_longer_than_a_tick():
     "options", [PhysicsOptions(0.002), PhysicsOptions(cone="elliptic", integrator="Euler")]
 )
 def test_physics_takes_the_simulators_options(options):
-    physics = Physics(2, "stock", PLAIN, 1, 0, options)
+    physics = BatchPhysics(2, "stock", PLAIN, 1, 0, options)
     option = physics._models[0].opt
     assert option.timestep == options.timestep
     assert (option.cone == mujoco.mjtCone.mjCONE_ELLIPTIC) == (options.cone == "elliptic")
     assert (option.integrator == mujoco.mjtIntegrator.mjINT_EULER) == (options.timestep == 0.005)
-    qpos = events.neutral(2)
+    qpos = neutral_qpos(2)
     physics.place(np.arange(2), qpos, qpos[:, 7:])
     physics.step(qpos[:, 7:], np.zeros(2, dtype=np.intp))
     assert physics.state[:, 0] == pytest.approx(0.02)  # s
@@ -144,9 +143,9 @@ def test_a_push_is_a_change_of_the_horizontal_velocity():
 def test_steps_cost_nothing_for_a_while_after_a_push():
     env = _env(2, commands=STANDING, disturbances=PLAIN)
     env.step(_zero(env))
-    env.loop.walk.gait.amount[:] = 1.0
-    env.loop.pushed(np.array([1]))
-    terms = env.loop.judge(env.physics.snapshot())
+    env.logic.walk.gait.amount[:] = 1.0
+    env.logic.pushed(np.array([1]))
+    terms = env.logic.reward_terms(env.physics.snapshot())
     assert terms["stepping"].tolist() == [1.0, 0.0]
 
 
@@ -271,10 +270,10 @@ def test_mirrored_twice_is_the_same():
 def test_a_mirrored_robot_under_mirrored_commands_does_the_mirrored_thing():
     """Robot 1 gets everything in the mirror, tick by tick; what is observed stays a mirror."""
     env = _env(2, commands=STANDING, disturbances=PLAIN)
-    qpos = events.neutral(2)  # itself its mirror image
+    qpos = neutral_qpos(2)  # itself its mirror image
     env.physics.place(np.arange(2), qpos, qpos[:, 7:])
-    env.loop.restart(np.arange(2))
-    commands = env.loop.commands
+    env.logic.restart(np.arange(2))
+    commands = env.logic.commands
     commands.velocity[:] = commands._goal[:] = [[0.2, 0.1, 0.2], [0.2, -0.1, -0.2]]
     commands._ticks_left[:] = 1000
     env._observe(env.physics.snapshot())
@@ -299,16 +298,16 @@ def _terms(env: LowLevelEnv, **change: np.ndarray) -> dict[str, np.ndarray]:
     x = replace(env.physics.snapshot(), **change)
     n = env.num_envs
     action = np.zeros((n, ACTIONS))
-    walk = env.loop.walk
-    motion, torso = rewards.Motion(n), TorsoMotion(n)
+    walk = env.logic.walk
+    motion, torso = rewards.AverageVelocity(n), TorsoMotion(n)
     for _ in range(100):
         motion.add(x)
         torso.add(env.physics.snapshot())
     torso.add(x)
     return rewards.terms(
         x,
-        motion.average,
-        env.loop.commands.vector,
+        motion.value,
+        env.logic.commands.vector,
         walk.height,
         walk.pitch,
         walk.gait.phase,

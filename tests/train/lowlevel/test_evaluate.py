@@ -12,9 +12,9 @@ from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import ACTION_BOX, ACTION_ETA, ACTION_RATE_LIMIT
 from egovcp_train.lowlevel import evaluate, skills, trial
+from egovcp_train.lowlevel.config import DisturbanceConfig
 from egovcp_train.lowlevel.evaluate import main
 from egovcp_train.lowlevel.skills import SKILLS, Skill
-from egovcp_train.lowlevel.task import DisturbanceConfig
 from egovcp_train.lowlevel.trial import _directions, _lag, _rotation, _velocity_error, play
 
 
@@ -78,7 +78,7 @@ def test_skills_in_other_directions_have_one_velocity(name: str, axis: int, spee
 
 
 def test_seldom_steps_are_far_at_the_rate_limit_and_then_held():
-    hands = ACTION_BOX.to_normalised(skills.seldom_walk(1000, 8, _rng())[..., 3:])[..., :6]
+    hands = ACTION_BOX.to_normalised(skills.held_walk(1000, 8, _rng())[..., 3:])[..., :6]
     step = np.abs(np.diff(hands[::2], axis=0))
     assert step.max() == pytest.approx(ACTION_RATE_LIMIT)
     assert 0.5 < (step.max(axis=2) < 1e-9).mean() < 0.9

@@ -10,8 +10,8 @@ import torch
 from egovcp.robot.g1 import STIFFNESS
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
 from egovcp.spec import JOINT_NAMES
+from egovcp_train.lowlevel.config import DisturbanceConfig, LowLevelTask, RewardConfig
 from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
-from egovcp_train.lowlevel.task import DisturbanceConfig, LowLevelTask, RewardConfig
 
 pytestmark = pytest.mark.timeout(900)  # Warp compiles its kernels once
 
@@ -127,11 +127,11 @@ def test_a_checkpoint_comes_with_the_controllers_file(env, tmp_path):
 
     first = runner()
     first.learn(1)
-    loop = terms_module.loop_term(env).loop
-    loop.difficulty = 0.5
+    logic = terms_module.logic_term(env).logic
+    logic.difficulty = 0.5
     first.save(str(tmp_path / "model_1.pt"))
-    loop.difficulty = 0.0
+    logic.difficulty = 0.0
     runner().load(str(tmp_path / "model_1.pt"))
-    assert loop.difficulty == 0.5
+    assert logic.difficulty == 0.5
     controller = make_controller(str(tmp_path / "model_1.safetensors"))
     assert controller.walks

@@ -12,11 +12,16 @@ from egovcp.robot.walk_policy import WalkPolicy
 from egovcp.robot.walking import OBSERVATION_DIM, WalkConfig, WalkingController
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import STATE_DIM
-from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig, PpoConfig
+from egovcp_train.lowlevel.config import (
+    CurriculumConfig,
+    LowLevelTask,
+    NetworkConfig,
+    RewardConfig,
+)
 from egovcp_train.lowlevel.env import LowLevelEnv
-from egovcp_train.lowlevel.learn import PpoLearner, adapted
-from egovcp_train.lowlevel.task import LowLevelTask, RewardConfig
+from egovcp_train.lowlevel.learner import LowLevelLearner, next_difficulty, walk_policy
 from egovcp_train.lowlevel.train import main
+from egovcp_train.on_policy import PpoOptions
 
 SMALL = ["--robots=8", "--threads=1", "--ppo.num_steps_per_env=8", "--save_freq=2"]
 LAST = Path("checkpoints/last/pretrained_model/walk.safetensors")
@@ -77,12 +82,12 @@ def test_another_network_does_not_continue_the_run(run: Path, capsys):
     assert "does not fit" in capsys.readouterr().err
 
 
-def _learner(**curriculum: float) -> PpoLearner:
+def _learner(**curriculum: float) -> LowLevelLearner:
     env = LowLevelEnv(4, LowLevelTask(), WalkConfig(), SensorConfig())
-    return PpoLearner(
+    return LowLevelLearner(
         env,
         NetworkConfig(actor=(16,), critic=(16,)),
-        PpoConfig(num_steps_per_env=4),
+        PpoOptions(num_steps_per_env=4),
         CurriculumConfig(**curriculum),
     )
 
@@ -90,7 +95,7 @@ def _learner(**curriculum: float) -> PpoLearner:
 def test_the_exported_policy_is_the_trained_one():
     learner = _learner()
     learner.iterate()
-    policy = learner.policy(WalkConfig(), {})
+    policy = walk_policy(learner.ppo.get_policy(), WalkConfig(), {})
     x = learner.env.get_observations()
     learner.ppo.eval_mode()
     with torch.no_grad():
@@ -101,21 +106,21 @@ def test_the_exported_policy_is_the_trained_one():
 
 def test_it_becomes_harder_with_success_and_easier_with_falls():
     rule = CurriculumConfig(step=0.1)
-    assert adapted(0.0, falls=0.0, tracked=0.9, rule=rule) == pytest.approx(0.1)
-    assert adapted(0.1, falls=0.0, tracked=0.1, rule=rule) == pytest.approx(0.1)
-    assert adapted(0.1, falls=1.0, tracked=0.9, rule=rule) == pytest.approx(0.0)
-    assert adapted(0.95, falls=0.0, tracked=0.9, rule=rule) == 1.0
-    assert adapted(0.05, falls=1.0, tracked=0.9, rule=rule) == 0.0
+    assert next_difficulty(0.0, falls=0.0, tracked=0.9, rule=rule) == pytest.approx(0.1)
+    assert next_difficulty(0.1, falls=0.0, tracked=0.1, rule=rule) == pytest.approx(0.1)
+    assert next_difficulty(0.1, falls=1.0, tracked=0.9, rule=rule) == pytest.approx(0.0)
+    assert next_difficulty(0.95, falls=0.0, tracked=0.9, rule=rule) == 1.0
+    assert next_difficulty(0.05, falls=1.0, tracked=0.9, rule=rule) == 0.0
 
 
 def test_ppo_learns_what_a_term_rewards():
     """With nothing but the cost of acting, it acts less and less boldly."""
     task = LowLevelTask(rewards=_only_action(RewardConfig()))
     env = LowLevelEnv(32, task, WalkConfig(), SensorConfig())
-    learner = PpoLearner(
+    learner = LowLevelLearner(
         env,
         NetworkConfig(actor=(16,), critic=(16,)),
-        PpoConfig(entropy_coef=0.0, desired_kl=0.05),
+        PpoOptions(entropy_coef=0.0, desired_kl=0.05),
         CurriculumConfig(),
     )
     torch.manual_seed(0)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from egovcp.robot.gait import GaitConfig
-from egovcp_train.lowlevel.tune import TuneConfig, flat, main, shifted, walk
+from egovcp_train.lowlevel.tune import TuneConfig, flat, main, score, shifted
 
 CONFIG = TuneConfig(output_dir="", seconds=0.4, threads=1)
 
@@ -34,13 +34,13 @@ def test_numbers_stay_where_they_mean_something():
 def test_a_gait_that_keeps_the_robot_up_scores_more_than_one_that_throws_it():
     good = GaitConfig()
     bad = GaitConfig(hip_pitch=(-8.0, -1.0), hip_roll=(-8.0, -1.0))
-    scores = walk([good, bad], TuneConfig(output_dir="", seconds=1.5, threads=1), 0)
+    scores = score([good, bad], TuneConfig(output_dir="", seconds=1.5, threads=1), 0)
     assert scores[0] > scores[1] + 0.5
 
 
 def test_the_same_seed_gives_the_same_score():
     gaits = [GaitConfig()]
-    np.testing.assert_array_equal(walk(gaits, CONFIG, 3), walk(gaits, CONFIG, 3))
+    np.testing.assert_array_equal(score(gaits, CONFIG, 3), score(gaits, CONFIG, 3))
 
 
 def test_it_leaves_numbers_that_a_gait_can_be_made_of(tmp_path):

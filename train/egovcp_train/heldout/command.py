@@ -1,4 +1,4 @@
-"""``egovcp-eval-model``: what a trained world model foresees, on episodes it has not seen."""
+"""``egovcp-eval-model``: measures a trained world model on recorded episodes."""
 
 from __future__ import annotations
 
@@ -23,13 +23,10 @@ from egovcp.policy_options import PolicyOptions
 from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
 from egovcp.trained import returns_of
+from egovcp_train.datasets import EVALUATION_EPISODES, ReturnScale, on_task_scales
 from egovcp_train.device import choose_device
-from egovcp_train.heldout.episodes import recorded
-from egovcp_train.heldout.pictures import draw
-from egovcp_train.heldout.recording import record
-from egovcp_train.heldout.report import Report, measure
-from egovcp_train.heldout.table import table
-from egovcp_train.return_scale import ReturnScale, on_task_scales
+from egovcp_train.heldout.pictures import draw, record, table
+from egovcp_train.heldout.report import HeldoutReport, episode_batches, measure
 
 PROG: Final = "egovcp-eval-model"
 RESULT: Final = "heldout.json"
@@ -40,20 +37,21 @@ class HeldoutConfig:
     """Measure a trained world model on whole recorded episodes, without a simulator.
 
     Open-loop prediction of depth and proprioception 1 to 16 ticks ahead beside "the last one
-    repeated", how well terminations are foretold, the calibration of Q, the latent dimensions in
-    use; per task, as a table, heldout.json and pictures. docs/world_model.md explains each.
+    repeated", prediction of terminations, calibration of Q, active latent dimensions; per task, as
+    a table, heldout.json and pictures. docs/world_model.md explains each.
     """
 
     output_dir: str
-    """Folder for heldout.json and the pictures; its other files are left alone."""
+    """Folder for heldout.json and the pictures; other files in it stay."""
     policy: PolicyOptions = field(default_factory=PolicyOptions)
     """Policy to measure."""
     dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
     """Dataset with the episodes."""
     split: str = "heldout"
-    """heldout, train or all; episodes are held out by a hash, the same ones in each training."""
-    episodes: int = bounded(512, least=0, most=1_000_000)
-    """At most this many episodes of each task, evenly spread over the split; 0: all."""
+    """heldout, train or all; a hash decides which episodes are held out, in every training."""
+    episodes: int = bounded(EVALUATION_EPISODES, least=0, most=1_000_000)
+    """At most this many episodes of each task, evenly spread over the split; 0: all. Open-loop
+    predictions use 64 of them."""
     stride: int = bounded(4, least=1)
     """Rows between the starts of open-loop predictions; 1: from each row."""
     pictures: bool = True
@@ -75,7 +73,7 @@ def evaluate(config: HeldoutConfig) -> None:
     After Ctrl-C the measures of the episodes so far are written, marked as incomplete.
 
     Raises:
-        UsageError: an option makes no sense.
+        UsageError: an option is wrong.
         ArtifactError: the policy is damaged, or of another low-level controller.
         DataError: the dataset is damaged.
         EnvironmentFailure: the folder cannot be written.
@@ -95,7 +93,7 @@ def evaluate(config: HeldoutConfig) -> None:
     model = artifact.world_model.to(device)
     with stop_on_signal() as received:
         stopped = partial(bool, received)
-        report = measure(model, recorded(store, device), config.stride, stopped)
+        report = measure(model, episode_batches(store, device), config.stride, stopped)
     requested = {task: store.tasks.count(task) for task in sorted(set(store.tasks))}
     played = {task: found["episodes"] for task, found in report.tasks.items()}
     complete = played == requested
@@ -115,7 +113,7 @@ def evaluate(config: HeldoutConfig) -> None:
 
 
 def _check(config: HeldoutConfig) -> Path:
-    """Refuse options that make no sense before any work starts."""
+    """Check the options before any work starts; returns the output folder."""
     if not config.policy.path:
         raise UsageError("no policy given: --policy.path=RUN/checkpoints/last/pretrained_model")
     output = Path(config.output_dir)
@@ -124,7 +122,7 @@ def _check(config: HeldoutConfig) -> Path:
 
 
 def require_same_controller(artifact: Artifact, reader: DatasetReader) -> None:
-    """Raise `ArtifactError` where the data's actions were given to another controller."""
+    """Raise `ArtifactError` unless policy and data have the same low-level controller."""
     if artifact.controller_id != reader.controller_id:
         raise ArtifactError(
             f"{artifact.path} was trained on data of low-level controller "
@@ -164,14 +162,14 @@ def _run(config: HeldoutConfig, artifact: Artifact, reader: DatasetReader) -> di
     }
 
 
-def _write(output: Path, report: Report, run: dict[str, Any]) -> None:
+def _write(output: Path, report: HeldoutReport, run: dict[str, Any]) -> None:
     output.mkdir(parents=True, exist_ok=True)
     content = {"tasks": report.tasks, "all_tasks": report.metrics, "_run": run}
     write_text(output / RESULT, json.dumps(content, indent=2) + "\n")
 
 
-def _show(output: Path, report: Report, depth_max_m: float) -> None:
-    """Draw the pictures and the recording, and say where they are."""
+def _show(output: Path, report: HeldoutReport, depth_max_m: float) -> None:
+    """Write the pictures and the recording."""
     from PIL import Image
 
     for name, picture in draw(report).items():

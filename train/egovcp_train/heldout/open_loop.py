@@ -1,31 +1,34 @@
-"""How far a model foresees pictures and proprioception without looking.
+"""Open-loop prediction of depth images and proprioception.
 
-After at least `CONTEXT` filtered frames the state at row s is imagined onwards with the recorded
-actions. At s + k the decoded picture and proprioception are compared with the recorded ones, and
-so are those of row s itself, "the last image repeated".
+After at least `CONTEXT` filtered frames the state at row s is imagined forward with the recorded
+actions. At s + k the decoded image and proprioception are compared with the recorded ones; so are
+those of row s itself ("last image repeated").
 
-Depth errors are mean absolute differences in mm over the pixels of a region of row s + k, of
-those in which something is in range; a prediction of nothing in range counts as the end of it.
-State errors are mean absolute differences in standard deviations of the training data.
+Depth errors are mean absolute differences in mm over the pixels of a region of row s + k with
+something in range; a prediction of nothing in range counts as the end of the range. State errors
+are mean absolute differences in standard deviations of the training data.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Final
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from egovcp import spec
 from egovcp.model import Batch, Carry, WorldModel
 from egovcp.model.losses import Rollout, moving_pixels
-from egovcp_train.heldout.episodes import Recorded
 
 HORIZONS: Final = (1, 2, 4, 8, 12, 16)
-CONTEXT: Final = 4  # frames that are filtered before anything is foreseen
+CONTEXT: Final = 4  # frames that are filtered before a prediction
 REGIONS: Final = ("valid", "near", "moving")
 NEAR_M: Final = 1.5  # m; upper end of the region "near", about the reach of the hands
+STRIP: Final = tuple(range(0, max(HORIZONS) + 1, 2))  # horizons of an image strip; 0 is filtered
+MAX_STRIPS: Final = 3  # per task
 _MOVING: Final = 0.04  # change of nearness, 0.2 m of 5 m, as in the loss
 _IMAGES_AT_ONCE: Final = 1024
 
@@ -33,10 +36,10 @@ type Errors = dict[str, dict[str, dict[str, float | int | None]]]
 
 
 class OpenLoop:
-    """Sums of the errors at each horizon, over any number of groups of episodes."""
+    """Sums of the errors at each horizon over batches of episodes."""
 
     def __init__(self, stride: int = 4) -> None:
-        """Foresee from every ``stride``-th row."""
+        """Predict from every ``stride``-th row."""
         self.stride = stride
         self._depth = {
             (r, k): torch.zeros(3, dtype=torch.float64) for r in REGIONS for k in HORIZONS
@@ -45,21 +48,21 @@ class OpenLoop:
         self._state = {k: torch.zeros(shape, dtype=torch.float64) for k in HORIZONS}
         self._rows = dict.fromkeys(HORIZONS, 0)
 
-    def add(self, model: WorldModel, episodes: Recorded, rollout: Rollout) -> None:
-        """Foresee one group of episodes, filtered as ``rollout``."""
-        batch = episodes.batch
-        s = _starts(batch, self.stride)
+    def add(self, model: WorldModel, batch: Batch, rollout: Rollout) -> None:
+        """Add a batch of episodes, filtered as ``rollout``."""
+        last = batch.valid.shape[1] - 1
+        s = torch.arange(CONTEXT - 1, max(CONTEXT - 1, last), self.stride)
+        s = s.to(batch.valid.device)  # rows from which states are imagined
         if len(s) == 0:
             return
         regions = _regions(rollout.near, model.config.depth_max_m)
         carry = rollout.carry.map(lambda x: x[:, s])
-        last = batch.valid.shape[1] - 1
         for k in range(1, max(HORIZONS) + 1):
             carry = model.imagine(carry, batch.action[:, (s + k - 1).clamp_max(last)])
             if k in HORIZONS:
                 exists = batch.valid[:, (s + k).clamp_max(last)] & (s + k <= last)
                 b, i = torch.nonzero(exists, as_tuple=True)
-                self._compare(model, carry, rollout, regions, s, k, b, i)
+                self._compare(model, _rows(carry, b, i), rollout, regions, b, s[i], k)
 
     def _compare(
         self,
@@ -67,28 +70,27 @@ class OpenLoop:
         carry: Carry,
         rollout: Rollout,
         regions: Mapping[str, Tensor],
-        starts: Tensor,
-        k: int,
         b: Tensor,
-        i: Tensor,
+        start: Tensor,
+        k: int,
     ) -> None:
-        """Add the errors of starts ``i`` of episodes ``b`` at horizon ``k``."""
-        found, then = carry.map(lambda x: x[b, i]), starts[i] + k
-        truth, before = rollout.state[b, then], rollout.state[b, starts[i]]
-        foreseen = model.decode_state(found.h, found.z).float()
-        errors = torch.stack([(foreseen - truth).abs().sum(0), (before - truth).abs().sum(0)])
+        """Add the errors of ``carry``, predicted from rows ``start`` of episodes ``b``."""
+        then = start + k
+        truth, before = rollout.state[b, then], rollout.state[b, start]
+        predicted = model.decode_state(carry.h, carry.z).float()
+        errors = torch.stack([(predicted - truth).abs().sum(0), (before - truth).abs().sum(0)])
         self._state[k] += errors.double().cpu()
         self._rows[k] += len(b)
+        scale = torch.tensor([1e3 * model.config.depth_max_m] * 2 + [1.0])
         for some in torch.split(torch.arange(len(b), device=b.device), _IMAGES_AT_ONCE):
             bs, ts = b[some], then[some]
-            image = model.decode_near(_some(found, some)).clamp(0.0, 1.0)
+            image = model.decode_near(_rows(carry, some)).clamp(0.0, 1.0)
             truth = rollout.near[bs, ts]
-            wrong = (image - truth).abs()
-            still = (rollout.near[bs, ts - k] - truth).abs()
+            error = (image - truth).abs()
+            repeated = (rollout.near[bs, ts - k] - truth).abs()
             for name, pixels in regions.items():
                 inside = pixels[bs, ts]
-                sums = [(wrong * inside).sum(), (still * inside).sum(), inside.sum()]
-                scale = torch.tensor([1e3 * model.config.depth_max_m] * 2 + [1.0])
+                sums = [(error * inside).sum(), (repeated * inside).sum(), inside.sum()]
                 self._depth[name, k] += torch.stack([x.double() for x in sums]).cpu() * scale
 
     def depth(self) -> Errors:
@@ -118,14 +120,8 @@ class OpenLoop:
         return out
 
 
-def _some(carry: Carry, rows: Tensor) -> Carry:
-    return carry.map(lambda x: x[rows])
-
-
-def _starts(batch: Batch, stride: int) -> Tensor:
-    """(S,) rows from which states are imagined."""
-    end = max(CONTEXT - 1, batch.valid.shape[1] - 1)
-    return torch.arange(CONTEXT - 1, end, stride, device=batch.valid.device)
+def _rows(carry: Carry, *index: Tensor) -> Carry:
+    return carry.map(lambda x: x[index])
 
 
 def _regions(near: Tensor, max_m: float) -> dict[str, Tensor]:
@@ -136,3 +132,53 @@ def _regions(near: Tensor, max_m: float) -> dict[str, Tensor]:
         "near": near > 1 - NEAR_M / max_m,
         "moving": valid & (moving_pixels(near, _MOVING) > 0),
     }
+
+
+class Strip(NamedTuple):
+    """Recorded and predicted images of one prediction."""
+
+    interest: float
+    start: int
+    """Row of the last observed image."""
+    observed: NDArray[np.float32]
+    """(len(STRIP), 48, 64) nearness."""
+    predicted: NDArray[np.float32]
+    """(len(STRIP), 48, 64) nearness."""
+
+
+def most_interesting(found: Sequence[Strip]) -> list[Strip]:
+    """The `MAX_STRIPS` most interesting ones."""
+    return sorted(found, key=lambda strip: -strip.interest)[:MAX_STRIPS]
+
+
+def strips(model: WorldModel, batch: Batch, rollout: Rollout) -> list[Strip]:
+    """The most interesting predictions of a batch of episodes, at most one per episode.
+
+    A strip starts before the rows in which most pixels move.
+    """
+    ahead = max(HORIZONS)
+    latest = batch.valid.sum(1) - 1 - ahead
+    moving = (moving_pixels(rollout.near, _MOVING).sum((-2, -1)) * batch.valid).cumsum(1)
+    window = torch.full_like(moving, -1.0)  # stays where the episode is too short
+    window[:, :-ahead] = moving[:, ahead:] - moving[:, :-ahead]
+    rows = torch.arange(window.shape[1], device=window.device)
+    possible = (rows >= CONTEXT - 1) & (rows <= latest[:, None])
+    interest, start = window.masked_fill(~possible, -1.0).max(1)
+    order = torch.argsort(-interest, stable=True)[:MAX_STRIPS]
+    return [
+        _strip(model, batch, rollout, int(b), int(start[b]), float(interest[b]))
+        for b in order
+        if interest[b] >= 0
+    ]
+
+
+def _strip(
+    model: WorldModel, batch: Batch, rollout: Rollout, b: int, s: int, interest: float
+) -> Strip:
+    states = [rollout.carry.map(lambda x: x[b, s][None])]
+    for k in range(max(HORIZONS)):
+        states.append(model.imagine(states[-1], batch.action[b, s + k][None]))
+    shown = Carry.join([states[k] for k in STRIP], torch.cat)
+    predicted = model.decode_near(shown).clamp(0.0, 1.0)
+    observed = rollout.near[b, [s + k for k in STRIP]]
+    return Strip(interest, s, observed.cpu().numpy(), predicted.cpu().numpy())

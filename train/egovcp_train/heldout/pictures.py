@@ -1,25 +1,87 @@
-"""Pictures of a report: open-loop strips and the calibration of Q."""
+"""A held-out report as text, as pictures, and as a Rerun recording."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, Final
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from egovcp.model.depth import to_metres
+from egovcp.packages import is_installed
 from egovcp.spec import PLANNER_DT
-from egovcp_train.heldout.report import Report, Values
-from egovcp_train.heldout.strips import STRIP, Strip
+from egovcp_train.heldout.open_loop import HORIZONS, STRIP, Strip
+from egovcp_train.heldout.report import HeldoutReport, Values
 
+if TYPE_CHECKING:
+    import rerun.blueprint as rrb
+
+RECORDING: Final = "open_loop.rrd"
 _DPI: Final = 100
-_GAP: Final = 2  # pixels between pictures
-_POINTS: Final = 3000  # of the rows that the scatter shows
+_GAP: Final = 2  # pixels between images
+_POINTS: Final = 3000  # of the scatter plot
+_KINDS: Final = ("observed", "predicted")
+_REGIONS: Final = {
+    "valid": "depth, all pixels",
+    "near": "depth, nearer than 1.5 m",
+    "moving": "depth, moving",
+}
 
 type Image = NDArray[np.uint8]
 
 
-def draw(report: Report) -> dict[str, Image]:
+# --- text ----------------------------------------------------------------------------
+def table(tasks: Mapping[str, Mapping[str, Any]]) -> str:
+    """A block per task; errors as model / repeated, depth in mm, state in standard deviations."""
+    return "\n\n".join(_block(task, report) for task, report in tasks.items())
+
+
+def _block(task: str, report: Mapping[str, Any]) -> str:
+    latent, value = report["latent"], report["value"]
+    ends = report["termination"].items()
+    aucs = (f"{_number(s['auc'], 3)} within {k} ({s['failing']} of {s['rows']})" for k, s in ends)
+    head = f"{task}: {report['episodes']} episodes, {report['rows']} rows"
+    lines = [
+        f"{head}; model / last one repeated, by ticks ahead",
+        _line("", (str(k) for k in HORIZONS)),
+    ]
+    for region, name in _REGIONS.items():
+        errors = report["depth"][region].values()
+        if any(e["pixels"] for e in errors):
+            cells = (_pair(e["model_mm"], e["repeat_mm"], 0) for e in errors)
+            lines.append(_line(f"{name}, mm", cells))
+    for group, by_horizon in report["state"].items():
+        cells = (_pair(e["model"], e["repeat"], 2) for e in by_horizon.values())
+        lines.append(_line(group, cells))
+    return "\n".join(
+        [
+            *lines,
+            f"termination AUC  {', '.join(aucs)} rows",
+            f"Q  slope {_number(value['slope'], 2)}, R2 {_number(value['r2'], 3)}, "
+            f"bias {_number(value['bias'], 3)} on {value['rows']} rows",
+            f"latent  {latent['active']} of {latent['dimensions']} dimensions active, "
+            f"KL {latent['kl_nats']:.2f} nats",
+        ]
+    )
+
+
+def _line(name: str, cells: Iterable[str]) -> str:
+    return f"  {name:<32}" + "".join(f"{cell:>13}" for cell in cells)
+
+
+def _pair(model: float | None, repeat: float | None, digits: int) -> str:
+    return "-" if model is None else f"{_number(model, digits)} / {_number(repeat, digits)}"
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+# --- pictures ------------------------------------------------------------------------
+def draw(report: HeldoutReport) -> dict[str, Image]:
     """``open_loop_TASK`` and ``value_TASK`` -> (height, width, 3) picture."""
     out: dict[str, Image] = {}
     for task, found in report.strips.items():
@@ -32,15 +94,15 @@ def draw(report: Report) -> dict[str, Image]:
 
 
 def strip_picture(strips: Sequence[Strip]) -> Image:
-    """Two lines per strip, seen and foreseen, one column per horizon; near is bright."""
-    lines = [_line(images) for strip in strips for images in (strip.seen, strip.foreseen)]
+    """Two rows per strip, observed and predicted; one column per horizon; near is bright."""
+    lines = [_joined(images) for strip in strips for images in (strip.observed, strip.predicted)]
     sheet = np.concatenate(lines)
     height, width = sheet.shape[0] / len(lines), sheet.shape[1] / len(STRIP)
     figure, axes = _figure(1.2 * len(STRIP), 0.95 * len(lines) + 0.4)
     axes.imshow(sheet, cmap="magma", vmin=0.0, vmax=1.0, interpolation="nearest")
     ticks = [f"+{k} ({1e3 * k * PLANNER_DT:.0f} ms)" for k in STRIP]
     axes.set_xticks([(i + 0.5) * width for i in range(len(STRIP))], ["filtered", *ticks[1:]])
-    names = [f"{what}\nrow {s.start}" for s in strips for what in ("seen", "foreseen")]
+    names = [f"{kind}\nrow {s.start}" for s in strips for kind in _KINDS]
     axes.set_yticks([(i + 0.5) * height for i in range(len(lines))], names)
     axes.tick_params(length=0, labelsize=8)
     return _pixels(figure)
@@ -61,14 +123,14 @@ def calibration_picture(values: Values, found: dict[str, Any]) -> Image:
     return _pixels(figure)
 
 
-def _line(images: NDArray[np.float32]) -> NDArray[np.float32]:
-    """(n, 48, 64) -> one line of pictures with gaps of no colour between them."""
+def _joined(images: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(n, 48, 64) -> one row of images with transparent gaps."""
     padded = np.pad(images, ((0, 0), (0, _GAP), (0, _GAP)), constant_values=np.nan)
     return np.concatenate(list(padded), axis=1)
 
 
 def _figure(width: float, height: float) -> tuple[Any, Any]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg  # half a second
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # takes half a second
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), dpi=_DPI, layout="constrained")
@@ -79,3 +141,70 @@ def _figure(width: float, height: float) -> tuple[Any, Any]:
 def _pixels(figure: Any) -> Image:
     figure.canvas.draw()
     return np.array(figure.canvas.buffer_rgba(), dtype=np.uint8)[..., :3]
+
+
+# --- recording -----------------------------------------------------------------------
+def record(report: HeldoutReport, folder: Path, depth_max_m: float) -> Path | None:
+    """Write ``FOLDER/open_loop.rrd``: observed beside predicted depth images, per task.
+
+    Entities ``/TASK/NUMBER/observed`` and ``.../predicted``, in mm, on the timelines
+    ``ticks_ahead`` and ``time_ahead``. It replaces an earlier one.
+
+    Returns:
+        The file; None if rerun is not installed, or no episode is long enough.
+    """
+    if not is_installed("rerun") or not any(report.strips.values()):
+        return None
+    import rerun as rr  # takes half a second
+
+    from egovcp.log.rerun import depth_style
+
+    path = folder / RECORDING
+    stream = rr.RecordingStream("egovcp_open_loop")
+    stream.save(path, default_blueprint=_blueprint(report))
+    ahead = [
+        rr.TimeColumn("ticks_ahead", sequence=STRIP),
+        rr.TimeColumn("time_ahead", duration=[k * PLANNER_DT for k in STRIP]),
+    ]
+    for task, found in report.strips.items():
+        for number, strip in enumerate(found):
+            for kind in _KINDS:
+                entity = f"/{task}/{number}/{kind}"
+                stream.log(entity, depth_style(), static=True)
+                buffers = _buffers(getattr(strip, kind), depth_max_m)
+                stream.send_columns(entity, ahead, rr.DepthImage.columns(buffer=buffers))
+    stream.flush()
+    stream.disconnect()
+    return path
+
+
+def _buffers(near: NDArray[np.float32], depth_max_m: float) -> list[NDArray[np.uint8]]:
+    """(n, 48, 64) nearness -> n images in uint16 mm, as bytes."""
+    from egovcp.log.messages import to_millimetres
+
+    metres = to_metres(torch.from_numpy(near), depth_max_m).numpy()
+    return [np.ascontiguousarray(to_millimetres(m)).view(np.uint8).ravel() for m in metres]
+
+
+def _blueprint(report: HeldoutReport) -> rrb.Blueprint:
+    """A tab per task; observed beside predicted, one row per prediction; played in a loop."""
+    import rerun.blueprint as rrb
+
+    tabs = []
+    for task, found in report.strips.items():
+        lines = [
+            rrb.Horizontal(
+                *(
+                    rrb.Spatial2DView(
+                        name=f"{kind}, from row {strip.start}", origin=f"/{task}/{number}/{kind}"
+                    )
+                    for kind in _KINDS
+                )
+            )
+            for number, strip in enumerate(found)
+        ]
+        tabs.append(rrb.Vertical(*lines, name=task))
+    time = rrb.TimePanel(
+        state="collapsed", timeline="time_ahead", play_state="playing", loop_mode="all"
+    )
+    return rrb.Blueprint(rrb.Tabs(*tabs), time, collapse_panels=True)

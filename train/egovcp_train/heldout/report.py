@@ -1,37 +1,165 @@
-"""All held-out measures of a model, task by task."""
+"""Measurements of a model on held-out episodes, task by task."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Iterator
+from typing import Any, Final, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from egovcp.data import EpisodeStore
+from egovcp.data.index import evenly_spaced
+from egovcp.data.store import gather
 from egovcp.errors import DataError
 from egovcp.model import Batch, WorldModel
 from egovcp.model.latent_state import kl_divergence
 from egovcp.model.losses import Rollout, filter_sequence
-from egovcp_train.evaluation import ACTIVE_NATS, Summary
-from egovcp_train.heldout.calibration import calibration
-from egovcp_train.heldout.episodes import Recorded
-from egovcp_train.heldout.open_loop import OpenLoop
-from egovcp_train.heldout.strips import Strip, best, strips
-from egovcp_train.heldout.termination import Foretold, foretell, termination_scores
+from egovcp_train.datasets import to_tensors
+from egovcp_train.heldout.open_loop import OpenLoop, Strip, most_interesting, strips
+
+EPISODES_AT_ONCE: Final = 16
+OPEN_LOOP_EPISODES: Final = 64
+"""Of each task, for open-loop predictions, which take most of the time."""
+ACTIVE_NATS: Final = 0.01  # KL below which a latent dimension carries no information
+WITHIN: Final = (1, 5, 25)  # rows; D is trained for 1, 25 are a second
+_FLAT: Final = 1e-12  # variance, units of return squared, below which something is constant
 
 
+class EpisodeBatch(NamedTuple):
+    """Whole episodes of one task, padded to the longest."""
+
+    task: str
+    batch: Batch
+    open_loop: bool = True
+    """Whether open-loop predictions are measured on it."""
+
+
+def episode_batches(
+    store: EpisodeStore, device: torch.device, per_task: int | None = None
+) -> Iterator[EpisodeBatch]:
+    """The episodes of a store, task by task.
+
+    Args:
+        store: the episodes.
+        device: of the tensors.
+        per_task: at most this many episodes of each task, evenly spread; None: all.
+    """
+    for task in sorted(set(store.tasks)):
+        own = evenly_spaced(np.flatnonzero(np.array(store.tasks) == task), per_task)
+        own = own[np.argsort(store.length[own], kind="stable")]  # little padding
+        groups = np.split(own, range(EPISODES_AT_ONCE, len(own), EPISODES_AT_ONCE))
+        predicted = evenly_spaced(
+            np.arange(len(groups)), max(1, OPEN_LOOP_EPISODES // EPISODES_AT_ONCE)
+        )
+        for number, which in enumerate(groups):
+            span = int(store.length[which].max())
+            batch = to_tensors(gather(store, store.start[which], which, span), device)
+            yield EpisodeBatch(task, batch, number in predicted)
+
+
+# --- calibration of Q ----------------------------------------------------------------
+def calibration(value: Tensor, target: Tensor) -> dict[str, float | int | None]:
+    """Q against the Monte Carlo return, (n,) each.
+
+    Returns:
+        rows; bias, mean of Q - return; r2, share of the return's variance that Q explains (below 0
+        if the mean is a better prediction); slope, regression of the return on Q (1: calibrated,
+        above 1: Q varies too little). None where rows or variance are missing.
+    """
+    out: dict[str, float | int | None] = {"rows": target.numel(), "bias": None}
+    out |= {"r2": None, "slope": None}
+    if target.numel() == 0:
+        return out
+    value, target = value.double(), target.double()
+    out["bias"] = float((value - target).mean())
+    variance = float(target.var(correction=0))
+    if variance > _FLAT:
+        out["r2"] = 1 - float((value - target).square().mean()) / variance
+    centred = value - value.mean()
+    if float(centred.square().mean()) > _FLAT:
+        out["slope"] = float((centred * target).mean() / centred.square().mean())
+    return out
+
+
+# --- termination ---------------------------------------------------------------------
+class TerminationRows(NamedTuple):
+    """Predicted and actual failure of rows, (n,) each."""
+
+    logit: Tensor
+    """D's log-odds, in the state that the row's action leads to."""
+    ahead: Tensor
+    """Rows until the failure, 1 if this row's action causes it; 0: no failure."""
+    known: Tensor
+    """Rows from this one on whose outcome is known."""
+
+
+def termination_rows(model: WorldModel, batch: Batch, rollout: Rollout) -> TerminationRows:
+    """D on every row, as it is trained: on the state imagined one tick ahead."""
+    logit = model.termination_logit(model.imagine(rollout.carry, batch.action))
+    length = batch.valid.sum(1, keepdim=True)
+    to_end = length - torch.arange(batch.valid.shape[1], device=length.device)
+    fails = (batch.terminal_next & batch.valid).any(1, keepdim=True).expand_as(to_end)
+    ahead = torch.where(fails, to_end, 0)
+    # The outcome after a time limit is unknown.
+    known = torch.where(fails, torch.iinfo(torch.int64).max, to_end)
+    rows = batch.valid
+    return TerminationRows(logit[rows].cpu(), ahead[rows].cpu(), known[rows].cpu())
+
+
+def termination_scores(
+    found: list[TerminationRows],
+) -> dict[str, dict[str, float | int | None]]:
+    """k -> AUC of "fails within k rows" (None without both outcomes), failing, rows."""
+    logit, ahead, known = (torch.cat(x) for x in zip(*found, strict=True))
+    out: dict[str, dict[str, float | int | None]] = {}
+    for k in WITHIN:
+        usable = known >= k
+        failing = ((ahead > 0) & (ahead <= k))[usable]
+        out[str(k)] = {
+            "auc": auc(logit[usable], failing),
+            "failing": int(failing.sum()),
+            "rows": int(usable.sum()),
+        }
+    return out
+
+
+def auc(score: Tensor, positive: Tensor) -> float | None:
+    """Area under the ROC curve from the ranks (Mann and Whitney), ties counting half.
+
+    Args:
+        score: (n,).
+        positive: (n,) bool.
+
+    Returns:
+        None without positives or without negatives.
+    """
+    positives = int(positive.sum())
+    negatives = positive.numel() - positives
+    if positives == 0 or negatives == 0:
+        return None
+    _, place, count = torch.unique(score, return_inverse=True, return_counts=True)
+    last = count.cumsum(0).double()
+    rank = (last - (count.double() - 1) / 2)[place]  # from 1; ties share their mean
+    above = rank[positive].sum() - positives * (positives + 1) / 2
+    return float(above) / (positives * negatives)
+
+
+# --- report --------------------------------------------------------------------------
 class Values(NamedTuple):
-    """Rows whose return is complete, (n,) each."""
+    """Q and return of the rows whose return is complete, (n,) each."""
 
     value: Tensor
     target: Tensor
 
 
-class Report(NamedTuple):
-    """What was measured."""
+class HeldoutReport(NamedTuple):
+    """All measurements."""
 
     metrics: dict[str, float]
-    """Over all tasks, see `egovcp_train.evaluation.evaluate`."""
+    """Over all tasks: value/r2, value/slope (see `calibration`), latent/kl (nats per row) and
+    latent/active (dimensions of z that carry information)."""
     tasks: dict[str, dict[str, Any]]
     """Task -> episodes, rows, depth, state, termination, value, latent; JSON-able."""
     values: dict[str, Values]
@@ -41,42 +169,47 @@ class Report(NamedTuple):
 
 
 class TaskReport:
-    """The measures of one task, summed over groups of its episodes."""
+    """Measurements of one task, summed over batches of its episodes."""
 
     def __init__(self, stride: int) -> None:
         self.episodes = self.rows = 0
         self.open_loop = OpenLoop(stride)
-        self.foretold: list[Foretold] = []
-        self.values: list[Values] = []
-        self.kl: list[Tensor] = []
+        self.termination: list[TerminationRows] = []
         self.strips: list[Strip] = []
+        self.kl = torch.zeros(0)
+        """Sum over the rows, of each dimension of z."""
+        self._values: list[Values] = []
 
-    def add(self, model: WorldModel, episodes: Recorded, rollout: Rollout) -> None:
-        """Measure one group of episodes."""
-        batch = episodes.batch
+    def add(self, model: WorldModel, batch: Batch, open_loop: bool) -> None:
+        """Filter a batch of episodes as on the robot, and measure it."""
+        rollout = filter_sequence(model, batch, sample=False)
         self.episodes += len(batch.valid)
         self.rows += int(batch.valid.sum())
-        self.open_loop.add(model, episodes, rollout)
-        self.foretold.append(foretell(model, batch, rollout))
-        self.values.append(_values(model, batch, rollout))
-        self.strips = best([*self.strips, *strips(model, episodes, rollout)])
-        kl = kl_divergence(rollout.posterior, rollout.prior)[batch.valid]
-        self.kl.append(kl.double().sum(0).cpu())
+        if open_loop:
+            self.open_loop.add(model, batch, rollout)
+            self.strips = most_interesting([*self.strips, *strips(model, batch, rollout)])
+        self.termination.append(termination_rows(model, batch, rollout))
+        usable = batch.valid & batch.mc_valid
+        value = model.value(rollout.carry, batch.action)
+        self._values.append(Values(value[usable].cpu(), batch.mc_return[usable].cpu()))
+        kl = kl_divergence(rollout.posterior, rollout.prior)[batch.valid].double().sum(0).cpu()
+        self.kl = kl + self.kl if len(self.kl) else kl
 
-    def all_values(self) -> Values:
-        """Those of all groups."""
-        return Values(*(torch.cat(x) for x in zip(*self.values, strict=True)))
+    @property
+    def values(self) -> Values:
+        """Q and returns of all batches."""
+        return Values(*(torch.cat(x) for x in zip(*self._values, strict=True)))
 
     def result(self) -> dict[str, Any]:
-        """The measures, JSON-able."""
-        kl = torch.stack(self.kl).sum(0) / self.rows
+        """The measurements, JSON-able."""
+        kl = self.kl / self.rows
         return {
             "episodes": self.episodes,
             "rows": self.rows,
             "depth": self.open_loop.depth(),
             "state": self.open_loop.state(),
-            "termination": termination_scores(self.foretold),
-            "value": calibration(*self.all_values()),
+            "termination": termination_scores(self.termination),
+            "value": calibration(*self.values),
             "latent": {
                 "active": int((kl > ACTIVE_NATS).sum()),
                 "dimensions": len(kl),
@@ -89,51 +222,53 @@ class TaskReport:
 @torch.no_grad()
 def measure(
     model: WorldModel,
-    episodes: Iterable[Recorded],
+    episodes: Iterable[EpisodeBatch],
     stride: int = 4,
     stopped: Callable[[], bool] = lambda: False,
-) -> Report:
-    """Filter the episodes once, as the robot does, and measure everything.
+) -> HeldoutReport:
+    """Measure a model.
 
     Args:
         model: the model.
-        episodes: groups of episodes.
+        episodes: batches of episodes.
         stride: rows between the starts of open-loop predictions.
-        stopped: once it returns true, the rest of the episodes is left out.
+        stopped: once it returns true, the remaining episodes are left out.
 
     Raises:
         DataError: there are no episodes.
         KeyboardInterrupt: it was stopped before anything was measured.
     """
     model.eval()
-    summary = Summary()
     tasks: dict[str, TaskReport] = {}
-    for group in episodes:
+    for task, batch, open_loop in episodes:
         if stopped():
             break
-        rollout = filter_sequence(model, group.batch, sample=False)
-        summary.add(model, group.batch, rollout)
-        tasks.setdefault(group.task, TaskReport(stride)).add(model, group, rollout)
+        tasks.setdefault(task, TaskReport(stride)).add(model, batch, open_loop)
     if not tasks:
         if stopped():
             raise KeyboardInterrupt
         raise DataError("no episodes to measure")
-    return Report(
-        summary.result(),
+    values = {task: found.values for task, found in tasks.items()}
+    return HeldoutReport(
+        _over_all_tasks(list(tasks.values()), list(values.values())),
         {task: found.result() for task, found in tasks.items()},
-        {task: found.all_values() for task, found in tasks.items()},
+        values,
         {task: found.strips for task, found in tasks.items()},
     )
 
 
-def _values(model: WorldModel, batch: Batch, rollout: Rollout) -> Values:
-    usable = batch.valid & batch.mc_valid
-    value = model.value(rollout.carry, batch.action)
-    return Values(value[usable].cpu(), batch.mc_return[usable].cpu())
+def _over_all_tasks(tasks: list[TaskReport], values: list[Values]) -> dict[str, float]:
+    kl = torch.stack([task.kl for task in tasks]).sum(0) / sum(task.rows for task in tasks)
+    found = calibration(*(torch.cat(x) for x in zip(*values, strict=True)))
+    return {
+        "latent/kl": float(kl.sum()),
+        "latent/active": float((kl > ACTIVE_NATS).sum()),
+        **{f"value/{name}": v for name in ("r2", "slope") if (v := found[name]) is not None},
+    }
 
 
 def scalars(tasks: dict[str, dict[str, Any]]) -> dict[str, float]:
-    """The report as one number per name, ``wall/depth_near_h4``; what is None is left out."""
+    """The report as one number per name, such as ``wall/depth_near_h4``, without those of None."""
     found: dict[str, float | None] = {}
     for task, report in tasks.items():
         for kind, model, repeat in (

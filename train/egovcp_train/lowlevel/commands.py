@@ -1,4 +1,4 @@
-"""Commands of training episodes: velocities, heights and hands that move as in collection."""
+"""Commands and pushes of training episodes: velocities, heights, and hands as in collection."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from egovcp.spec import (
     CONTROLLER_TICKS_PER_PLAN,
     reflect,
 )
-from egovcp_train.lowlevel.task import CommandConfig, Range
+from egovcp_train.lowlevel.config import CommandConfig, DisturbanceConfig, Range
 
 Array = NDArray[np.float64]
-_DT: Final = 1.0 / CONTROLLER_HZ
-_HEIGHT: Final = ACTION_DIM - 1
-_HELD_ETA: Final = 1.0  # box units, the steps of a random walk that steps seldom
-_HELD_TICKS: Final = (5, 15)  # planner ticks between them, inclusive
+HEIGHT: Final = ACTION_DIM - 1
+"""Index of the pelvis height in an action."""
+HELD_TICKS: Final = (5, 15)
+"""Planner ticks between the steps of a random walk that holds its targets, inclusive."""
+_HELD_ETA: Final = 1.0  # box units, step size of that random walk
 
 
 def between(easy: Range, hard: Range, difficulty: float) -> Range:
@@ -40,20 +41,13 @@ class Commands:
         self.velocity = np.zeros((robots, 3))  # m/s, m/s, rad/s, ramped
         self._goal = np.zeros((robots, 3))
         self._action = np.zeros((robots, ACTION_DIM))  # as the planner would send it
-        self._wanted = np.zeros((robots, ACTION_DIM))  # where it is on its way to
-        self._held = np.zeros(robots, dtype=bool)  # which step seldom and far
-        self._rest: NDArray[np.intp] = np.zeros(
-            robots, dtype=np.intp
-        )  # planner ticks until their next step
+        self._target = np.zeros((robots, ACTION_DIM))  # towards which the action moves
+        self._held = np.zeros(robots, dtype=bool)  # whose random walk holds its targets
+        self._rest: NDArray[np.intp] = np.zeros(robots, dtype=np.intp)  # planner ticks of holding
         self._moves = np.zeros((robots, ACTION_DIM), dtype=bool)  # which follow the random walk
-        self._low = np.full(robots, -1.0)  # of the height's action
+        self._low = np.full(robots, -1.0)  # lower bound of the height's action
         self._ticks_left = np.zeros(robots, dtype=np.intp)
         self._tick = 0
-
-    @property
-    def standing(self) -> NDArray[np.bool_]:
-        """(N,) no velocity is wanted."""
-        return np.asarray(~self._goal.any(axis=1))
 
     @property
     def vector(self) -> Array:
@@ -61,20 +55,20 @@ class Commands:
         return np.concatenate([self.velocity, ACTION_BOX.to_metric(self._action)], axis=1)
 
     def reset(self, rows: NDArray[np.intp]) -> None:
-        """New episodes: standing, neutral, and soon another command."""
+        """New episodes: standing and neutral, with another command within a second."""
         self.velocity[rows] = self._goal[rows] = 0.0
-        self._action[rows] = self._wanted[rows] = 0.0
+        self._action[rows] = self._target[rows] = 0.0
         self._moves[rows] = self._held[rows] = False
         self._rest[rows] = 0
         self._ticks_left[rows] = self._rng.integers(5, 50, len(rows))
 
     def advance(self) -> None:
-        """One tick: new commands where their time is over, hands and height a step on."""
+        """One tick: draws the commands that are due, ramps velocities, moves hands and height."""
         self._ticks_left -= 1
         rows = np.flatnonzero(self._ticks_left <= 0)
         if len(rows):
             self._draw(rows)
-        limit = self._config.acceleration * _DT
+        limit = self._config.acceleration / CONTROLLER_HZ
         self.velocity += np.clip(self._goal - self.velocity, -limit, limit)
         self._tick += 1
         if self._tick % CONTROLLER_TICKS_PER_PLAN == 0:
@@ -83,14 +77,14 @@ class Commands:
     def _walk_randomly(self) -> None:
         steps = ~self._held | (self._rest <= 0)
         size = np.where(self._held, _HELD_ETA, ACTION_ETA) * steps
-        drawn = self._rng.integers(*_HELD_TICKS, len(steps), endpoint=True)
+        drawn = self._rng.integers(*HELD_TICKS, len(steps), endpoint=True)
         self._rest = np.where(self._held & steps, drawn, self._rest) - 1
         step = size[:, None] * self._rng.uniform(-1, 1, self._action.shape)
         low = np.full(step.shape, -1.0)
-        low[:, _HEIGHT] = self._low
-        self._wanted[:] = reflect(self._wanted + np.where(self._moves, step, 0.0), low)
+        low[:, HEIGHT] = self._low
+        self._target[:] = reflect(self._target + np.where(self._moves, step, 0.0), low)
         limit = ACTION_RATE_LIMIT
-        self._action += np.clip(self._wanted - self._action, -limit, limit)
+        self._action += np.clip(self._target - self._action, -limit, limit)
 
     def _draw(self, rows: NDArray[np.intp]) -> None:
         config, rng, n = self._config, self._rng, len(rows)
@@ -100,7 +94,7 @@ class Commands:
         self._goal[rows] = np.where(walks[:, None], self._velocities(n), 0.0)
         self._moves[rows] = (rng.random(n) > config.still_hands)[:, None]
         self._held[rows] = rng.random(n) < config.held_hands
-        self._wanted[rows] = self._action[rows]
+        self._target[rows] = self._action[rows]
         heights = np.where(
             walks,
             rng.uniform(*between(*config.walking_height, self.difficulty), n),
@@ -124,15 +118,34 @@ class Commands:
         return out
 
     def _set_height(self, rows: NDArray[np.intp], height: Array, walks: NDArray[np.bool_]) -> None:
-        """Half of the standing robots squat at random, the rest go to a height and keep it."""
-        metric = np.tile(np.asarray(ACTION_BOX.neutral), (len(rows), 1))
-        metric[:, _HEIGHT] = height
-        wanted = np.clip(ACTION_BOX.to_normalised(metric)[:, _HEIGHT], -1.0, 1.0)
+        """Half of the standing robots squat at random; the others keep one height."""
+        target = _height_action(height)
         squats = ~walks & (self._rng.random(len(rows)) < 0.5)
         lowest = between(*self._config.standing_height, self.difficulty)[0]
-        metric[:, _HEIGHT] = lowest
-        bound = np.clip(ACTION_BOX.to_normalised(metric)[:, _HEIGHT], -1.0, 1.0)
-        self._moves[rows, _HEIGHT] = squats
+        bound = _height_action(np.full(len(rows), lowest))
+        self._moves[rows, HEIGHT] = squats
         self._low[rows] = np.where(squats, bound, -1.0)
-        kept = self._action[rows, _HEIGHT]
-        self._action[rows, _HEIGHT] = self._wanted[rows, _HEIGHT] = np.where(squats, kept, wanted)
+        kept = self._action[rows, HEIGHT]
+        self._action[rows, HEIGHT] = self._target[rows, HEIGHT] = np.where(squats, kept, target)
+
+
+def _height_action(height: Array) -> Array:
+    """(N,) m -> (N,) in [-1, 1]."""
+    metric = np.tile(np.asarray(ACTION_BOX.neutral), (len(height), 1))
+    metric[:, HEIGHT] = height
+    return np.clip(ACTION_BOX.to_normalised(metric)[:, HEIGHT], -1.0, 1.0)
+
+
+def random_push(
+    n: int, config: DisturbanceConfig, difficulty: float, rng: np.random.Generator
+) -> Array:
+    """(n, 2) m/s to add to the pelvis's horizontal velocity, any direction."""
+    low, high = config.push
+    most = between((low, low), (high, high), difficulty)[0]
+    angle = rng.uniform(-np.pi, np.pi, n)
+    return horizontal(rng.uniform(0.0, most, n), angle)
+
+
+def horizontal(speed: Array | float, angle: Array) -> Array:
+    """(n, 2) m/s of that speed in the directions ``angle`` (n,)."""
+    return np.stack([speed * np.cos(angle), speed * np.sin(angle)], axis=1)

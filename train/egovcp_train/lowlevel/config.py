@@ -1,10 +1,130 @@
-"""Options of the networks, of PPO and of the curriculum."""
+"""Options of the low-level training: task, networks, PPO and curriculum.
+
+The difficulty is a number in [0, 1] that rises with success. Options with an easy and a hard range
+are interpolated between both.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
-from egovcp.bounds import bounded
+from egovcp.bounds import bounded, check_bounds
+from egovcp.errors import UsageError
+
+Range = tuple[float, float]
+
+
+def _check_ranges(where: str, config: object) -> None:
+    """Raise `UsageError` for a (low, high) pair with low > high, nested ones included."""
+    for name, value in vars(config).items():
+        pairs = value if isinstance(value, tuple) and isinstance(value[0], tuple) else (value,)
+        for pair in pairs:
+            if isinstance(pair, tuple) and pair[0] > pair[1]:
+                raise UsageError(
+                    f"expected low <= high, found {pair[0]} > {pair[1]} in task.{where}.{name}"
+                )
+
+
+@dataclass(frozen=True)
+class CommandConfig:
+    """The commands of training episodes; a new one every few seconds."""
+
+    interval: Range = bounded((2.0, 6.0), least=0.02, most=3600)
+    """s between changes of velocity and of how hands and height move."""
+    standing: float = bounded(0.4, least=0, most=1)
+    """Share of commands with zero velocity."""
+    forward: tuple[Range, Range] = bounded(((0.1, 0.3), (0.1, 0.8)), least=-3, most=3)
+    """Speed forwards, m/s, easy and hard."""
+    backward: float = bounded(0.15, least=0, most=1)
+    """Share of the walking commands that go backwards."""
+    backward_speed: tuple[Range, Range] = bounded(((0.1, 0.15), (0.1, 0.35)), least=0, most=3)
+    """Speed backwards, m/s, easy and hard."""
+    in_place: float = bounded(0.25, least=0, most=1)
+    """Share of the walking commands that go neither forwards nor backwards, only sideways or
+    turning."""
+    sideways: float = bounded(0.25, least=0, most=3)
+    """m/s at the hardest, either way, in a third of the other walking commands."""
+    turning: float = bounded(0.7, least=0, most=5)
+    """rad/s at the hardest, either way, in a third of the other walking commands."""
+    standing_height: tuple[Range, Range] = bounded(((0.65, 0.75), (0.50, 0.76)), least=0.3, most=1)
+    """m, easy and hard."""
+    walking_height: tuple[Range, Range] = bounded(((0.70, 0.75), (0.55, 0.75)), least=0.3, most=1)
+    """m, easy and hard."""
+    acceleration: float = bounded(0.8, least=0.01, most=100)
+    """m/s^2 and rad/s^2 at which the commanded velocity changes."""
+    still_hands: float = bounded(0.2, least=0, most=1)
+    """Share of commands with resting hands; the others follow a random walk."""
+    held_hands: float = bounded(0.4, least=0, most=1)
+    """Share of those random walks that hold each target for 5 to 15 planner steps; the others
+    change at every planner step, as in the paper."""
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+        _check_ranges("commands", self)
+
+
+@dataclass(frozen=True)
+class DisturbanceConfig:
+    """Pushes, physical parameters and delay."""
+
+    push_interval: Range = bounded((3.0, 8.0), least=0.02, most=3600)
+    """s between pushes."""
+    push: Range = bounded((0.1, 0.8), least=0, most=5)
+    """m/s of horizontal velocity at most, easy and hard."""
+    friction: Range = bounded((0.5, 1.1), least=0.01, most=5)
+    """Sliding friction of the feet."""
+    payload: Range = bounded((-0.5, 2.0), least=-2, most=30)
+    """kg on the torso."""
+    mass_scale: Range = bounded((0.95, 1.05), least=0.5, most=2)
+    """Factor on every mass."""
+    stiffness_scale: Range = bounded((0.8, 1.2), least=0.1, most=5)
+    """Factor on the stiffness of every joint."""
+    damping_scale: Range = bounded((0.8, 1.2), least=0.1, most=5)
+    """Factor on the damping of every joint."""
+    delay: Range = bounded((0.0, 0.02), least=0, most=0.04)
+    """s from a measurement until the new joint targets act, rounded to physics steps."""
+    models: int = bounded(64, least=1, most=4096)
+    """Robots of different physical parameters."""
+
+    def __post_init__(self) -> None:
+        check_bounds(self)
+        _check_ranges("disturbances", self)
+
+
+@dataclass(frozen=True)
+class RewardConfig:
+    """Weights of the reward terms, per second; see `rewards`."""
+
+    alive: float = 0.5
+    velocity: float = 3.0
+    turning: float = 1.0
+    height: float = 1.0
+    upright: float = 1.0
+    contact: float = 1.0
+    stepping: float = -1.0
+    torso_rate: float = -0.6
+    torso_change: float = -0.2
+    slip: float = -0.5
+    stance_width: float = -5.0
+    foot_heading: float = -1.0
+    action: float = -0.02
+    action_rate: float = -0.02
+    torque: float = -1.0
+    fall: float = -100.0
+
+
+@dataclass(frozen=True)
+class LowLevelTask:
+    """Commands, disturbances and rewards."""
+
+    commands: CommandConfig = field(default_factory=CommandConfig)
+    """Commands."""
+    disturbances: DisturbanceConfig = field(default_factory=DisturbanceConfig)
+    """Pushes, physical parameters and delay."""
+    rewards: RewardConfig = field(default_factory=RewardConfig)
+    """Weights of the reward terms."""
+    episode: float = bounded(20.0, above=0)
+    """Longest episode, s."""
 
 
 @dataclass(frozen=True)
@@ -14,48 +134,24 @@ class NetworkConfig:
     actor: tuple[int, ...] = bounded((256, 128, 64), least=1, most=8192, longest=16)
     """Hidden layers of the policy."""
     critic: tuple[int, ...] = bounded((256, 128, 64), least=1, most=8192, longest=16)
-    """Hidden layers of the critic, which also sees what only the simulator knows."""
+    """Hidden layers of the critic, which also reads the true state of the simulation."""
     activation: str = "elu"
     """Activation of both."""
     initial_std: float = bounded(0.3, above=0)
-    """Standard deviation of the policy's actions at the start."""
-
-
-@dataclass(frozen=True)
-class PpoConfig:
-    """Proximal policy optimisation; the names are rsl-rl's."""
-
-    num_steps_per_env: int = bounded(24, least=1, most=100_000)
-    """Ticks per robot and iteration."""
-    num_learning_epochs: int = bounded(4, least=1, most=10_000)
-    """Passes over the data of an iteration."""
-    num_mini_batches: int = bounded(4, least=1, most=65_536)
-    """Mini-batches per pass."""
-    learning_rate: float = bounded(1e-3, above=0)
-    """At the start; then it follows desired_kl."""
-    desired_kl: float = bounded(0.02, above=0)
-    """Change of the policy per update that the learning rate aims at."""
-    gamma: float = bounded(0.99, least=0, most=1)
-    """Discount per tick of 20 ms."""
-    lam: float = bounded(0.95, least=0, most=1)
-    """Of generalised advantage estimation."""
-    clip_param: float = bounded(0.2, above=0)
-    """Clipping of the probability ratio."""
-    entropy_coef: float = bounded(0.0, least=0)
-    """Weight of the entropy; with one, the exploration noise shakes the torso."""
+    """Initial standard deviation of the policy's actions."""
 
 
 @dataclass(frozen=True)
 class CurriculumConfig:
-    """When the task becomes harder."""
+    """Curriculum: when the task becomes harder."""
 
     start: float = bounded(0.0, least=0, most=1)
     """Difficulty of the first iteration."""
     step: float = bounded(0.004, least=0)
     """Change of the difficulty per iteration."""
     few_falls: float = bounded(0.02, least=0, most=1)
-    """Falls per robot and second, below which it becomes harder."""
+    """Falls per robot and second below which the task becomes harder."""
     many_falls: float = bounded(0.08, least=0, most=1)
-    """Above which it becomes easier."""
+    """Falls per robot and second above which it becomes easier."""
     tracking: float = bounded(0.65, least=0)
-    """Mean of the velocity reward (1: perfect) that is also needed to make it harder."""
+    """Mean velocity reward (1: perfect) above which the task becomes harder."""

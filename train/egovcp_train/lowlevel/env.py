@@ -1,7 +1,7 @@
-"""The vectorised environment in which PPO trains the low-level policy (rsl-rl's `VecEnv`).
+"""The low-level training environment: the task's logic, and rsl-rl's `VecEnv` on MuJoCo.
 
-One tick is 20 ms. The policy sees what a real robot measures (`Walk.observe`), the critic also
-what only the simulator knows.
+`TaskLogic` is independent of the simulator: the CPU environment `LowLevelEnv` and the mjlab task
+(`mjlab_terms`) hold one each and add physics and resets. One tick is 20 ms.
 """
 
 from __future__ import annotations
@@ -16,17 +16,116 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 
 from egovcp.data.mirror import STATE_SIGN, STATE_SOURCE
+from egovcp.robot.arms import DT
 from egovcp.robot.mjcf import FootModel
-from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
+from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, Walk, WalkConfig
 from egovcp.sim.config import SensorConfig
+from egovcp.sim.robot import noise_std
 from egovcp.spec import CONTROLLER_HZ, STATE_DIM, STATE_SLICES
-from egovcp_train.lowlevel import events, rewards, sensing
-from egovcp_train.lowlevel.loop import Loop
-from egovcp_train.lowlevel.physics import Physics, Snapshot
-from egovcp_train.lowlevel.task import LowLevelTask
+from egovcp_train.lowlevel import physics, rewards, sensing
+from egovcp_train.lowlevel.commands import Commands, random_push
+from egovcp_train.lowlevel.config import LowLevelTask
+from egovcp_train.lowlevel.physics import BatchPhysics, Snapshot
 
 Array = NDArray[np.float64]
-_DT: Final = 1.0 / CONTROLLER_HZ
+_RECOVERY_TICKS: Final = 2 * CONTROLLER_HZ  # after a push, in which steps cost nothing
+
+
+class TaskLogic:
+    """Commands, controller (`Walk`), observations and rewards of N robots.
+
+    Each tick: `targets`, physics, `reward_terms`, new commands, `restart` of some, `observe`.
+    """
+
+    def __init__(
+        self,
+        robots: int,
+        task: LowLevelTask,
+        walk: WalkConfig,
+        sensors: SensorConfig,
+        rng: np.random.Generator,
+    ) -> None:
+        self.task, self.rng = task, rng
+        self.commands = Commands(robots, task.commands, rng)
+        self.walk = Walk(walk)
+        self.fallen: NDArray[np.bool_] = np.zeros(robots, dtype=np.bool_)
+        self._velocity = rewards.AverageVelocity(robots)
+        self._torso = sensing.TorsoMotion(robots)
+        self._since_push = np.full(robots, _RECOVERY_TICKS)  # ticks, at most that
+        self._noise = noise_std(sensors)
+        self._action: Array = np.zeros((robots, ACTIONS))
+        self._last_action: Array = np.zeros((robots, ACTIONS))
+        self._fresh = np.ones(robots, dtype=np.bool_)
+
+    @property
+    def difficulty(self) -> float:
+        """0 to 1; raised by the trainer as the policy succeeds."""
+        return self.commands.difficulty
+
+    @difficulty.setter
+    def difficulty(self, value: float) -> None:
+        self.commands.difficulty = float(np.clip(value, 0.0, 1.0))
+
+    def targets(self, action: NDArray[np.floating]) -> Array:
+        """The policy's actions (N, 15) -> joint targets (N, 29), rad."""
+        self._last_action, self._action = self._action, np.array(action, dtype=np.float64)
+        return self.walk.targets(self._action)
+
+    def reward_terms(self, x: Snapshot) -> dict[str, Array]:
+        """Reward terms of the tick except the fall, (N,) per second; sets ``fallen``.
+
+        They are not finite where the state is not; see `rewards.finite_terms`.
+        """
+        self._velocity.add(x)
+        self._torso.add(x)
+        self._since_push = np.minimum(self._since_push + 1, _RECOVERY_TICKS)
+        walk, gait = self.walk, self.walk.gait
+        self.fallen = rewards.fallen(x, walk.height, walk.pitch)
+        return rewards.terms(
+            x,
+            self._velocity.value,
+            self.commands.vector,
+            walk.height,
+            walk.pitch,
+            gait.phase,
+            gait.amount,
+            self._action,
+            self._last_action,
+            self._torso,
+            self._since_push < _RECOVERY_TICKS,
+        )
+
+    def pushed(self, rows: NDArray[np.intp]) -> None:
+        """``rows`` have just been pushed: steps cost nothing for a while."""
+        self._since_push[rows] = 0
+
+    def restart(self, rows: NDArray[np.intp]) -> None:
+        """``rows`` begin new episodes in the posture that `observe` measures next."""
+        self.commands.reset(rows)
+        self._velocity.reset(rows)
+        self._torso.reset(rows)
+        self._since_push[rows] = _RECOVERY_TICKS
+        self._action[rows] = 0.0
+        self._fresh[rows] = True
+
+    def observe(
+        self, x: Snapshot, friction: Array
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Input of the policy (N, 95), and additional input of the critic (N, 16).
+
+        Args:
+            x: the true state.
+            friction: (N,) of the feet.
+        """
+        if self._fresh.any():  # as on the robot, the first measurement resets the controller
+            rows = None if self._fresh.all() else np.flatnonzero(self._fresh)
+            self.walk.reset(self._measure(x), rows)
+            self._fresh[:] = False
+        seen = self.walk.observe(self._measure(x))
+        return seen, sensing.privileged(x, self._velocity.value, self.walk.height, friction)
+
+    def _measure(self, x: Snapshot) -> Array:
+        return sensing.measure(x, self.commands.vector, self._noise, self.rng)
 
 
 class LowLevelEnv(VecEnv):  # type: ignore[misc]
@@ -47,16 +146,15 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self.device = "cpu"
         self.cfg = asdict(task)
         self.task = task
-        self.physics = Physics(robots, feet, task.disturbances, threads, seed)
+        self.physics = BatchPhysics(robots, feet, task.disturbances, threads, seed)
         self.seed, self.rng = seed, np.random.default_rng(seed)
-        self.loop = Loop(robots, task, walk, sensors, self.rng)
+        self.logic = TaskLogic(robots, task, walk, sensors, self.rng)
         self.episode_length_buf = torch.zeros(robots, dtype=torch.long)
         self._delay = np.zeros(robots, dtype=np.intp)
         self._next_push = np.zeros(robots, dtype=np.intp)
         self._start(np.arange(robots))
         self._observe(self.physics.snapshot())
 
-    # --- VecEnv ----------------------------------------------------------------------
     def get_observations(self) -> TensorDict:
         """Groups ``policy`` (N, 95) and ``privileged`` (N, 16)."""
         return self._observations
@@ -65,17 +163,17 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
         """One tick of 20 ms."""
-        self.physics.step(self.loop.targets(actions.detach().numpy()), self._delay)
+        self.physics.step(self.logic.targets(actions.detach().numpy()), self._delay)
         self.episode_length_buf += 1
         self._push()
         x = self.physics.snapshot()
-        terms = self.loop.judge(x)
-        fallen = self.loop.fallen
-        reward = self._weighted(rewards.earned(terms, fallen, x.broken))
+        terms = self.logic.reward_terms(x)
+        fallen = self.logic.fallen
+        reward = self._weighted(rewards.finite_terms(terms, fallen, x.broken))
         late = self.episode_length_buf.numpy() >= self.max_episode_length
         done = fallen | late
         log = self._record(terms, done, fallen)
-        self.loop.commands.advance()
+        self.logic.commands.advance()
         if done.any():
             self._start(np.flatnonzero(done))
             x = self.physics.snapshot()
@@ -89,13 +187,13 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         )
 
     def spread_ends(self) -> None:
-        """Let the running episodes end at different times, as if they had begun at random ones."""
+        """Give the running episodes random ages, so that they end at different times."""
         age = self.rng.integers(0, self.max_episode_length, self.num_envs)
         self.episode_length_buf[:] = torch.from_numpy(age)
         self._schedule_push(np.arange(self.num_envs))
 
     def reseed(self, number: int) -> None:
-        """Go on with other random numbers than at the start: those of ``number``."""
+        """Continue with the random stream ``number`` of the seed."""
         self.rng.bit_generator.state = np.random.default_rng(
             [self.seed, number]
         ).bit_generator.state
@@ -104,15 +202,14 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         """End the threads."""
         self.physics.close()
 
-    # --- inside ----------------------------------------------------------------------
     def _start(self, rows: NDArray[np.intp]) -> None:
         """New episodes."""
         n = len(rows)
-        qpos = events.standing(n, self.rng)
+        qpos = physics.random_qpos(n, self.rng)
         self.physics.place(rows, qpos, qpos[:, 7:])
-        self.loop.restart(rows)
+        self.logic.restart(rows)
         self.episode_length_buf[torch.from_numpy(rows)] = 0
-        self._delay[rows] = events.delays(n, self.task.disturbances, self.rng)
+        self._delay[rows] = physics.random_delays(n, self.task.disturbances, self.rng)
         self._schedule_push(rows)
 
     def _schedule_push(self, rows: NDArray[np.intp]) -> None:
@@ -121,24 +218,24 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         self._next_push[rows] = now + (seconds * CONTROLLER_HZ).astype(np.intp)
 
     def _push(self) -> None:
-        """A horizontal impulse, of at most the speed that the difficulty allows."""
+        """Pushes the robots that are due."""
         rows = np.flatnonzero(self.episode_length_buf.numpy() >= self._next_push)
         if len(rows) == 0:
             return
-        self.physics.qvel[rows, :2] += events.pushes(
-            len(rows), self.task.disturbances, self.loop.difficulty, self.rng
+        self.physics.qvel[rows, :2] += random_push(
+            len(rows), self.task.disturbances, self.logic.difficulty, self.rng
         )
-        self.loop.pushed(rows)
+        self.logic.pushed(rows)
         self._schedule_push(rows)
 
-    def _weighted(self, earned: dict[str, Array]) -> Array:
+    def _weighted(self, terms: dict[str, Array]) -> Array:
         """(N,) reward of the tick."""
         weights = asdict(self.task.rewards)
-        parts = [weights[name] * _DT * value for name, value in earned.items()]
+        parts = [weights[name] * DT * value for name, value in terms.items()]
         return np.asarray(sum(parts))
 
     def _observe(self, x: Snapshot) -> None:
-        policy, privileged = self.loop.observe(x, self.physics.floor_friction)
+        policy, privileged = self.logic.observe(x, self.physics.floor_friction)
         self._observations = TensorDict(
             {"policy": torch.from_numpy(policy), "privileged": torch.from_numpy(privileged)},
             batch_size=[self.num_envs],
@@ -151,11 +248,11 @@ class LowLevelEnv(VecEnv):  # type: ignore[misc]
         log = {f"/reward/{name}": float(np.nanmean(value)) for name, value in terms.items()}
         if done.any():
             log["/episode/fell"] = float(fallen[done].mean())
-        log["/episode/difficulty"] = self.loop.difficulty
+        log["/episode/difficulty"] = self.logic.difficulty
         return log
 
 
-# --- left and right ------------------------------------------------------------------
+# --- mirror images -------------------------------------------------------------------
 _JOINTS = STATE_SLICES["joint_position"]
 _ACTION_SOURCE: Final = np.array(STATE_SOURCE[_JOINTS][:ACTIONS] - _JOINTS.start)
 _ACTION_SIGN: Final = STATE_SIGN[_JOINTS][:ACTIONS]
@@ -173,7 +270,7 @@ _PRIVILEGED_SIGN: Final = np.array([1, -1, 1, -1, -1, 1, 1, 1, 1, 1, 1, 1, -1, 1
 def mirrored(
     env: VecEnv, obs: TensorDict | None, actions: torch.Tensor | None
 ) -> tuple[TensorDict | None, torch.Tensor | None]:
-    """Append to each batch what the robot would have seen and done in a mirror (rsl-rl)."""
+    """Append the mirror image of each sample to a batch (`data_augmentation_func` of rsl-rl)."""
     both: TensorDict | None = None
     doubled: torch.Tensor | None = None
     if obs is not None:

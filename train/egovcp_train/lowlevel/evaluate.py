@@ -1,4 +1,4 @@
-"""``egovcp-eval-lowlevel``: how well a controller stands, reaches, squats, walks and is pushed."""
+"""``egovcp-eval-lowlevel``: how well a controller stands, reaches, squats, walks, takes pushes."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ from egovcp.sim.config import SensorConfig
 from egovcp.spec import JOINT_NAMES
 from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
+from egovcp_train.lowlevel.config import DisturbanceConfig
 from egovcp_train.lowlevel.skills import SKILLS, Skill
-from egovcp_train.lowlevel.task import DisturbanceConfig
 
 PROG = "egovcp-eval-lowlevel"
 RESULT = "lowlevel.json"
@@ -47,7 +47,7 @@ _CAMERA: Final = {"camera_px_per_step": "camera", "camera_px_8_steps": "camera_8
 
 @dataclass(frozen=True)
 class LowLevelEvalConfig:
-    """Judge a low-level controller under randomised physics on the stock collision model.
+    """Evaluate a low-level controller under randomised physics on the stock collision model.
 
     Every skill is played by --episodes robots of different mass, friction and gains, with
     delay and sensor noise. A fall is a tilt of more than 1 rad or a pelvis below 0.35 m.
@@ -88,7 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def evaluate(config: LowLevelEvalConfig) -> None:
     """Play, print the table, write the JSON.
 
-    Whatever ends it early, the robots that have played are written, marked as incomplete.
+    If it ends early, the results of the robots that have played are written, marked incomplete.
 
     Raises:
         UsageError: an option makes no sense.
@@ -225,7 +225,7 @@ def _figures(skill: Skill, outcome: dict[str, NDArray[Any]], requested: int) -> 
 
 def _standing_load(config: LowLevelEvalConfig) -> dict[str, Any]:
     """Torques at rest against what gravity needs; prints the worst joint."""
-    from egovcp_train.lowlevel.heat import describe, standing_load
+    from egovcp_train.lowlevel.torque import describe, standing_load
 
     load = standing_load(make_controller(config.controller), config.feet)
     echo(describe(load))

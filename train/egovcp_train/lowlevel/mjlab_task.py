@@ -1,13 +1,12 @@
-"""The low-level task for mjlab: physics on the GPU, everything else as on the CPU.
+"""The low-level task for mjlab: physics on the GPU, the rest as in the CPU environment.
 
 mjlab finds ``Egovcp-LowLevel-Unitree-G1`` by this package's entry point (group ``mjlab.tasks``):
 
     train Egovcp-LowLevel-Unitree-G1 --env.scene.num-envs 4096
 
-Commands, surroundings of the policy (`Walk`), rewards, disturbances, gains and curriculum are the
-very objects of `env` (`mjlab_terms`). What differs: physical parameters are drawn by mjlab,
-masses body by body. Every checkpoint is written as ``model_N.safetensors``, too, which the
-simulator, the evaluation and the robot load.
+Commands, controller (`Walk`), rewards, pushes, gains and curriculum are those of the CPU
+environment (`env.TaskLogic`). mjlab draws the physical parameters, masses body by body. Every
+checkpoint comes with ``model_N.safetensors``, the controller's file.
 """
 
 from __future__ import annotations
@@ -42,10 +41,16 @@ from egovcp.robot.walking import WalkConfig
 from egovcp.sim.scene import strip_visuals
 from egovcp.spec import ACTION_BOX, JOINT_NAMES, PHYSICS_DT, PHYSICS_STEPS_PER_CONTROLLER_TICK
 from egovcp_train.lowlevel import mjlab_terms as terms
-from egovcp_train.lowlevel.config import NetworkConfig, PpoConfig
-from egovcp_train.lowlevel.learn import rsl_rl_config, start_at_zero, walk_policy
-from egovcp_train.lowlevel.mjlab_terms import LOOP, ROBOT, LoopTermCfg, TargetsCfg, loop_term
-from egovcp_train.lowlevel.task import DisturbanceConfig, LowLevelTask
+from egovcp_train.lowlevel.config import DisturbanceConfig, LowLevelTask, NetworkConfig
+from egovcp_train.lowlevel.learner import rsl_rl_config, walk_policy
+from egovcp_train.lowlevel.mjlab_terms import (
+    LOGIC,
+    ROBOT,
+    TargetsCfg,
+    TaskLogicTermCfg,
+    logic_term,
+)
+from egovcp_train.on_policy import PpoOptions, shrink_output
 
 TASK_ID: Final = "Egovcp-LowLevel-Unitree-G1"
 
@@ -80,7 +85,7 @@ def env_cfg(
 ) -> ManagerBasedRlEnvCfg:
     """The environment, with the numbers of ``task`` and ``walk``."""
     task = task or LowLevelTask()
-    term = LoopTermCfg(task=task, walk=walk or WalkConfig())
+    term = TaskLogicTermCfg(task=task, walk=walk or WalkConfig())
     return ManagerBasedRlEnvCfg(
         decimation=PHYSICS_STEPS_PER_CONTROLLER_TICK,
         scene=SceneCfg(
@@ -89,7 +94,7 @@ def env_cfg(
             entities={ROBOT: _robot_cfg()},
         ),
         sim=SimulationCfg(nconmax=24, njmax=120, mujoco=MujocoCfg(timestep=PHYSICS_DT)),
-        commands={LOOP: term},
+        commands={LOGIC: term},
         actions={"targets": TargetsCfg(disturbances=task.disturbances)},
         observations={
             "policy": ObservationGroupCfg(
@@ -152,9 +157,9 @@ class SymmetricPpoCfg(RslRlPpoAlgorithmCfg):
     rnd_cfg: dict[str, Any] | None = None
 
 
-def rl_cfg(network: NetworkConfig | None = None, ppo: PpoConfig | None = None) -> Any:
+def rl_cfg(network: NetworkConfig | None = None, ppo: PpoOptions | None = None) -> Any:
     """PPO as on the CPU."""
-    shared = rsl_rl_config(network or NetworkConfig(), ppo or PpoConfig())
+    shared = rsl_rl_config(network or NetworkConfig(), ppo or PpoOptions())
     algorithm = shared["algorithm"]
     algorithm["symmetry_cfg"]["data_augmentation_func"] = "egovcp_train.lowlevel.env:mirrored"
     return RslRlOnPolicyRunnerCfg(
@@ -175,30 +180,32 @@ def _model_cfg(options: dict[str, Any]) -> RslRlModelCfg:
 
 
 class LowLevelRunner(MjlabOnPolicyRunner):
-    """mjlab's runner, whose checkpoints hold the difficulty and come with the controller's file."""
+    """mjlab's runner; its checkpoints hold the difficulty and come with the controller's file."""
 
     def __init__(self, env: Any, train_cfg: dict[str, Any], *args: Any, **kwargs: Any) -> None:
         super().__init__(env, train_cfg, *args, **kwargs)
-        start_at_zero(self.alg.get_policy().mlp)
+        shrink_output(self.alg.get_policy().mlp)
 
     def save(self, path: str, infos: dict[str, Any] | None = None) -> None:
-        """``model_N.pt`` to go on from, and ``model_N.safetensors`` to run."""
-        term = loop_term(self.env.unwrapped)
-        super().save(path, {**(infos or {}), "difficulty": term.loop.difficulty})
+        """Write ``model_N.pt`` to resume from, and the controller ``model_N.safetensors``."""
+        term = logic_term(self.env.unwrapped)
+        super().save(path, {**(infos or {}), "difficulty": term.logic.difficulty})
         steps = self.current_learning_iteration * self.cfg["num_steps_per_env"] * self.env.num_envs
         provenance = {
             "task": TASK_ID,
             "steps": steps,
-            "difficulty": term.loop.difficulty,
+            "difficulty": term.logic.difficulty,
             "seed": self.cfg["seed"],
         }
         policy = walk_policy(self.alg.get_policy(), term.cfg.walk, provenance)
         policy.save(Path(path).with_suffix(".safetensors"))
 
     def load(self, path: str, *args: Any, **kwargs: Any) -> dict[str, Any]:
-        """Go on where ``path`` was saved."""
+        """Continue from ``path``."""
         infos: dict[str, Any] = super().load(path, *args, **kwargs)
-        loop_term(self.env.unwrapped).loop.difficulty = float((infos or {}).get("difficulty", 0.0))
+        logic_term(self.env.unwrapped).logic.difficulty = float(
+            (infos or {}).get("difficulty", 0.0)
+        )
         return infos
 
 

@@ -1,7 +1,6 @@
-"""What the low-level task adds to mjlab: its terms, all of which read from one `Loop`.
+"""Terms of the low-level task for mjlab, all of which read from one `TaskLogic`.
 
-The loop runs in numpy on the host, once per tick, on 0.3 kB per robot; `mjlab_task` puts the
-terms together.
+It runs in numpy on the host, once per tick, on 0.3 kB per robot. `mjlab_task` configures the terms.
 """
 
 from __future__ import annotations
@@ -20,105 +19,103 @@ from egovcp.errors import UsageError
 from egovcp.robot.walking import ACTIONS, WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import CONTROLLER_HZ, JOINT_NAMES
-from egovcp_train.lowlevel import events, rewards
-from egovcp_train.lowlevel.config import CurriculumConfig, PpoConfig
-from egovcp_train.lowlevel.learn import adapted
-from egovcp_train.lowlevel.loop import Loop
+from egovcp_train.lowlevel import physics, rewards
+from egovcp_train.lowlevel.commands import random_push
+from egovcp_train.lowlevel.config import CurriculumConfig, DisturbanceConfig, LowLevelTask
+from egovcp_train.lowlevel.env import TaskLogic
+from egovcp_train.lowlevel.learner import next_difficulty
 from egovcp_train.lowlevel.physics import HEAD, Snapshot
-from egovcp_train.lowlevel.task import DisturbanceConfig, LowLevelTask
+from egovcp_train.on_policy import PpoOptions
 
-ROBOT: Final = "robot"  # in the scene
-LOOP: Final = "loop"  # among the command terms
+ROBOT: Final = "robot"  # name in the scene
+LOGIC: Final = "loop"  # name of the command term
 _FEET: Final = ("left_ankle_roll_link", "right_ankle_roll_link")
 _PALMS: Final = ("left_palm", "right_palm")
-_NEVER: Final = 1e9  # s; `Commands` draws anew by itself
+_NEVER: Final = 1e9  # s; `Commands` has its own intervals
 
 Array = NDArray[np.float64]
 
 
 @dataclass(kw_only=True)
-class LoopTermCfg(CommandTermCfg):
-    """The numbers of the loop and of its curriculum."""
+class TaskLogicTermCfg(CommandTermCfg):
+    """Options of the task logic and of its curriculum."""
 
     resampling_time_range: tuple[float, float] = (_NEVER, _NEVER)
     task: LowLevelTask = field(default_factory=LowLevelTask)
     walk: WalkConfig = field(default_factory=WalkConfig)
     sensors: SensorConfig = field(default_factory=SensorConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
-    ticks_per_iteration: int = PpoConfig.num_steps_per_env
+    ticks_per_iteration: int = PpoOptions.num_steps_per_env
 
-    def build(self, env: ManagerBasedRlEnv) -> LoopTerm:
-        return LoopTerm(self, env)
+    def build(self, env: ManagerBasedRlEnv) -> TaskLogicTerm:
+        return TaskLogicTerm(self, env)
 
 
-class LoopTerm(CommandTerm):
-    """The `Loop` of all robots, as a command term; the other terms read from it."""
+class TaskLogicTerm(CommandTerm):
+    """`TaskLogic` of all robots as a command term, from which the other terms read."""
 
-    cfg: LoopTermCfg
+    cfg: TaskLogicTermCfg
 
-    def __init__(self, cfg: LoopTermCfg, env: ManagerBasedRlEnv) -> None:
+    def __init__(self, cfg: TaskLogicTermCfg, env: ManagerBasedRlEnv) -> None:
         super().__init__(cfg, env)
         rng = np.random.default_rng(env.cfg.seed)
-        self.loop = Loop(self.num_envs, cfg.task, cfg.walk, cfg.sensors, rng)
-        self.robot = Robot(env)
+        self.logic = TaskLogic(self.num_envs, cfg.task, cfg.walk, cfg.sensors, rng)
+        self.robot = MjlabRobot(env)
         self._falls = self._tracked = 0.0
         self._ticks = 0
         self._observations: tuple[torch.Tensor, ...] | None = None
         self._rewards: dict[str, torch.Tensor] = {}
 
-    # --- for the other terms ---------------------------------------------------------
     @property
     def command(self) -> torch.Tensor:
         """(N, 10) v, hands, height."""
-        return self._tensor(self.loop.commands.vector)
+        return self._tensor(self.logic.commands.vector)
 
     def observation(self, which: int) -> torch.Tensor:
-        """0: what the policy sees (N, 95); 1: what only the critic sees (N, 16)."""
+        """0: input of the policy (N, 95); 1: additional input of the critic (N, 16)."""
         if self._observations is None:
-            seen = self.loop.observe(self.robot.snapshot(), self.robot.friction())
+            seen = self.logic.observe(self.robot.snapshot(), self.robot.friction())
             self._observations = tuple(self._tensor(part) for part in seen)
         return self._observations[which]
 
     def targets(self, action: torch.Tensor) -> torch.Tensor:
         """(N, 15) -> joint targets (N, 29), rad."""
-        return self._tensor(self.loop.targets(action.detach().cpu().numpy()))
+        return self._tensor(self.logic.targets(action.detach().cpu().numpy()))
 
-    def judge(self) -> torch.Tensor:
+    def update_rewards(self) -> torch.Tensor:
         """(N,) which robots have fallen; called once per tick, before `reward`."""
         x = self.robot.snapshot()
-        terms, fell = self.loop.judge(x), self.loop.fallen
-        earned = rewards.earned(terms, fell, x.broken)
-        self._rewards = {name: self._tensor(value) for name, value in earned.items()}
-        self._adapt(fell, earned["velocity"])
+        terms, fell = self.logic.reward_terms(x), self.logic.fallen
+        finite = rewards.finite_terms(terms, fell, x.broken)
+        self._rewards = {name: self._tensor(value) for name, value in finite.items()}
+        self._adapt(fell, finite["velocity"])
         return torch.from_numpy(fell).to(self.device)
 
     def reward(self, name: str) -> torch.Tensor:
         """(N,) one term of the last tick."""
         return self._rewards[name]
 
-    # --- mjlab's hooks ---------------------------------------------------------------
     def _update_metrics(self) -> None:
-        """Rewards are logged by mjlab; there is nothing else."""
+        """No metrics: mjlab logs the rewards."""
 
     def _resample_command(self, env_ids: torch.Tensor) -> None:
-        self.loop.restart(env_ids.cpu().numpy())
+        self.logic.restart(env_ids.cpu().numpy())
 
     def _update_command(self, env_ids: torch.Tensor | None) -> None:
         """Once per tick (or reset), with the simulation up to date."""
         if env_ids is None:
-            self.loop.commands.advance()
+            self.logic.commands.advance()
         self._observations = None
 
-    # --- inside ----------------------------------------------------------------------
     def _adapt(self, fell: NDArray[np.bool_], velocity: Array) -> None:
-        """The curriculum's rule, as often as an iteration of PPO."""
+        """Apply the curriculum once per iteration of PPO."""
         self._falls += float(fell.mean()) * CONTROLLER_HZ
         self._tracked += float(velocity.mean())
         self._ticks += 1
         if self._ticks == self.cfg.ticks_per_iteration:
             falls, tracked = self._falls / self._ticks, self._tracked / self._ticks
             rule = self.cfg.curriculum
-            self.loop.difficulty = adapted(self.loop.difficulty, falls, tracked, rule)
+            self.logic.difficulty = next_difficulty(self.logic.difficulty, falls, tracked, rule)
             self._falls = self._tracked = 0.0
             self._ticks = 0
 
@@ -126,8 +123,8 @@ class LoopTerm(CommandTerm):
         return torch.from_numpy(np.asarray(value, dtype=np.float32)).to(self.device)
 
 
-class Robot:
-    """The robots of an mjlab scene as the CPU environment knows them."""
+class MjlabRobot:
+    """The robots of an mjlab scene, with the state of the CPU environment."""
 
     def __init__(self, env: ManagerBasedRlEnv) -> None:
         self._env, self._sim = env, cast("Any", env.sim)
@@ -194,12 +191,12 @@ class TargetsCfg(ActionTermCfg):
     entity_name: str = ROBOT
     disturbances: DisturbanceConfig = field(default_factory=DisturbanceConfig)
 
-    def build(self, env: ManagerBasedRlEnv) -> Targets:
-        return Targets(self, env)
+    def build(self, env: ManagerBasedRlEnv) -> TargetsAction:
+        return TargetsAction(self, env)
 
 
-class Targets(ActionTerm):
-    """New targets act some physics steps late, as many as the robot's delay."""
+class TargetsAction(ActionTerm):
+    """Joint targets that act after the delay of each robot, in physics steps."""
 
     cfg: TargetsCfg
 
@@ -210,7 +207,7 @@ class Targets(ActionTerm):
                 f"found {cfg.disturbances.delay[1]}"
             )
         super().__init__(cfg, env)
-        self._term = loop_term(env)
+        self._term = logic_term(env)
         shape = (self.num_envs, len(JOINT_NAMES))
         self._raw = torch.zeros((self.num_envs, ACTIONS), device=self.device)
         self._old = torch.zeros(shape, device=self.device)
@@ -240,49 +237,51 @@ class Targets(ActionTerm):
     def reset(self, env_ids: torch.Tensor | slice | None = None) -> None:
         ids = slice(None) if env_ids is None else env_ids
         n = len(self._delay[ids])
-        drawn = events.delays(n, self.cfg.disturbances, self._term.loop.rng)
+        drawn = physics.random_delays(n, self.cfg.disturbances, self._term.logic.rng)
         self._delay[ids] = torch.from_numpy(drawn)[:, None].to(self._delay)
         self._raw[ids] = 0.0
         now = self._entity.data.joint_pos[:, self._term.robot.joints]
         self._new[ids] = now[ids]
 
 
-def loop_term(env: ManagerBasedRlEnv) -> LoopTerm:
-    """The term that holds the state of the task."""
-    term = env.command_manager.get_term(LOOP)
-    assert isinstance(term, LoopTerm)
+def logic_term(env: ManagerBasedRlEnv) -> TaskLogicTerm:
+    """The term that holds the task logic."""
+    term = env.command_manager.get_term(LOGIC)
+    assert isinstance(term, TaskLogicTerm)
     return term
 
 
 def policy_observation(env: ManagerBasedRlEnv) -> torch.Tensor:
     """(N, 95)."""
-    return loop_term(env).observation(0)
+    return logic_term(env).observation(0)
 
 
 def privileged_observation(env: ManagerBasedRlEnv) -> torch.Tensor:
     """(N, 16)."""
-    return loop_term(env).observation(1)
+    return logic_term(env).observation(1)
 
 
 def fallen(env: ManagerBasedRlEnv) -> torch.Tensor:
     """(N,)."""
-    return loop_term(env).judge()
+    return logic_term(env).update_rewards()
 
 
 def reward(env: ManagerBasedRlEnv, term: str) -> torch.Tensor:
     """(N,) a term of `rewards`, per second."""
-    return loop_term(env).reward(term)
+    return logic_term(env).reward(term)
 
 
 def difficulty(env: ManagerBasedRlEnv, env_ids: torch.Tensor) -> float:
     """For the log."""
-    return loop_term(env).loop.difficulty
+    return logic_term(env).logic.difficulty
 
 
 def stand(env: ManagerBasedRlEnv, env_ids: torch.Tensor) -> None:
-    """New episodes start as on the CPU."""
-    term, robot = loop_term(env), env.scene[ROBOT]
-    qpos = torch.from_numpy(events.standing(len(env_ids), term.loop.rng)).float().to(env.device)
+    """Initial state of new episodes."""
+    term, robot = logic_term(env), env.scene[ROBOT]
+    qpos = (
+        torch.from_numpy(physics.random_qpos(len(env_ids), term.logic.rng)).float().to(env.device)
+    )
     state = torch.zeros((len(env_ids), 13), device=env.device)
     state[:, :7] = qpos[:, :7]
     state[:, :3] += env.scene.env_origins[env_ids]
@@ -293,12 +292,12 @@ def stand(env: ManagerBasedRlEnv, env_ids: torch.Tensor) -> None:
 
 
 def push(env: ManagerBasedRlEnv, env_ids: torch.Tensor) -> None:
-    """A horizontal impulse, of at most the speed that the difficulty allows."""
-    term, robot = loop_term(env), env.scene[ROBOT]
-    kick = events.pushes(
-        len(env_ids), term.cfg.task.disturbances, term.loop.difficulty, term.loop.rng
+    """A horizontal impulse, limited by the difficulty."""
+    term, robot = logic_term(env), env.scene[ROBOT]
+    kick = random_push(
+        len(env_ids), term.cfg.task.disturbances, term.logic.difficulty, term.logic.rng
     )
-    term.loop.pushed(env_ids.cpu().numpy())
+    term.logic.pushed(env_ids.cpu().numpy())
     velocity = robot.data.root_link_vel_w[env_ids].clone()
     velocity[:, :2] += torch.from_numpy(kick).to(velocity)
     robot.write_root_link_velocity_to_sim(velocity, env_ids=env_ids)

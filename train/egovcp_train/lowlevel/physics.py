@@ -1,4 +1,4 @@
-"""Many robots on a floor, stepped by threads (`mujoco.rollout`); state as arrays."""
+"""Many robots on a floor, stepped in threads by `mujoco.rollout`; their states as arrays."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from mujoco.rollout import Rollout
 from numpy.typing import NDArray
 
 from egovcp.robot.mjcf import FootModel, robot_spec
+from egovcp.robot.stance_table import NU, standing_pose
 from egovcp.sim.scene import FLOOR, strip_visuals
-from egovcp.spec import CONTROLLER_HZ, JOINT_NAMES, PHYSICS_DT
-from egovcp_train.lowlevel.task import DisturbanceConfig
+from egovcp.spec import ACTION_BOX, CONTROLLER_HZ, JOINT_NAMES, PHYSICS_DT
+from egovcp_train.lowlevel.config import DisturbanceConfig
 
 Array = NDArray[np.float64]
-SIDES: Final = ("left", "right")
 HEAD: Final = "head_collision"  # a sphere
 _STATE: Final = mujoco.mjtState.mjSTATE_FULLPHYSICS
-#: What the sensors read per body: foot place and velocity, its x and z axis, palm place.
+#: Sensors of each side: position, velocity and x axis of the foot, position of the palm.
 _SENSORS: Final = (
     ("ankle_roll_link", mujoco.mjtSensor.mjSENS_FRAMEPOS),
     ("ankle_roll_link", mujoco.mjtSensor.mjSENS_FRAMELINVEL),
@@ -30,7 +30,7 @@ _SENSORS: Final = (
 
 @dataclass(frozen=True)
 class PhysicsOptions:
-    """Options of MuJoCo; by default those that controllers are trained with."""
+    """Options of MuJoCo; the defaults are those of training."""
 
     timestep: float = PHYSICS_DT
     """s; a divisor of a controller tick of 20 ms."""
@@ -63,12 +63,12 @@ class Snapshot:
     feet_velocity: Array  # (N, 2, 3) m/s
     feet_forward: Array  # (N, 2, 3) x axes
     palms: Array  # (N, 2, 3) m
-    torque: Array  # (N, J) N m, of the servos
+    torque: Array  # (N, J) N m, of the motors
     head_top: Array  # (N,) m
     broken: NDArray[np.bool_]  # (N,) the simulation diverged
 
 
-class Physics:
+class BatchPhysics:
     """N robots; robot i has the physical parameters of model i modulo the number of models."""
 
     def __init__(
@@ -96,7 +96,7 @@ class Physics:
         self._control = np.zeros((robots, steps, base.nu))
         self._warm = np.zeros((robots, base.nv))
         self._target = np.zeros((robots, base.nu))
-        self._older = np.zeros((robots, base.nu))  # targets of the tick before
+        self._previous = np.zeros((robots, base.nu))  # targets of the tick before
         self.floor_friction = np.array([m.geom_friction[_feet(m)[0], 0] for m in self._models])
 
     @property
@@ -110,19 +110,23 @@ class Physics:
         return self.state[:, 1 + self._nq : 1 + self._nq + self._nv]
 
     def place(self, rows: NDArray[np.intp], qpos: Array, target: Array) -> None:
-        """Put robots at rest at ``qpos``, their servos holding ``target``."""
+        """Put robots at rest at ``qpos``, with joint targets ``target``."""
         self.state[rows] = 0.0
         self.qpos[rows] = qpos
-        self._target[rows] = self._older[rows] = target
+        self._target[rows] = self._previous[rows] = target
 
     def step(self, target: Array, delay: NDArray[np.intp]) -> None:
-        """One controller tick: the new targets (N, J) act after ``delay`` (N,) physics steps, which
-        are two ticks at most."""
+        """One controller tick.
+
+        Args:
+            target: (N, J) joint targets, rad.
+            delay: (N,) physics steps after which they act, at most two ticks.
+        """
         steps = self._control.shape[1]
         for k in range(steps):
-            last = np.where((k + steps < delay)[:, None], self._older, self._target)
+            last = np.where((k + steps < delay)[:, None], self._previous, self._target)
             self._control[:, k] = np.where((k < delay)[:, None], last, target)
-        self._older, self._target = self._target, target.copy()
+        self._previous, self._target = self._target, target.copy()
         self._rollout.rollout(
             self._models,
             self._data,
@@ -137,10 +141,10 @@ class Physics:
         self.state[:] = self._states[:, -1]
 
     def snapshot(self) -> Snapshot:
-        """Where everything is now; of a robot just placed, feet, palms and torques are old."""
+        """The state now; of a robot just placed, feet, palms and torques are of the step before."""
         qpos, qvel = self.qpos, self.qvel
         readings = self._readings[:, -1, : 3 * 2 * len(_SENSORS)]
-        place, speed, forward, palms = np.moveaxis(readings.reshape(-1, len(_SENSORS), 2, 3), 1, 0)
+        feet, speed, forward, palms = np.moveaxis(readings.reshape(-1, len(_SENSORS), 2, 3), 1, 0)
         torque = self._readings[:, -1, 3 * 2 * len(_SENSORS) : -3]
         broken = ~np.isfinite(self.state).all(axis=1)
         broken |= np.abs(qvel).max(axis=1) > 100.0
@@ -151,7 +155,7 @@ class Physics:
             angular_velocity=qvel[:, 3:6],
             joints=qpos[:, 7:],
             joint_rates=qvel[:, 6:],
-            feet=place,
+            feet=feet,
             feet_velocity=speed,
             feet_forward=forward,
             palms=palms,
@@ -166,7 +170,7 @@ class Physics:
 
 
 def compile_model(feet: FootModel, options: PhysicsOptions | None = None) -> mujoco.MjModel:
-    """The robot on a floor, with the sensors that `Physics` reads."""
+    """The robot on a floor, with the sensors that `BatchPhysics` reads."""
     spec = robot_spec(feet)
     (options or PhysicsOptions()).apply(spec)
     strip_visuals(spec)
@@ -176,7 +180,7 @@ def compile_model(feet: FootModel, options: PhysicsOptions | None = None) -> muj
         name=FLOOR, type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0, 0, 1], contype=1, conaffinity=0
     )
     for name, kind in _SENSORS:
-        for side in SIDES:
+        for side in ("left", "right"):
             on_site = name == "palm"
             spec.add_sensor(
                 type=kind,
@@ -192,9 +196,9 @@ def compile_model(feet: FootModel, options: PhysicsOptions | None = None) -> muj
     spec.add_sensor(
         type=mujoco.mjtSensor.mjSENS_FRAMEPOS, objtype=mujoco.mjtObj.mjOBJ_GEOM, objname=HEAD
     )
-    # A robot whose simulation diverges must not be put back on its feet unnoticed.
+    # MuJoCo must not reset a robot whose simulation diverges.
     spec.option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    spec.visual.global_.bvactive = 0  # nobody looks at bounding volumes; 5 to 10 % of the time
+    spec.visual.global_.bvactive = 0  # bounding volumes for display take 5 to 10 % of the time
     return spec.compile()
 
 
@@ -205,7 +209,7 @@ def _feet(model: mujoco.MjModel) -> list[int]:
 def _randomised(
     base: mujoco.MjModel, config: DisturbanceConfig, rng: np.random.Generator
 ) -> mujoco.MjModel:
-    """A copy of ``base`` with drawn physical parameters; gains are drawn joint by joint."""
+    """A copy of ``base`` with random physical parameters; each joint has gains of its own."""
     model = mujoco.MjModel.__copy__(base)
     model.geom_friction[_feet(model), 0] = rng.uniform(*config.friction)
     scale = rng.uniform(*config.mass_scale)
@@ -219,3 +223,40 @@ def _randomised(
     model.actuator_biasprm[:, 2] *= rng.uniform(*config.damping_scale, model.nu)
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
+
+
+# --- initial states ------------------------------------------------------------------
+_ARM_NOISE: Final = 0.1  # rad
+
+
+def neutral_qpos(n: int) -> Array:
+    """(n, 36) pelvis position and quaternion, joints: at the neutral height, facing along x."""
+    pose = standing_pose(ACTION_BOX.neutral[-1])
+    return np.tile(np.concatenate([pose.position, pose.quaternion, pose.joints]), (n, 1))
+
+
+def random_qpos(n: int, rng: np.random.Generator) -> Array:
+    """(n, 36) as `neutral_qpos`, with a random heading and noise on the arm joints."""
+    qpos, quaternion = neutral_qpos(n), standing_pose(ACTION_BOX.neutral[-1]).quaternion
+    yaw = rng.uniform(-np.pi, np.pi, n) / 2  # half the angle, as in a quaternion
+    pitch = np.arctan2(quaternion[2], quaternion[0])  # likewise
+    qpos[:, 3:7] = np.stack(
+        [
+            np.cos(yaw) * np.cos(pitch),
+            -np.sin(yaw) * np.sin(pitch),
+            np.cos(yaw) * np.sin(pitch),
+            np.sin(yaw) * np.cos(pitch),
+        ],
+        axis=1,
+    )
+    arms = qpos[:, 7 + NU :]
+    arms += rng.uniform(-_ARM_NOISE, _ARM_NOISE, arms.shape)
+    return qpos
+
+
+def random_delays(
+    n: int, config: DisturbanceConfig, rng: np.random.Generator, timestep: float = PHYSICS_DT
+) -> NDArray[np.intp]:
+    """(n,) physics steps of ``timestep`` s after which new joint targets act."""
+    low, high = (round(seconds / timestep) for seconds in config.delay)
+    return rng.integers(low, high + 1, n)

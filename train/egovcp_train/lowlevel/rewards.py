@@ -1,4 +1,4 @@
-"""The reward terms of the low-level policy, each (N,) per second; weights in `task`."""
+"""Reward terms of the low-level policy, (N,) per second each; `RewardConfig` weights them."""
 
 from __future__ import annotations
 
@@ -11,42 +11,38 @@ from egovcp.robot.arms import DT
 from egovcp.robot.g1 import EFFORT_LIMIT
 from egovcp.robot.geometry import rotation_matrix
 from egovcp.robot.stance_table import NU
-from egovcp_train.lowlevel.camera import TorsoMotion
-from egovcp_train.lowlevel.geometry import heading, in_heading
 from egovcp_train.lowlevel.physics import Snapshot
+from egovcp_train.lowlevel.sensing import (
+    TorsoMotion,
+    heading,
+    in_heading,
+    standing_feet,
+)
 
 Array = NDArray[np.float64]
-SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the floor when the foot is flat
-_CONTACT: Final = 0.012  # m above that, below which a foot counts as standing
-_AVERAGED: Final = 0.3  # s
-_STANDS: Final = 0.05  # m/s and rad/s, a slower command asks to stand
-_LEAST_WIDTH: Final = 0.16  # m between the feet, across
-_MOST_ROTATION: Final = 10.0  # rad^2/s^2, bound of the terms of the torso's rotation
+_AVERAGE_S: Final = 0.3
+_STANDING_SPEED: Final = 0.05  # m/s and rad/s, below which a command means standing
+_MIN_WIDTH: Final = 0.16  # m between the feet, across
+_MAX_ROTATION: Final = 10.0  # rad^2/s^2, bound of the terms of the torso's rotation
 _FALLEN_TILT: Final = 0.8  # rad off the natural pitch
 _FALLEN_HEIGHT: Final = 0.2  # m below the height's reference
 
 
-class Motion:
-    """Velocity and turning over the last moments: a pelvis swings with each step."""
+class AverageVelocity:
+    """Velocity and turning, averaged because the pelvis swings with each step."""
 
     def __init__(self, robots: int) -> None:
-        self.average = np.zeros((robots, 3))  # m/s ahead and across, rad/s
+        self.value = np.zeros((robots, 3))  # m/s ahead and across, rad/s
 
     def reset(self, rows: NDArray[np.intp]) -> None:
         """Robots that start from rest."""
-        self.average[rows] = 0.0
+        self.value[rows] = 0.0
 
     def add(self, x: Snapshot) -> None:
-        """One tick of 20 ms."""
+        """Adds a tick of 20 ms."""
         forward = heading(rotation_matrix(x.quaternion))
         now = np.concatenate([in_heading(x.velocity, forward), x.angular_velocity[:, 2:]], axis=1)
-        self.average += DT / _AVERAGED * (np.nan_to_num(now) - self.average)
-
-
-def standing_feet(x: Snapshot) -> NDArray[np.bool_]:
-    """(N, 2) which feet are on the floor."""
-    on: NDArray[np.bool_] = x.feet[..., 2] < SOLE_HEIGHT + _CONTACT
-    return on
+        self.value += DT / _AVERAGE_S * (np.nan_to_num(now) - self.value)
 
 
 def terms(
@@ -62,20 +58,20 @@ def terms(
     torso: TorsoMotion,
     pushed: NDArray[np.bool_],
 ) -> dict[str, Array]:
-    """All terms but the fall.
+    """All terms except the fall.
 
     Args:
         x: the true state.
-        motion: (N, 3) m/s ahead and across, rad/s of turning, averaged (`Motion`).
+        motion: (N, 3) m/s ahead and across, rad/s of turning, averaged (`AverageVelocity`).
         command: (N, 10) v, hands, height.
-        height: (N,) m, where the pelvis should be by now.
+        height: (N,) m, reference of the pelvis.
         pitch: (N,) rad, the natural pitch at that height.
-        phase: (N,) rad of the gait's clock.
-        gait: (N,) how much of the gait is in.
+        phase: (N,) rad, phase of the gait.
+        gait: (N,) amplitude of the gait, 0 to 1.
         action: (N, 15) of the policy.
         last_action: (N, 15) of the tick before.
-        torso: its angular velocity, up to this tick.
-        pushed: (N,) whether a push was so recent that steps are needed.
+        torso: its angular velocity, including this tick.
+        pushed: (N,) whether a push was so recent that steps cost nothing.
     """
     turn = rotation_matrix(x.quaternion)
     forward = heading(turn)
@@ -93,12 +89,12 @@ def terms(
         "turning": np.exp(-((motion[:, 2] - command[:, 2]) ** 2) / 0.1),
         "height": np.exp(-((x.position[:, 2] - height) ** 2) / 0.001),
         "upright": np.exp(-np.sum(off**2, axis=1) / 0.03),
-        "contact": _in_step(on, phase, gait),
-        "stepping": gait * (np.abs(command[:, :3]).max(axis=1) < _STANDS) * ~pushed,
-        "torso_rate": np.minimum(_off_turning(torso.rate, command), _MOST_ROTATION),
-        "torso_change": np.minimum(np.sum(torso.change**2, axis=1), _MOST_ROTATION),
+        "contact": _feet_in_phase(on, phase, gait),
+        "stepping": gait * (np.abs(command[:, :3]).max(axis=1) < _STANDING_SPEED) * ~pushed,
+        "torso_rate": np.minimum(_off_turning(torso.rate, command), _MAX_ROTATION),
+        "torso_change": np.minimum(np.sum(torso.change**2, axis=1), _MAX_ROTATION),
         "slip": np.sum(np.minimum(slipping, 4.0), axis=1),
-        "stance_width": np.maximum(_LEAST_WIDTH - width, 0.0),
+        "stance_width": np.maximum(_MIN_WIDTH - width, 0.0),
         "foot_heading": np.sum(ahead[..., 1] ** 2, axis=1),
         "action": np.sum(action**2, axis=1),
         "action_rate": np.sum((action - last_action) ** 2, axis=1),
@@ -107,7 +103,7 @@ def terms(
 
 
 def fallen(x: Snapshot, height: Array, pitch: Array) -> NDArray[np.bool_]:
-    """(N,) tilted or sunk far off the reference, or the simulation diverged."""
+    """(N,) whether tilt or height are far off the reference, or the simulation diverged."""
     up = rotation_matrix(x.quaternion)[:, 2]
     cosine = up[:, 2] * np.cos(pitch) - up[:, 0] * np.sin(pitch)
     low = x.position[:, 2] < height - _FALLEN_HEIGHT
@@ -115,10 +111,10 @@ def fallen(x: Snapshot, height: Array, pitch: Array) -> NDArray[np.bool_]:
     return out
 
 
-def earned(
+def finite_terms(
     terms: dict[str, Array], fell: NDArray[np.bool_], broken: NDArray[np.bool_]
 ) -> dict[str, Array]:
-    """`terms` and the ``fall``, finite: a robot whose simulation diverged earns nothing else."""
+    """`terms` and the ``fall``, all finite; 0 for a robot whose simulation diverged."""
     finite = {name: np.where(broken, 0.0, np.nan_to_num(v)) for name, v in terms.items()}
     return finite | {"fall": fell.astype(np.float64)}
 
@@ -130,10 +126,10 @@ def _off_turning(rate: Array, command: Array) -> Array:
     return np.asarray(np.sum(off**2, axis=1))
 
 
-def _in_step(on: NDArray[np.bool_], phase: Array, gait: Array) -> Array:
-    """Share of the feet that stand or swing as the clock says; standing, all feet stand."""
+def _feet_in_phase(on: NDArray[np.bool_], phase: Array, gait: Array) -> Array:
+    """Share of the feet that stand or swing as the phase requires; without a gait, all stand."""
     swing = np.stack([np.sin(phase), -np.sin(phase)], axis=1) * gait[:, None]
-    undecided = np.abs(swing) < 0.25
-    undecided &= gait[:, None] > 0.5
-    right = np.where(undecided, True, on == (swing < 0.25))
+    either = np.abs(swing) < 0.25
+    either &= gait[:, None] > 0.5
+    right = np.where(either, True, on == (swing < 0.25))
     return np.asarray(np.mean(right, axis=1))

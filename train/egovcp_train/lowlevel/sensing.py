@@ -1,4 +1,9 @@
-"""What many robots measure at once (`egovcp.sim.robot` is for one), and what a critic sees."""
+"""Measurements of many simulated robots: frames, proprioception, critic input, camera rotation.
+
+A rotation of the head camera by a small angle moves the centre of its depth image by f times the
+angle, f = 43.3 pixels per rad for 48 rows and a vertical field of view of 58 degrees. A roll moves
+the left and right edges, 32 pixels from the centre, by 32 times the angle.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +12,47 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.robot.geometry import rotation_matrix
-from egovcp.spec import COMMAND_SLICE, STATE_DIM, STATE_SLICES
-from egovcp_train.lowlevel.geometry import heading, in_heading
+from egovcp.robot.g1 import WAIST
+from egovcp.robot.geometry import focal_length, rotation_matrix, rotation_vector
+from egovcp.robot.kinematics import torso_rotation
+from egovcp.sim.config import CameraConfig
+from egovcp.spec import (
+    COMMAND_SLICE,
+    CONTROLLER_HZ,
+    CONTROLLER_TICKS_PER_PLAN,
+    DEPTH_COLS,
+    STATE_DIM,
+    STATE_SLICES,
+)
 from egovcp_train.lowlevel.physics import Snapshot
-from egovcp_train.lowlevel.rewards import standing_feet
 
 Array = NDArray[np.float64]
+FOCAL: Final = focal_length(CameraConfig().vertical_fov)
+"""Pixels per rad at the centre of the depth image."""
 PRIVILEGED_DIM: Final = 2 + 3 + 1 + 1 + 2 + 2 + 4 + 1  # see `privileged`
+SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the floor when the foot is flat
+_CONTACT: Final = 0.012  # m above that, below which a foot counts as standing
+_MAX_TORSO_RATE: Final = 20.0  # rad/s, bound for robots whose simulation diverges
+
+
+def heading(turn: Array) -> Array:
+    """(N, 3, 3) rotations -> (N, 2) unit vector of the horizontal forward direction."""
+    forward = turn[:, :2, 0]
+    return np.asarray(forward / np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), 1e-6))
+
+
+def in_heading(vector: Array, forward: Array) -> Array:
+    """World vectors (N, ..., 2 or 3) -> their x and y in the heading frame (N, ..., 2)."""
+    shape = (len(forward), *(1,) * (vector.ndim - 2))
+    c, s = forward[:, 0].reshape(shape), forward[:, 1].reshape(shape)
+    x, y = vector[..., 0], vector[..., 1]
+    return np.stack([c * x + s * y, c * y - s * x], axis=-1)
+
+
+def standing_feet(x: Snapshot) -> NDArray[np.bool_]:
+    """(N, 2) which feet are on the floor."""
+    on: NDArray[np.bool_] = x.feet[..., 2] < SOLE_HEIGHT + _CONTACT
+    return on
 
 
 def measure(x: Snapshot, command: Array, std: Array, rng: np.random.Generator) -> Array:
@@ -32,24 +70,66 @@ def measure(x: Snapshot, command: Array, std: Array, rng: np.random.Generator) -
 
 
 def privileged(x: Snapshot, motion: Array, height: Array, friction: Array) -> NDArray[np.float32]:
-    """What only the simulator knows, (N, 16) for the critic.
+    """Additional input of the critic, (N, 16).
 
-    True velocity 2, its average and that of the turning 3, upward velocity 1, height error 1, feet
-    on the floor 2, their heights 2, their places along and across 4, friction 1.
+    Velocity 2, its average with that of the turning 3, upward velocity 1, height error 1, feet on
+    the floor 2, their heights 2, their positions along and across 4, friction 1.
     """
-    turn = rotation_matrix(x.quaternion)
-    forward = heading(turn)
-    velocity = in_heading(x.velocity, forward)
-    feet = in_heading(x.feet - x.position[:, None], forward)
+    forward = heading(rotation_matrix(x.quaternion))
     columns = [
-        velocity,
+        in_heading(x.velocity, forward),
         motion,
         x.velocity[:, 2:],
         (x.position[:, 2] - height)[:, None],
         standing_feet(x),
         x.feet[..., 2],
-        feet.reshape(-1, 4),
+        in_heading(x.feet - x.position[:, None], forward).reshape(-1, 4),
         friction[:, None],
     ]
     out = np.concatenate(columns, axis=1)
     return np.asarray(np.nan_to_num(np.clip(out, -10, 10)), dtype=np.float32)
+
+
+# --- rotation of the camera ----------------------------------------------------------
+def torso(x: Snapshot) -> Array:
+    """(N, 3, 3) rotation from the torso, which carries the camera, to the world."""
+    return torso_rotation(rotation_matrix(x.quaternion), x.joints[:, WAIST])
+
+
+def pixels(vector: Array) -> Array:
+    """Rotation vectors (..., 3) rad -> (..., 3) pixels up, across, and by roll at the edge."""
+    scales = [FOCAL, FOCAL, DEPTH_COLS / 2]
+    return np.asarray(vector[..., [1, 2, 0]] * scales)
+
+
+class TorsoMotion:
+    """Angular velocity of the torso, averaged over a tick, and its change over a planner step."""
+
+    def __init__(self, robots: int) -> None:
+        self._attitude: Array = np.tile(np.eye(3), (robots, 1, 1))
+        self._known = np.zeros(robots, dtype=np.bool_)
+        self._rates: Array = np.zeros((CONTROLLER_TICKS_PER_PLAN + 1, robots, 3))  # newest last
+
+    @property
+    def rate(self) -> Array:
+        """(N, 3) rad/s, torso frame; 0 in the first tick."""
+        return np.asarray(self._rates[-1])
+
+    @property
+    def change(self) -> Array:
+        """(N, 3) rad/s, the rate minus that of one planner step before."""
+        return np.asarray(self._rates[-1] - self._rates[0])
+
+    def reset(self, rows: NDArray[np.intp]) -> None:
+        """Robots that start from rest."""
+        self._known[rows] = False
+        self._rates[:, rows] = 0.0
+
+    def add(self, x: Snapshot) -> None:
+        """Adds a tick of 20 ms."""
+        attitude = np.nan_to_num(torso(x))
+        rate = rotation_vector(self._attitude, attitude) * CONTROLLER_HZ
+        rate[~self._known] = 0.0
+        self._rates = np.roll(self._rates, -1, axis=0)
+        self._rates[-1] = np.clip(rate, -_MAX_TORSO_RATE, _MAX_TORSO_RATE)
+        self._attitude, self._known[:] = attitude, True

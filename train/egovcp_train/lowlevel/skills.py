@@ -1,4 +1,4 @@
-"""The skills that a low-level controller is judged by: what is commanded, tick by tick."""
+"""Skills that a low-level controller is evaluated on: the commands of each tick."""
 
 from __future__ import annotations
 
@@ -18,18 +18,17 @@ from egovcp.spec import (
     CONTROLLER_TICKS_PER_PLAN,
     reflect,
 )
+from egovcp_train.lowlevel.commands import HEIGHT, HELD_TICKS
 
 Array = NDArray[np.float64]
-HOLD: Final = 60  # ticks for which a held target stays
+HOLD: Final = 60  # ticks for which a target is held
 SETTLED: Final = 30  # ticks after which a held target should be reached
-_HELD_TICKS: Final = (5, 15)  # planner ticks between steps of `seldom_walk`, inclusive
 _RAMP: Final = 25  # ticks from standing to the commanded velocity
-_HEIGHT: Final = ACTION_DIM - 1
 
 
 @dataclass(frozen=True)
 class Skill:
-    """One line of the table."""
+    """One row of the table."""
 
     name: str
     about: str
@@ -37,11 +36,11 @@ class Skill:
     script: Callable[[int, int, np.random.Generator], Array]
     """(ticks, robots, generator) -> commands (ticks, robots, 10)."""
     settled_only: bool = False
-    """Judge hands and height only where their target has been held for 0.6 s."""
+    """Measure hands and height only after their target has been held for 0.6 s."""
     push: float = 0.0
     """m/s of an impulse, after 1 s."""
     push_any: bool = True
-    """Whether the impulse has any horizontal direction; otherwise it is forwards or backwards."""
+    """Whether the impulse has a random horizontal direction; else forwards or backwards."""
 
     @property
     def ticks(self) -> int:
@@ -56,23 +55,23 @@ def _commands(actions: Array, velocity: Array | None = None) -> Array:
 
 
 def random_walk(ticks: int, robots: int, rng: np.random.Generator) -> Array:
-    """The data's own: a += eta delta each 40 ms, reflected at the box, from neutral."""
+    """Random walk of collection: a += eta delta each 40 ms, reflected at the box, from neutral."""
     steps = ACTION_ETA * rng.uniform(-1, 1, (ticks // CONTROLLER_TICKS_PER_PLAN, robots, 7))
     walk = reflect(np.cumsum(steps, axis=0))
     return _commands(np.repeat(walk, CONTROLLER_TICKS_PER_PLAN, axis=0))
 
 
-def seldom_walk(ticks: int, robots: int, rng: np.random.Generator) -> Array:
-    """As `egovcp-collect --eta=1 --step_ticks=[5,15]`: far steps, at the rate limit, and rests."""
-    wanted, sent = np.zeros((2, robots, ACTION_DIM))
+def held_walk(ticks: int, robots: int, rng: np.random.Generator) -> Array:
+    """As `egovcp-collect --eta=1 --step_ticks=[5,15]`: targets held for 5 to 15 planner ticks."""
+    target, sent = np.zeros((2, robots, ACTION_DIM))
     wait: NDArray[np.intp] = np.zeros(robots, dtype=np.intp)
     walk = []
     for _ in range(ticks // CONTROLLER_TICKS_PER_PLAN):
         steps = wait <= 0
-        wait = np.where(steps, rng.integers(*_HELD_TICKS, robots, endpoint=True), wait) - 1
-        step = rng.uniform(-1, 1, wanted.shape)
-        wanted = reflect(wanted + np.where(steps[:, None], step, 0.0))
-        sent = sent + np.clip(wanted - sent, -ACTION_RATE_LIMIT, ACTION_RATE_LIMIT)
+        wait = np.where(steps, rng.integers(*HELD_TICKS, robots, endpoint=True), wait) - 1
+        step = rng.uniform(-1, 1, target.shape)
+        target = reflect(target + np.where(steps[:, None], step, 0.0))
+        sent = sent + np.clip(target - sent, -ACTION_RATE_LIMIT, ACTION_RATE_LIMIT)
         walk.append(sent)
     return _commands(np.repeat(np.array(walk), CONTROLLER_TICKS_PER_PLAN, axis=0))
 
@@ -103,7 +102,7 @@ def walking(
     Args:
         speed: range, m/s or rad/s; negative: backwards.
         height: range, m.
-        axis: of the velocity: 0 ahead, 1 to either side, 2 turning either way.
+        axis: 0 forwards, 1 to either side, 2 turning either way.
     """
 
     def script(ticks: int, robots: int, rng: np.random.Generator) -> Array:
@@ -112,7 +111,7 @@ def walking(
         velocity[..., axis] = ramp * rng.uniform(*speed, robots)
         if axis > 0:
             velocity[..., axis] *= rng.choice([-1.0, 1.0], robots)
-        start = ACTION_BOX.neutral[_HEIGHT]
+        start = ACTION_BOX.neutral[HEIGHT]
         goal = rng.uniform(*height, robots)
         return _at_height(start + ramp * (goal - start), velocity)
 
@@ -129,7 +128,7 @@ _UPRIGHT: Final = (0.70, 0.74)  # m
 SKILLS: Final = (
     Skill("still", "20 s at the neutral pose", 20.0, neutral),
     Skill("stand", "20 s of the paper's random walk of hands and height", 20.0, random_walk),
-    Skill("held", "20 s of random targets held for 5 to 15 planner ticks", 20.0, seldom_walk),
+    Skill("held", "20 s of random targets held for 5 to 15 planner ticks", 20.0, held_walk),
     Skill("reach", "targets held for 1.2 s, judged after 0.6 s", 12.0, held_targets, True),
     Skill("squat", "heights of 0.50 to 0.74 m, judged after 0.6 s", 12.0, squats, True),
     Skill("walk", "10 s at 0.1 to 0.8 m/s, 0.70 to 0.74 m", 10.0, walking((0.1, 0.8), _UPRIGHT)),

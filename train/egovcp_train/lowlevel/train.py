@@ -1,4 +1,4 @@
-"""``egovcp-train-lowlevel``: the controller that stands, squats, reaches and walks."""
+"""``egovcp-train-lowlevel``: trains the controller that stands, squats, reaches and walks."""
 
 from __future__ import annotations
 
@@ -23,21 +23,14 @@ from egovcp.robot.walking import WalkConfig
 from egovcp.sim.config import SensorConfig, require_memory_for_robots
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import (
-    checkpoint_dir,
-    load_training_state,
-    new_checkpoint,
-    restoring,
-)
-from egovcp_train.iterations import run_iterations
-from egovcp_train.loop import Budget
-from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig, PpoConfig
-from egovcp_train.lowlevel.task import LowLevelTask
-from egovcp_train.output import (
     CONFIG_FILE,
+    load_training_state,
     prepare_output,
+    restoring,
     resumed_options,
 )
-from egovcp_train.records import Recorder
+from egovcp_train.lowlevel.config import CurriculumConfig, LowLevelTask, NetworkConfig
+from egovcp_train.on_policy import PpoOptions, run_iterations
 
 PROG = "egovcp-train-lowlevel"
 POLICY_FILE = "walk.safetensors"
@@ -50,8 +43,7 @@ class LowLevelTrainConfig:
 
     The result, OUTPUT_DIR/checkpoints/last/pretrained_model/walk.safetensors, is a controller
     for egovcp-eval-lowlevel and for the simulator; walk.onnx beside it is the same for a robot
-    computer. Stop it at any time (Ctrl-C) and go on with
-    --resume.
+    computer. Ctrl-C stops the run, --resume continues it.
     """
 
     output_dir: str
@@ -59,7 +51,7 @@ class LowLevelTrainConfig:
     task: LowLevelTask = field(default_factory=LowLevelTask)
     """Commands, disturbances and rewards."""
     walk: WalkConfig = field(default_factory=WalkConfig)
-    """What surrounds the policy: stance law, gait, arms."""
+    """Parts of the controller around the policy: stance law, gait, arms."""
     init: str = ""
     """Controller whose network the policy starts from: walk (which the package ships) or
     PATH.safetensors; empty: a new network."""
@@ -69,7 +61,7 @@ class LowLevelTrainConfig:
     """Noise of proprioception."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """Policy and critic."""
-    ppo: PpoConfig = field(default_factory=PpoConfig)
+    ppo: PpoOptions = field(default_factory=PpoOptions)
     """Proximal policy optimisation."""
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     """When the task becomes harder."""
@@ -80,7 +72,7 @@ class LowLevelTrainConfig:
     steps: int = bounded(50_000_000, least=1)
     """Control steps of 20 ms, over all robots."""
     max_minutes: float = bounded(0.0, least=0)
-    """Wall-clock limit in minutes; 0: none."""
+    """Wall-clock limit in minutes, over all resumes; 0: none."""
     seed: int = bounded(0, least=0)
     """Seed of networks, commands, disturbances and noise."""
     threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
@@ -108,7 +100,7 @@ def train(config: LowLevelTrainConfig) -> None:
     """Run PPO to its end, or to the first SIGINT or SIGTERM, and write the controller.
 
     Raises:
-        UsageError: --init is no network of this size.
+        UsageError: the network of --init has another size.
         ArtifactError: the file of --init cannot be used.
         KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
     """
@@ -119,14 +111,18 @@ def train(config: LowLevelTrainConfig) -> None:
     torch.manual_seed(config.seed)
     init = load_walk_policy(config.init) if config.init and not config.resume else None
     learner = _build(config, threads)
+    spent = 0.0
     if config.resume:
-        _restore(output, learner)
+        state = load_training_state(output)
+        spent = float(state.get("seconds", 0.0))  # checkpoints of earlier versions have none
+        with restoring(output):
+            learner.load_state_dict(state)
     elif init is not None:
         learner.start_from(init)
     output.mkdir(parents=True, exist_ok=True)
     save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
     try:
-        _Run(config, output, learner).execute()
+        _run(config, output, learner, spent)
     finally:
         learner.env.close()
 
@@ -136,7 +132,7 @@ def _build(config: LowLevelTrainConfig, threads: int) -> Any:
     # onnx, too: each checkpoint holds the controller as an ONNX graph
     require_packages("egovcp-train", PROG, "onnx", "rsl_rl", "tensordict", *SIMULATOR_MODULES)
     from egovcp_train.lowlevel.env import LowLevelEnv
-    from egovcp_train.lowlevel.learn import PpoLearner
+    from egovcp_train.lowlevel.learner import LowLevelLearner
 
     env = LowLevelEnv(
         config.robots,
@@ -148,55 +144,32 @@ def _build(config: LowLevelTrainConfig, threads: int) -> Any:
         seed=config.seed,
     )
     env.spread_ends()
-    return PpoLearner(env, config.network, config.ppo, config.curriculum, config.critic_warmup)
+    return LowLevelLearner(env, config.network, config.ppo, config.curriculum, config.critic_warmup)
 
 
-def _restore(output: Path, learner: Any) -> None:
-    state = load_training_state(output)
-    with restoring(output):
-        learner.load_state_dict(state)
+def _run(config: LowLevelTrainConfig, output: Path, learner: Any, spent: float) -> None:
+    from egovcp_train.lowlevel.learner import walk_policy
 
-
-class _Run:
-    """Iterations, records and checkpoints of one run."""
-
-    def __init__(self, config: LowLevelTrainConfig, output: Path, learner: Any) -> None:
-        self.config, self.output, self.learner = config, output, learner
-        self.recorder = Recorder(output, enabled=config.tensorboard)
-
-    def execute(self) -> None:
-        """Learn until the budget or a signal ends it; the last state is always saved."""
-        config, learner = self.config, self.learner
-        budget = Budget(config.steps, config.max_minutes)
-        finished = run_iterations(
-            learner, budget, self.recorder, self.save, config.save_freq, _summary
-        )
-        final = checkpoint_dir(self.output, learner.iteration) / "pretrained_model" / POLICY_FILE
-        state = "done" if finished else "stopped early"
-        echo(f"{PROG}: {state} after {learner.steps} steps, difficulty {self._difficulty:.2f}")
-        echo(f"controller: {final}")
-        echo(f"next: egovcp-eval-lowlevel --controller={final} --output_dir=...")
-        if not finished:
-            raise KeyboardInterrupt
-
-    @property
-    def _difficulty(self) -> float:
-        return float(self.learner.env.loop.difficulty)
-
-    def save(self) -> None:
-        """Write a checkpoint: the controller's file, and the training state."""
+    def write_policy(folder: Path) -> None:
         provenance = {
             "command": [PROG, *sys.argv[1:]],
-            "seed": self.config.seed,
-            "steps": self.learner.steps,
-            "difficulty": self._difficulty,
-            "train_config": draccus.encode(self.config),
+            "seed": config.seed,
+            "steps": learner.steps,
+            "difficulty": float(learner.env.logic.difficulty),
+            "train_config": draccus.encode(config),
         }
-        policy = self.learner.policy(self.config.walk, provenance)
-        state = self.learner.state_dict()
-        with new_checkpoint(self.output, self.learner.iteration, state) as folder:
-            policy.save(folder / POLICY_FILE)
-            export_onnx(policy, folder / ONNX_FILE)
+        policy = walk_policy(learner.ppo.get_policy(), config.walk, provenance)
+        policy.save(folder / POLICY_FILE)
+        export_onnx(policy, folder / ONNX_FILE)
+
+    folder, finished = run_iterations(learner, config, output, write_policy, _summary, spent)
+    state = "done" if finished else "stopped early"
+    difficulty = learner.env.logic.difficulty
+    echo(f"{PROG}: {state} after {learner.steps} steps, difficulty {difficulty:.2f}")
+    echo(f"controller: {folder / POLICY_FILE}")
+    echo(f"next: egovcp-eval-lowlevel --controller={folder / POLICY_FILE} --output_dir=...")
+    if not finished:
+        raise KeyboardInterrupt
 
 
 def _summary(scalars: dict[str, float]) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Plays a skill with many robots at once and measures what came of it."""
+"""Plays a skill with many robots at once and measures the outcome."""
 
 from __future__ import annotations
 
@@ -20,13 +20,19 @@ from egovcp.robot.mjcf import FootModel
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.robot import MAX_SPEED, noise_std
 from egovcp.spec import CONTROLLER_HZ, CONTROLLER_TICKS_PER_PLAN
-from egovcp_train.lowlevel import camera, events
-from egovcp_train.lowlevel.geometry import heading, in_heading
-from egovcp_train.lowlevel.heat import relative_rms
-from egovcp_train.lowlevel.physics import Physics, PhysicsOptions, Snapshot
-from egovcp_train.lowlevel.sensing import measure
+from egovcp_train.lowlevel import sensing
+from egovcp_train.lowlevel.commands import horizontal
+from egovcp_train.lowlevel.config import DisturbanceConfig
+from egovcp_train.lowlevel.physics import (
+    BatchPhysics,
+    PhysicsOptions,
+    Snapshot,
+    neutral_qpos,
+    random_delays,
+)
+from egovcp_train.lowlevel.sensing import heading, in_heading, measure
 from egovcp_train.lowlevel.skills import HOLD, SETTLED, Skill
-from egovcp_train.lowlevel.task import DisturbanceConfig
+from egovcp_train.lowlevel.torque import relative_rms
 
 Array = NDArray[np.float64]
 _FALLEN_TILT: Final = 1.0  # rad
@@ -38,8 +44,8 @@ _LAGS: Final = 25  # ticks, the longest lag looked for
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """Per robot (N,); not-a-number where nothing could be judged."""
+class SkillOutcome:
+    """Figures per robot, (N,); NaN where there was nothing to measure."""
 
     survived: NDArray[np.bool_]
     hand_error: Array  # m, mean distance to the nearest reachable target
@@ -54,8 +60,8 @@ class Outcome:
     torque_rms: Array  # (N, 29) RMS torque of each joint, relative to the motor's peak
 
 
-class _Record:
-    """Series (T, N, ...) of one trial."""
+class _Series:
+    """Time series (T, N, ...) of one trial."""
 
     def __init__(self) -> None:
         self.hands: list[Array] = []
@@ -78,7 +84,7 @@ class _Record:
         self.targets.append(nearest_reachable(command[:, 3:9].reshape(-1, 2, 3), pelvis, torso))
         self.height.append(x.position[:, 2].copy())
         if len(self.height) % CONTROLLER_TICKS_PER_PLAN == 1:
-            self.torso.append(np.nan_to_num(camera.torso(x)))
+            self.torso.append(np.nan_to_num(sensing.torso(x)))
         planar = in_heading(x.velocity, forward)
         self.velocity.append(np.concatenate([planar, x.angular_velocity[:, 2:]], axis=1))
         self.head.append(x.head_top.copy())
@@ -97,45 +103,45 @@ def play(
     threads: int = 1,
     stopped: Callable[[], bool] = lambda: False,
     options: PhysicsOptions | None = None,
-) -> Outcome:
+) -> SkillOutcome:
     """Run ``skill`` once with each of ``robots`` robots of different physical parameters.
 
     Raises:
-        SimulationDiverged: the physics of a robot that has not fallen is not that of a real one.
+        SimulationDiverged: the velocities of a robot that has not fallen are unphysical.
         KeyboardInterrupt: ``stopped`` has returned true.
     """
     rng = np.random.default_rng([seed, 1])
     commands = skill.script(skill.ticks, robots, rng)
-    qpos = events.neutral(robots)
-    std, record = noise_std(sensors), _Record()
+    qpos = neutral_qpos(robots)
+    std, series = noise_std(sensors), _Series()
     alive = np.ones((skill.ticks, robots), dtype=bool)
-    with closing(Physics(robots, feet, disturbances, threads, seed, options)) as physics:
+    with closing(BatchPhysics(robots, feet, disturbances, threads, seed, options)) as physics:
         physics.place(np.arange(robots), qpos, qpos[:, 7:])
-        delay = events.delays(robots, disturbances, rng, physics.options.timestep)
+        delay = random_delays(robots, disturbances, rng, physics.options.timestep)
         x = physics.snapshot()
         controller.reset(measure(x, commands[0], std, rng))
         for tick, command in enumerate(commands):
             if stopped():
                 raise KeyboardInterrupt
             if skill.push and tick == _PUSH_TICK:
-                physics.qvel[:, :2] += events.kick(skill.push, _directions(skill, robots, rng))
+                physics.qvel[:, :2] += horizontal(skill.push, _directions(skill, robots, rng))
             state = measure(x, command, std, rng)
             physics.step(controller.step(state), delay)
             x = physics.snapshot()
             _require_valid(physics, alive[tick], f"skill {skill.name}, seed {seed}, tick {tick}")
             alive[tick:] &= ~_fallen(x)
-            record.add(x, command, controller.stepping)
-    return _judge(skill, commands, record, alive)
+            series.add(x, command, controller.stepping)
+    return _measure(skill, commands, series, alive)
 
 
 def _directions(skill: Skill, robots: int, rng: np.random.Generator) -> Array:
     """(N,) rad from the direction that the robots face."""
     if skill.push_any:
-        return events.directions(robots, rng)
+        return rng.uniform(-np.pi, np.pi, robots)
     return np.asarray(rng.choice([0.0, np.pi], robots))
 
 
-def _require_valid(physics: Physics, alive: NDArray[np.bool_], where: str) -> None:
+def _require_valid(physics: BatchPhysics, alive: NDArray[np.bool_], where: str) -> None:
     speed = np.abs(physics.qvel).max(axis=1)
     valid = np.isfinite(physics.state).all(axis=1) & (speed <= MAX_SPEED)
     for robot in np.flatnonzero(alive & ~valid):
@@ -159,41 +165,43 @@ def _heading_from_world(forward: Array) -> Array:
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _judge(skill: Skill, commands: Array, record: _Record, alive: NDArray[np.bool_]) -> Outcome:
-    hands, targets = np.array(record.hands), np.array(record.targets)  # (T, N, 2, 3)
-    height, velocity = np.array(record.height), np.array(record.velocity)
+def _measure(
+    skill: Skill, commands: Array, series: _Series, alive: NDArray[np.bool_]
+) -> SkillOutcome:
+    hands, targets = np.array(series.hands), np.array(series.targets)  # (T, N, 2, 3)
+    height, velocity = np.array(series.height), np.array(series.velocity)
     moves = commands[..., :3].any()
     counted = alive.copy()
     if skill.settled_only:
         counted &= (np.arange(len(commands)) % HOLD >= SETTLED)[:, None]
     elif moves:
         counted[:_WARM_UP] = False
-    torso = np.array(record.torso)
+    torso = np.array(series.torso)
     planned = (counted if moves else alive)[::CONTROLLER_TICKS_PER_PLAN]
     apart = np.linalg.norm(hands - targets, axis=-1).mean(axis=-1)
     off = np.abs(height - commands[..., -1])
-    return Outcome(
+    return SkillOutcome(
         survived=alive[-1],
         hand_error=_mean(apart, counted),
         hand_lag=_lag(hands, targets, counted)
         if np.ptp(commands[..., 3:9], axis=0).any() and not skill.settled_only
-        else _nothing(alive),
+        else _nan(alive),
         height_error=_mean(off, counted),
         velocity_error=_velocity_error(velocity[..., :2], commands[..., :2], counted)
         if moves
-        else _nothing(alive),
+        else _nan(alive),
         turning_error=_velocity_error(velocity[..., 2:], commands[..., 2:3], counted)
         if moves
-        else _nothing(alive),
-        head_top=_highest(np.array(record.head), counted) if moves else _nothing(alive),
-        stepping=_mean(np.array(record.stepping), alive),
+        else _nan(alive),
+        head_top=_highest(np.array(series.head), counted) if moves else _nan(alive),
+        stepping=_mean(np.array(series.stepping), alive),
         camera=_rotation(torso, planned, 1),
         camera_8=_rotation(torso, planned, 8),
-        torque_rms=relative_rms(np.array(record.torque), alive),
+        torque_rms=relative_rms(np.array(series.torque), alive),
     )
 
 
-def _nothing(alive: NDArray[np.bool_]) -> Array:
+def _nan(alive: NDArray[np.bool_]) -> Array:
     return np.full(alive.shape[1], np.nan)
 
 
@@ -208,7 +216,7 @@ def _rotation(torso: Array, counted: NDArray[np.bool_], apart: int) -> Array:
     """Attitudes (P, N, 3, 3) at planner ticks -> (N, 3) px, mean rotation over ``apart`` ticks."""
     if len(torso) <= apart:
         return np.full((counted.shape[1], 3), np.nan)
-    turned = np.abs(camera.pixels(rotation_vector(torso[:-apart], torso[apart:])))
+    turned = np.abs(sensing.pixels(rotation_vector(torso[:-apart], torso[apart:])))
     both = counted[:-apart] & counted[apart:]
     return np.stack([_mean(turned[..., axis], both) for axis in range(3)], axis=-1)
 
@@ -221,7 +229,7 @@ def _highest(series: Array, counted: NDArray[np.bool_]) -> Array:
 def _velocity_error(velocity: Array, wanted: Array, counted: NDArray[np.bool_]) -> Array:
     """Distance of the mean velocity of each stride to the mean of what was commanded."""
     if len(velocity) <= _STRIDE:
-        return _nothing(counted)
+        return _nan(counted)
     kernel = np.cumsum(np.concatenate([np.zeros_like(velocity[:1]), velocity - wanted]), axis=0)
     mean = (kernel[_STRIDE:] - kernel[:-_STRIDE]) / _STRIDE
     return _mean(np.linalg.norm(mean, axis=-1), counted[_STRIDE - 1 :])

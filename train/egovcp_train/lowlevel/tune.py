@@ -1,8 +1,8 @@
-"""Find the numbers of the hand-made gait by evolution (CMA-ES): ``egovcp-tune-gait``.
+"""``egovcp-tune-gait``: optimises the parameters of the scripted gait by CMA-ES.
 
-Each candidate walks with robots of its own at several speeds and turns, under noise, delay and
-randomised physics, without any policy. What counts is how long it stays up, how well it follows
-the velocity and how still the pelvis is.
+Each candidate walks with several robots at different velocities, under noise, delay and randomised
+physics, without a policy. The score is the time before a fall, weighted by how well it follows the
+velocity and how still the pelvis is.
 """
 
 from __future__ import annotations
@@ -29,15 +29,14 @@ from egovcp.robot.walking import ACTIONS, Walk, WalkConfig
 from egovcp.sim.config import SensorConfig, require_memory_for_robots
 from egovcp.spec import ACTION_BOX, CONTROLLER_HZ
 from egovcp.terminal import echo
-from egovcp_train.lowlevel import events
-from egovcp_train.lowlevel.task import DisturbanceConfig
+from egovcp_train.lowlevel.config import DisturbanceConfig
 
 PROG: Final = "egovcp-tune-gait"
 RESULT: Final = "gait.json"
 _DT: Final = 1.0 / CONTROLLER_HZ
 _FIXED: Final = ("reach", "least_speed", "tipping", "rise", "fade", "linger")
-_SPREAD: Final = 0.3  # of a number, relative to its size
-_LEAST: Final = 0.1  # ... and at least this
+_SPREAD: Final = 0.3  # of a parameter, relative to its size
+_MIN_SIZE: Final = 0.1
 _SPEEDS: Final = ((0.0, 0.0), (0.1, 0.3), (0.2, -0.3), (0.3, 0.0), (0.4, 0.2), (0.5, -0.2))
 
 Array = NDArray[np.float64]
@@ -45,16 +44,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TuneConfig:
-    """Improve the hand-made gait by CMA-ES, starting from the present numbers.
+    """Improve the scripted gait by CMA-ES, starting from the present parameters.
 
-    Writes OUTPUT_DIR/gait.json, the numbers of `GaitConfig`; give them to egovcp-train-lowlevel
-    as --walk.gait.NAME=....
+    Writes OUTPUT_DIR/gait.json, the options of `GaitConfig`; give them to egovcp-train-lowlevel as
+    --walk.gait.NAME=....
     """
 
     output_dir: str
-    """Where gait.json goes."""
+    """Folder for gait.json."""
     start: GaitConfig = field(default_factory=GaitConfig)
-    """Where to start from."""
+    """Initial parameters."""
     minutes: float = bounded(15.0, above=0)
     """Wall-clock limit."""
     population: int = bounded(28, least=4, most=65_536)
@@ -75,17 +74,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def tune(config: TuneConfig) -> None:
-    """Search until the time is over; the best mean so far is always on disk.
+    """Search until the time is over; the last mean is always on disk.
 
     Raises:
-        UsageError: an option makes no sense.
+        UsageError: the population does not fit in memory.
         EnvironmentFailure: the package cma is missing, or the folder cannot be written.
     """
     require_memory_for_robots("--population", config.population, config.population * len(_SPEEDS))
     require_packages("egovcp-train", PROG, "cma", *SIMULATOR_MODULES)
     output = Path(config.output_dir)
     require_writable(output)
-    import cma
+    import cma  # an optional package
 
     output.mkdir(parents=True, exist_ok=True)
     search = cma.CMAEvolutionStrategy(
@@ -98,26 +97,26 @@ def tune(config: TuneConfig) -> None:
         while time.monotonic() < end and not search.stop():
             candidates = search.ask()
             gaits = [shifted(config.start, x) for x in candidates]
-            scores = walk(gaits, config, generation)
+            scores = score(gaits, config, generation)
             search.tell(candidates, (-scores).tolist())
             generation += 1
             _save(output / RESULT, shifted(config.start, search.mean), generation)
-            most = config.seconds * _MOST
+            most = config.seconds * _MAX_SCORE
             bar.set_postfix_str(f"best {scores.max() / most:.0%}, mean {scores.mean() / most:.0%}")
             bar.update(1)
     echo(f"gait: {output / RESULT}")
 
 
 def flat(gait: GaitConfig) -> Array:
-    """(D,) the numbers that are searched."""
+    """(D,) the parameters that are searched."""
     values = (getattr(gait, f.name) for f in fields(gait) if f.name not in _FIXED)
     return np.concatenate([np.atleast_1d(np.asarray(v, dtype=np.float64)) for v in values])
 
 
 def shifted(gait: GaitConfig, by: Sequence[float] | Array) -> GaitConfig:
-    """``gait`` with its numbers moved by ``by`` (D,), in units of what is a usual change."""
+    """``gait`` with its parameters moved by ``by`` (D,), in units of their spread."""
     now = flat(gait)
-    moved = now + np.asarray(by) * _SPREAD * np.maximum(np.abs(now), _LEAST)
+    moved = now + np.asarray(by) * _SPREAD * np.maximum(np.abs(now), _MIN_SIZE)
     change: dict[str, Any] = {}
     for f in fields(gait):
         old = getattr(gait, f.name)
@@ -133,15 +132,14 @@ def shifted(gait: GaitConfig, by: Sequence[float] | Array) -> GaitConfig:
     return replace(gait, **change)
 
 
-_MOST: Final = 3.0  # of the score below, per second
+_MAX_SCORE: Final = 3.0  # per second
 
 
-def walk(gaits: Sequence[GaitConfig], config: TuneConfig, generation: int) -> Array:
+def score(gaits: Sequence[GaitConfig], config: TuneConfig, generation: int) -> Array:
     """(len(gaits),) score of each, the mean over its robots, at most 3 per second."""
-    # They need the simulator, which `tune` asks for together with the other packages.
+    # These modules need the simulator, whose presence `tune` has checked.
     from egovcp.sim.robot import noise_std
-    from egovcp_train.lowlevel import rewards
-    from egovcp_train.lowlevel.physics import Physics
+    from egovcp_train.lowlevel import physics, rewards
     from egovcp_train.lowlevel.sensing import measure
 
     each = len(_SPEEDS)
@@ -152,20 +150,20 @@ def walk(gaits: Sequence[GaitConfig], config: TuneConfig, generation: int) -> Ar
         stiffness_scale=(0.9, 1.1), damping_scale=(0.9, 1.1), friction=(0.6, 1.0)
     )
     seed = int(rng.integers(1 << 31))
-    physics = Physics(robots, "points", disturbances, threads, seed)
-    qpos = events.standing(robots, rng)
-    physics.place(np.arange(robots), qpos, qpos[:, 7:])
-    delay = events.delays(robots, disturbances, rng)
+    batch = physics.BatchPhysics(robots, "points", disturbances, threads, seed)
+    qpos = physics.random_qpos(robots, rng)
+    batch.place(np.arange(robots), qpos, qpos[:, 7:])
+    delay = physics.random_delays(robots, disturbances, rng)
     walks = [Walk(WalkConfig(gait=gait)) for gait in gaits]
     rows = [slice(i * each, (i + 1) * each) for i in range(len(gaits))]
     command = np.zeros((robots, 10))
     command[:, 3:] = ACTION_BOX.neutral
     command[:, 9] = config.height
     command[:, [0, 2]] = np.tile(_SPEEDS, (len(gaits), 1))
-    command[:, 0] = np.maximum(command[:, 0], 0.06)  # even the slowest has to step
-    std, motion = noise_std(SensorConfig()), rewards.Motion(robots)
-    score, up = np.zeros(robots), np.ones(robots, dtype=bool)
-    x = physics.snapshot()
+    command[:, 0] = np.maximum(command[:, 0], 0.06)  # the slowest steps, too
+    std, velocity = noise_std(SensorConfig()), rewards.AverageVelocity(robots)
+    total, up = np.zeros(robots), np.ones(robots, dtype=bool)
+    x = batch.snapshot()
     for tick in range(round(config.seconds * CONTROLLER_HZ)):
         state = measure(x, command, std, rng)
         targets = []
@@ -174,17 +172,17 @@ def walk(gaits: Sequence[GaitConfig], config: TuneConfig, generation: int) -> Ar
                 w.reset(state[r])
             w.observe(state[r])
             targets.append(w.targets(np.zeros((each, ACTIONS))))
-        physics.step(np.concatenate(targets), delay)
-        x = physics.snapshot()
+        batch.step(np.concatenate(targets), delay)
+        x = batch.snapshot()
         height = np.concatenate([w.height for w in walks])
         pitch = np.concatenate([w.pitch for w in walks])
         up &= ~rewards.fallen(x, height, pitch)
-        motion.add(x)
-        score += up * _DT * _quality(x.angular_velocity, motion.average, command)
+        velocity.add(x)
+        total += up * _DT * _quality(x.angular_velocity, velocity.value, command)
         if not up.any():
             break
-    physics.close()
-    return np.asarray(score.reshape(len(gaits), each).mean(axis=1))
+    batch.close()
+    return np.asarray(total.reshape(len(gaits), each).mean(axis=1))
 
 
 def _quality(rate: Array, motion: Array, command: Array) -> Array:

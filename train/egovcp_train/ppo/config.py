@@ -10,33 +10,10 @@ from egovcp.errors import UsageError, suggest
 from egovcp.reactive import ReactiveConfig
 from egovcp.sim.config import EnvConfig
 from egovcp.spec import GAMMA, TASKS
+from egovcp_train.on_policy import PpoOptions
 
 HELD_OUT: Final = 1_000_000_000  # seeds from here on are those of egovcp-eval
 ALL: Final = "all"
-
-
-@dataclass(frozen=True)
-class ContactPpoConfig:
-    """Proximal policy optimisation; the names are rsl-rl's."""
-
-    num_steps_per_env: int = bounded(50, least=1, most=100_000)
-    """Ticks per robot and iteration."""
-    num_learning_epochs: int = bounded(4, least=1, most=10_000)
-    """Passes over the data of an iteration."""
-    num_mini_batches: int = bounded(4, least=1, most=65_536)
-    """Mini-batches per pass."""
-    learning_rate: float = bounded(1e-3, above=0)
-    """At the start; then it follows desired_kl."""
-    desired_kl: float = bounded(0.01, above=0)
-    """Change of the policy per update that the learning rate aims at."""
-    gamma: float = bounded(GAMMA, least=0, most=1)
-    """Discount per tick of 40 ms; that of the world model's returns."""
-    lam: float = bounded(0.95, least=0, most=1)
-    """Of generalised advantage estimation."""
-    clip_param: float = bounded(0.2, above=0)
-    """Clipping of the probability ratio."""
-    entropy_coef: float = bounded(0.002, least=0)
-    """Weight of the entropy."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +22,7 @@ class PpoTrainConfig:
 
     The baseline of the paper's figure 5. The result,
     OUTPUT_DIR/checkpoints/last/pretrained_model/ppo.safetensors, is played by
-    egovcp-eval --controllers=ppo --ppo.path=FILE. Stop it at any time (Ctrl-C) and go on with
-    --resume.
+    egovcp-eval --controllers=ppo --ppo.path=FILE. Ctrl-C stops the run, --resume continues it.
     """
 
     output_dir: str
@@ -59,7 +35,11 @@ class PpoTrainConfig:
     """Policy and critic."""
     initial_std: float = bounded(0.4, above=0)
     """Standard deviation of the actions at the start, box units."""
-    ppo: ContactPpoConfig = field(default_factory=ContactPpoConfig)
+    ppo: PpoOptions = field(
+        default_factory=lambda: PpoOptions(
+            num_steps_per_env=50, desired_kl=0.01, gamma=GAMMA, entropy_coef=0.002
+        )
+    )
     """Proximal policy optimisation."""
     robots: int = bounded(32, least=1, most=65_536)
     """Robots simulated side by side."""

@@ -19,16 +19,14 @@ from egovcp.robot.controllers import absolute_controller, make_controller
 from egovcp.sim.config import require_memory_for_robots
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import (
-    checkpoint_dir,
+    CONFIG_FILE,
     load_training_state,
-    new_checkpoint,
+    prepare_output,
     restoring,
+    resumed_options,
 )
-from egovcp_train.iterations import run_iterations
-from egovcp_train.loop import Budget
-from egovcp_train.output import CONFIG_FILE, prepare_output, resumed_options
+from egovcp_train.on_policy import run_iterations
 from egovcp_train.ppo.config import PpoTrainConfig
-from egovcp_train.records import Recorder
 
 PROG = "egovcp-train-ppo"
 POLICY_FILE = "ppo.safetensors"
@@ -45,7 +43,7 @@ def train(config: PpoTrainConfig) -> None:
     """Run PPO to its end, or to the first SIGINT or SIGTERM, and write the policy.
 
     Raises:
-        KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
+        KeyboardInterrupt: a signal ended it early; the checkpoint is written.
     """
     require_memory_for_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)
@@ -70,24 +68,17 @@ def train(config: PpoTrainConfig) -> None:
 def _build(config: PpoTrainConfig, first: int) -> Any:
     """The simulator and PPO; imported here, so that --help needs neither."""
     require_packages("egovcp-train", PROG, "rsl_rl", "tensordict", *SIMULATOR_MODULES)
-    from egovcp_train.ppo.learn import ContactLearner
+    from egovcp_train.ppo.learner import ContactLearner
 
     return ContactLearner(config, first)
 
 
 def _run(config: PpoTrainConfig, output: Path, learner: Any, spent: float) -> None:
-    """Iterations, records and checkpoints of one run."""
-    budget = Budget(config.steps, config.max_minutes, spent=spent)
+    def write_policy(folder: Path) -> None:
+        learner.policy(_provenance(config, learner)).save(folder / POLICY_FILE)
 
-    def save() -> None:
-        """The policy's file, and the training state."""
-        state = learner.state_dict() | {"seconds": budget.spent}
-        with new_checkpoint(output, learner.iteration, state) as folder:
-            learner.policy(_provenance(config, learner)).save(folder / POLICY_FILE)
-
-    recorder = Recorder(output, enabled=config.tensorboard)
-    finished = run_iterations(learner, budget, recorder, save, config.save_freq, _summary)
-    final = checkpoint_dir(output, learner.iteration) / "pretrained_model" / POLICY_FILE
+    folder, finished = run_iterations(learner, config, output, write_policy, _summary, spent)
+    final = folder / POLICY_FILE
     echo(f"{PROG}: {'done' if finished else 'stopped early'} after {learner.steps} steps")
     echo(f"policy: {final}")
     echo(f"next: egovcp-eval --controllers=ppo --ppo.path={final} --task=... --output_dir=...")

@@ -9,23 +9,22 @@ from egovcp.errors import UsageError
 from egovcp.robot.controllers import load_walk_policy
 from egovcp.robot.walking import OBSERVATION_DIM, WalkConfig
 from egovcp.sim.config import SensorConfig
-from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig, PpoConfig
+from egovcp_train.lowlevel.config import CurriculumConfig, LowLevelTask, NetworkConfig
 from egovcp_train.lowlevel.env import LowLevelEnv, mirrored
-from egovcp_train.lowlevel.learn import PpoLearner
+from egovcp_train.lowlevel.learner import LowLevelLearner, SymmetricStart
 from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
-from egovcp_train.lowlevel.task import LowLevelTask
 from egovcp_train.lowlevel.train import main
-from egovcp_train.lowlevel.warm_start import SymmetricStart
+from egovcp_train.on_policy import PpoOptions
 
 
-def _learner(critic_warmup: int, **network: object) -> PpoLearner:
+def _learner(critic_warmup: int, **network: object) -> LowLevelLearner:
     env = LowLevelEnv(8, LowLevelTask(), WalkConfig(), SensorConfig())
-    return PpoLearner(
-        env, NetworkConfig(**network), PpoConfig(), CurriculumConfig(start=0.5), critic_warmup
+    return LowLevelLearner(
+        env, NetworkConfig(**network), PpoOptions(), CurriculumConfig(start=0.5), critic_warmup
     )
 
 
-def _asymmetry(learner: PpoLearner, seen: TensorDict) -> float:
+def _asymmetry(learner: LowLevelLearner, seen: TensorDict) -> float:
     actor = learner.ppo.get_policy()
     with torch.no_grad():
         action = actor(seen)
@@ -41,7 +40,7 @@ def test_the_actor_begins_as_the_controller():
     with torch.no_grad():
         action = learner.ppo.get_policy()(seen).numpy()
     np.testing.assert_allclose(action, policy(seen["policy"].numpy()), atol=1e-3)
-    assert learner.env.loop.difficulty == 0.5
+    assert learner.env.logic.difficulty == 0.5
 
 
 def test_the_warm_up_trains_the_critic_and_keeps_the_noise():
@@ -50,7 +49,7 @@ def test_the_warm_up_trains_the_critic_and_keeps_the_noise():
     scalars = [learner.iterate() for _ in range(2)]
     assert all(s["ppo/symmetric_error"] < 0.1 for s in scalars)
     assert scalars[-1]["ppo/action_std"] == pytest.approx(NetworkConfig().initial_std)
-    assert scalars[-1]["ppo/learning_rate"] == PpoConfig().learning_rate
+    assert scalars[-1]["ppo/learning_rate"] == PpoOptions().learning_rate
 
 
 def test_the_actor_becomes_symmetric():

@@ -5,12 +5,12 @@ import sys
 
 import pytest
 
-from egovcp_train import allocation
+from egovcp_train import device
 
 PROGRAM = """
 import resource, sys
 import numpy as np
-from egovcp_train.allocation import keep_freed_memory
+from egovcp_train.device import keep_freed_memory
 if sys.argv[1] == "keep" and not keep_freed_memory():
     raise SystemExit(77)
 def faults():
@@ -36,5 +36,5 @@ def test_memory_that_was_freed_is_used_again_without_page_faults() -> None:
 
 
 def test_a_c_library_without_the_setting_is_left_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(allocation.ctypes, "CDLL", lambda name: object())
-    assert not allocation.keep_freed_memory()
+    monkeypatch.setattr(device.ctypes, "CDLL", lambda name: object())
+    assert not device.keep_freed_memory()

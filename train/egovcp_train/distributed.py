@@ -1,8 +1,7 @@
-"""The processes that train together, as ``accelerate launch`` or ``torchrun`` starts them.
+"""Processes that train together, started by ``accelerate launch`` or ``torchrun``.
 
-Each holds all weights and a part of every batch. What one of them must decide alone (the clock,
-what a resumed run continues) the first one does; what all must do together (stop, step) they
-agree on. Only the first writes, evaluates and speaks.
+Each process holds all weights and a part of every batch. The first one keeps the clock, writes,
+evaluates and prints. All of them stop and step together.
 """
 
 from __future__ import annotations
@@ -22,11 +21,11 @@ from egovcp.packages import require_packages
 
 type Terms = dict[str, Tensor]
 
-PATIENCE: Final = timedelta(hours=24)  # the others wait while the first evaluates
+TIMEOUT: Final = timedelta(hours=24)  # the other processes wait while the first evaluates
 
 
-class Ranks:
-    """One process on its own."""
+class ProcessGroup:
+    """A single process; `LaunchedGroup` has several."""
 
     rank: int = 0
     """Number of this process."""
@@ -39,53 +38,53 @@ class Ranks:
 
     @property
     def is_first(self) -> bool:
-        """Whether this process writes, evaluates and speaks."""
+        """Whether this process writes, evaluates and prints."""
         return self.rank == 0
 
     def rows(self, batch_size: int) -> slice:
-        """Those of this process, ``batch_size`` of them, in a batch that all draw alike."""
+        """This process' rows, ``batch_size`` of them, of a batch that all processes draw."""
         return slice(self.rank * batch_size, (self.rank + 1) * batch_size)
 
-    def decided[T](self, value: T) -> T:
-        """The first process' value, given to each; the others wait for it."""
+    def broadcast[T](self, value: T) -> T:
+        """The first process' value, on every process."""
         return value
 
-    def collected[T](self, value: T) -> list[T]:
-        """Every process' value in their order, on the first; nothing on the others."""
+    def gather[T](self, value: T) -> list[T]:
+        """Every process' value in their order on the first process; empty on the others."""
         return [value]
 
-    def agreed(self, progress: float, stopped: bool) -> tuple[float, bool]:
-        """The first process' progress, and whether any of them was asked to stop."""
+    def all_reduce(self, progress: float, stopped: bool) -> tuple[float, bool]:
+        """The first process' progress, and whether any process was asked to stop."""
         return progress, stopped
 
-    def add_up(self, parameters: Iterable[Tensor], terms: Terms) -> Terms:
+    def sum_gradients(self, parameters: Iterable[Tensor], terms: Terms) -> Terms:
         """Sum gradients, in place, and scalar terms over the processes."""
         return terms
 
     def close(self) -> None:
-        """Wait until all are done."""
+        """Wait for all processes."""
 
 
-ALONE: Final = Ranks()
+SINGLE: Final = ProcessGroup()
 
 
-class LaunchedRanks(Ranks):
+class LaunchedGroup(ProcessGroup):
     """Processes with a launcher, connected through torch.distributed."""
 
     def __init__(self, cpu: bool) -> None:
         """Connect to the others.
 
         Args:
-            cpu: train on the processor even where there is a GPU.
+            cpu: train on the CPU even where there is a GPU.
 
         Raises:
-            EnvironmentFailure: accelerate is not installed, or the others cannot be reached.
+            EnvironmentFailure: accelerate is not installed, or the connection fails.
         """
         require_packages("egovcp-train", "training on several processes", "accelerate")
-        from accelerate import PartialState  # a second that a single process should not wait
+        from accelerate import PartialState  # takes a second
 
         try:
-            state = PartialState(cpu=cpu, timeout=PATIENCE)
+            state = PartialState(cpu=cpu, timeout=TIMEOUT)
         except (RuntimeError, ValueError) as error:  # torch.distributed has no narrower one
             reason = " ".join(str(error).split())[:200]
             raise EnvironmentFailure(f"cannot connect the processes ({reason})") from error
@@ -93,22 +92,22 @@ class LaunchedRanks(Ranks):
         self.local = int(os.environ.get("LOCAL_WORLD_SIZE", self.count))
         self.share = DataParallelRank(self.rank, self.count, _summed)
 
-    def decided[T](self, value: T) -> T:
-        box = [value]
-        dist.broadcast_object_list(box, src=0)
-        return box[0]
+    def broadcast[T](self, value: T) -> T:
+        values = [value]
+        dist.broadcast_object_list(values, src=0)
+        return values[0]
 
-    def collected[T](self, value: T) -> list[T]:
+    def gather[T](self, value: T) -> list[T]:
         found: list[Any] | None = [None] * self.count if self.is_first else None
         dist.gather_object(value, found, dst=0)
         return found or []
 
-    def agreed(self, progress: float, stopped: bool) -> tuple[float, bool]:
+    def all_reduce(self, progress: float, stopped: bool) -> tuple[float, bool]:
         own = torch.tensor([progress if self.is_first else 0.0, stopped], dtype=torch.float64)
-        summed, anyone = _summed(own).tolist()
-        return summed, anyone > 0
+        summed, stopped_count = _summed(own).tolist()
+        return summed, stopped_count > 0
 
-    def add_up(self, parameters: Iterable[Tensor], terms: Terms) -> Terms:
+    def sum_gradients(self, parameters: Iterable[Tensor], terms: Terms) -> Terms:
         gradients = [p.grad for p in parameters if p.grad is not None]
         values = list(terms.values())
         flat = _summed(torch.cat([x.reshape(-1).float() for x in (*gradients, *values)]))
@@ -123,14 +122,9 @@ class LaunchedRanks(Ranks):
         dist.destroy_process_group()
 
 
-def launched() -> bool:
-    """Whether a launcher started this process together with others."""
-    return int(os.environ.get("WORLD_SIZE", "1")) > 1
-
-
-def join(cpu: bool) -> Ranks:
-    """The processes that this one trains with; see `LaunchedRanks`."""
-    return LaunchedRanks(cpu) if launched() else ALONE
+def join_processes(cpu: bool) -> ProcessGroup:
+    """The processes that a launcher started with this one; see `LaunchedGroup`."""
+    return LaunchedGroup(cpu) if int(os.environ.get("WORLD_SIZE", "1")) > 1 else SINGLE
 
 
 def _summed(x: Tensor) -> Tensor:

@@ -1,13 +1,12 @@
-"""How much a controller heats the motors: RMS torque, and torque beyond what gravity needs.
+"""Motor load of a controller: RMS torque, and torque beyond what gravity needs.
 
-Winding losses grow with the square of the torque, so the RMS torque over time tells how hot a
-motor gets. Unitree publishes no continuous rating of the G1's motors; torques are given relative
-to the peak torque (`egovcp.robot.g1.EFFORT_LIMIT`).
+Winding losses grow with the square of the torque, so the RMS torque over time is a measure of
+heating. Unitree publishes no continuous rating of the G1's motors, so torques are relative to the
+peak torque (`egovcp.robot.g1.EFFORT_LIMIT`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -22,20 +21,19 @@ from egovcp.robot.mjcf import FootModel
 from egovcp.sim.config import SensorConfig
 from egovcp.sim.robot import noise_std
 from egovcp.spec import CONTROLLER_HZ, JOINT_NAMES
-from egovcp_train.lowlevel import events
-from egovcp_train.lowlevel.physics import Physics, compile_model
+from egovcp_train.lowlevel.config import DisturbanceConfig
+from egovcp_train.lowlevel.physics import BatchPhysics, compile_model, neutral_qpos
 from egovcp_train.lowlevel.sensing import measure
 from egovcp_train.lowlevel.skills import neutral
-from egovcp_train.lowlevel.task import DisturbanceConfig
 
 Array = NDArray[np.float64]
 
 STANDING_S: Final = 60.0
 RELATIVE_MARGIN: Final = 0.2  # of the torque that gravity needs
-#: Share of the peak torque that any joint may be loaded with; joint friction is of this order.
+#: Share of the peak torque that every joint may have in addition; joint friction is of this order.
 ABSOLUTE_MARGIN: Final = 0.01
-_CONE_EDGES: Final = 8  # of the pyramid that stands for a friction cone
-_BALANCE_WEIGHT: Final = 1e3  # of the pelvis' six equations, against relative torques near 0.1
+_CONE_EDGES: Final = 8  # of the pyramid that approximates a friction cone
+_BALANCE_WEIGHT: Final = 1e3  # weight of the pelvis' six equations; torques have 1 / peak
 _NOMINAL: Final = DisturbanceConfig(
     models=1,
     friction=(0.8, 0.8),
@@ -59,8 +57,8 @@ class StandingLoad:
 
     @property
     def excess(self) -> Array:
-        """(29,) by how much |mean| exceeds |needed| plus both margins, share of the peak torque;
-        negative: within the bar."""
+        """(29,) |mean| minus |needed| and both margins, share of the peak torque; at most 0: within
+        the limit."""
         allowed = (1.0 + RELATIVE_MARGIN) * np.abs(self.needed) + ABSOLUTE_MARGIN * EFFORT_LIMIT
         return np.asarray((np.abs(self.mean) - allowed) / EFFORT_LIMIT)
 
@@ -85,7 +83,6 @@ def standing_load(
     controller: LowLevelController,
     feet: FootModel = "stock",
     seconds: float = STANDING_S,
-    tick: Callable[[], object] = lambda: None,
 ) -> StandingLoad:
     """Let the nominal robot stand at the neutral pose and compare its torques with gravity's need.
 
@@ -93,23 +90,20 @@ def standing_load(
         controller: for one robot.
         feet: foot collision model.
         seconds: how long to stand.
-        tick: called after every simulated second.
     """
-    physics = Physics(1, feet, _NOMINAL, threads=1, seed=0)
+    physics = BatchPhysics(1, feet, _NOMINAL, threads=1, seed=0)
     rng, std = np.random.default_rng(0), noise_std(_NOISELESS)
-    qpos = events.neutral(1)
+    qpos = neutral_qpos(1)
     physics.place(np.arange(1), qpos, qpos[:, 7:])
     commands = neutral(round(seconds * CONTROLLER_HZ), 1, rng)
     no_delay = np.zeros(1, np.intp)
     x = physics.snapshot()
     controller.reset(measure(x, commands[0], std, rng))
     torques = []
-    for k, command in enumerate(commands):
+    for command in commands:
         physics.step(controller.step(measure(x, command, std, rng)), no_delay)
         x = physics.snapshot()
         torques.append(x.torque[0].copy())
-        if k % CONTROLLER_HZ == 0:
-            tick()
     final = physics.qpos[0].copy()
     physics.close()
     mean = np.mean(torques[len(torques) // 2 :], axis=0)
@@ -155,11 +149,11 @@ def _cone_edges(model: mujoco.MjModel, data: mujoco.MjData) -> Array:
 
 
 def describe(load: StandingLoad) -> str:
-    """One line about the joint that is loaded most beyond the bar."""
+    """One line about the joint with the largest excess."""
     joint = int(np.argmax(load.excess))
-    verdict = "within the bar" if load.excess[joint] <= 0.0 else "EXCEEDED"
+    verdict = "within the limit" if load.excess[joint] <= 0.0 else "EXCEEDED"
     return (
         f"standing load: {JOINT_NAMES[joint]} {abs(load.mean[joint]):.2f} N m, gravity needs "
         f"{abs(load.needed[joint]):.2f} N m; {load.excess[joint]:+.1%} of the peak torque against "
-        f"the bar (need + {RELATIVE_MARGIN:.0%} + {ABSOLUTE_MARGIN:.0%} of peak): {verdict}"
+        f"the limit (need + {RELATIVE_MARGIN:.0%} + {ABSOLUTE_MARGIN:.0%} of peak): {verdict}"
     )

@@ -15,8 +15,8 @@ from egovcp.robot.stance import StanceController
 from egovcp.robot.stance_table import standing_pose
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp_train.lowlevel.evaluate import main
-from egovcp_train.lowlevel.heat import StandingLoad, relative_rms, standing_load, static_torque
 from egovcp_train.lowlevel.physics import compile_model
+from egovcp_train.lowlevel.torque import StandingLoad, relative_rms, standing_load, static_torque
 
 KNEE = JOINT_NAMES.index("left_knee_joint")
 HIP_ROLLS = [JOINT_NAMES.index(f"{side}_hip_roll_joint") for side in ("left", "right")]
@@ -86,7 +86,7 @@ def test_lowlevel_json_has_the_torque_of_every_joint(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     quick = standing_load(make_controller("stance"), seconds=1.0)
-    monkeypatch.setattr("egovcp_train.lowlevel.heat.standing_load", lambda *_: quick)
+    monkeypatch.setattr("egovcp_train.lowlevel.torque.standing_load", lambda *_: quick)
     from egovcp_train.lowlevel import skills
 
     short = skills.Skill("rest", "1 s at the neutral pose", 1.0, skills.neutral)

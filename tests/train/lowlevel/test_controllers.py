@@ -1,4 +1,4 @@
-"""The controller that the package ships: small, told where it comes from, and it walks."""
+"""The gait without a policy, and the controller that the package ships."""
 
 import json
 from importlib import resources
@@ -8,11 +8,34 @@ import pytest
 from safetensors import safe_open
 
 from egovcp.robot.controllers import make_controller
+from egovcp.robot.walking import ACTIONS, WalkConfig, WalkingController
 from egovcp.sim.config import SensorConfig
-from egovcp_train.lowlevel.skills import SKILLS, Skill
-from egovcp_train.lowlevel.task import DisturbanceConfig
-from egovcp_train.lowlevel.trial import Outcome, play
+from egovcp_train.lowlevel.config import DisturbanceConfig
+from egovcp_train.lowlevel.skills import SKILLS, Skill, walking
+from egovcp_train.lowlevel.trial import SkillOutcome, play
 
+
+# --- the gait without a policy --------------------------------------------------------
+class NoResidual:
+    """A policy that leaves everything to what surrounds it."""
+
+    config = WalkConfig()
+    digest = "none"
+
+    def __call__(self, observation: np.ndarray) -> np.ndarray:
+        return np.zeros((len(observation), ACTIONS), np.float32)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_robots_of_randomised_physics_are_still_up_and_walking_after_two_seconds(seed: int):
+    skill = Skill("alone", "", 2.0, walking((0.1, 0.6), (0.70, 0.74)))
+    physics, sensors = DisturbanceConfig(models=16), SensorConfig()
+    outcome = play(WalkingController(NoResidual()), skill, 16, seed, physics, sensors, "points")
+    assert outcome.survived.mean() > 0.7
+    assert outcome.stepping.min() > 0.6
+
+
+# --- the shipped controller -----------------------------------------------------------
 FILE = resources.files("egovcp.robot").joinpath("g1_walk.safetensors")
 
 
@@ -35,7 +58,7 @@ def test_it_walks_and_the_stance_law_does_not():
     assert not make_controller("stance").walks
 
 
-def _short(name: str, seconds: float) -> Outcome:
+def _short(name: str, seconds: float) -> SkillOutcome:
     (skill,) = [s for s in SKILLS if s.name == name]
     short = Skill(**{**vars(skill), "seconds": seconds})
     return play(make_controller("walk"), short, 8, 3, DisturbanceConfig(models=8), SensorConfig())

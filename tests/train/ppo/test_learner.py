@@ -1,6 +1,7 @@
 """The simulator as PPO sees it, and PPO: episodes, pictures, time limits, and that it learns."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,9 +15,8 @@ from egovcp.reactive import ReactiveConfig
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import Observation, StepResult
 from egovcp.sim.scenario import Scenario
-from egovcp_train.ppo.config import ContactPpoConfig, PpoTrainConfig
-from egovcp_train.ppo.env import ContactEnv
-from egovcp_train.ppo.learn import ContactLearner
+from egovcp_train.ppo.config import PpoTrainConfig
+from egovcp_train.ppo.learner import ContactEnv, ContactLearner
 
 LIMIT = 4
 TINY = ReactiveConfig(frames=2, channels=(2, 2, 2), hidden=(16,))
@@ -65,7 +65,7 @@ class _Fake:
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("egovcp_train.ppo.env.VectorEnv", _Fake)
+    monkeypatch.setattr("egovcp_train.ppo.learner.VectorEnv", _Fake)
 
 
 @pytest.fixture
@@ -139,7 +139,7 @@ def test_returns_are_those_of_whole_episodes(build: Build) -> None:
 
 def test_it_learns_what_is_rewarded_and_exports_what_it_learned() -> None:
     torch.manual_seed(0)
-    ppo = ContactPpoConfig(num_steps_per_env=8, learning_rate=3e-3, desired_kl=0.05)
+    ppo = replace(PpoTrainConfig("").ppo, num_steps_per_env=8, learning_rate=3e-3, desired_kl=0.05)
     config = PpoTrainConfig("unused", robots=8, network=TINY, ppo=ppo, initial_std=0.2)
     learner = ContactLearner(config)
     rewards = [learner.iterate()["reward"] for _ in range(25)]

@@ -9,15 +9,15 @@ from scipy.spatial.transform import Rotation
 from egovcp.robot.geometry import rotation_vector
 from egovcp.sim.camera import RayCastCamera
 from egovcp.sim.config import CameraConfig
-from egovcp_train.lowlevel import camera, events
-from egovcp_train.lowlevel.camera import TorsoMotion
-from egovcp_train.lowlevel.physics import Physics, Snapshot
-from egovcp_train.lowlevel.task import DisturbanceConfig
+from egovcp_train.lowlevel import sensing
+from egovcp_train.lowlevel.config import DisturbanceConfig
+from egovcp_train.lowlevel.physics import BatchPhysics, Snapshot, neutral_qpos
+from egovcp_train.lowlevel.sensing import TorsoMotion
 
 
 def test_the_focal_length_is_that_of_the_depth_image():
-    assert pytest.approx(RayCastCamera(CameraConfig()).focal) == camera.FOCAL
-    assert pytest.approx(43.3, abs=0.01) == camera.FOCAL
+    assert pytest.approx(RayCastCamera(CameraConfig()).focal) == sensing.FOCAL
+    assert pytest.approx(43.3, abs=0.01) == sensing.FOCAL
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-5, 0.3, 3.0])
@@ -31,13 +31,13 @@ def test_a_rotation_vector_is_axis_times_angle(angle: float):
 
 def test_pixels_are_those_of_pitch_yaw_and_roll():
     roll, pitch, yaw = 0.1 * np.eye(3)
-    found = camera.pixels(np.stack([pitch, yaw, roll]))
+    found = sensing.pixels(np.stack([pitch, yaw, roll]))
     np.testing.assert_allclose(found, np.diag([4.33, 4.33, 3.2]), atol=0.01)
 
 
 def _standing(n: int) -> Snapshot:
-    physics = Physics(n, "points", DisturbanceConfig(models=1), 1, 0)
-    qpos = events.neutral(n)
+    physics = BatchPhysics(n, "points", DisturbanceConfig(models=1), 1, 0)
+    qpos = neutral_qpos(n)
     physics.place(np.arange(n), qpos, qpos[:, 7:])
     x = physics.snapshot()
     physics.close()

@@ -1,0 +1,222 @@
+"""Training with rsl-rl's PPO: options, learner, and the loop of iterations."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections import defaultdict
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from egovcp.bounds import bounded
+from egovcp.stop_signals import stop_on_signal
+from egovcp_train.checkpoint import checkpoint_dir, new_checkpoint
+from egovcp_train.loop import Budget
+from egovcp_train.records import TensorBoardRecorder
+
+type Log = dict[str, list[float]]
+
+
+@dataclass(frozen=True)
+class PpoOptions:
+    """Proximal policy optimisation; the names are rsl-rl's."""
+
+    num_steps_per_env: int = bounded(24, least=1, most=100_000)
+    """Ticks per robot and iteration."""
+    num_learning_epochs: int = bounded(4, least=1, most=10_000)
+    """Passes over the data of an iteration."""
+    num_mini_batches: int = bounded(4, least=1, most=65_536)
+    """Mini-batches per pass."""
+    learning_rate: float = bounded(1e-3, above=0)
+    """Initial learning rate; it then follows desired_kl."""
+    desired_kl: float = bounded(0.02, above=0)
+    """KL divergence per update at which the learning rate aims."""
+    gamma: float = bounded(0.99, least=0, most=1)
+    """Discount per tick."""
+    lam: float = bounded(0.95, least=0, most=1)
+    """Lambda of generalised advantage estimation."""
+    clip_param: float = bounded(0.2, above=0)
+    """Clipping of the probability ratio."""
+    entropy_coef: float = bounded(0.0, least=0)
+    """Weight of the entropy bonus."""
+
+
+def rsl_rl_config(
+    ppo: PpoOptions,
+    actor: Mapping[str, Any],
+    critic: Mapping[str, Any],
+    obs_groups: Mapping[str, list[str]],
+    initial_std: float,
+    symmetry: Mapping[str, Any] | None = None,
+) -> dict[str, Any]:
+    """rsl-rl's configuration.
+
+    Args:
+        ppo: options of the algorithm.
+        actor: options of its model.
+        critic: likewise.
+        obs_groups: model -> groups of observations that it reads.
+        initial_std: standard deviation of the actions at the start.
+        symmetry: rsl-rl's ``symmetry_cfg``.
+    """
+    noise = {"class_name": "GaussianDistribution", "init_std": initial_std, "std_type": "log"}
+    options = asdict(ppo)
+    return {
+        "num_steps_per_env": options.pop("num_steps_per_env"),
+        "obs_groups": dict(obs_groups),
+        "actor": {**actor, "distribution_cfg": noise},
+        "critic": dict(critic),
+        "algorithm": {
+            **options,
+            "class_name": "PPO",
+            "schedule": "adaptive",
+            "symmetry_cfg": symmetry,
+            "rnd_cfg": None,
+        },
+        "multi_gpu": None,
+    }
+
+
+def shrink_output(mlp: torch.nn.Sequential) -> None:
+    """Scale the last layer down, so that the initial actions are almost zero.
+
+    Under symmetry augmentation, the probability ratios of mirrored samples are far from 1 for a
+    policy that is not symmetric; one whose actions are near zero almost is.
+    """
+    last = [m for m in mlp if isinstance(m, torch.nn.Linear)][-1]
+    with torch.no_grad():
+        last.weight.mul_(0.01)
+        last.bias.zero_()
+
+
+class OnPolicyLearner:
+    """An environment (rsl-rl's `VecEnv`) and PPO, one iteration at a time."""
+
+    def __init__(self, env: Any, config: dict[str, Any]) -> None:
+        from rsl_rl.algorithms import PPO  # an optional package
+
+        self.env, self.iteration = env, 0
+        self.ticks: int = config["num_steps_per_env"]
+        with contextlib.redirect_stdout(io.StringIO()):  # rsl-rl prints its networks
+            self.ppo = PPO.construct_algorithm(env.get_observations(), env, config, "cpu")
+        shrink_output(self.ppo.get_policy().mlp)
+        self.ppo.train_mode()
+
+    @property
+    def steps(self) -> int:
+        """Ticks simulated so far, over all robots."""
+        return self.iteration * self.ticks * int(self.env.num_envs)
+
+    def iterate(self) -> dict[str, float]:
+        """Collect and update once; returns scalars to log."""
+        log: Log = defaultdict(list)
+        with torch.inference_mode():
+            obs = self.env.get_observations()
+            for _ in range(self.ticks):
+                before = obs
+                obs, reward, done, extras = self.env.step(self.ppo.act(obs))
+                self.ppo.process_env_step(obs, reward, done, extras)
+                self.record(log, before, reward, done, extras)
+            self.ppo.compute_returns(obs)
+        losses = self.update()
+        self.iteration += 1
+        losses |= {
+            "learning_rate": self.ppo.learning_rate,
+            "action_std": self.ppo.get_policy().output_std.mean().item(),
+        }
+        scalars = {name: float(np.mean(values)) for name, values in log.items()}
+        return scalars | {f"ppo/{name}": float(value) for name, value in losses.items()}
+
+    def record(
+        self, log: Log, obs: Any, reward: torch.Tensor, done: torch.Tensor, extras: dict[str, Any]
+    ) -> None:
+        """Add a tick to the log, the mean of whose values is recorded per iteration."""
+        raise NotImplementedError
+
+    def update(self) -> dict[str, float]:
+        """One update of PPO; returns its losses."""
+        losses: dict[str, float] = self.ppo.update()
+        return losses
+
+    def state_dict(self) -> dict[str, Any]:
+        """Networks and optimiser; after a resume the robots start new episodes."""
+        return {"ppo": self.ppo.save(), "iteration": self.iteration}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Restore what `state_dict` has returned."""
+        self.ppo.load(state["ppo"], None, strict=True)
+        self.iteration = int(state["iteration"])
+
+
+class OnPolicyConfig(Protocol):
+    """Options that both commands have."""
+
+    @property
+    def steps(self) -> int: ...
+    @property
+    def max_minutes(self) -> float: ...
+    @property
+    def save_freq(self) -> int: ...
+    @property
+    def tensorboard(self) -> bool: ...
+
+
+def run_iterations(
+    learner: OnPolicyLearner,
+    config: OnPolicyConfig,
+    output: Path,
+    write_policy: Callable[[Path], None],
+    summary: Callable[[dict[str, float]], dict[str, str]],
+    spent: float = 0.0,
+) -> tuple[Path, bool]:
+    """Train until the budget or a signal ends the run; the last state is always saved.
+
+    Args:
+        learner: what is trained.
+        config: its budget.
+        output: folder of the run.
+        write_policy: writes the policy to a folder.
+        summary: scalars of an iteration -> text beside the progress bar.
+        spent: seconds that the run took before it was resumed.
+
+    Returns:
+        The folder of the last policy, and whether the budget is spent.
+    """
+    budget = Budget(config.steps, config.max_minutes, spent=spent)
+    recorder = TensorBoardRecorder(output, enabled=config.tensorboard)
+
+    def save() -> None:
+        state = learner.state_dict() | {"seconds": budget.spent}
+        with new_checkpoint(output, learner.iteration, state) as folder:
+            write_policy(folder)
+
+    start = learner.iteration
+    with (
+        stop_on_signal() as stopped,
+        tqdm(
+            total=budget.steps,
+            initial=learner.steps,
+            unit="step",
+            unit_scale=True,
+            desc="ppo",
+            mininterval=2.0,
+        ) as bar,
+    ):
+        while budget.progress(learner.steps) < 1.0 and not stopped:
+            scalars = learner.iterate()
+            recorder.scalars(learner.steps, scalars)
+            bar.set_postfix(summary(scalars), refresh=False)
+            bar.update(learner.steps - bar.n)
+            if learner.iteration % config.save_freq == 0:
+                save()
+    if learner.iteration > start and learner.iteration % config.save_freq:
+        save()
+    recorder.close()
+    final = checkpoint_dir(output, learner.iteration) / "pretrained_model"
+    return final, budget.progress(learner.steps) >= 1.0
