@@ -53,6 +53,7 @@ from egovcp_train.publish import publish_trained, reserve_policy, versions, writ
 from egovcp_train.records import Records, TensorBoardRecorder, WandbRecorder, require_wandb
 
 PROG = "egovcp-train"
+EPILOG = "Other options are constants of --preset; a file given as --config_path can set them."
 LAUNCHER_ECHO_S = 5.0
 _BATCH_COPIES: Final = 4  # of a batch on a CPU: float32, and intermediate results of gradients
 _UNRECORDED = (
@@ -63,7 +64,9 @@ _UNRECORDED = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return run_command(TrainConfig, train, argv, prog=PROG, defaults=option_defaults)
+    return run_command(
+        TrainConfig, train, argv, prog=PROG, epilog=EPILOG, defaults=option_defaults
+    )
 
 
 def option_defaults(argv: Sequence[str]) -> dict[str, Any]:
