@@ -48,19 +48,25 @@ type Curves = dict[str, list[float | None]]
 
 
 class PictureSink:
-    """Collects the ticks of a run and draws them on `close`."""
+    """Collects the ticks of a run and draws them on `close`, as a picture or a video."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, *paths: Path) -> None:
+        """Choose the files.
+
+        Args:
+            paths: ``.png`` for key frames, ``.gif`` or ``.mp4`` for a video.
+        """
+        self._paths = paths
         self._title = ""
         self._ticks: list[Tick] = []
 
     def open(self, info: RunInfo) -> None:
-        """Check that the file does not exist."""
-        if self._path.exists():
-            raise EnvironmentFailure(
-                f"{self._path} exists already; recordings are never overwritten: choose another"
-            )
+        """Check that the files do not exist."""
+        for path in self._paths:
+            if path.exists():
+                raise EnvironmentFailure(
+                    f"{path} exists already; recordings are never overwritten: choose another"
+                )
         self._title = f"{info.task}, seed {info.seed}, episode {info.episode}"
 
     def write(self, tick: Tick) -> None:
@@ -70,10 +76,15 @@ class PictureSink:
         self._ticks.append(replace(tick, candidates=None, depth_imagined=shown))
 
     def close(self) -> None:
-        """Draw the picture, if there are ticks."""
-        if self._ticks:
-            rollout_picture(self._ticks, self._path, self._title)
-            self._ticks = []
+        """Draw the files, if there are ticks."""
+        ticks, self._ticks = self._ticks, []
+        for path in self._paths if ticks else ():
+            if path.suffix == ".png":
+                rollout_picture(ticks, path, self._title)
+            else:
+                from egovcp.log.video import write_video
+
+                write_video(ticks, path)
 
 
 def rollout_picture(ticks: Sequence[Tick], path: Path, title: str = "") -> None:
@@ -126,12 +137,12 @@ def _draw_images(
     first, *others = grid.subplots(squeeze=False)
     meshes = link_meshes(_MESH_GRID_M)
     for axes, i in zip(first, frames, strict=True):
-        _robot(axes, ticks[i], meshes)
+        draw_robot(axes, ticks[i], meshes)
         axes.set_title(f"{ticks[i].index * PLANNER_DT:.2f} s", fontsize=9)
     for row, (name, images) in zip(others, rows.items(), strict=True):
         row[0].set_ylabel(name, fontsize=9)
         for axes, depth in zip(row, images, strict=True):
-            _depth(axes, depth)
+            draw_depth(axes, depth)
 
 
 def imagined_of(ticks: Sequence[Tick], i: int) -> NDArray[np.floating] | None:
@@ -140,7 +151,8 @@ def imagined_of(ticks: Sequence[Tick], i: int) -> NDArray[np.floating] | None:
     return images[AHEAD - 1] if images is not None and len(images) >= AHEAD else None
 
 
-def _robot(axes: Any, tick: Tick, meshes: dict[str, LinkMesh]) -> None:
+def draw_robot(axes: Any, tick: Tick, meshes: dict[str, LinkMesh]) -> None:
+    """Draw robot and scene of a tick; without meshes the robot is a skeleton."""
     pose = robot_pose(tick)
     pelvis_w = pose.positions_w[0]
     view = Viewpoint().following(pelvis_w)
@@ -154,7 +166,8 @@ def _robot(axes: Any, tick: Tick, meshes: dict[str, LinkMesh]) -> None:
     axes.set_frame_on(False)
 
 
-def _depth(axes: Any, depth_m: NDArray[np.floating] | None) -> None:
+def draw_depth(axes: Any, depth_m: NDArray[np.floating] | None) -> None:
+    """Draw a depth image (48, 64) in m; None: an empty field."""
     axes.set(xticks=[], yticks=[])
     if depth_m is None:
         axes.set_facecolor("0.95")
