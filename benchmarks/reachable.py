@@ -28,7 +28,7 @@ from report import publish
 from true_state import Array, Columns, true_states
 
 from egovcp import spec
-from egovcp.artifact import Artifact, load_artifact
+from egovcp.artifact import Artifact, load_artifact, returns_of
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore, ReturnConfig
 from egovcp.data.index import EpisodeIndex, in_split, require_mixable
@@ -37,7 +37,6 @@ from egovcp.data.store import gather
 from egovcp.errors import DataError, UsageError
 from egovcp.model.losses import filter_sequence
 from egovcp.policy_options import PolicyOptions
-from egovcp.trained import returns_of
 from egovcp_train.datasets import to_tensors
 from egovcp_train.heldout.command import require_same_controller
 from egovcp_train.heldout.report import calibration

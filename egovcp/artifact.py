@@ -1,35 +1,46 @@
-"""The policy artifact: a LeRobot ``pretrained_model`` folder that explains itself.
+"""The policy artifact: a LeRobot ``pretrained_model`` folder.
 
     config.json        "type": "egovcp", network and planner configuration, features
     model.safetensors  weights and normalisation statistics
-    policy_*.json      the steps LeRobot takes before and after the policy
+    policy_*.json      LeRobot's steps before and after the policy
     manifest.json      schema version, SHA-256 of all files and its own, data, controller, code
 
-safetensors and JSON only: loading an artifact never executes code. Other files beside these, such
-as a model card and its pictures, are no part of it: neither read nor, from the Hub, fetched.
+Loading never executes code: there is only safetensors and JSON. Other files in the folder, such as
+a model card, are neither read nor fetched from the Hub.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import draccus
 from safetensors.torch import save
 from torch import Tensor
 
-from egovcp.atomic import removed_on_error, write_bytes
 from egovcp.decode import DecodeError, decode, require_type, shown
 from egovcp.errors import ArtifactError, UsageError
+from egovcp.files import (
+    JSON_LIMIT_BYTES,
+    UnsafeFileError,
+    read_bytes,
+    removed_on_error,
+    sha256,
+    write_bytes,
+)
 from egovcp.hub import HubUnreachable, RetryPolicy, is_local_path, is_repo_id, snapshot
 from egovcp.manifest import (
+    INPUT_FEATURES,
     MANIFEST,
+    OUTPUT_FEATURES,
+    PROCESSORS,
     SCHEMA_VERSION,
     feature_spec,
     read_manifest,
@@ -41,10 +52,11 @@ from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.model.weights import load_model, size_limit, tensor_shapes
 from egovcp.plan import PlannerConfig, Policy, require_compatible
 from egovcp.plan.config import require_affordable
-from egovcp.processors import INPUT_FEATURES, OUTPUT_FEATURES, PROCESSORS
-from egovcp.safe_files import JSON_LIMIT_BYTES, UnsafeFileError, read_bytes, sha256
 
-#: Options of world models that older versions trained; this version has none of them.
+if TYPE_CHECKING:
+    from egovcp.data import ReturnConfig
+
+#: Options of world models of older versions.
 _TRACKER_OPTIONS: Final = frozenset(
     {
         "flight",
@@ -57,7 +69,7 @@ _TRACKER_OPTIONS: Final = frozenset(
     }
 )
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
-#: All files of an artifact: nothing else is read, nor fetched from the Hub.
+#: All files of an artifact.
 FILES: Final = (CONFIG, WEIGHTS, MANIFEST, *PROCESSORS)
 #: Where a training run keeps its latest policy.
 _IN_RUN: Final = "checkpoints/last/pretrained_model"
@@ -75,7 +87,7 @@ class Artifact:
 
     @property
     def controller_id(self) -> str:
-        """The low-level controller of the data; the policy drives no other."""
+        """Id of the low-level controller of the training data."""
         return str(self.manifest["controller_id"])
 
     def make_policy(
@@ -102,9 +114,8 @@ def save_artifact(
 
     Args:
         path: folder to create; an older artifact there is replaced once the new one is
-            complete, and stays if anything fails.
-        provenance: JSON-able; must hold ``controller_id`` and says which data and
-            command made the policy.
+            complete, and stays on an error.
+        provenance: entries of the manifest; must hold ``controller_id``.
 
     Raises:
         ArtifactError: the provenance names no controller, or a number in it is not finite.
@@ -136,7 +147,7 @@ def write_artifact(
     Args:
         config: LeRobot's configuration of the policy, with ``world_model`` and ``planner``.
         weights: the state of the world model.
-        processors: JSON file name -> content; may be empty if somebody else writes them.
+        processors: JSON file name -> content; empty: they are not written.
 
     Raises:
         ArtifactError: the provenance names no controller, or a number in it is not finite.
@@ -163,7 +174,7 @@ def _require_controller_id(path: Path, provenance: Mapping[str, Any]) -> None:
 
 
 def _replace(path: Path, new: Path) -> None:
-    """Put folder ``new`` in the place of ``path``, whose old content stays until it is there."""
+    """Rename folder ``new`` to ``path``, replacing it; on an error the old folder stays."""
     old = path.with_name(path.name + ".old")
     shutil.rmtree(old, ignore_errors=True)
     if path.exists():
@@ -180,25 +191,27 @@ def _replace(path: Path, new: Path) -> None:
 def load_artifact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POLICY) -> Artifact:
     """Load and validate a policy from a folder or, failing that, a Hub model id.
 
-    If the Hub cannot be reached, an earlier download of that revision serves.
+    If the Hub cannot be reached, an earlier download of that revision is used.
 
     Args:
         path: the folder, or `user/name`.
         revision: branch, tag or commit SHA on the Hub; empty: the latest. The name of
             `Artifact.path` is the commit's SHA then.
-        retry: how often and how long the Hub is asked.
+        retry: retries of requests to the Hub.
 
     Raises:
         ArtifactError: missing, tampered with, made for another feature spec, or with weights or
             options that cannot be used.
-        UsageError: a revision is asked of a folder.
+        UsageError: a revision is given for a folder.
         EnvironmentFailure: the Hub cannot be reached, or refuses.
     """
     folder = _locate(path, revision, retry)
     manifest = read_manifest(folder)
     digests = manifest["files"]
     for name in (CONFIG, *(name for name in PROCESSORS if name in digests)):
-        _require_digest(folder / name, _json_digest(folder / name), digests.get(name))
+        with _readable(folder / name, "the file is damaged"):
+            digest = sha256(folder / name, JSON_LIMIT_BYTES)
+        _require_digest(folder / name, digest, digests.get(name))
     _check_processors(folder)
     config, planner = read_options(folder)
     model = _load_weights(folder, config, digests.get(WEIGHTS))
@@ -206,10 +219,10 @@ def load_artifact(path: str, revision: str = "", retry: RetryPolicy = _RETRY_POL
 
 
 def read_options(folder: Path) -> tuple[WorldModelConfig, PlannerConfig]:
-    """What the policy in a folder is and how it plans, without its weights.
+    """World model and planner configuration of the policy in a folder, without its weights.
 
     Raises:
-        ArtifactError: they are missing, not readable, or ask too much of the machine.
+        ArtifactError: missing, damaged, or too expensive for this machine.
     """
     config = read_object(folder / CONFIG)
     world_model = config.get("world_model")
@@ -242,17 +255,11 @@ def _load_weights(folder: Path, config: WorldModelConfig, digest: object) -> Wor
         shapes = tensor_shapes(config)
     except ValueError as error:
         raise ArtifactError(f"{folder / CONFIG}: {error}") from error
-    try:
+    remedy = f"expected the weights of the networks in {CONFIG}: fetch or train the policy again"
+    with _readable(path, remedy):
         content = read_bytes(path, size_limit(shapes))
         _require_digest(path, hashlib.sha256(content).hexdigest(), digest)
         return load_model(config, shapes, content)
-    except OSError as error:
-        raise ArtifactError(f"{path}: {error.strerror}; the artifact is incomplete") from error
-    except UnsafeFileError as error:
-        raise ArtifactError(
-            f"{path}: {error}; expected the weights of the networks in {CONFIG}: fetch or train "
-            "the policy again"
-        ) from error
 
 
 def _locate(path: str, revision: str, retry: RetryPolicy) -> Path:
@@ -293,7 +300,7 @@ def _require_artifact_folder(folder: Path) -> None:
 def _check_processors(folder: Path) -> None:
     """Raise `ArtifactError` unless LeRobot's processors name only registered steps.
 
-    LeRobot imports whatever module a step of another kind names.
+    For other steps LeRobot would import a module that the file names.
     """
     for name in PROCESSORS:
         if not os.path.lexists(folder / name):
@@ -319,11 +326,29 @@ def _require_digest(path: Path, found: str, expected: object) -> None:
         )
 
 
-def _json_digest(path: Path) -> str:
-    """SHA-256 of a JSON file."""
+@contextlib.contextmanager
+def _readable(path: Path, remedy: str) -> Iterator[None]:
+    """Turn errors of reading a file into `ArtifactError`."""
     try:
-        return sha256(path, JSON_LIMIT_BYTES)
+        yield
     except OSError as error:
         raise ArtifactError(f"{path}: {error.strerror}; the artifact is incomplete") from error
     except UnsafeFileError as error:
-        raise ArtifactError(f"{path}: {error}; the file is damaged") from error
+        raise ArtifactError(f"{path}: {error}; {remedy}") from error
+
+
+def returns_of(artifact: Artifact) -> ReturnConfig:
+    """The configuration of the returns that Q was trained on; the default if not recorded.
+
+    Raises:
+        ArtifactError: its options are unknown to this version.
+    """
+    from egovcp.data import ReturnConfig  # needs the extra egovcp[data]
+
+    options: Any = artifact.manifest.get("train_config", {})
+    try:
+        return decode(ReturnConfig, options.get("returns", {}), "train_config.returns")
+    except DecodeError as error:
+        raise ArtifactError(
+            f"{artifact.path / MANIFEST}: {error}; train again with this version"
+        ) from error

@@ -1,11 +1,11 @@
-"""What numbers an option may be, said beside its default and checked before any work starts.
+"""Bounds of numeric options, declared with the default and checked before any work starts.
 
     @dataclass(frozen=True)
     class OptimizerConfig:
         lr: float = bounded(1e-3, above=0)
 
-`egovcp.cli` checks what it has parsed, and ``--help`` tells the bounds. A config that is made
-elsewhere too checks itself in its ``__post_init__``, beside what its options must be together.
+`egovcp.cli` checks parsed options, and ``--help`` shows the bounds. A config that is also created
+elsewhere calls `check_bounds` in ``__post_init__``.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from egovcp.errors import UsageError
 from egovcp.hardware import available_cores
 
 MOST_PER_CORE: Final = 8
-"""Threads or processes that a processor core may be shared by."""
+"""Most threads or processes per processor core."""
 
 _KEY: Final = "bounds"
 _FINITE: Final = "a finite number"
@@ -32,19 +32,19 @@ _LARGE: Final = 10**100
 
 @dataclass(frozen=True)
 class Bounds:
-    """An interval, open where it is ``above`` or ``below`` something."""
+    """An interval, closed at ``least`` and ``most``, open at ``above`` and ``below``."""
 
     least: float | None = None
     most: float | None = None
     above: float | None = None
     below: float | None = None
     longest: int | None = None
-    """Most numbers of a list."""
+    """Longest list."""
     per_core: int | None = None
-    """Largest number for each processor core of this machine, see `check_cores`."""
+    """Largest number per processor core of this machine, see `check_cores`."""
 
     def hold(self, value: float) -> bool:
-        """Whether a number lies within."""
+        """Whether a number is within the bounds."""
         return (
             _is_finite(value)
             and (self.least is None or value >= self.least)
@@ -54,7 +54,7 @@ class Bounds:
         )
 
     def __str__(self) -> str:
-        """In words, as after "expected"."""
+        """Text for messages, to follow "expected"."""
         words = {
             "at least": self.least,
             "more than": self.above,
@@ -80,8 +80,8 @@ def bounded[T](
     longest: int | None = None,
     per_core: int | None = None,
 ) -> T:
-    """A dataclass field with this default whose value, or each number in it, has bounds; None,
-    where the type allows it, stands for no number."""
+    """A dataclass field with a default and bounds on its value, or on each number in it; None is
+    not checked."""
     metadata = {_KEY: Bounds(least, most, above, below, longest, per_core)}
     if isinstance(default, dict):
         return field(default_factory=partial(copy, default), metadata=metadata)
@@ -89,20 +89,20 @@ def bounded[T](
 
 
 def bounds_of(option: dataclasses.Field[Any]) -> Bounds | None:
-    """Those that were declared."""
+    """The declared bounds of a field, if any."""
     found: Bounds | None = option.metadata.get(_KEY)
     return found
 
 
 class OutOfBounds(UsageError):
-    """A number that an option may not be."""
+    """The value of an option is out of bounds."""
 
     def __init__(self, option: str, value: object, expected: str) -> None:
         super().__init__(f"{option}={as_flag_value(value)}: expected {expected}")
         self._facts = option, value, expected
 
     def under(self, prefix: str) -> OutOfBounds:
-        """The same, of an option of the config that has this name."""
+        """The same error with a prefix before the name of the option."""
         option, value, expected = self._facts
         return OutOfBounds(f"{prefix}{option}", value, expected)
 
@@ -110,11 +110,7 @@ class OutOfBounds(UsageError):
 def leaf_options(
     config: Any, prefix: str = ""
 ) -> Iterator[tuple[str, dataclasses.Field[Any], Any]]:
-    """Name, field and value of every option of a dataclass and of the dataclasses within it.
-
-    Args:
-        prefix: what stands before each name, such as ``--policy.``.
-    """
+    """(name with ``prefix``, field, value) of every option of a dataclass and nested ones."""
     for option in dataclasses.fields(config):
         name, value = f"{prefix}{option.name}", getattr(config, option.name)
         if dataclasses.is_dataclass(value):
@@ -124,15 +120,8 @@ def leaf_options(
 
 
 def check_bounds(config: Any, prefix: str = "") -> None:
-    """Hold every number in a dataclass, and in those within it, against its bounds; without any it
-    has to be finite.
-
-    Args:
-        prefix: as `leaf_options`.
-
-    Raises:
-        OutOfBounds: one is not within.
-    """
+    """Raise `OutOfBounds` unless all numbers in a dataclass and nested ones are finite and within
+    their bounds."""
     for name, option, value in leaf_options(config, prefix):
         bounds = bounds_of(option) or _ANY
         if bounds.longest is not None and len(value) > bounds.longest:
@@ -144,12 +133,9 @@ def check_bounds(config: Any, prefix: str = "") -> None:
 
 
 def check_cores(config: Any, prefix: str = "") -> None:
-    """Hold the numbers of threads and processes in a dataclass against the processor cores here.
+    """Raise `OutOfBounds` for more threads or processes than this machine's cores allow.
 
-    It is not part of `check_bounds`, because a config may describe work on another machine.
-
-    Raises:
-        OutOfBounds: there are too many.
+    Not part of `check_bounds`, because a config may describe work on another machine.
     """
     for name, option, value in leaf_options(config, prefix):
         bounds = bounds_of(option)
@@ -158,7 +144,7 @@ def check_cores(config: Any, prefix: str = "") -> None:
 
 
 def require_cores(option: str, count: int, per_core: int = MOST_PER_CORE) -> None:
-    """Raise `OutOfBounds` for more threads or processes than ``per_core`` on each core here."""
+    """Raise `OutOfBounds` for more than ``per_core`` threads or processes per processor core."""
     cores = available_cores()
     if count > per_core * cores:
         expected = f"at most {per_core * cores}, {per_core} for each of {cores} processor cores"
@@ -168,12 +154,12 @@ def require_cores(option: str, count: int, per_core: int = MOST_PER_CORE) -> Non
 def _is_finite(number: float) -> bool:
     try:
         return math.isfinite(number)
-    except OverflowError:  # an integer that no float can hold
+    except OverflowError:  # an integer beyond float64
         return False
 
 
 def _numbers(value: object, name: str) -> Iterator[float]:
-    """All numbers in a value; dataclasses in a list of them are checked one by one."""
+    """All numbers in a value; dataclasses in a list are checked."""
     match value:
         case bool() | str():
             return
@@ -191,9 +177,9 @@ def _numbers(value: object, name: str) -> Iterator[float]:
 
 
 def as_flag_value(value: object) -> str:
-    """A value as it is written on a command line, shortened if it is long."""
+    """A value in command-line syntax, truncated if it is long."""
     text = ""
-    for part in _yaml(value):  # may be endless: a YAML alias can name the list that it is in
+    for part in _yaml(value):  # may be endless: YAML aliases can be recursive
         text += part
         if len(text) > _SHOWN_LENGTH:
             return f"{text[:_SHOWN_LENGTH]}..."
@@ -205,7 +191,7 @@ def _yaml(value: object) -> Iterator[str]:
         case None | bool():
             yield {None: "null", True: "true", False: "false"}[value]
         case int():
-            yield f"{value:d}" if abs(value) < _LARGE else f"{value:#x}"  # decimal is limited
+            yield (f"{value:d}" if abs(value) < _LARGE else f"{value:#x}")  # digits are limited
         case Mapping():
             yield "{"
             for index, (key, inner) in enumerate(value.items()):

@@ -1,6 +1,6 @@
-"""What every command shares: dotted flags from a dataclass, clear errors, exit codes.
+"""Runs a command: parses flags into a dataclass, reports errors, returns exit codes.
 
-A command is a dataclass of its options and a function that takes it::
+A command is a dataclass of options and a function::
 
     def main(argv: Sequence[str] | None = None) -> int:
         return run_command(CollectConfig, collect, argv, prog="egovcp-collect")
@@ -21,13 +21,12 @@ from typing import Any, Final
 
 import draccus
 
-from egovcp.atomic import write_text
 from egovcp.bounds import bounded, check_bounds, check_cores
+from egovcp.entry_point import INTERRUPTED, raise_on_sigint
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
+from egovcp.files import write_text
 from egovcp.flags import HELP, flag_values, merged, split_flags
 from egovcp.help_text import print_help
-from egovcp.interrupts import EXIT_CODE as INTERRUPTED
-from egovcp.interrupts import raise_on_sigint
 from egovcp.outputs import check_output_files
 from egovcp.packages import missing_package
 from egovcp.terminal import echo, one_line
@@ -36,7 +35,7 @@ from egovcp.values import WrongValue, build
 
 @dataclass(frozen=True)
 class DatasetConfig:
-    """Which LeRobot dataset: on the Hub, or on disk."""
+    """A LeRobot dataset on the Hub or on disk."""
 
     repo_id: str = ""
     """Dataset id, `user/name`; looked up on the Hub unless root holds it."""
@@ -73,12 +72,12 @@ def parse_config[C](
 ) -> C:
     """Parse dotted flags into ``config_class``.
 
-    A switch without a value is true (``--resume`` is ``--resume=true``). A list is written
-    ``[a, b]`` or ``(a, b)``. ``defaults`` maps the flags, ``--name=value`` each, to nested values
-    that stand where no flag and no config file says otherwise.
+    A flag without a value is true (``--resume`` is ``--resume=true``). A list is written
+    ``[a, b]`` or ``(a, b)``. ``defaults`` maps the flags, each as ``--name=value``, to nested
+    default values; flags and the config file override them.
 
     Raises:
-        EgovcpError: a value is not allowed; the message names the flag.
+        EgovcpError: a value is invalid; the message names the flag.
         SystemExit: after ``--help``.
     """
     try:
@@ -105,7 +104,7 @@ def run_command[C](
     epilog: str = "",
     defaults: Callable[[Sequence[str]], Mapping[str, Any]] | None = None,
 ) -> int:
-    """Parse ``argv``, call ``run`` and return the exit code; one line on an error."""
+    """Parse ``argv``, call ``run`` and return the exit code; errors are printed as one line."""
     args = list(sys.argv[1:] if argv is None else argv)
     switch = ("--debug", "--debug=true")
     debug = any(a in switch for a in args)
@@ -125,7 +124,7 @@ def run_command[C](
             raise
         return report_error(prog, missing, debug)
     except BrokenPipeError:
-        raise  # the reader of the output has gone: `EntryPoint` ends the process
+        raise  # handled by `EntryPoint`
     except (OSError, UnicodeEncodeError) as error:
         failure = _user_error(error)
         if failure is None:
@@ -135,12 +134,12 @@ def run_command[C](
 
 
 _MESSAGE_LIMIT: Final = 2000
-#: What a path on the command line can be wrong in.
+#: Errors of a path on the command line.
 _PATH_ERRNOS: Final = {
     *(errno.ENAMETOOLONG, errno.ELOOP, errno.ENOTDIR, errno.EISDIR, errno.EINVAL, errno.ENOENT),
     *(errno.EEXIST, errno.ENOTEMPTY, errno.ENXIO, errno.ENODEV, errno.ESPIPE),
 }
-#: What the system refuses, whether it names a file or not.
+#: Errors of the system, with or without a file.
 _ENVIRONMENT_ERRNOS: Final = {
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EADDRINUSE),
     *(errno.EMFILE, errno.ENFILE, errno.EIO, errno.EBUSY, errno.EFBIG, errno.ESTALE),
@@ -149,7 +148,7 @@ _ENVIRONMENT_ERRNOS: Final = {
 
 
 def _user_error(error: OSError | UnicodeEncodeError) -> EgovcpError | None:
-    """The error as one that a user can cause; None: a bug."""
+    """The error as an `EgovcpError`; None: a bug."""
     if isinstance(error, UnicodeEncodeError):
         if error.reason != "surrogates not allowed":
             return None
@@ -163,18 +162,18 @@ def _user_error(error: OSError | UnicodeEncodeError) -> EgovcpError | None:
 
 
 def report_error(prog: str, error: EgovcpError, debug: bool = False) -> int:
-    """Print the error as one line, with ``debug`` after its traceback; return its exit code."""
+    """Print the error as one line, after its traceback if ``debug``; return its exit code."""
     if debug:
         echo(_without_token(traceback.format_exc()), end="", error=True)
     message = one_line(error)
-    if len(message) > _MESSAGE_LIMIT:  # it quotes a long value
+    if len(message) > _MESSAGE_LIMIT:
         message = f"{message[:_MESSAGE_LIMIT]}..."
     echo(f"{prog}: error: {message}", error=True)
     return error.exit_code
 
 
 def _without_token(text: str) -> str:
-    """The text without the user's token for the Hub, which a server may have repeated."""
+    """The text without the user's Hub token, which the answer of a server may contain."""
     if "huggingface_hub" not in sys.modules:
         return text
     from huggingface_hub import get_token
@@ -184,5 +183,5 @@ def _without_token(text: str) -> str:
 
 
 def save_config(config: Any, path: str) -> None:
-    """Write the resolved config as YAML, so that a run can be repeated with ``--config_path``."""
+    """Write the config as YAML, for ``--config_path``."""
     write_text(Path(path), str(draccus.dump(config)))

@@ -1,8 +1,8 @@
-"""CUDA graphs: the many small kernels of a plan, or of a gradient step, recorded once per shape and
-replayed as one.
+"""Captures functions of tensors as CUDA graphs, one per shape of the arguments.
 
-A recording reads and writes memory of its own: inputs are copied into it. What cannot be recorded
-is computed as before, and is not tried again.
+A plan or a gradient step launches many small kernels; replaying a graph launches all of them at
+once. A graph reads and writes its own memory: arguments are copied into it. A function that cannot
+be captured is called directly.
 """
 
 from __future__ import annotations
@@ -13,114 +13,110 @@ from typing import Any, Final, NamedTuple
 import torch
 from torch import Tensor
 
-MOST_RECORDINGS: Final = 8
-"""By default: searches have few shapes, and further ones are computed as before."""
-WARM_UP: Final = 3
-"""Calls before a recording: libraries choose their kernels, constants are made and kept."""
+MAX_GRAPHS: Final = 8
+WARM_UP_CALLS: Final = 3
+"""Calls before a capture, in which libraries choose kernels and constants are created."""
 
 type Replay = Callable[[], object]
-type Record = Callable[[Callable[[], Any], torch.device], tuple[Replay, Any]]
-"""Makes of a function without arguments, which works on a device, its replay, and what that writes
-its results to."""
+type Capture = Callable[[Callable[[], Any], torch.device], tuple[Replay, Any]]
+"""(function without arguments, device) -> (replay, results that the replay overwrites)."""
 
 
-class Recorder:
-    """Makes CUDA graphs, none of which may be replayed while another is: they share the memory of
-    what is no result."""
+class GraphCapture:
+    """Captures CUDA graphs that share their memory: only one may be replayed at a time."""
 
     def __init__(self) -> None:
         self._pools: dict[torch.device, Any] = {}
 
     def __call__(self, function: Callable[[], Any], device: torch.device) -> tuple[Replay, Any]:
-        """See `Record`.
+        """See `Capture`.
 
         Raises:
-            RuntimeError: something in it cannot be recorded, such as a copy from the processor.
+            RuntimeError: the function has an operation that cannot be captured.
         """
-        # Whose streams are meant: a recording of another's is empty.
-        with torch.cuda.device(device):
+        with torch.cuda.device(device):  # a capture on another device's stream is empty
             if device not in self._pools:
                 self._pools[device] = torch.cuda.graph_pool_handle()
-            return _record(function, self._pools[device])
+            return _capture(function, self._pools[device])
 
 
-def _record(function: Callable[[], Any], pool: Any) -> tuple[Replay, Any]:
+def _capture(function: Callable[[], Any], pool: Any) -> tuple[Replay, Any]:
     stream = torch.cuda.Stream()  # type: ignore[no-untyped-call]
     stream.wait_stream(torch.cuda.current_stream())
     with torch.cuda.stream(stream):
-        for _ in range(WARM_UP):
+        for _ in range(WARM_UP_CALLS):
             function()
     torch.cuda.current_stream().wait_stream(stream)
     graph = torch.cuda.CUDAGraph()
-    with torch.cuda.graph(graph, pool, capture_error_mode="thread_local"):  # others go on meanwhile
+    with torch.cuda.graph(graph, pool, capture_error_mode="thread_local"):  # other threads may work
         results = function()
     return graph.replay, results
 
 
-class _Recording(NamedTuple):
-    inputs: list[Tensor]  # that the replay reads
+class _Graph(NamedTuple):
+    inputs: list[Tensor]
     replay: Replay
-    results: Any  # that it writes
+    results: Any
 
 
-class Recorded:
-    """A function of tensors, in tuples or None as well, that does the same to equal shapes; what is
-    no tensor is part of the shape.
+class GraphedFunction:
+    """A function that is captured once per shape of its arguments and then replayed.
 
     Args:
-        function: waits for nothing, draws nothing, and has no effect but its results.
-        how: makes a recording; a `RuntimeError` says that there can be none. None: a `Recorder`.
-        most: recordings.
-        copies: of the results, so that no later call changes them.
+        function: takes and returns tensors, None, or tuples of them; without synchronisation,
+            random numbers and side effects. Arguments other than tensors are part of the shape.
+        capture: makes a graph, or raises `RuntimeError`; None: a `GraphCapture`.
+        max_graphs: further shapes are computed without a graph.
+        copies: return copies of the results, which later calls do not overwrite.
     """
 
     def __init__(
         self,
         function: Callable[..., Any],
-        how: Record | None = None,
-        most: int = MOST_RECORDINGS,
+        capture: Capture | None = None,
+        max_graphs: int = MAX_GRAPHS,
         copies: bool = True,
     ) -> None:
-        self._function, self._how = function, how or Recorder()
-        self._most, self._copies = most, copies
-        self._recordings: dict[object, _Recording | None] = {}
-        self.refused = ""
-        """Why something could not be recorded; empty: nothing was tried in vain."""
+        self._function, self._capture = function, capture or GraphCapture()
+        self._max_graphs, self._copies = max_graphs, copies
+        self._graphs: dict[object, _Graph | None] = {}
+        self.error = ""
+        """Error of the last failed capture; empty: none failed."""
 
     def __call__(self, *arguments: Any) -> Any:
-        """The function's results."""
+        """The results of the function."""
         key = _shape(arguments)
-        if key not in self._recordings:
-            full = len(self._recordings) >= self._most
-            self._recordings[key] = None if full else self._record(arguments)
-        recording = self._recordings[key]
-        if recording is None:
+        if key not in self._graphs:
+            full = len(self._graphs) >= self._max_graphs
+            self._graphs[key] = None if full else self._make(arguments)
+        graph = self._graphs[key]
+        if graph is None:
             return self._function(*arguments)
-        for buffer, given in zip(recording.inputs, _tensors(arguments), strict=True):
+        for buffer, given in zip(graph.inputs, _tensors(arguments), strict=True):
             buffer.copy_(given)
-        recording.replay()
-        return _map(recording.results, Tensor.clone) if self._copies else recording.results
+        graph.replay()
+        return _map(graph.results, Tensor.clone) if self._copies else graph.results
 
     @property
     def shapes(self) -> int:
-        """How many are replayed."""
-        return sum(recording is not None for recording in self._recordings.values())
+        """Number of shapes that have a graph."""
+        return sum(graph is not None for graph in self._graphs.values())
 
-    @torch.inference_mode(False)  # buffers are written to under either mode
+    @torch.inference_mode(False)  # buffers are written under both modes
     @torch.no_grad()
-    def _record(self, arguments: tuple[Any, ...]) -> _Recording | None:
+    def _make(self, arguments: tuple[Any, ...]) -> _Graph | None:
         own = _map(arguments, lambda x: x.detach().clone(memory_format=torch.contiguous_format))
         try:
             device = next(_tensors(own)).device
-            replay, results = self._how(lambda: self._function(*own), device)
+            replay, results = self._capture(lambda: self._function(*own), device)
         except RuntimeError as error:
-            self.refused = " ".join(str(error).split())[:200]
+            self.error = " ".join(str(error).split())[:200]
             return None
-        return _Recording(list(_tensors(own)), replay, results)
+        return _Graph(list(_tensors(own)), replay, results)
 
 
 def _tensors(tree: Any) -> Iterator[Tensor]:
-    """In the order of the tuples they are in."""
+    """The tensors in nested tuples, in order."""
     if isinstance(tree, Tensor):
         yield tree
     elif isinstance(tree, tuple):
@@ -129,7 +125,7 @@ def _tensors(tree: Any) -> Iterator[Tensor]:
 
 
 def _map(tree: Any, function: Callable[[Tensor], Tensor]) -> Any:
-    """The same tuples of other tensors."""
+    """Apply a function to the tensors in nested tuples."""
     if not isinstance(tree, tuple):
         return function(tree) if isinstance(tree, Tensor) else tree
     parts = [_map(part, function) for part in tree]
@@ -137,7 +133,7 @@ def _map(tree: Any, function: Callable[[Tensor], Tensor]) -> Any:
 
 
 def _shape(tree: Any) -> object:
-    """What a recording depends on."""
+    """The key of a graph: shapes, dtypes and devices of the tensors, and all other values."""
     if not isinstance(tree, tuple):
         return (tree.shape, tree.dtype, tree.device) if isinstance(tree, Tensor) else tree
     return (type(tree), *(_shape(part) for part in tree))

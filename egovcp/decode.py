@@ -1,7 +1,7 @@
-"""Decodes configuration dataclasses from JSON that somebody else wrote, without converting types.
+"""Decodes dataclasses from untrusted JSON without type conversions.
 
-`draccus.decode` converts where Python can: ``true`` and ``"256"`` become integers, and ``null``
-ends in a TypeError. Here every value must already have the type of its option.
+`draccus.decode` converts ``true`` and ``"256"`` to integers and raises TypeError for ``null``. Here
+every value must have the type of its option.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ _JSON_NAMES: Final[Mapping[Any, str]] = {
 
 
 class DecodeError(ValueError):
-    """A JSON value is not of the kind that was asked for; names the option."""
+    """A JSON value does not have the expected type."""
 
 
 def decode[C](kind: type[C], value: object, name: str) -> C:
-    """What a JSON value describes, for example a dataclass; absent options have their defaults.
+    """A JSON value as an instance of ``kind``; missing options get their defaults.
 
     Args:
         kind: a dataclass, number, string, boolean, literal, or a tuple, list, dict or union of
             these. The fields of the dataclass are of the same kinds.
         value: as `json.loads` returns it.
-        name: of the value within its file, for messages.
+        name: of the value, for messages.
 
     Raises:
         DecodeError: a value has another type or is out of bounds, or an option is unknown or
@@ -53,7 +53,7 @@ def require_type(value: object, kind: Any, name: str) -> None:
 
 
 def shown(value: object) -> str:
-    """A JSON value as ASCII of bounded length, for messages."""
+    """A JSON value as ASCII text of bounded length, for messages."""
     if isinstance(value, (dict, list)):
         return "an object" if isinstance(value, dict) else "a list"
     if isinstance(value, str) and len(value) > _SHOWN_CHARACTERS:
@@ -142,7 +142,7 @@ def _number(value: float, name: str) -> float:
 
 
 def _described(hint: Any) -> str:
-    """A type in the words of JSON."""
+    """Name of a type in JSON terms."""
     return " or ".join(dict.fromkeys(_words(hint)))
 
 

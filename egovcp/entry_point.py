@@ -1,4 +1,4 @@
-"""Console entry points: everything that has to be in place before heavy modules are imported.
+"""Console entry points: signals, streams and environment are prepared before slow imports.
 
 A distribution declares its commands in a module that imports nothing else::
 
@@ -8,21 +8,28 @@ and names them in its ``pyproject.toml``: ``egovcp-collect = "egovcp_collect.com
 ``--version`` is answered here, before the command is imported.
 
 Exit codes beyond those of `egovcp.errors`: 130 after Ctrl-C, 141 if the reader of the output has
-gone (``| head -1``), 1 with a traceback for a bug.
+closed it (``| head -1``), 1 with a traceback for a bug.
+
+Several libraries swallow a KeyboardInterrupt during their import, or turn it into an ImportError.
+So SIGINT ends the process at once before a command has started, and is delivered after the import
+later.
 """
 
 from __future__ import annotations
 
 import os
+import signal
 import sys
 
-from egovcp import interrupts
-
 TYPE_CHECKING = False
-if TYPE_CHECKING:  # these take as long as all the rest that is imported before SIGINT is handled
+if TYPE_CHECKING:  # slow imports
     from collections.abc import Callable, Sequence
+    from types import FrameType
     from typing import Any
 
+INTERRUPTED = 130  # 128 + SIGINT, as a shell reports a program which that signal ended
+_RETRY_S = 0.05
+_IMPORT_MACHINERY = "<frozen importlib._bootstrap>"
 BROKEN_PIPE = 141  # 128 + SIGPIPE, as a shell reports a program which that signal ended
 
 
@@ -30,7 +37,7 @@ class EntryPoint:
     """A command whose module is imported when it is called."""
 
     def __init__(self, prog: str, module: str) -> None:
-        """Describe a command; nothing is imported.
+        """Describe a command.
 
         Args:
             prog: its name.
@@ -40,7 +47,7 @@ class EntryPoint:
 
     def __call__(self, argv: Sequence[str] | None = None) -> int:
         """Run the command on ``argv``, or on ``sys.argv``, and return its exit code."""
-        interrupts.exit_on_sigint(self.prog)
+        exit_on_sigint(self.prog)
         prepare_process()
         from egovcp.errors import EnvironmentFailure
         from egovcp.terminal import discard_output, reader_is_gone
@@ -48,7 +55,7 @@ class EntryPoint:
         try:
             return self._run(argv)
         except KeyboardInterrupt:
-            return interrupts.EXIT_CODE
+            return INTERRUPTED
         except BrokenPipeError:
             if reader_is_gone():
                 discard_output()
@@ -59,10 +66,10 @@ class EntryPoint:
                 return _report_bug()
             _print_last(f"{self.prog}: error: cannot write the output: {error}\n")
             return EnvironmentFailure.exit_code
-        except Exception:  # noqa: BLE001 - a bug: as Python itself does, but with text escaped
+        except Exception:  # noqa: BLE001 - a bug: print the traceback with escaped text
             return _report_bug()
         finally:
-            interrupts.exit_on_sigint(self.prog)  # while the interpreter ends
+            exit_on_sigint(self.prog)  # while the interpreter ends
 
     def _run(self, argv: Sequence[str] | None) -> int:
         from importlib import import_module
@@ -101,14 +108,14 @@ class EntryPoint:
 
 
 def prepare_process() -> None:
-    """Make standard streams, user name and home folder usable, whatever started the process."""
+    """Make standard streams, user name and home folder usable."""
     _open_standard_streams()
     _name_user()
     _escape_log_messages()
 
 
 def _open_standard_streams() -> None:
-    """Replace closed streams by the null device, and make any text printable in any encoding."""
+    """Replace closed streams by the null device; escape characters that cannot be encoded."""
     for descriptor in (0, 1, 2):
         try:
             os.fstat(descriptor)
@@ -123,13 +130,13 @@ def _open_standard_streams() -> None:
 
 
 def _name_user() -> None:
-    """Name a user and a home folder where the system knows none, as in `docker run --user 12345`.
+    """Set a user and a home folder if the system has none, as in `docker run --user 12345`.
 
-    Libraries look both up, some while they are imported, and raise KeyError or RuntimeError.
+    Otherwise some libraries raise KeyError or RuntimeError, also during import.
     """
     import pwd
 
-    names = ("LOGNAME", "USER", "LNAME", "USERNAME")  # in which getpass.getuser() looks
+    names = ("LOGNAME", "USER", "LNAME", "USERNAME")  # of getpass.getuser()
     try:
         pwd.getpwuid(os.getuid())
     except KeyError:
@@ -140,7 +147,7 @@ def _name_user() -> None:
 
 
 def _escape_log_messages() -> None:
-    """Log records quote answers of servers."""
+    """Escape control characters in log records, which may quote answers of servers."""
     import logging
 
     from egovcp.terminal import printable
@@ -167,6 +174,50 @@ def _print_last(text: str) -> None:
     with suppress(OSError):  # stderr may be closed as well
         echo(text, error=True, end="")
     discard_output()
+
+
+def exit_on_sigint(prog: str) -> None:
+    """Exit at once on SIGINT: before the command has started, and after it has ended.
+
+    Does nothing if SIGINT is ignored, as in a background job of a shell script.
+    """
+
+    def leave(number: int, frame: FrameType | None) -> None:
+        try:
+            os.write(2, f"{prog}: interrupted\n".encode())
+        finally:
+            os._exit(INTERRUPTED)
+
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:
+        signal.signal(signal.SIGINT, leave)
+
+
+def raise_on_sigint() -> None:
+    """Raise KeyboardInterrupt on SIGINT, delayed until a running import has finished.
+
+    Replaces only the handler of `exit_on_sigint`; other handlers stay in place.
+    """
+    import threading  # slow: after SIGINT is handled
+
+    main = threading.main_thread().ident
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if not _is_importing(frame):
+            raise KeyboardInterrupt
+        retry = threading.Timer(_RETRY_S, signal.pthread_kill, [main, signal.SIGINT])
+        retry.daemon = True
+        retry.start()
+
+    if getattr(signal.getsignal(signal.SIGINT), "__module__", "") == __name__:
+        signal.signal(signal.SIGINT, interrupt)
+
+
+def _is_importing(frame: FrameType | None) -> bool:
+    while frame is not None:
+        if frame.f_code.co_filename == _IMPORT_MACHINERY:
+            return True
+        frame = frame.f_back
+    return False
 
 
 info = EntryPoint("egovcp-info", "egovcp.info")

@@ -1,4 +1,4 @@
-"""The errors a user can cause, and the exit code that each ends a command with.
+"""Errors that a user can cause, with their exit codes.
 
 A message says what was found, what was expected, where, and what to do.
 """
@@ -12,7 +12,7 @@ from typing import Self
 
 
 class EgovcpError(Exception):
-    """Root of all errors that a user can cause. ``exit_code`` ends the command."""
+    """Base class; ``exit_code`` is the exit code of the command."""
 
     exit_code = 1
 
@@ -28,13 +28,13 @@ class DataError(EgovcpError):
 
     exit_code = 3
     problem: str = ""
-    """What is wrong, without the place; empty: the message says it all."""
+    """The problem without its place; empty: only the message is known."""
     file: str = ""
-    """The file at fault, if that is known."""
+    """The damaged file, if known."""
     episode: int | None = None
-    """The episode at fault, if it is one."""
+    """The damaged episode, if it is one."""
     frame: int | None = None
-    """The frame of that episode, if it is one."""
+    """The frame in the episode, if it is one."""
 
     @classmethod
     def at(
@@ -44,7 +44,7 @@ class DataError(EgovcpError):
         episode: int | None = None,
         frame: int | None = None,
     ) -> Self:
-        """``"FILE, episode 3, frame 7: problem"``, with the place kept for reports."""
+        """An error with the message ``"FILE, episode 3, frame 7: problem"``."""
         numbers = {"episode": episode, "frame": frame}
         place = [f"{name} {number}" for name, number in numbers.items() if number is not None]
         path = os.fsencode(file).decode("utf-8", "backslashreplace")  # a name is bytes
@@ -54,7 +54,7 @@ class DataError(EgovcpError):
 
 
 class SimulationDiverged(DataError):
-    """The physics of an episode left the range of real robots; the episode is not valid data."""
+    """The physics of an episode diverged; the episode is not valid data."""
 
 
 class ArtifactError(EgovcpError):
@@ -64,7 +64,7 @@ class ArtifactError(EgovcpError):
 
 
 class EnvironmentFailure(EgovcpError):
-    """Disk, permissions, network, device, port: the surroundings fail."""
+    """A failure of disk, permissions, network, device or port."""
 
     exit_code = 5
 
@@ -76,11 +76,11 @@ class SafetyStop(EgovcpError):
 
 
 class ConformanceError(EgovcpError):
-    """A part does not keep its contract with the others (see `egovcp.checks`)."""
+    """A component violates its interface (see `egovcp.checks`)."""
 
 
 def did_you_mean(name: str, valid: Iterable[str]) -> str:
-    """``"; did you mean 'ball'?"`` for an unknown ``name``; empty: nothing is near."""
+    """``"; did you mean 'ball'?"`` for an unknown ``name``; empty: no similar name."""
     near = difflib.get_close_matches(name, sorted(valid), n=1)
     return f"; did you mean {near[0]!r}?" if near else ""
 
@@ -92,7 +92,7 @@ def suggest(name: str, valid: Iterable[str]) -> str:
 
 
 def suggest_path(path: str | os.PathLike[str]) -> str:
-    """``"; did you mean data/ball?"`` for a path that does not exist; empty: nothing is near."""
+    """``"; did you mean data/ball?"`` for a path that does not exist; empty: no similar name."""
     known, missing = os.path.split(os.fspath(path).rstrip("/"))
     while known and not os.path.lexists(known):
         known, missing = os.path.split(known)

@@ -16,14 +16,15 @@ from typing import Any, Final
 from draccus.utils import CONFIG_ARG
 
 from egovcp.errors import UsageError, did_you_mean
+from egovcp.files import UnsafeFileError, read_text, require_bounded
 from egovcp.removed_options import (
     refuse_preset_flag,
     refuse_removed_flag,
     refuse_removed_options,
 )
-from egovcp.safe_files import UnsafeFileError, read_text, require_bounded
 from egovcp.values import (
     WrongValue,
+    collection_or_text,
     convert,
     is_collection,
     is_dataclass_type,
@@ -75,7 +76,7 @@ def split_flags(argv: Sequence[str], config_class: type) -> list[str]:
     """The arguments as ``--name=value`` each: ``--a b`` is ``--a=b``, a switch alone is true.
 
     Raises:
-        UsageError: an argument is no flag, an unknown or removed one, or lacks its value.
+        UsageError: a flag is unknown, removed, or without its value, or an argument is no flag.
     """
     joined: list[str] = []
     for arg in argv:
@@ -116,8 +117,7 @@ def flag_values(args: Sequence[str], config_class: type) -> dict[str, Any]:
         config_class: the dataclass of the options.
 
     Raises:
-        UsageError: a value is not of the type of its option, or the file cannot be read or has
-            options that were removed.
+        UsageError: a value has the wrong type, or the file cannot be read or has removed options.
     """
     flags = options_of(config_class)
     given: dict[str, Any] = {}
@@ -138,13 +138,10 @@ def flag_values(args: Sequence[str], config_class: type) -> dict[str, Any]:
 
 
 def _value(flag: str, text: str, kind: Any) -> Any:
-    """The value as it is merged with others: checked, except that a group is left as a mapping."""
+    """The checked value of a flag; a group stays a mapping, to be merged with other flags."""
     value: Any = text
     if is_collection(kind) and text:
-        try:
-            value = parse_collection(text)
-        except ValueError:
-            value = text
+        value = collection_or_text(text)
     if is_dataclass_type(kind) and isinstance(value, Mapping):
         return value
     convert(kind, value, flag)
@@ -161,7 +158,7 @@ def _refuse_preset_options(flag: str, value: Any, flags: Mapping[str, Any]) -> N
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Both, groups within groups; ``above`` has the last word."""
+    """Both mappings merged recursively; ``above`` wins."""
     out = {**below}
     for key, value in above.items():
         old = out.get(key)
@@ -189,7 +186,7 @@ def read_config(path: Path) -> dict[str, Any]:
 
     Raises:
         UnsafeFileError: it is not a regular file, too large, or not UTF-8.
-        ValueError: it holds something else.
+        ValueError: it holds no options.
         OSError: it is missing, or cannot be read.
     """
     text = read_text(path, _FILE_LIMIT_BYTES)

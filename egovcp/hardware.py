@@ -1,4 +1,4 @@
-"""What the machine has: processor cores, memory, and its description."""
+"""Processor cores, free memory, and a description of the machine."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ def require_memory(option: str, needed: int) -> None:
     """Raise `UsageError`, which names the option, unless ``needed`` bytes of memory are free.
 
     Args:
-        option: as it was given, ``--num_envs=8``.
-        needed: a lower estimate; what would have worked must not be refused.
+        option: as on the command line, ``--num_envs=8``.
+        needed: a lower bound.
     """
     free = available_bytes()
     if needed > free:
@@ -37,7 +37,7 @@ def require_memory(option: str, needed: int) -> None:
 
 
 def available_bytes() -> int:
-    """Memory that this process can take without the system swapping, or its container ending it."""
+    """Memory that this process can allocate within the limits of the system and its container."""
     return min(_of_the_system(), _of_the_container())
 
 
@@ -51,20 +51,20 @@ def _of_the_system() -> int:
 
 
 def _of_the_container() -> int:
-    """What is left below the limit of control group v2; `sys.maxsize` if it has none."""
+    """Memory left below the limit of control group v2; `sys.maxsize` without a limit."""
     try:
         limit = (_CGROUP / "memory.max").read_text(encoding="ascii").strip()
         used = int((_CGROUP / "memory.current").read_text(encoding="ascii"))
         statistics = (_CGROUP / "memory.stat").read_text(encoding="ascii").splitlines()
         cached = next(int(n) for key, n in map(str.split, statistics) if key == "inactive_file")
-        return int(limit) - used + cached  # the page cache is given up for other uses
-    except (OSError, ValueError, StopIteration):  # no such group, or its limit is "max"
+        return int(limit) - used + cached  # the page cache can be freed
+    except (OSError, ValueError, StopIteration):  # no group, or no limit
         return sys.maxsize
 
 
 def hardware() -> dict[str, object]:
-    """What figures of speed and time depend on."""
-    import torch  # here, so that a process that only simulates does not hold it
+    """Flat description of the hardware for reports of timings."""
+    import torch  # processes that only simulate do not import it
 
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")

@@ -22,14 +22,14 @@ _PACKAGES = (
 
 
 @dataclass(frozen=True)
-class InfoConfig:
+class MachineInfoConfig:
     """Show versions, hardware and the planner backends that this machine can use."""
 
     json: str = output_file()
     """Also write everything to this JSON file."""
 
 
-def show(config: InfoConfig) -> None:
+def show(config: MachineInfoConfig) -> None:
     """Print the report, and write it if a file is given."""
     report = machine_report()
     write_report(config.json, report)
@@ -67,4 +67,4 @@ def _version(distribution: str) -> str:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command and return its exit code."""
-    return run_command(InfoConfig, show, argv, prog="egovcp-info")
+    return run_command(MachineInfoConfig, show, argv, prog="egovcp-info")

@@ -1,4 +1,4 @@
-"""Confidence intervals of rates, and of whatever episodes say together."""
+"""Confidence intervals of rates and of statistics of episodes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _RESAMPLES: Final = 4000
 
 
 def wilson(successes: int, trials: int) -> Interval:
-    """Wilson's score interval of a rate; it stays inside [0, 1] and is honest at 0 and 1.
+    """Wilson's score interval of a rate, at 95 %; valid also at 0 and 1.
 
     (p + z^2/2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)
     """
@@ -30,14 +30,13 @@ def wilson(successes: int, trials: int) -> Interval:
 def bootstrap(
     statistic: Callable[[NDArray[np.int64]], NDArray[np.floating]], count: int
 ) -> Interval:
-    """95 % percentile interval of a statistic of ``count`` episodes.
+    """95 % percentile bootstrap interval of a statistic of ``count`` episodes.
 
-    What was measured on the same episodes is paired by reading both with the same picks. The draws
-    are fixed: equal episodes give equal intervals.
+    The resamples have a fixed seed. For a paired comparison the statistic reads both measurements
+    at the same indices.
 
     Args:
-        statistic: picks (R, count) of episodes -> the statistic of each row, (R,).
-        count: number of episodes.
+        statistic: episode indices (R, count) -> the statistic of each row, (R,).
     """
     picks = np.random.default_rng(0).integers(count, size=(_RESAMPLES, count))
     low, high = np.percentile(statistic(picks), [2.5, 97.5])

@@ -1,8 +1,7 @@
-"""The manifest of a policy artifact: which files it has, and where the policy comes from.
+"""The JSON files of a policy artifact: its manifest, and LeRobot's processors.
 
-The SHA-256 of every file is in the manifest, and so is the manifest's own: nothing in an artifact
-changes unnoticed. Whoever can write the files can also write the digests, so that every value is
-checked all the same.
+The manifest holds the SHA-256 of every file and of itself, so that damage is noticed. An attacker
+can renew the digests: every value is validated too.
 """
 
 from __future__ import annotations
@@ -11,21 +10,21 @@ import dataclasses
 import hashlib
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 
 from egovcp import spec
-from egovcp.atomic import write_text
 from egovcp.decode import DecodeError, require_type, shown
 from egovcp.errors import ArtifactError
-from egovcp.safe_files import UnsafeFileError, read_json
+from egovcp.files import UnsafeFileError, read_json, write_json
 
 SCHEMA_VERSION: Final = 2
 MANIFEST: Final = "manifest.json"
 SEAL: Final = "manifest_sha256"
 
-#: Type of each entry that is read somewhere; entries but for the first two may be absent.
+#: Type of each entry that is read; all but the first two are optional.
 _TYPES: Final[Mapping[str, Any]] = {
     "controller_id": str,
     "files": dict[str, str],
@@ -50,7 +49,7 @@ _DATASET_TYPES: Final[Mapping[str, Any]] = {
 
 
 def feature_spec() -> dict[str, Any]:
-    """What an artifact reads and writes: names, shapes and the action box."""
+    """Names and shapes of observations and actions, and the action box."""
     return {
         "spec_version": spec.SPEC_VERSION,
         "planner_hz": spec.PLANNER_HZ,
@@ -74,22 +73,18 @@ def sealed(manifest: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
-    """Seal a manifest and write it.
+    """Write a manifest with its SHA-256.
 
     Raises:
         ArtifactError: it holds NaN or an infinite number.
     """
-    try:
+    with _finite(folder / MANIFEST):
         content = sealed(manifest)
-    except ValueError as error:
-        raise ArtifactError(
-            f"{folder / MANIFEST}: a number is NaN or infinite ({error}); expected finite numbers"
-        ) from error
     write_json_file(folder / MANIFEST, content)
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read a manifest and check everything but the digests of the files.
+    """Read a manifest and check everything except the digests of the files.
 
     Raises:
         ArtifactError: it is missing, damaged, or made for another feature spec.
@@ -105,8 +100,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     _check_features(path, manifest.get("features"))
     if manifest.get(SEAL) != sealed(manifest)[SEAL]:
         raise ArtifactError(
-            f"{path}: its SHA-256 is not the one that it names; it was changed or damaged: fetch "
-            "it again"
+            f"{path}: its SHA-256 does not match; it was changed or damaged: fetch it again"
         )
     try:
         _check_types(manifest)
@@ -139,7 +133,7 @@ def _check_types(manifest: Mapping[str, Any]) -> None:
 
 
 def finite_or_null(value: Any) -> Any:
-    """A JSON value with null in place of every number that is NaN or infinite."""
+    """A JSON value with NaN and infinite numbers replaced by null."""
     match value:
         case float():
             return value if math.isfinite(value) else None
@@ -174,10 +168,60 @@ def write_json_file(path: Path, content: Mapping[str, Any]) -> None:
     Raises:
         ArtifactError: it holds NaN or an infinite number.
     """
+    with _finite(path):
+        write_json(path, content)
+
+
+@contextmanager
+def _finite(path: Path) -> Iterator[None]:
+    """Turn the ValueError of `json.dumps` for NaN and infinities into `ArtifactError`."""
     try:
-        text = json.dumps(content, indent=2, allow_nan=False)
+        yield
     except ValueError as error:
         raise ArtifactError(
             f"{path}: a number is NaN or infinite ({error}); expected finite numbers"
         ) from error
-    write_text(path, text + "\n")
+
+
+# --- LeRobot's processors ---------------------------------------------------------
+# LeRobot requires these files. Their steps change no number: the world model normalises its inputs.
+INPUT_FEATURES: Final[dict[str, Any]] = {
+    spec.DEPTH_KEY: {"type": "VISUAL", "shape": [1, spec.DEPTH_ROWS, spec.DEPTH_COLS]},
+    spec.STATE_KEY: {"type": "STATE", "shape": [spec.STATE_DIM]},
+}
+OUTPUT_FEATURES: Final[dict[str, Any]] = {
+    spec.ACTION_KEY: {"type": "ACTION", "shape": [spec.ACTION_DIM]}
+}
+
+_IDENTITY = dict.fromkeys(("VISUAL", "STATE", "ACTION"), "IDENTITY")
+
+
+def _step(name: str, **config: Any) -> dict[str, Any]:
+    return {"registry_name": name, "config": config}
+
+
+def _normalisation(name: str, features: dict[str, Any]) -> dict[str, Any]:
+    return _step(name, eps=1e-8, features=features, norm_map=_IDENTITY)
+
+
+def _pipeline(name: str, *steps: dict[str, Any]) -> dict[str, Any]:
+    return {"name": name, "steps": list(steps)}
+
+
+_TO_CPU = _step("device_processor", device="cpu", float_dtype=None)
+
+#: File name -> content.
+PROCESSORS: Final[dict[str, dict[str, Any]]] = {
+    "policy_preprocessor.json": _pipeline(
+        "policy_preprocessor",
+        _step("rename_observations_processor", rename_map={}),
+        _step("to_batch_processor"),
+        _TO_CPU,
+        _normalisation("normalizer_processor", {**INPUT_FEATURES, **OUTPUT_FEATURES}),
+    ),
+    "policy_postprocessor.json": _pipeline(
+        "policy_postprocessor",
+        _normalisation("unnormalizer_processor", OUTPUT_FEATURES),
+        _TO_CPU,
+    ),
+}

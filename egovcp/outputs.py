@@ -1,4 +1,4 @@
-"""Files and folders that a command writes, refused before work starts if they cannot be written.
+"""Checks the files and folders that a command will write before its work starts.
 
     @dataclass(frozen=True)
     class InfoConfig:
@@ -17,22 +17,21 @@ from dataclasses import field
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.atomic import partial_path, write_text
 from egovcp.bounds import as_flag_value, leaf_options
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.safe_files import UnsafeFileError, require_regular
+from egovcp.files import UnsafeFileError, partial_path, require_regular, write_text
 
 STDOUT: Final = "-"
-"""Stands for standard output where an option allows it."""
+"""Standard output, where an option allows it."""
 
 _KEY: Final = "output_file"
 
 
 def output_file(*, or_stdout: bool = False) -> str:
-    """A dataclass field for a file to write; its default, the empty string, means none.
+    """A dataclass field for a file to write; default: empty, no file.
 
     Args:
-        or_stdout: `STDOUT` is allowed too.
+        or_stdout: whether `STDOUT` is allowed.
     """
     exceptions = ("", STDOUT) if or_stdout else ("",)
     option: str = field(default="", metadata={_KEY: exceptions})
@@ -40,15 +39,7 @@ def output_file(*, or_stdout: bool = False) -> str:
 
 
 def check_output_files(config: Any, prefix: str = "") -> None:
-    """Check every option of a dataclass, and of those within it, that names a file to write.
-
-    Args:
-        prefix: as `egovcp.bounds.leaf_options`.
-
-    Raises:
-        UsageError: as `require_output_file`.
-        EnvironmentFailure: as `require_output_file`.
-    """
+    """Call `require_output_file` for every `output_file` of a dataclass and nested ones."""
     for name, option, value in leaf_options(config, prefix):
         if _KEY in option.metadata and value not in option.metadata[_KEY]:
             require_output_file(value, name)
@@ -60,12 +51,12 @@ def require_output_file(file: str, option: str) -> None:
     Files are replaced by renaming, which would replace a FIFO, a device or a dangling link too.
 
     Args:
-        file: its path; ``~`` is expanded, and missing folders are created by `write_report`.
+        file: its path; ``~`` is expanded; missing folders are allowed.
         option: the flag, for messages.
 
     Raises:
-        UsageError: something else is there, a parent is a file, or the name is too long.
-        EnvironmentFailure: no permission, or a file system that takes no files.
+        UsageError: another kind of file exists, a parent is a file, or the name is too long.
+        EnvironmentFailure: no permission, or a read-only file system.
     """
     path, named = Path(os.path.expanduser(file)), f"{option}={as_flag_value(file)}"
     try:
@@ -94,7 +85,7 @@ def require_writable(folder: Path) -> None:
     """Raise unless files can be created in ``folder``, or the folder itself can be created.
 
     Raises:
-        EnvironmentFailure: no permission, no space, a file or a broken link in the way.
+        EnvironmentFailure: no permission or space, or a parent is a file or a broken link.
         OSError: the path is too long.
     """
     existing = nearest_existing(folder)
@@ -106,12 +97,10 @@ def require_writable(folder: Path) -> None:
 
 
 def write_report(file: str, content: Any, durable: bool = True) -> None:
-    """Write the result of a command as strict JSON to the file of --json; nothing if empty.
-
-    Missing folders are created. A link is replaced, not followed.
+    """Write strict JSON to the file of --json, if any; missing folders are created.
 
     Raises:
-        UsageError: the path is a folder, or lies below a file.
+        UsageError: the path is a folder, or below a file.
         ValueError: ``content`` holds NaN or infinite numbers.
     """
     if not file:
@@ -125,7 +114,7 @@ def write_report(file: str, content: Any, durable: bool = True) -> None:
 
 
 def nearest_existing(path: Path) -> Path:
-    """The path itself, or the nearest of its parents that exists; links are not followed."""
+    """The path or its nearest existing parent; links are not followed."""
     for candidate in (path, *path.absolute().parents):
         with suppress(FileNotFoundError, NotADirectoryError):
             candidate.lstat()

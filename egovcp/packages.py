@@ -1,7 +1,6 @@
-"""Optional packages: which of them are missing, and which command installs them.
+"""Finds missing optional packages and the command that installs them.
 
-Extras are read from the metadata of the installed distributions, so that a message never names one
-that does not exist.
+The extras come from the metadata of the installed distributions.
 """
 
 from __future__ import annotations
@@ -29,11 +28,11 @@ DISTRIBUTIONS: Final = MappingProxyType(
         "zmq": "pyzmq",
     }
 )
-#: What reading and writing datasets imports: the extra `egovcp[data]`.
+#: Imports of datasets: the extra `egovcp[data]`.
 DATA_MODULES: Final = ("filelock", "pandas", "PIL", "pyarrow")
-#: What the simulator imports: the extra `egovcp[sim]`.
+#: Imports of the simulator: the extra `egovcp[sim]`.
 SIMULATOR_MODULES: Final = ("mjlab", "mujoco")
-#: Our own distributions. The extras of no others are searched.
+#: Our own distributions, whose extras are searched.
 _OWN: Final = ("egovcp", "lerobot-env-egovcp", "lerobot-policy-egovcp", "lerobot-robot-egovcp")
 
 
@@ -56,15 +55,15 @@ def is_installed(module: str) -> bool:
 
 
 def require_packages(distribution: str, purpose: str, *modules: str) -> None:
-    """Refuse work that needs modules which are not installed.
+    """Raise unless modules are installed.
 
     Args:
-        distribution: the distribution whose extras are named, such as ``egovcp-deploy``.
-        purpose: what needs them, the subject of the message, such as ``--wandb.enable``.
+        distribution: the distribution with the extras, such as ``egovcp-deploy``.
+        purpose: subject of the message, such as ``--wandb.enable``.
         modules: top-level modules.
 
     Raises:
-        MissingPackage: names all that are missing, and the command that installs them.
+        MissingPackage: names the missing packages and the command that installs them.
     """
     missing = [module for module in modules if not is_installed(module)]
     if missing:
@@ -74,15 +73,11 @@ def require_packages(distribution: str, purpose: str, *modules: str) -> None:
 def missing_package(
     error: ModuleNotFoundError, distribution: str, purpose: str
 ) -> MissingPackage | None:
-    """A failed import as an error of the user's environment.
+    """The error for a failed import; None if the module is our own or the standard library's.
 
     Args:
-        error: the failed import.
-        distribution: see `require_packages`; the module that was imported may be given, too.
+        distribution: see `require_packages`, or the name of the imported module.
         purpose: see `require_packages`.
-
-    Returns:
-        The error; None if the module is our own or the standard library's: then it is a bug.
     """
     top = (error.name or "").partition(".")[0]
     own = distribution_of(top) in _OWN or top.startswith("egovcp_")
@@ -92,10 +87,10 @@ def missing_package(
 
 
 def install_command(distribution: str, *packages: str) -> str:
-    """The command that installs packages as the extra of a distribution that needs them.
+    """The command that installs packages as an extra of a distribution.
 
-    If several extras do, its smallest is named, then one of those of our distributions that it
-    depends on. A package that none of them contains is named itself.
+    Prefers extras of the distribution itself to those of its dependencies, and small extras. A
+    package in no extra is installed by its name.
     """
     wanted = {canonicalize_name(package) for package in packages}
     targets: list[str] = []
@@ -116,7 +111,7 @@ def _message(distribution: str, purpose: str, modules: list[str]) -> str:
 
 
 def _best(distribution: str, wanted: frozenset[str]) -> tuple[str, frozenset[str]]:
-    """What to install, and which of the wanted packages that brings."""
+    """(what to install, the wanted packages that it contains)."""
     options = [
         (name, wanted & brought, len(brought)) for name, brought in _installable(distribution)
     ]
@@ -135,7 +130,7 @@ def _best(distribution: str, wanted: frozenset[str]) -> tuple[str, frozenset[str
 
 
 def _installable(distribution: str) -> Iterator[tuple[str, frozenset[str]]]:
-    """(``NAME`` or ``NAME[EXTRA]``, what it brings), of a distribution and our own below it."""
+    """(``NAME`` or ``NAME[EXTRA]``, its packages), of a distribution and its own dependencies."""
     plain = _closure(distribution, "")
     own = [distribution, *sorted(name for name in plain if _is_own(name) and name != distribution)]
     for name in own:
@@ -146,7 +141,7 @@ def _installable(distribution: str) -> Iterator[tuple[str, frozenset[str]]]:
 
 @cache
 def _closure(distribution: str, extra: str) -> frozenset[str]:
-    """Distributions that ``distribution[extra]`` names, and those that our own among them name."""
+    """Direct requirements of ``distribution[extra]``, and those of our own distributions in it."""
     found = {distribution}
     for requirement in _requirements(distribution, extra):
         name = canonicalize_name(requirement.name)
@@ -159,7 +154,7 @@ def _closure(distribution: str, extra: str) -> frozenset[str]:
 
 
 def _requirements(distribution: str, extra: str) -> list[Requirement]:
-    """What it requires here, with that extra or, if it is empty, without any."""
+    """Requirements on this platform with an extra; empty: without extras."""
     try:
         declared = metadata.requires(distribution) or []
     except metadata.PackageNotFoundError:

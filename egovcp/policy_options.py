@@ -1,4 +1,4 @@
-"""Options that name a policy artifact and change its planner, for every command that plays."""
+"""Options of commands that play a policy artifact."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class PolicyOptions:
     """Branch, tag or commit SHA on the Hub; empty: the latest."""
 
     def require(self, otherwise: str = "") -> None:
-        """Raise `UsageError`, which offers to do ``otherwise``, unless an artifact is named."""
+        """Raise `UsageError` unless a path is given; ``otherwise`` is an alternative to name."""
         if not self.path:
             offer = f", or {otherwise}" if otherwise else ""
             raise UsageError(f"--policy.path is missing; name the artifact{offer}")
@@ -37,7 +37,7 @@ class PolicyOptions:
 
 @dataclass(frozen=True)
 class PlannerOptions:
-    """Changes to the artifact's own planner; what is not given stays as it is there."""
+    """Overrides of the planner options of the artifact."""
 
     samples: int | None = bounded(None, least=1, most=2**20)
     """M, candidate plans per iteration."""
@@ -51,30 +51,28 @@ class PlannerOptions:
     elites: int | None = bounded(None, least=1, most=2**20)
     """Best candidates that the next round is fitted to."""
     min_std: float | None = bounded(None, least=0)
-    """Floor of the deviation that candidates are drawn with, in steps of the action process."""
+    """Smallest standard deviation of candidates, in steps of the action parameterization."""
     hands_cost: float | None = bounded(None, least=0)
-    """What hands away from the neutral pose cost a plan: so much return times their mean squared
-    action (docs/planner.md)."""
+    """Cost of hands away from the neutral pose: this return times their mean squared action."""
     step_cost: float | None = bounded(None, least=0)
-    """What moving costs a plan: so much return times its mean squared step."""
+    """Cost of motion: this return times the mean squared step of the plan."""
     action_parameterization: ActionParameterization | None = None
-    """What candidates are made of: walk (a step in every tick), or ramp (to a place to rest at, as
-    in data of a longer `egovcp-collect --step_ticks`)."""
+    """Candidates: random_walk (a step in every tick), or target (a ramp to a pose that is held)."""
     termination_rule: TerminationRule | None = None
-    """What a failed plan's later values are: paper (0), shift (the data's worst return), survival
-    (weighted with the probability of being alive)."""
+    """Values after a predicted failure: paper (0), shift (lowest return of the data), survival
+    (weighted with the survival probability)."""
     latent: Latent | None = None
-    """z of imagined states: mean of the prior, or a sample."""
+    """z of imagined states: mean or sample of the prior."""
     optimiser: OptimiserName | None = None
-    """The search: cem, icem, mppi or shooting (docs/planner.md)."""
+    """Optimiser: cem, icem, mppi or shooting."""
     backend: BackendName | None = None
-    """Implementation of the planner's networks: auto, eager, float32 or int8 (docs/planner.md)."""
+    """Implementation of the networks: auto, eager, float32 or int8."""
 
     def apply(self, planner: PlannerConfig) -> PlannerConfig:
         """``planner`` with these changes.
 
         Raises:
-            UsageError: a number is out of bounds, or the numbers do not go together.
+            UsageError: a number is out of bounds, or numbers contradict each other.
         """
         try:
             return replace(planner, **{k: v for k, v in asdict(self).items() if v is not None})
@@ -83,13 +81,13 @@ class PlannerOptions:
 
 
 def load_policy(policy: PolicyOptions, planner: PlannerOptions) -> Artifact:
-    """The artifact, whose planner is changed as the options say.
+    """The artifact with the planner options applied.
 
     Raises:
-        ArtifactError: missing, tampered with, or made for another feature spec.
+        ArtifactError: missing, changed, or made for another feature spec.
         EnvironmentFailure: the Hub cannot be reached.
-        UsageError: the planner's numbers do not go together, a plan would take too long or too
-            much memory, or it asks what the model never learned.
+        UsageError: contradicting numbers, a plan that takes too much time or memory, or a head that
+            the model does not have.
     """
     artifact = load_artifact(policy.path, policy.revision)
     changed = planner.apply(artifact.planner)

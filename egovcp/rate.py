@@ -1,8 +1,7 @@
-"""A fixed-rate loop on an injectable clock, with counters that say when it ran late.
+"""A fixed-rate loop on an injectable clock, with counters of overruns.
 
-Hardware and the real-time simulator run on `MonotonicClock`; lock-step simulation and the
-tests run on `LockstepClock`, where time passes only by waiting, so nothing depends on the
-speed of the machine.
+Hardware and the real-time simulator use `MonotonicClock`, lock-step simulation and tests use
+`LockstepClock`, whose time does not depend on the speed of the machine.
 """
 
 from __future__ import annotations
@@ -15,26 +14,24 @@ NS_PER_S = 1_000_000_000
 
 
 class Clock(Protocol):
-    """A clock that never goes backwards and that can be waited on."""
+    """A monotonic clock that can be waited on."""
 
     def now_ns(self) -> int:
         """Nanoseconds since an arbitrary start."""
-        ...
 
     def sleep_until(self, deadline_ns: int) -> None:
         """Return at ``deadline_ns``, or at once if it has passed."""
-        ...
 
 
 class MonotonicClock:
-    """The machine's monotonic clock: jumps of the wall clock do not touch it."""
+    """The monotonic clock of the machine, independent of the wall clock."""
 
     def now_ns(self) -> int:
         """Nanoseconds since an arbitrary start."""
         return time.monotonic_ns()
 
     def sleep_until(self, deadline_ns: int) -> None:
-        """Sleep until ``deadline_ns``; the operating system may wake us a little later."""
+        """Sleep until ``deadline_ns``."""
         remaining = deadline_ns - time.monotonic_ns()
         if remaining > 0:
             time.sleep(remaining / NS_PER_S)
@@ -42,7 +39,7 @@ class MonotonicClock:
 
 @dataclass
 class LockstepClock:
-    """Time that passes only by waiting or by `advance`: computing takes no time at all."""
+    """Simulated time that changes only by `sleep_until` and `advance`."""
 
     time_ns: int = 0
 
@@ -55,31 +52,31 @@ class LockstepClock:
         self.time_ns = max(self.time_ns, deadline_ns)
 
     def advance(self, duration_ns: int) -> None:
-        """Let ``duration_ns`` pass, as if work had taken that long."""
+        """Add ``duration_ns`` to the time."""
         self.time_ns += duration_ns
 
 
 @dataclass
 class RateCounters:
-    """How well a loop kept its rate."""
+    """Counters of a fixed-rate loop."""
 
     ticks: int = 0
     """Ticks completed."""
     overruns: int = 0
     """Ticks whose work ended after their period."""
     skipped: int = 0
-    """Periods in which no tick started, because an earlier one was still busy."""
+    """Periods without a tick because of an overrun."""
     worst_lateness_ns: int = 0
-    """Longest time by which work passed the end of its period."""
+    """Longest overrun, ns."""
 
 
 @dataclass
 class FixedRate:
-    """Paces a loop at ``hz`` on a grid of deadlines that does not drift.
+    """Runs a loop at ``hz`` on a grid of deadlines that does not drift.
 
-    Tick k owns the period [k, k+1) / hz after `start`. Work that runs past its period is an
-    overrun; the loop then resumes at the next whole period, never in a burst to catch up:
-    a robot must not receive several commands at once::
+    Tick k has the period [k, k + 1) / hz after `start`. After an overrun the loop resumes at the
+    next whole period, without a burst of ticks, so that a robot never receives several commands at
+    once::
 
         rate = FixedRate(25, clock)
         rate.start()
@@ -99,18 +96,18 @@ class FixedRate:
         return round(NS_PER_S / self.hz)
 
     def start(self) -> None:
-        """Begin the first period now; counters keep their values."""
+        """Start the first period now; counters keep their values."""
         self._next_ns = self.clock.now_ns() + self.period_ns
 
     def remaining_ns(self) -> int:
-        """Time left in the current period; negative once it has been overrun."""
+        """Time left in the current period; negative after an overrun."""
         return self._next_ns - self.clock.now_ns()
 
     def wait(self) -> int:
-        """Sleep to the end of the period; return by how many ns the work had passed it (or 0)."""
+        """Sleep until the end of the period; returns the overrun, ns."""
         late = max(0, -self.remaining_ns())
         self._count(late)
-        missed = -(-late // self.period_ns)  # whole periods to let go, rounded up
+        missed = -(-late // self.period_ns)  # whole periods, rounded up
         self._next_ns += missed * self.period_ns
         self.clock.sleep_until(self._next_ns)
         self._next_ns += self.period_ns

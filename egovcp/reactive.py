@@ -1,9 +1,8 @@
-"""A policy without a world model: the last pictures and proprioception in, an action out.
+"""A policy without a world model: recent depth images and proprioception to an action.
 
-What ``egovcp-train-ppo`` learns and ``egovcp-eval --controllers=ppo`` plays. Its file holds
-``mean`` and ``std`` of the state, ``cnn.I`` and ``mlp.I`` with ``.weight`` and ``.bias``; its
-metadata, as JSON, the schema's version, the `ReactiveConfig`, the low-level controller and where
-it comes from.
+``egovcp-train-ppo`` trains it, ``egovcp-eval --controllers=ppo`` plays it. Its safetensors file
+holds ``mean`` and ``std`` of the state, and ``.weight`` and ``.bias`` of ``cnn.I`` and ``mlp.I``.
+Metadata: the schema, and as JSON the `ReactiveConfig`, the controller id and the provenance.
 """
 
 from __future__ import annotations
@@ -26,10 +25,10 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.atomic import write_bytes
 from egovcp.bounds import bounded, check_bounds
 from egovcp.decode import decode, shown
 from egovcp.errors import ArtifactError
+from egovcp.files import write_bytes
 from egovcp.model.depth import nearness
 from egovcp.plan import PolicyStep
 from egovcp.tensor_file import TensorFile, read_tensor_file
@@ -44,11 +43,10 @@ type Layer = tuple[Tensor, Tensor]  # weight, bias
 
 @dataclass(frozen=True)
 class ReactiveConfig:
-    """Sizes of the networks, and how much of the past they see."""
+    """Sizes of the networks, and the number of stacked images."""
 
     frames: int = bounded(3, least=1, most=64)
-    """Pictures seen at once, the present one and those of the ticks before: one alone does not show
-    where a ball is going."""
+    """Number of stacked depth images, the newest and those before it."""
     channels: tuple[int, int, int] = bounded((16, 32, 32), least=1, most=1024)
     """Channels of the three layers of the depth CNN; actor and critic have one each."""
     hidden: tuple[int, ...] = bounded((256, 128), least=1, most=8192, longest=16)
@@ -62,25 +60,25 @@ class ReactiveConfig:
 
 @dataclass(frozen=True)
 class _Content:
-    """The metadata's JSON."""
+    """The JSON in the metadata of a file."""
 
     config: ReactiveConfig
     controller_id: str
     provenance: dict[str, Any]
 
 
-class Eyes:
-    """The last pictures of E robots; training and playing see through the same ones."""
+class FrameStack:
+    """The last depth images of E robots, for training and playing."""
 
     def __init__(self, robots: int, config: ReactiveConfig) -> None:
         self._max_m = config.depth_max_m
         shape = (robots, config.frames, spec.DEPTH_ROWS, spec.DEPTH_COLS)
         self._pictures = torch.zeros(shape)
 
-    def look(self, depth: NDArray[np.uint16], fresh: NDArray[np.bool_]) -> Tensor:
-        """Depth (E, 48, 64) mm -> nearness (E, frames, 48, 64), the present one first.
+    def push(self, depth: NDArray[np.uint16], fresh: NDArray[np.bool_]) -> Tensor:
+        """Add depth (E, 48, 64) mm; returns nearness (E, frames, 48, 64), newest first.
 
-        Rows that are ``fresh`` (E,) have just begun an episode: their past is the present.
+        Rows with ``fresh`` (E,) start an episode: all their frames are set to the newest.
         """
         near = nearness(torch.from_numpy(depth.astype(np.int32)), self._max_m)[:, None]
         self._pictures = torch.cat([near, self._pictures[:, :-1]], 1)
@@ -91,18 +89,17 @@ class Eyes:
 
 @dataclass(frozen=True)
 class ReactiveNetwork:
-    """The actor: convolutions and an MLP with ELU between them, on the standardised state."""
+    """The actor: a CNN of the images, and an MLP of its output and the standardised state (ELU)."""
 
     mean: Tensor  # (74,)
     std: Tensor  # (74,)
     cnn: tuple[Layer, ...]
     mlp: tuple[Layer, ...]
     config: ReactiveConfig
-    """Sizes."""
     controller_id: str
-    """Low-level controller that it was trained with."""
+    """Low-level controller of the training."""
     provenance: Mapping[str, Any]
-    """Command, seed and steps of its training."""
+    """Command, seed and steps of the training."""
 
     @torch.inference_mode()
     def __call__(self, pictures: Tensor, state: Tensor) -> Tensor:
@@ -148,7 +145,7 @@ class ReactiveNetwork:
             ) from error
 
     def require_controller(self, controller_id: str) -> None:
-        """Raise `ArtifactError` unless the robot has the controller it was trained with."""
+        """Raise `ArtifactError` unless the robot has the controller of the training."""
         if controller_id != self.controller_id:
             raise ArtifactError(
                 f"this policy was trained with the low-level controller {self.controller_id}, the "
@@ -172,7 +169,7 @@ class ReactiveNetwork:
         controller_id: str,
         provenance: Mapping[str, Any],
     ) -> ReactiveNetwork:
-        """From tensors by the names of `tensor_shapes`.
+        """A network from tensors with the names of `tensor_shapes`.
 
         Raises:
             KeyError: one is missing.
@@ -191,7 +188,7 @@ class ReactiveNetwork:
         return network
 
     def check(self) -> None:
-        """Raise ValueError unless shapes and numbers are those of its configuration."""
+        """Raise ValueError unless tensors have the configured shapes and finite values."""
         expected = tensor_shapes(self.config)
         for name, tensor in self._tensors().items():
             if tuple(tensor.shape) != expected[name]:
@@ -229,15 +226,15 @@ def tensor_shapes(config: ReactiveConfig) -> dict[str, tuple[int, ...]]:
 
 
 class ReactivePolicy:
-    """The network and its pictures, for E robots in step; call `act` once a tick."""
+    """Plays the network for E robots; call `act` or `observe` once per tick."""
 
     def __init__(self, network: ReactiveNetwork, robots: int) -> None:
         self._network, self._robots = network, robots
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past: every robot has just begun an episode."""
-        self._eyes = Eyes(self._robots, self._network.config)
+        """Start an episode of every robot."""
+        self._frames = FrameStack(self._robots, self._network.config)
         self._fresh = np.ones(self._robots, dtype=np.bool_)
 
     def act(
@@ -246,19 +243,19 @@ class ReactivePolicy:
         state: NDArray[np.floating],
         remaining: Callable[[], float] | None = None,
     ) -> PolicyStep:
-        """Depth (E, 48, 64) mm and state (E, 74) -> actions and no plan, in no time."""
-        pictures = self._look(depth)
+        """Depth (E, 48, 64) mm and state (E, 74) -> actions, without a plan."""
+        pictures = self._push(depth)
         action = self._network(pictures, torch.as_tensor(state, dtype=torch.float32)).numpy()
         return PolicyStep(action)
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
-        """See a picture without acting."""
-        self._look(depth)
+        """Add a depth image without acting."""
+        self._push(depth)
 
     def advance(self, sent: NDArray[np.floating]) -> None:
-        """What was sent is in the next state."""
+        """Does nothing: the next state contains the action."""
 
-    def _look(self, depth: NDArray[np.uint16]) -> Tensor:
-        pictures = self._eyes.look(depth, self._fresh)
+    def _push(self, depth: NDArray[np.uint16]) -> Tensor:
+        pictures = self._frames.push(depth, self._fresh)
         self._fresh = np.zeros(self._robots, dtype=np.bool_)
         return pictures

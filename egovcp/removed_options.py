@@ -55,7 +55,7 @@ _INDEX: Final = re.compile(r"\[\d+\]")
 
 
 class RemovedOptionError(UsageError):
-    """An option that only older versions had."""
+    """An option of older versions."""
 
 
 def refuse_removed_flag(flag: str) -> None:
@@ -100,7 +100,7 @@ def _removed(value: object, name: str) -> Iterator[tuple[str, str]]:
 
 
 def _reason(name: str) -> str | None:
-    """The sentence about ``group.option``, or about the group that was removed as a whole."""
+    """The reason of ``group.option``, or of the removed group that contains it."""
     parts = _INDEX.sub("", name).split(".")
     prefixes = (".".join(parts[:end]) for end in range(1, len(parts) + 1))
     known = dict(REMOVED_OPTIONS) | {

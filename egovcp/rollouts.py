@@ -1,7 +1,6 @@
-"""Episodes of a dataset as recordings, and recordings as episodes.
+"""Converts episodes of a dataset to recordings and back.
 
-Row t of an episode is tick t of a recording, with nothing shifted: o_t, a_t as sent, r_t, done.
-Shared by what shows datasets and by what turns rollouts into data.
+Row t of an episode is tick t of a recording: o_t, a_t as sent, r_t, done.
 """
 
 from __future__ import annotations
@@ -21,15 +20,15 @@ TICK_NS: Final = 1_000_000_000 // PLANNER_HZ
 CONTROLLER: Final = "low_level_controller"
 POSE: Final = (
     "The pelvis pose is not recorded: the robot is drawn at the origin, at its commanded height, "
-    "tilted as its IMU says."
+    "with the tilt of its IMU."
 )
 _EVENT: Final = {"ball": "the ball is thrown", "wall": "the push", "arch": "the way to the arch"}
-_STANDS_OUT: Final = 0.2  # a block, a hit, a passage or a fall; not a tick of bracing
-_SEED_DIGITS: Final = 12  # hexadecimal; far beyond the seeds of collections and evaluations
+_EVENT_REWARD: Final = 0.2  # from the median; a block, a hit, a passage or a fall
+_SEED_DIGITS: Final = 12  # hexadecimal; larger than seeds of collections and evaluations
 
 
 def run_info(reader: DatasetReader, index: int, episode: Episode) -> RunInfo:
-    """What the recording of an episode says before its first tick."""
+    """The run description of the recording of an episode."""
     facts, known = episode.metadata, reader.provenance
     return RunInfo(
         task=episode.task,
@@ -51,7 +50,7 @@ def run_info(reader: DatasetReader, index: int, episode: Episode) -> RunInfo:
 
 
 def camera_view(config: Mapping[str, Any], facts: Mapping[str, Any]) -> CameraView:
-    """The camera as it was mounted in an episode; the default where that is not recorded."""
+    """The camera of an episode; default values where it is not recorded."""
     camera, usual = config.get("env", {}).get("camera", {}), CameraView()
     x, y, z = camera.get("position", usual.position)
     return CameraView(
@@ -62,7 +61,7 @@ def camera_view(config: Mapping[str, Any], facts: Mapping[str, Any]) -> CameraVi
 
 
 def ticks_of(episode: Episode) -> Iterator[Tick]:
-    """The rows of an episode as the logs know them."""
+    """The rows of an episode as ticks."""
     for t in range(len(episode)):
         ended = bool(episode.done[t])
         yield Tick(
@@ -85,26 +84,26 @@ def _events(episode: Episode, t: int) -> Iterator[str]:
         yield _EVENT[episode.task]
     if t > 0 and episode.success[t] != episode.success[t - 1]:
         yield "success" if episode.success[t] else "no success any more"
-    if abs(episode.reward[t] - np.median(episode.reward)) > _STANDS_OUT:
+    if abs(episode.reward[t] - np.median(episode.reward)) > _EVENT_REWARD:
         yield f"reward {episode.reward[t]:+.3f}"
     if episode.done[t]:
         yield "a fall ends the episode" if episode.terminated else "the time is up"
 
 
 def follows(before: Tick, tick: Tick) -> bool:
-    """Whether a tick comes one period after another, so that both may be rows of an episode."""
+    """Whether ``tick`` follows ``before`` by one period, so that both can be rows of an episode."""
     late = abs(tick.time_ns - before.time_ns - TICK_NS) > TICK_NS / 2
     return tick.index == before.index + 1 and not late
 
 
 def episode_of(info: RunInfo, ticks: Sequence[Tick]) -> Episode:
-    """The rows of consecutive ticks, the first of which begins the run.
+    """The episode of consecutive ticks from the start of a run.
 
-    What ends it without a fall (the time is up, an operator, a gap) truncates it: its planned
-    length is then the number of its ticks. After a fall it is the one that was configured.
+    An end without a fall (time limit, operator, gap) is a truncation, and the time limit is the
+    number of ticks. After a fall the time limit is the configured one.
 
     Raises:
-        DataError: there is no tick, or the run's task is none of ours.
+        DataError: there is no tick, or the task is unknown.
     """
     if info.task not in TASKS:
         raise DataError(f"its task is {info.task!r}; expected one of {', '.join(TASKS)}")
@@ -137,7 +136,7 @@ def _depth(tick: Tick) -> np.ndarray[Any, np.dtype[np.uint16]]:
 
 
 def planned_ticks(info: RunInfo) -> int:
-    """How long the run was to be, ticks; 0 where its configuration does not say."""
+    """Configured length of the run, ticks; 0 if unknown."""
     if "time_limit" in info.config:
         return int(str(info.config["time_limit"]))
     env = info.config.get("env")
@@ -146,13 +145,12 @@ def planned_ticks(info: RunInfo) -> int:
 
 
 def _facts(info: RunInfo, episode: Episode) -> dict[str, Any]:
-    """What the dataset keeps of an episode beside its rows.
+    """The metadata of an episode.
 
-    A rollout is named after its content, not after its scenario: another policy plays the same
-    scenario, and an episode of a collection may have the same numbers.
+    The seed of a rollout is a hash of its content, since several policies play the same scenario.
     """
     scenario = info.config.get("scenario")
-    if isinstance(scenario, Mapping):  # it was an episode of a dataset
+    if isinstance(scenario, Mapping):  # recorded from a dataset
         return dict(scenario)
     return {
         "seed": int(episode.digest()[:_SEED_DIGITS], 16),

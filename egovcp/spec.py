@@ -1,4 +1,4 @@
-"""The single source of names, shapes, units and clock rates that every part shares.
+"""Names, shapes, units and clock rates shared by all packages.
 
 Axis letters used in shape comments throughout the code:
 
@@ -88,7 +88,6 @@ STATE_SLICES: Final = {
 }
 STATE_DIM: Final = 74
 COMMAND_SLICE: Final = slice(6, 16)  # velocity 3, hands 6, height 1
-COMMAND_DIM: Final = 10
 
 STATE_NAMES: Final = (
     *(f"angular_velocity.{a}" for a in "xyz"),
@@ -116,7 +115,7 @@ ACTION_RATE_LIMIT: Final = 0.32  # box units per planner tick; same in collectio
 
 
 def reflect(action: NDArray[np.floating], low: NDArray[np.floating] | float = -1.0) -> _Array:
-    """Fold normalised actions that left [low, 1] back inside, as a mirror at the wall would."""
+    """Reflect normalised actions into [low, 1] at the bounds."""
     width = 1.0 - low
     out: _Array = 1.0 - np.abs((action - low) % (2.0 * width) - width)
     return out

@@ -1,7 +1,6 @@
-"""Reads safetensors files that somebody else wrote: the header is checked before the tensors.
+"""Reads untrusted safetensors files: the header is checked before tensors are allocated.
 
-The header of a safetensors file names dtype, shape and byte range of every tensor. It is compared
-with what the caller expects before anything of that size is allocated.
+The header holds dtype, shape and byte range of every tensor.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.decode import DecodeError, decode, require_type, shown
-from egovcp.safe_files import UnsafeFileError, parse_json, read_bytes
+from egovcp.files import UnsafeFileError, parse_json, read_bytes
 
 HEADER_LIMIT_BYTES: Final = 1 << 20
 _LENGTH_BYTES: Final = 8  # of the header, a little-endian integer before it
@@ -42,7 +41,7 @@ ITEM_BYTES: Final[Mapping[str, int]] = {
 
 @dataclass(frozen=True)
 class TensorInfo:
-    """What the header says about a tensor."""
+    """Dtype and shape of a tensor."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -50,7 +49,7 @@ class TensorInfo:
 
 @dataclass(frozen=True)
 class TensorFile:
-    """A safetensors file in memory, whose header is consistent with its size."""
+    """A safetensors file in memory with a valid header."""
 
     metadata: Mapping[str, str]
     tensors: Mapping[str, TensorInfo]
@@ -59,10 +58,10 @@ class TensorFile:
 
     @classmethod
     def parse(cls, content: bytes) -> TensorFile:
-        """Read the header of a file in memory.
+        """Parse a file in memory.
 
         Raises:
-            UnsafeFileError: it is not a header, or does not describe the bytes that follow.
+            UnsafeFileError: the header is invalid, or does not match the size of the file.
         """
         length = int.from_bytes(content[:_LENGTH_BYTES], "little")
         start = _LENGTH_BYTES + length
@@ -92,10 +91,10 @@ class TensorFile:
         return cls(metadata, tensors, content)
 
     def json_metadata(self, key: str) -> Any:
-        """The JSON that the metadata hold under ``key``.
+        """The JSON value in the metadata under ``key``.
 
         Raises:
-            UnsafeFileError: they do not hold it, or it is not plain JSON.
+            UnsafeFileError: it is missing, or not valid JSON.
         """
         if key not in self.metadata:
             raise UnsafeFileError(f"its metadata lack {key}")
@@ -104,11 +103,11 @@ class TensorFile:
     def require(
         self, shapes: Mapping[str, tuple[int, ...]], dtypes: Collection[str] = ("F32",)
     ) -> None:
-        """Raise `UnsafeFileError` unless these tensors are in the file, and no others.
+        """Raise `UnsafeFileError` unless the file holds exactly these tensors.
 
         Args:
-            shapes: of the tensors, by name.
-            dtypes: any of which a tensor may have.
+            shapes: name -> shape.
+            dtypes: allowed dtypes.
         """
         self.require_names(shapes, dtypes)
         for name, info in self.tensors.items():
@@ -118,7 +117,7 @@ class TensorFile:
                 )
 
     def require_names(self, names: Collection[str], dtypes: Collection[str] = ("F32",)) -> None:
-        """The same for tensors of any shape."""
+        """As `require`, for any shape."""
         missing = [name for name in names if name not in self.tensors]
         unknown = [name for name in self.tensors if name not in names]
         if missing:
@@ -146,7 +145,7 @@ class _Entry:
 
 
 def _check_ranges(entries: Mapping[str, _Entry], size: int) -> None:
-    """Raise unless the tensors fill the ``size`` bytes after the header without gap or overlap."""
+    """Raise unless the tensors cover the ``size`` bytes after the header exactly once."""
     end = 0
     for name, entry in sorted(entries.items(), key=lambda item: item[1].data_offsets):
         if entry.dtype not in ITEM_BYTES:
@@ -168,7 +167,7 @@ def read_tensor_file(path: Path, limit_bytes: int) -> TensorFile:
     """Read a safetensors file of at most ``limit_bytes``.
 
     Raises:
-        UnsafeFileError: it is not a regular file, larger, or its header is not one.
+        UnsafeFileError: it is not a regular file, too large, or has an invalid header.
         OSError: it is missing, or cannot be read.
     """
     return TensorFile.parse(read_bytes(path, limit_bytes))

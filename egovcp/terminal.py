@@ -1,7 +1,7 @@
-"""Text for the terminal: every message of every command is printed by this module.
+"""Prints all terminal output of the commands, with control characters escaped.
 
-Messages quote names and texts from datasets, recordings, policies and servers. A control character
-among them could move the cursor, change the window title or hide text, so that it is escaped.
+Messages quote text from datasets, recordings, policies and servers, whose control characters could
+move the cursor, change the window title or hide text.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _KEPT: Final = "\n"
 
 
 def printable(text: object, keep: str = _KEPT) -> str:
-    r"""The text with everything that is neither printable nor in ``keep`` as a backslash escape.
+    r"""The text with backslash escapes for all characters neither printable nor in ``keep``.
 
     Control characters, bidirectional overrides, zero-width characters and bytes that are not UTF-8
     (surrogates) are escaped: ``"\x1b"`` becomes ``"\\x1b"``.
@@ -28,15 +28,15 @@ def printable(text: object, keep: str = _KEPT) -> str:
 
 
 def one_line(text: object) -> str:
-    """As `printable`, with line breaks escaped as well: for a name, a table cell, or an error."""
+    """As `printable`, with line breaks escaped too."""
     return printable(text, keep="")
 
 
 def echo(text: object = "", *, error: bool = False, end: str = "\n") -> None:
-    """Print a text to stdout, or to stderr if it is an error, with control characters escaped.
+    """Print a text to stdout, or to stderr for an error.
 
     Raises:
-        BrokenPipeError: whoever read the output has gone.
+        BrokenPipeError: the reader of the output has closed it.
     """
     print(printable(text), file=sys.stderr if error else sys.stdout, end=end, flush=True)
 
@@ -47,7 +47,7 @@ def echo_lines(lines: Iterable[object]) -> None:
 
 
 def reader_is_gone() -> bool:
-    """Whether stdout or stderr is a pipe that nobody reads any more, as after ``| head -1``."""
+    """Whether stdout or stderr is a pipe without a reader, as after ``| head -1``."""
     return any(_has_no_reader(stream) for stream in (sys.stdout, sys.stderr))
 
 
@@ -62,7 +62,7 @@ def _has_no_reader(stream: Any) -> bool:
 
 
 def discard_output() -> None:
-    """Send what is still to be written nowhere, so that the interpreter's exit does not fail."""
+    """Discard unwritten output, so that the exit of the interpreter does not fail."""
     for stream in (sys.stdout, sys.stderr):
         try:
             stream.flush()

@@ -1,7 +1,7 @@
-"""A cache folder whose files may be loaded as code, because nobody else can have written them.
+"""A cache folder for compiled code that no other user can write to.
 
-Ownership and permissions are checked as OpenSSH checks ``~/.ssh``. Each file has its SHA-256
-beside it, as ``NAME.sha256`` in the format of ``sha256sum``.
+Ownership and permissions are checked as OpenSSH checks ``~/.ssh``. The SHA-256 of each file is
+stored in ``NAME.sha256``, in the format of ``sha256sum``.
 """
 
 from __future__ import annotations
@@ -26,10 +26,8 @@ _loaded_descriptors: list[int] = []
 
 
 def user_cache_folder() -> Path | None:
-    """``$XDG_CACHE_HOME/egovcp``, else ``~/.cache/egovcp``; None if the user has no home folder.
-
-    A user id without an account and without ``$HOME`` has none (``docker run --user 12345``).
-    """
+    """``$XDG_CACHE_HOME/egovcp`` or ``~/.cache/egovcp``; None if the user has no home folder, as in
+    ``docker run --user 12345``."""
     root = os.environ.get("XDG_CACHE_HOME", "")
     if os.path.isabs(root):
         return Path(root) / "egovcp"
@@ -76,14 +74,14 @@ class TrustedCache:
         os.close(self._descriptor)
 
     def read(self, name: str) -> bytes | None:
-        """Content of a file; None if it is missing, not trusted, or differs from its digest."""
+        """Content of a file; None if it is missing, not trusted, or does not match its digest."""
         content, digest = self._read(name), self._read(_digest_name(name))
         if content is None or digest is None or digest != _digest_line(name, content):
             return None
         return content
 
     def write(self, name: str, content: bytes) -> None:
-        """Store a file and its digest durably; each replaces an older one in one step.
+        """Write a file and its digest durably and atomically.
 
         Raises:
             OSError: it cannot be written.
@@ -122,11 +120,10 @@ class TrustedCache:
 
 
 def load_library(content: bytes, name: str) -> ctypes.CDLL:
-    """Load a shared library from memory, so that no file can be exchanged after its check.
+    """Load a shared library from memory, so that it cannot change after its check.
 
     Args:
-        content: the library.
-        name: shown by debuggers and profilers.
+        name: its name in debuggers and profilers.
 
     Raises:
         OSError: it is not a library for this machine.
@@ -140,9 +137,9 @@ def load_library(content: bytes, name: str) -> ctypes.CDLL:
             fcntl.fcntl(descriptor, fcntl.F_ADD_SEALS, seals)
             library = ctypes.CDLL(f"/proc/self/fd/{descriptor}")
         except OSError:
-            os.close(descriptor)  # no /proc, or no executable memory files: use a private file
+            os.close(descriptor)  # no /proc, or memory files are not executable: use a private file
         else:
-            # The loader knows libraries by path: the number must not be used again.
+            # The loader identifies libraries by path, so the descriptor must stay open.
             _loaded_descriptors.append(descriptor)
             return library
     with tempfile.TemporaryDirectory(prefix="egovcp-") as folder:
@@ -160,7 +157,7 @@ def _make_private(folder: Path) -> None:
 
 
 def _ancestors(folder: Path) -> Iterator[Path]:
-    """The folders above one, links resolved, up to the home folder or the root."""
+    """The parents of a folder, links resolved, up to the home folder or the root."""
     try:
         home: Path | None = Path.home().resolve()
     except RuntimeError:
@@ -172,11 +169,10 @@ def _ancestors(folder: Path) -> Iterator[Path]:
 
 
 def _distrust(status: os.stat_result, sticky: bool = False) -> str:
-    """Why another user may have changed a file or folder; empty if none can.
+    """Why another user may have changed a file or folder; empty: none can.
 
     Args:
-        sticky: whether a folder that others can write to is safe if they cannot replace what
-            is in it, as in ``/tmp``.
+        sticky: accept a folder with the sticky bit that others can write to, such as ``/tmp``.
     """
     if status.st_uid not in (0, os.geteuid()):
         return f"belongs to user id {status.st_uid}, expected {os.geteuid()}"

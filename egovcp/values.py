@@ -1,9 +1,8 @@
-"""Values of options: parsed from text, checked against the type of the option, built.
+"""Parses values of options and builds configuration dataclasses.
 
-An option has one of these types: text, int, float, bool, `Literal`, tuple, list, dict with text as
-keys, dataclass, or any of them or None. A collection is written in YAML, in which ``(1, 2)`` stands
-for ``[1, 2]``. Numbers may be text, as on a command line; `egovcp.decode` reads JSON that somebody
-else wrote, and converts nothing.
+Types of options: str, int, float, bool, `Literal`, tuple, list, dict with str keys, dataclass, and
+unions with None. Collections are written in YAML, with ``(1, 2)`` as another form of ``[1, 2]``.
+Numbers may be text, as on a command line; `egovcp.decode` reads untrusted JSON without conversions.
 """
 
 from __future__ import annotations
@@ -30,13 +29,13 @@ _INT: Final = re.compile(r"[+-]?[0-9]{1,19}")
 _YAML_FLOATS: Final[Mapping[Any, str]] = {".inf": "inf", "-.inf": "-inf", ".nan": "nan"}
 _INT_LIMIT: Final = 2**63
 _MAIN_OPTIONS: Final = ("root", "path", "type")
-"""Of a group such as ``--dataset``: what its name alone is likely to stand for."""
+"""The option that is probably meant by the name of a group such as ``--dataset``."""
 _SHOWN_OPTIONS: Final = 6
 _NESTING_LIMIT: Final = 32
 
 
 class WrongValue(UsageError):
-    """A value that is not of the type of its option."""
+    """A value that does not have the type of its option."""
 
     @classmethod
     def of(cls, name: str, value: object, kind: Any, hint: str = "") -> WrongValue:
@@ -45,7 +44,7 @@ class WrongValue(UsageError):
 
 
 def type_name(kind: Any) -> str:
-    """A type as its values are written on a command line: ``[float, float]``, ``int or null``."""
+    """A type in command-line syntax: ``[float, float]``, ``int or null``."""
     origin, args = get_origin(kind), get_args(kind)
     if is_dataclass_type(kind):
         return "{NAME: VALUE, ...}"
@@ -65,27 +64,27 @@ def type_name(kind: Any) -> str:
 
 @cache
 def option_types(config_class: type) -> Mapping[str, Any]:
-    """Option -> type, of a dataclass."""
+    """Option -> type of a dataclass."""
     return get_type_hints(config_class)
 
 
 def is_dataclass_type(kind: Any) -> bool:
-    """Whether options of this type have options of their own."""
+    """Whether the type is a group of options."""
     return isinstance(kind, type) and dataclasses.is_dataclass(kind)
 
 
 def is_collection(kind: Any) -> bool:
-    """Whether a value of this type is written in YAML: a list, a mapping, or either or null."""
+    """Whether values of this type are written in YAML."""
     if get_origin(kind) in (Union, UnionType):
         return any(is_collection(part) for part in get_args(kind))
     return get_origin(kind) in (tuple, list, dict) or is_dataclass_type(kind)
 
 
 def parse_collection(text: str) -> Any:
-    """The value of a text in YAML, in which a list may be written in parentheses.
+    """The value of a YAML text, in which lists may be in parentheses.
 
     Raises:
-        ValueError: it is not YAML.
+        ValueError: invalid YAML.
     """
     try:
         return cfgparsing.parse_string(_with_brackets(text))
@@ -100,13 +99,13 @@ def build[C](
 
     Args:
         config_class: the dataclass.
-        values: option -> value; may lack options.
-        prefix: what precedes the name of an option in messages, ``--env.``.
-        default: has the options that are lacking; None: the defaults of the class.
+        values: option -> value; options may be missing.
+        prefix: prefix of option names in messages, ``--env.``.
+        default: an instance with the values of missing options; None: the defaults of the class.
 
     Raises:
-        WrongValue: an option is unknown, lacking without a default, or not of its type.
-        EgovcpError: what the dataclass itself raises; bounds name the flag.
+        WrongValue: an option is unknown, required and missing, or has another type.
+        EgovcpError: raised by the dataclass.
     """
     kinds = option_types(config_class)  # type: ignore[arg-type]
     options = {field.name: field for field in dataclasses.fields(config_class)}  # type: ignore[arg-type]
@@ -130,16 +129,16 @@ def build[C](
 
 
 def convert(kind: Any, value: Any, name: str, default: Any = None) -> Any:
-    """The value as one of a type.
+    """The value converted to a type.
 
     Args:
         kind: the type.
-        value: a Python value, or text that a user wrote.
+        value: a Python value, or text from a command line.
         name: of the option, for messages.
-        default: of a dataclass: has the options that ``value`` lacks.
+        default: for a dataclass: an instance with the values of missing options.
 
     Raises:
-        WrongValue: it is not of the type; the message names the option, or the one within it.
+        WrongValue: the value has another type.
     """
     origin, args = get_origin(kind), get_args(kind)
     if origin in (Union, UnionType):
@@ -182,7 +181,7 @@ def _items(kind: Any, value: Any, name: str) -> Iterator[Any]:
     """The items of a tuple or a list, converted."""
     args = get_args(kind)
     if isinstance(value, str) and value.strip().startswith(("(", "[")):
-        value = _collection_or(value)  # a tuple in a config file
+        value = collection_or_text(value)  # a tuple in YAML
     if not isinstance(value, Sequence) or isinstance(value, str | bytes):
         raise WrongValue.of(name, value, kind)
     variadic = get_origin(kind) is list or args[-1] is Ellipsis
@@ -199,7 +198,8 @@ def _items(kind: Any, value: Any, name: str) -> Iterator[Any]:
             raise WrongValue.of(name, value, kind) from None
 
 
-def _collection_or(text: str) -> Any:
+def collection_or_text(text: str) -> Any:
+    """The value of a YAML text, or the text itself if it is not YAML."""
     try:
         return parse_collection(text)
     except ValueError:
@@ -220,11 +220,13 @@ def _text(value: Any, name: str) -> str:
 
 
 def _scalar(kind: Any, value: Any) -> Any:
-    """A number, a boolean or one of several values; None: the value is not of the type."""
+    """A number, a boolean or a literal; None: the value has another type."""
     if get_origin(kind) is Literal:
         return next((v for v in get_args(kind) if v == value and type(v) is type(value)), None)
     if kind is bool:
-        return _BOOLEANS.get(value.lower()) if isinstance(value, str) else _if_is(bool, value)
+        if isinstance(value, str):
+            return _BOOLEANS.get(value.lower())
+        return value if isinstance(value, bool) else None
     if isinstance(value, bool):
         return None
     if kind is int:
@@ -239,39 +241,35 @@ def _scalar(kind: Any, value: Any) -> Any:
     return None
 
 
-def _if_is(kind: type, value: Any) -> Any:
-    return value if isinstance(value, kind) else None
-
-
 def _options_of(config_class: Any, value: Any, name: str) -> str:
-    """What a group has for options, and which of them may have been meant."""
+    """The options of a group, and the one that may be meant."""
     names = [field.name for field in dataclasses.fields(config_class)]
     meant = [key for key in _MAIN_OPTIONS if key in names and isinstance(value, str)]
     if meant:
         return f"; did you mean {name}.{meant[0]}={as_flag_value(value)}?"
-    prefix = "" if name.endswith("]") else f"{name}."  # of an item in a list: no flag
+    prefix = "" if name.endswith("]") else f"{name}."  # an item of a list is no flag
     listed = ", ".join(f"{prefix}{key}" for key in names[:_SHOWN_OPTIONS])
     return f"; its options are {listed}{', ...' if len(names) > _SHOWN_OPTIONS else ''}"
 
 
 def default_of(field: dataclasses.Field[Any]) -> Any:
-    """Of the class; `MISSING`: the option is required."""
+    """The default of a field; `MISSING`: the option is required."""
     if field.default_factory is not dataclasses.MISSING:
         return field.default_factory()
     return field.default
 
 
 def _with_brackets(text: str) -> str:
-    """The text with the parentheses of lists replaced by brackets; others are left alone.
+    """The text with parentheses of lists replaced by brackets.
 
     Raises:
-        ValueError: it is nested too deeply, for which a parser would take long.
+        ValueError: it is nested too deeply.
     """
     out: list[str] = []
     opened: list[str] = []
-    quote, before = "", ""  # the quote that is open; the last character that is not a space
+    quote, before = "", ""  # open quote; last character that is not a space
     for character in text:
-        starts = before in "[{(,:"  # a value may start here
+        starts = before in "[{(,:"  # a value can start here
         written = character
         if quote:
             quote = "" if character == quote else quote

@@ -1,21 +1,26 @@
-"""What worker processes inherit from the command that starts them."""
+"""Worker processes: what they inherit, graceful stops, and the Ray cluster."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import os
 import signal
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Final
+from typing import Any, Final
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.packages import require_packages
 
 _THREAD_LIMITS: Final = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-@contextmanager
+@contextlib.contextmanager
 def inherited_by_workers() -> Iterator[None]:
-    """Workers start deaf to Ctrl-C, which the main process answers, and with one thread each.
+    """Processes started in the block ignore SIGINT and use one compute thread each.
 
-    Enter it around the call that starts the processes, on the main thread.
+    Enter it on the main thread.
     """
     previous = signal.signal(signal.SIGINT, signal.SIG_IGN)
     limits = {name: "1" for name in _THREAD_LIMITS if name not in os.environ}
@@ -26,3 +31,66 @@ def inherited_by_workers() -> Iterator[None]:
         for name in limits:
             del os.environ[name]
         signal.signal(signal.SIGINT, previous)
+
+
+@contextlib.contextmanager
+def stop_on_signal(echo_s: float = 0.0) -> Iterator[list[int]]:
+    """A list that is empty until SIGINT or SIGTERM arrives; a second signal raises at once.
+
+    Enter it on the main thread. The block checks the list, saves its results, and raises
+    KeyboardInterrupt.
+
+    Args:
+        echo_s: seconds after the first signal in which further signals are ignored: a launcher
+            forwards the Ctrl-C that the terminal has already sent to its processes.
+    """
+    received: list[int] = []
+    ignored_until = 0.0
+
+    def note(number: int, frame: object) -> None:
+        nonlocal ignored_until
+        if not received:
+            received.append(number)
+            ignored_until = time.monotonic() + echo_s
+        elif time.monotonic() >= ignored_until:
+            raise KeyboardInterrupt
+
+    previous = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield received
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def ray_package(distribution: str) -> Any:
+    """The package `ray`, which is optional.
+
+    Args:
+        distribution: the distribution whose extra `ray` installs it.
+
+    Raises:
+        MissingPackage: it is not installed.
+    """
+    require_packages(distribution, "--backend=ray", "ray")
+    return importlib.import_module("ray")
+
+
+def connect(distribution: str) -> Any:
+    """Connect to the cluster of ``RAY_ADDRESS``, or start a local one; returns the package `ray`.
+
+    Raises:
+        EnvironmentFailure: Ray is not installed, or the cluster cannot be reached.
+    """
+    ray = ray_package(distribution)
+    address = os.environ.get("RAY_ADDRESS")
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    own = {} if address else {"include_dashboard": False, "_node_ip_address": "127.0.0.1"}
+    try:
+        ray.init(address, log_to_driver=False, logging_level="warning", **own)
+    except (ConnectionError, RuntimeError, ValueError) as error:
+        raise EnvironmentFailure(
+            f"cannot reach the Ray cluster at {address or 'this machine'}: {error}; check "
+            "RAY_ADDRESS"
+        ) from error
+    return ray

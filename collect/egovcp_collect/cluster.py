@@ -1,4 +1,4 @@
-"""Workers as actors of a Ray cluster (`egovcp.cluster`); their episodes come back sealed.
+"""Workers as actors of a Ray cluster (`egovcp.workers`); their episodes come back sealed.
 
 Every node needs this package, and nothing of this machine's disk.
 """
@@ -9,9 +9,9 @@ import logging
 from collections.abc import Sequence
 from typing import Any, Final
 
-from egovcp.cluster import connect, ray_package
 from egovcp.data.staging import StagedEpisode
 from egovcp.sim.scenario import Scenario
+from egovcp.workers import connect, ray_package
 from egovcp_collect.backend import Brief, Report, encode_numbered, portable
 from egovcp_collect.config import CollectConfig
 from egovcp_collect.simulation import Simulation

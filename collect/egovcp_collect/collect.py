@@ -19,8 +19,8 @@ from egovcp.packages import require_packages
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.env import resolve_config
 from egovcp.sim.scenario import Scenario
-from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
+from egovcp.workers import stop_on_signal
 from egovcp_collect.backend import Backend
 from egovcp_collect.config import SHAPING, CollectConfig
 from egovcp_collect.crew import Crew

@@ -9,7 +9,7 @@ from typing import Any, Final
 
 from egovcp.cli import run_command
 from egovcp.errors import DataError, UsageError, suggest
-from egovcp.safe_files import read_json
+from egovcp.files import read_json
 from egovcp.terminal import echo
 from egovcp_deploy.report import aligned
 from egovcp_deploy.scores import (

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from egovcp.errors import DataError
-from egovcp.safe_files import UnsafeFileError, read_json
+from egovcp.files import UnsafeFileError, read_json
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
 from egovcp_deploy.scenarios import for_search

@@ -13,10 +13,10 @@ import draccus
 from tqdm import tqdm
 
 from egovcp.artifact import Artifact
-from egovcp.atomic import write_json
 from egovcp.bounds import MOST_PER_CORE, bounded, check_bounds
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
+from egovcp.files import write_json
 from egovcp.hardware import available_cores
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork
@@ -25,8 +25,8 @@ from egovcp.sim.config import EnvConfig, evaluation_config, require_memory_for_r
 from egovcp.sim.env import resolve_config
 from egovcp.sim.scenario import EPISODE_TASKS, Scenario
 from egovcp.spec import TASKS
-from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
+from egovcp.workers import stop_on_signal
 from egovcp_deploy.constant_search import Action, BestConstant, load_constants, search_constant
 from egovcp_deploy.controllers import CONTROLLERS, PPO
 from egovcp_deploy.episodes import Group, Setup, Stage

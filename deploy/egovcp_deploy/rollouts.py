@@ -11,7 +11,7 @@ import numpy as np
 from tqdm import tqdm
 
 from egovcp.artifact import Artifact
-from egovcp.atomic import write_json
+from egovcp.files import write_json
 from egovcp.log.tick import RunInfo, Tick
 from egovcp.rate import FixedRate, LockstepClock
 from egovcp.spec import PLANNER_HZ

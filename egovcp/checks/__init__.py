@@ -1,11 +1,11 @@
-"""Public conformance checks: does a part keep its contract with the others?
+"""Public conformance checks of datasets, environments, world models and policies.
 
     check_world_model(model)     recurrence, reset, batching and shapes of a world model
     check_artifact(path)         a policy artifact loads, conforms and plans
     check_env(env, scenarios)    clock, reset, repeatability and limits of an environment
-    check_dataset(config)        every episode reads, and its commands line up in time
+    check_dataset(config)        every episode is readable, and its commands agree with its actions
 
-Each returns quietly, or raises an `EgovcpError` that says what is wrong and where.
+Each raises an `EgovcpError` that names the problem and its place.
 """
 
 from __future__ import annotations
@@ -16,10 +16,9 @@ from typing import TYPE_CHECKING
 from egovcp.errors import ConformanceError
 
 if TYPE_CHECKING:
-    from egovcp.checks.artifact import check_artifact
     from egovcp.checks.dataset import check_dataset
     from egovcp.checks.environment import check_env
-    from egovcp.checks.world_model import check_world_model
+    from egovcp.checks.world_model import check_artifact, check_world_model
 
 __all__ = [
     "ConformanceError",
@@ -29,9 +28,9 @@ __all__ = [
     "check_world_model",
 ]
 
-#: Each check is imported when it is asked for: whoever checks a dataset need not wait for torch.
+#: Imported on first use: a check of a dataset does not import torch.
 _MODULES = {
-    "check_artifact": "artifact",
+    "check_artifact": "world_model",
     "check_dataset": "dataset",
     "check_env": "environment",
     "check_world_model": "world_model",

@@ -1,4 +1,4 @@
-"""Does a vectorised environment keep time, limits and promises?"""
+"""Conformance check of a vectorised environment: clock, reset, limits, repeatability."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class _Step[O: _Observation](Protocol):
 
 
 class Environment[S, O: _Observation](Protocol):
-    """What collection and evaluation need of a vectorised environment."""
+    """The interface of a vectorised environment that collection and evaluation use."""
 
     @property
     def num_envs(self) -> int: ...
@@ -65,10 +65,10 @@ def check_env[S, O: _Observation](
 
     Args:
         scenarios: one per row of the environment.
-        ticks: planner ticks per run; actions jump farther than the rate limit allows.
+        ticks: planner ticks per run; the actions exceed the rate limit.
 
     Raises:
-        ConformanceError: naming the tick and the property that it breaks.
+        ConformanceError: names the tick and the property.
     """
     rng = np.random.default_rng(seed)
     actions = rng.uniform(-1, 1, (ticks, env.num_envs, spec.ACTION_DIM))
@@ -82,7 +82,7 @@ def check_env[S, O: _Observation](
 def _drive[S, O: _Observation](
     env: Environment[S, O], scenarios: Sequence[S], actions: Array
 ) -> list[dict[str, NDArray[np.generic]]]:
-    """What each tick brought; tick 0 is the observation of the reset."""
+    """Observation and reward of each tick; tick 0 is the reset."""
     sent: Array = np.zeros((env.num_envs, spec.ACTION_DIM))
     over: NDArray[np.bool_] = np.zeros(env.num_envs, dtype=np.bool_)
     observation = env.reset(scenarios)

@@ -1,4 +1,4 @@
-"""Do the statistics of a dataset, which normalise every network's input, fit its frames?"""
+"""Compares the statistics of a dataset, which normalise network inputs, with its frames."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from egovcp.data import DatasetReader, Episode, metadata, schema, stats
 from egovcp.data.parquet import EPISODE_FEATURES, data_errors, open_parquet
 from egovcp.errors import DataError
 
-_RELATIVE = 1e-4  # of the column's range: statistics may have been gathered in float32
-_LEAST = 1e-6
-#: LeRobot's editing tools keep the statistics that these had in the dataset an episode came from.
+_RELATIVE = 1e-4  # of the column's range: statistics may be float32
+_ABSOLUTE = 1e-6
+#: LeRobot's editing tools copy these statistics unchanged from the source dataset.
 _STALE = ("index", "episode_index", "task_index")
 _CHECKED = tuple(key for key in schema.FEATURES if key not in _STALE)
 
 
 class StatisticsCheck:
-    """Compares the statistics of each episode and of all with those of the frames."""
+    """Compares ``meta/stats.json`` with the frames."""
 
     def __init__(self, reader: DatasetReader) -> None:
         self._reader = reader
@@ -30,7 +30,7 @@ class StatisticsCheck:
         self._total: stats.Matrix | None = None
 
     def add(self, episode: Episode) -> stats.Matrix:
-        """Take in a valid episode; the statistics (R, D) of its frames."""
+        """Add a valid episode; returns the statistics (R, D) of its frames."""
         matrix = _statistics(self._reader, episode)
         parts = [matrix] if self._total is None else [self._total, matrix]
         counts = [len(episode)] if self._total is None else [self._frames, len(episode)]
@@ -39,7 +39,7 @@ class StatisticsCheck:
         return matrix
 
     def problems(self) -> Iterator[DataError]:
-        """What differs from ``meta/stats.json``, if every frame of the dataset was added.
+        """Differences from ``meta/stats.json``, if all frames of the dataset were added.
 
         Raises:
             DataError: the file is missing or damaged.
@@ -58,14 +58,14 @@ class StatisticsCheck:
 
 
 class EpisodeStatistics:
-    """The statistics of each episode in ``meta/episodes``, read file by file."""
+    """Compares the statistics in ``meta/episodes`` with the frames, file by file."""
 
     def __init__(self, reader: DatasetReader) -> None:
         self._reader = reader
         self._rows = self._all_rows()
 
     def problems(self, index: int, matrix: stats.Matrix | None) -> Iterator[DataError]:
-        """What differs from the table's row of an episode; call it for every episode in order.
+        """Differences from the table's row of an episode; call it for every episode in order.
 
         Args:
             index: the episode.
@@ -112,7 +112,7 @@ def _differences(
 ) -> Iterator[str]:
     part = matrix[:, stats.LAYOUT[key]]
     least, most, mean = part[0], part[1], part[2]
-    slack = _RELATIVE * (most - least + np.abs(mean)) + _LEAST
+    slack = _RELATIVE * (most - least + np.abs(mean)) + _ABSOLUTE
     for name, expected in zip(stats.ROWS, part, strict=True):
         values = _numbers(found.get(name))
         if values is None or values.shape != expected.shape:
@@ -126,7 +126,7 @@ def _differences(
 
 
 def _numbers(value: object) -> NDArray[np.float64] | None:
-    """Nested lists of numbers as a flat array; None if there is something else in them."""
+    """Nested lists of numbers as a flat array; None if they hold other values."""
     flat: list[float] = []
     waiting = [value]
     while waiting:

@@ -1,22 +1,24 @@
-"""Does a world model keep the contract that filtering and planning rely on?"""
+"""Conformance checks of a world model and of a policy artifact."""
 
 from __future__ import annotations
 
 import copy
 from typing import Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.errors import ConformanceError
+from egovcp.artifact import Artifact, load_artifact
+from egovcp.errors import ArtifactError, ConformanceError
 from egovcp.model import Carry
 
-TOLERANCE = 1e-4  # of network outputs computed in another order
+TOLERANCE = 1e-4  # rounding of network outputs
 
 
 class RecurrentModel(Protocol):
-    """What filtering and planning need of a world model; shapes as in `WorldModel`."""
+    """The methods of a world model that filtering and planning use; shapes as in `WorldModel`."""
 
     @property
     def min_return(self) -> Tensor: ...
@@ -39,7 +41,7 @@ class RecurrentModel(Protocol):
 
 
 class RandomInputs:
-    """Random but repeatable inputs for B rows."""
+    """Random inputs for B rows, given by the seed."""
 
     def __init__(self, rows: int, seed: int) -> None:
         rng = torch.Generator().manual_seed(seed)
@@ -55,7 +57,7 @@ def check_world_model(model: RecurrentModel, seed: int = 0) -> None:
     """Check the contract that filtering on the robot and planning rely on.
 
     Raises:
-        ConformanceError: naming the method and the property that it breaks.
+        ConformanceError: names the method and the property.
     """
     rows = 3
     first, rest = torch.ones(rows, dtype=torch.bool), torch.zeros(rows, dtype=torch.bool)
@@ -85,7 +87,7 @@ def _row(carry: Carry, row: slice) -> Carry:
 
 
 def _check_rows(model: RecurrentModel, start: Carry, inputs: RandomInputs, batched: Carry) -> None:
-    """Each row of a batch is treated as if it were alone."""
+    """Each row of a batch gives the same result alone."""
     going_on = torch.zeros(1, dtype=torch.bool)
     for b in range(len(inputs.action)):
         row = slice(b, b + 1)
@@ -156,3 +158,30 @@ def _same(problem: str, expected: Carry, found: Carry) -> None:
     for a, b in zip(expected, found, strict=True):
         close = torch.allclose(a, b, rtol=TOLERANCE, atol=TOLERANCE)
         _require(close, f"{problem}: differs by up to {float((a - b).abs().max()):.3g}")
+
+
+def check_artifact(path: str, revision: str = "") -> Artifact:
+    """Load an artifact, check its model, and let it plan once.
+
+    Raises:
+        ArtifactError: it does not load, does not conform, or does not plan.
+        EnvironmentFailure: the Hub cannot be reached.
+    """
+    artifact = load_artifact(path, revision)
+    inputs = RandomInputs(1, seed=0)
+    try:
+        check_world_model(artifact.world_model)
+    except ConformanceError as error:
+        raise ArtifactError(f"{artifact.path}: {error}; train again") from error
+    steps = [
+        artifact.make_policy(seed=0).act(
+            inputs.depth.numpy().astype(np.uint16), inputs.state.numpy()
+        )
+        for _ in range(2)
+    ]
+    plan = steps[0].plan
+    if not (np.isfinite(plan).all() and np.abs(plan).max() <= 1 and np.isfinite(steps[0].value)):
+        raise ArtifactError(f"{artifact.path}: its plan is not finite or leaves [-1, 1]")
+    if not np.array_equal(plan, steps[1].plan):
+        raise ArtifactError(f"{artifact.path}: a seed does not repeat a plan")
+    return artifact

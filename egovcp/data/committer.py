@@ -23,7 +23,6 @@ from typing import Any, Final
 
 import pyarrow as pa
 
-from egovcp.atomic import removed_on_error
 from egovcp.data import files, metadata, schema, stats
 from egovcp.data.destination import (
     is_vacant,
@@ -40,6 +39,7 @@ from egovcp.data.source import Source
 from egovcp.data.staging import EncodedEpisode, StagingDir
 from egovcp.data.writer import VersionContents, VersionWriter, publish_version, recover, shard_paths
 from egovcp.errors import DataError, EnvironmentFailure, UsageError
+from egovcp.files import removed_on_error
 
 _STAGING: Final = "sealed"  # name on disk, which unfinished collections of older versions have
 

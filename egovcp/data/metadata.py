@@ -18,7 +18,7 @@ from egovcp.data.episode import EPISODE_FRAMES
 from egovcp.data.parquet import data_errors, open_parquet
 from egovcp.data.paths import check_template, files_below, require_file
 from egovcp.errors import DataError
-from egovcp.safe_files import JSON_LIMIT_BYTES, read_json, sha256
+from egovcp.files import JSON_LIMIT_BYTES, read_json, sha256
 
 _EPISODE_COLUMNS = (
     "episode_index",

@@ -21,7 +21,7 @@ from egovcp import spec
 from egovcp.data import schema, tiff
 from egovcp.data.paths import require_file
 from egovcp.errors import DataError
-from egovcp.safe_files import require_regular
+from egovcp.files import require_regular
 
 ROW_GROUP_ROWS: Final = 65_536
 """Largest number of rows of a row group, which is read as a whole: 0.4 GB of depth."""

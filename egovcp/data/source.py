@@ -19,8 +19,8 @@ from egovcp.cli import DatasetConfig
 from egovcp.data import schema
 from egovcp.data.files import write_json
 from egovcp.errors import DataError, UsageError, suggest_path
+from egovcp.files import read_json
 from egovcp.hub import HubFileCache, RetryPolicy, is_repo_id, snapshot
-from egovcp.safe_files import read_json
 
 _RETRY_POLICY = RetryPolicy()
 _PART = re.compile(r"(\d{1,18})|(\d{0,18}):(\d{0,18})", re.ASCII)

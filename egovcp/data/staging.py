@@ -24,7 +24,7 @@ from egovcp.data import files, schema, stats, tiff
 from egovcp.data.episode import Episode
 from egovcp.data.parquet import EPISODE_FEATURES
 from egovcp.errors import DataError, EnvironmentFailure
-from egovcp.safe_files import sha256
+from egovcp.files import sha256
 
 _RECORD: Final = b"egovcp.facts"
 _STATS: Final = b"egovcp.stats"

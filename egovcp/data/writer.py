@@ -23,14 +23,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from egovcp import spec
-from egovcp.atomic import removed_on_error
 from egovcp.data import files, schema, stats
 from egovcp.data.destination import is_vacant, make_parent, require_new, resolve_root
 from egovcp.data.episode import Episode
 from egovcp.data.provenance import Provenance
 from egovcp.data.staging import EncodedEpisode, encode, with_index
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.safe_files import sha256
+from egovcp.files import removed_on_error, sha256
 
 #: A file system or kernel that cannot exchange two folders.
 _NO_EXCHANGE: Final = (errno.EINVAL, errno.ENOSYS, errno.ENOTSUP)

@@ -2,32 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Final
 
 import rerun.blueprint as rrb
 
-from egovcp.log.paths import (
-    ACTION,
-    CAMERA,
-    DEPTH,
-    EVENTS,
-    IMAGINED,
-    INFO,
-    LINK,
-    MOTOR_FAULTS,
-    MOTOR_LOST,
-    MOTOR_TEMPERATURE,
-    MOTOR_TORQUE,
-    OUTCOME,
-    PLAN,
-    RECONSTRUCTED,
-    REWARD,
-    RUNNER,
-    STATE,
-    TIMING,
-    VALUE_MAP,
-    WORLD,
-)
+from egovcp.log import paths
+
+_DARK: Final = [24, 26, 32]
+_FRONT: Final = (1.9, 1.5, 1.2)  # shows both hands and approaching objects
+_SIDE: Final = (0.3, 3.1, 1.6)  # a surface in front of the robot does not hide it
 
 
 def blueprint(imagined: tuple[int, ...] = ()) -> rrb.Blueprint:
@@ -37,139 +21,130 @@ def blueprint(imagined: tuple[int, ...] = ()) -> rrb.Blueprint:
     Tab ``robot``: motors, connection and state of the runner.
 
     Args:
-        imagined: horizons of the imagined depth images, ticks ahead; none leaves them out.
+        imagined: horizons of the imagined depth images, ticks ahead; empty: no such images.
     """
-    return rrb.Blueprint(
-        rrb.Tabs(
-            rrb.Horizontal(
-                rrb.Vertical(_scene(), _below_scene(), row_shares=[5, 2]),
-                rrb.Vertical(*_images(imagined), *_curves(), row_shares=_shares(imagined)),
-                column_shares=[3, 2],
-                name="plan",
+    images = [*_images(imagined)]
+    plan = rrb.Horizontal(
+        rrb.Vertical(_scene(_FRONT), _below_scene(), row_shares=[5, 2]),
+        rrb.Vertical(
+            *images,
+            _curves(
+                {
+                    "value of the plan": f"{paths.PLAN}/value",
+                    "termination probability": f"{paths.PLAN}/termination",
+                }
             ),
-            _robot_tab(),
-            active_tab=0,
+            _curves({"reward": paths.REWARD, "timing (ms)": paths.TIMING}),
+            row_shares=[3.0, *[2.0] * (len(images) + 1)],
         ),
-        _time_panel(),
-        collapse_panels=True,
+        column_shares=[3, 2],
+        name="plan",
     )
+    return _blueprint(rrb.Tabs(plan, _robot_tab(), active_tab=0))
 
 
 def signals_blueprint() -> rrb.Blueprint:
     """Layout for a recording without a planner: left, 3D view and depth; right, curves."""
-    seen = rrb.Spatial2DView(name="depth seen", origin=CAMERA, contents=[DEPTH])
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Vertical(_scene(_SIDE), seen, row_shares=[3, 2]),
-            rrb.Vertical(*_outcome_curves(), *_action_curves(), _state_tabs()),
-            column_shares=[1, 1],
-        ),
-        _time_panel(),
-        collapse_panels=True,
+    action, state = paths.ACTION, paths.STATE
+    hands = {
+        "left hand target (m)": f"{action}/left_hand",
+        "right hand target (m)": f"{action}/right_hand",
+    }
+    height = {
+        "height target (m)": f"{action}/height",
+        "action in [-1, 1]": f"{action}/normalised",
+    }
+    imu = {
+        "angular velocity (rad/s)": f"{state}/angular_velocity",
+        "projected gravity": f"{state}/projected_gravity",
+    }
+    command = {
+        "velocity (m/s, rad/s)": f"{state}/command_velocity",
+        "hands (m)": f"{state}/command_hands",
+        "height (m)": f"{state}/command_height",
+    }
+    tabs = rrb.Tabs(
+        _curves(imu, "IMU"),
+        _curves(command, "command in o_t"),
+        rrb.TimeSeriesView(name="joint angles (rad)", origin=f"{state}/joint_position"),
+        rrb.TimeSeriesView(name="joint velocities (rad/s)", origin=f"{state}/joint_velocity"),
+        rrb.TextLogView(name="events", origin=paths.EVENTS),
+        rrb.TextDocumentView(name="episode", origin=paths.INFO),
     )
+    curves = [
+        _curves({"reward": paths.REWARD, "done, success": paths.OUTCOME}),
+        _curves(hands),
+        _curves(height),
+    ]
+    return _blueprint(
+        rrb.Horizontal(
+            rrb.Vertical(_scene(_SIDE), _depth_view(), row_shares=[3, 2]),
+            rrb.Vertical(*curves, tabs),
+            column_shares=[1, 1],
+        )
+    )
+
+
+def _blueprint(root: rrb.Container) -> rrb.Blueprint:
+    time = rrb.TimePanel(
+        state="collapsed", timeline="time", fps=25.0, play_state="playing", loop_mode="all"
+    )
+    return rrb.Blueprint(root, time, collapse_panels=True)
+
+
+def _curves(origins: dict[str, str], name: str | None = None) -> rrb.Container:
+    """Plots side by side: title -> entity path."""
+    views = [rrb.TimeSeriesView(name=title, origin=path) for title, path in origins.items()]
+    return rrb.Horizontal(*views, name=name)
 
 
 def _robot_tab() -> rrb.Container:
     """Motors and connection."""
+    last = _curves(
+        {
+            "connection, image age, mode machine": paths.LINK,
+            "state of the runner": paths.RUNNER,
+        }
+    )
+    temperature = {
+        "motor temperature (deg C)": paths.MOTOR_TEMPERATURE,
+        "motor torque (N m)": paths.MOTOR_TORQUE,
+    }
+    faults = {
+        "motor faults (status bits)": paths.MOTOR_FAULTS,
+        "packets lost by motors": paths.MOTOR_LOST,
+    }
+    events = rrb.TextLogView(name="events", origin=paths.EVENTS)
     return rrb.Vertical(
-        rrb.Horizontal(
-            rrb.TimeSeriesView(name="motor temperature (deg C)", origin=MOTOR_TEMPERATURE),
-            rrb.TimeSeriesView(name="motor torque (N m)", origin=MOTOR_TORQUE),
-        ),
-        rrb.Horizontal(
-            rrb.TimeSeriesView(name="motor faults (status bits)", origin=MOTOR_FAULTS),
-            rrb.TimeSeriesView(name="packets lost by motors", origin=MOTOR_LOST),
-        ),
-        rrb.Horizontal(
-            rrb.TimeSeriesView(name="connection, image age, mode machine", origin=LINK),
-            rrb.TimeSeriesView(name="state of the runner", origin=RUNNER),
-            rrb.TextLogView(name="events", origin=EVENTS),
-        ),
+        _curves(temperature),
+        _curves(faults),
+        rrb.Horizontal(last, events, column_shares=[2, 1]),
         name="robot",
     )
-
-
-def _time_panel() -> rrb.TimePanel:
-    return rrb.TimePanel(
-        state="collapsed", timeline="time", fps=25.0, play_state="playing", loop_mode="all"
-    )
-
-
-def _outcome_curves() -> list[rrb.View | rrb.Container]:
-    return [
-        rrb.Horizontal(
-            rrb.TimeSeriesView(name="reward", origin=REWARD),
-            rrb.TimeSeriesView(name="done, success", origin=OUTCOME),
-        )
-    ]
-
-
-def _action_curves() -> list[rrb.View | rrb.Container]:
-    return [
-        rrb.Horizontal(
-            rrb.TimeSeriesView(name="left hand target (m)", origin=f"{ACTION}/left_hand"),
-            rrb.TimeSeriesView(name="right hand target (m)", origin=f"{ACTION}/right_hand"),
-        ),
-        rrb.Horizontal(
-            rrb.TimeSeriesView(name="height target (m)", origin=f"{ACTION}/height"),
-            rrb.TimeSeriesView(name="action in [-1, 1]", origin=f"{ACTION}/normalised"),
-        ),
-    ]
-
-
-def _state_tabs() -> rrb.Container:
-    return rrb.Tabs(
-        rrb.Horizontal(
-            rrb.TimeSeriesView(name="angular velocity (rad/s)", origin=f"{STATE}/angular_velocity"),
-            rrb.TimeSeriesView(name="projected gravity", origin=f"{STATE}/projected_gravity"),
-            name="IMU",
-        ),
-        _command_curves(),
-        rrb.TimeSeriesView(name="joint angles (rad)", origin=f"{STATE}/joint_position"),
-        rrb.TimeSeriesView(name="joint velocities (rad/s)", origin=f"{STATE}/joint_velocity"),
-        rrb.TextLogView(name="events", origin=EVENTS),
-        rrb.TextDocumentView(name="episode", origin=INFO),
-    )
-
-
-def _command_curves() -> rrb.Container:
-    return rrb.Horizontal(
-        rrb.TimeSeriesView(name="velocity (m/s, rad/s)", origin=f"{STATE}/command_velocity"),
-        rrb.TimeSeriesView(name="hands (m)", origin=f"{STATE}/command_hands"),
-        rrb.TimeSeriesView(name="height (m)", origin=f"{STATE}/command_height"),
-        name="command in o_t",
-    )
-
-
-def _shares(imagined: tuple[int, ...]) -> list[float]:
-    return [3.0, *([2.0] if imagined else []), 2.0, 2.0]
 
 
 def _below_scene() -> rrb.Container:
     maps = [
         rrb.Spatial2DView(
-            name=f"Q over x, z of the {hand} hand", origin=f"{VALUE_MAP}/{hand}", background=_DARK
+            name=f"Q over x, z of the {hand} hand",
+            origin=f"{paths.VALUE_MAP}/{hand}",
+            background=_DARK,
         )
         for hand in ("left", "right")
     ]
-    words = rrb.Tabs(
-        rrb.TextLogView(name="events", origin=EVENTS),
-        rrb.TextDocumentView(name="run", origin=INFO),
+    texts = rrb.Tabs(
+        rrb.TextLogView(name="events", origin=paths.EVENTS),
+        rrb.TextDocumentView(name="run", origin=paths.INFO),
     )
-    return rrb.Horizontal(*maps, words, column_shares=[1, 1, 1.4])
+    return rrb.Horizontal(*maps, texts, column_shares=[1, 1, 1.4])
 
 
-_DARK: Final = [24, 26, 32]
-_FRONT: Final = (1.9, 1.5, 1.2)  # shows both hands and approaching objects
-_SIDE: Final = (0.3, 3.1, 1.6)  # a surface in front of the robot does not hide it
-
-
-def _scene(eye: tuple[float, float, float] = _FRONT) -> rrb.View:
-    """The scene, seen from the world position ``eye``."""
+def _scene(eye: tuple[float, float, float]) -> rrb.View:
+    """The 3D scene, seen from the world position ``eye``."""
     return rrb.Spatial3DView(
         name="robot",
-        origin=WORLD,
-        contents=[f"{WORLD}/**"],
+        origin=paths.WORLD,
+        contents=[f"{paths.WORLD}/**"],
         background=_DARK,
         eye_controls=rrb.EyeControls3D(
             position=eye, look_target=(0.45, 0.0, 0.68), eye_up=(0.0, 0.0, 1.0)
@@ -177,27 +152,16 @@ def _scene(eye: tuple[float, float, float] = _FRONT) -> rrb.View:
     )
 
 
-def _images(imagined: tuple[int, ...]) -> list[rrb.Container]:
-    seen = rrb.Spatial2DView(name="depth seen", origin=CAMERA, contents=[DEPTH])
-    decoded = rrb.Spatial2DView(name="reconstructed", origin=RECONSTRUCTED)
-    rows: list[rrb.Container] = [rrb.Horizontal(seen, decoded)]
+def _depth_view() -> rrb.View:
+    return rrb.Spatial2DView(name="depth seen", origin=paths.CAMERA, contents=[paths.DEPTH])
+
+
+def _images(imagined: tuple[int, ...]) -> Iterator[rrb.Container]:
+    decoded = rrb.Spatial2DView(name="reconstructed", origin=paths.RECONSTRUCTED)
+    yield rrb.Horizontal(_depth_view(), decoded)
     if imagined:
         views = [
-            rrb.Spatial2DView(name=f"imagined +{k}", origin=f"{IMAGINED}/{i}")
+            rrb.Spatial2DView(name=f"imagined +{k}", origin=f"{paths.IMAGINED}/{i}")
             for i, k in enumerate(imagined)
         ]
-        rows.append(rrb.Horizontal(*views))
-    return rows
-
-
-def _curves() -> list[rrb.View | rrb.Container]:
-    return [
-        rrb.Horizontal(
-            rrb.TimeSeriesView(name="value of the plan", origin=f"{PLAN}/value"),
-            rrb.TimeSeriesView(name="termination probability", origin=f"{PLAN}/termination"),
-        ),
-        rrb.Horizontal(
-            rrb.TimeSeriesView(name="reward", origin=REWARD),
-            rrb.TimeSeriesView(name="timing (ms)", origin=TIMING),
-        ),
-    ]
+        yield rrb.Horizontal(*views)

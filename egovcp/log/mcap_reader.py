@@ -19,12 +19,12 @@ from mcap.records import Channel, McapRecord, Message, Metadata, Schema
 from mcap_ros2.decoder import DecoderFactory
 
 from egovcp.errors import DataError
+from egovcp.files import UnsafeFileError, open_regular
 from egovcp.log.mcap import METADATA_NAME, RecordedTopic, checksum_matches, without_checksum
 from egovcp.log.mcap_records import MAGIC, Damage, RecordFile
 from egovcp.log.messages import Topic, decode_mode, decode_tick, motor_readings
 from egovcp.log.tick import MotorReadings, RunInfo, Tick
 from egovcp.rate import NS_PER_S
-from egovcp.safe_files import UnsafeFileError, open_regular
 
 #: Topics of a dataset row.
 ROW_TOPICS: Final = frozenset(

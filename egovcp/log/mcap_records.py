@@ -90,7 +90,7 @@ class Damage:
 
 
 @dataclass(frozen=True)
-class Summary:
+class SummarySection:
     """The summary section at the end of a complete file."""
 
     start: int
@@ -197,7 +197,7 @@ class RecordFile:
             position += at + 1
         return None
 
-    def _summary(self, file: IO[bytes]) -> Summary | None:
+    def _summary(self, file: IO[bytes]) -> SummarySection | None:
         """The summary, if its checksum matches."""
         try:
             footer, _ = read_record(file, self.size - _FOOTER_BYTES, self.size)
@@ -212,7 +212,7 @@ class RecordFile:
         content = file.read(end + _HEADER.size + 8 + 8 - footer.summary_start)
         if footer.summary_crc not in (0, zlib.crc32(content)) or file.read(12)[4:] != MAGIC:
             return None
-        summary = Summary(footer.summary_start)
+        summary = SummarySection(footer.summary_start)
         position = footer.summary_start
         while position < end:
             try:
@@ -227,7 +227,7 @@ class RecordFile:
             elif isinstance(record, MetadataIndex):
                 summary.metadata.append(record)
             elif isinstance(record, Statistics):
-                summary = Summary(**{**vars(summary), "statistics": record})
+                summary = SummarySection(**{**vars(summary), "statistics": record})
         return summary
 
     def _has_end(self, file: IO[bytes]) -> bool:

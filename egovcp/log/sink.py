@@ -14,15 +14,12 @@ class Sink(Protocol):
 
     def open(self, info: RunInfo) -> None:
         """Start the log of a run."""
-        ...
 
     def write(self, tick: Tick) -> None:
         """Write one tick."""
-        ...
 
     def close(self) -> None:
         """Complete the log on disk; further calls do nothing."""
-        ...
 
 
 @runtime_checkable
@@ -31,7 +28,6 @@ class RetryingSink(Sink, Protocol):
 
     def retry(self) -> None:
         """Write that tick; raises OSError if the disk is still full."""
-        ...
 
 
 class Fanout:

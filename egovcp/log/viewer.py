@@ -17,7 +17,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Final, Literal, Protocol, Self
+from typing import ClassVar, Final, Literal, Protocol, Self
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -37,10 +37,8 @@ _END_TIMEOUT_S: Final = 3.0
 class Destination(Protocol):
     """Receives a recording."""
 
-    @property
-    def is_live(self) -> bool:
-        """Whether it is shown while it is written."""
-        ...
+    is_live: ClassVar[bool]
+    """Whether it is shown while it is written."""
 
     def attach(self, stream: rr.RecordingStream, look: rrb.Blueprint) -> None:
         """Send the stream to the destination.
@@ -51,19 +49,14 @@ class Destination(Protocol):
         Raises:
             EnvironmentFailure: the file cannot be created, or no viewer listens.
         """
-        ...
 
 
 @dataclass(frozen=True)
 class RrdFile:
     """A new file."""
 
+    is_live: ClassVar[bool] = False
     path: Path
-
-    @property
-    def is_live(self) -> bool:
-        """False: a file is shown later."""
-        return False
 
     def attach(self, stream: rr.RecordingStream, look: rrb.Blueprint) -> None:
         """Create the file."""
@@ -85,6 +78,7 @@ class Viewer:
         UsageError: the address has another form.
     """
 
+    is_live: ClassVar[bool] = True
     url: str = f"rerun+http://{LOOPBACK}:{GRPC_PORT}/proxy"
 
     def __post_init__(self) -> None:
@@ -93,11 +87,6 @@ class Viewer:
                 f"{self.url!r} is no address of a Rerun viewer; "
                 f"expected rerun+http://{LOOPBACK}:{GRPC_PORT}/proxy or the like"
             )
-
-    @property
-    def is_live(self) -> bool:
-        """True."""
-        return True
 
     @property
     def address(self) -> tuple[str, int]:

@@ -16,9 +16,9 @@ from safetensors.torch import load
 from torch import Tensor
 
 from egovcp import spec
+from egovcp.files import UnsafeFileError
 from egovcp.model.config import WorldModelConfig
 from egovcp.model.world_model import WorldModel
-from egovcp.safe_files import UnsafeFileError
 from egovcp.tensor_file import HEADER_LIMIT_BYTES, TensorFile
 
 MAX_WEIGHT_BYTES: Final = 512 << 20

@@ -25,15 +25,14 @@ from numpy.typing import NDArray
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
-from egovcp.atomic import write_bytes
 from egovcp.bounds import check_bounds
 from egovcp.decode import decode, require_type, shown
 from egovcp.errors import ArtifactError
+from egovcp.files import parse_json, read_bytes, write_bytes
 from egovcp.packages import require_packages
 from egovcp.robot.g1 import DAMPING, STIFFNESS
 from egovcp.robot.stance_table import standing_pose
 from egovcp.robot.walking import ACTIONS, OBSERVATION_DIM, WalkConfig
-from egovcp.safe_files import parse_json, read_bytes
 from egovcp.spec import ACTION_BOX, JOINT_NAMES, STATE_NAMES
 from egovcp.tensor_file import TensorFile, read_tensor_file
 

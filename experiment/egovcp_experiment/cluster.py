@@ -1,4 +1,4 @@
-"""Cells on the nodes of a Ray cluster (`egovcp.cluster`), each beside an actor that watches it.
+"""Cells on the nodes of a Ray cluster (`egovcp.workers`), each beside an actor that watches it.
 
 Commands read and write files of each other and of the experiment, so the output folder, and all
 that flags name, must be on a file system that every node has under the same path. Every node needs
@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.cluster import connect
 from egovcp.errors import EnvironmentFailure
+from egovcp.workers import connect
 from egovcp_experiment.cell import Tool
 from egovcp_experiment.config import RayConfig
 from egovcp_experiment.local import LocalProcess, machine

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp.stop_signals import stop_on_signal
+from egovcp.workers import stop_on_signal
 from egovcp_experiment.cell import Cell, in_order
 from egovcp_experiment.local import LocalRunner
 from egovcp_experiment.runner import INTERRUPTED, Run, Runner

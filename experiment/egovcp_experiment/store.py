@@ -17,9 +17,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.atomic import write_json
 from egovcp.data.destination import writer_lock
 from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.files import write_json
 from egovcp_experiment.cell import Cell, Found, Given, Output, Reference, filled, written
 from egovcp_experiment.tools import given_digest, read_json
 

@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.data.schema import COLLECTION_PATH, HASHES_PATH
+from egovcp.files import sha256
 from egovcp.manifest import MANIFEST, SEAL, read_manifest
 from egovcp.reactive import ReactiveNetwork
-from egovcp.safe_files import sha256
 from egovcp_experiment.cell import Flags, Tool
 
 #: Where egovcp-train leaves its artifact, below the folder of the run.

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from egovcp.artifact import FILES, save_artifact
-from egovcp.atomic import removed_on_error, write_bytes, write_json, write_text
+from egovcp.files import removed_on_error, write_bytes, write_json, write_text
 from egovcp.plan import PlannerConfig
 from egovcp.testing import toy_model
 

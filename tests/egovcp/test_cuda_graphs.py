@@ -8,12 +8,12 @@ import torch
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.cuda_graphs import MOST_RECORDINGS, Recorded
+from egovcp.cuda_graphs import MAX_GRAPHS, GraphedFunction
 from egovcp.model import PRESETS, Carry
 from egovcp.plan import PlannerConfig, ReferenceEvaluator
 from egovcp.plan.backends import FloatEvaluator
 from egovcp.testing import toy_model
-from tests.support.cuda_graphs import RecomputingRecorder
+from tests.support.cuda_graphs import RecomputingCapture
 
 
 class _Pair(NamedTuple):
@@ -33,8 +33,8 @@ def _arguments(size: int, seed: int, third: bool = True) -> tuple[Tensor, Any]:
 
 
 def test_a_graph_is_reused_for_equal_shapes_only() -> None:
-    recorder = RecomputingRecorder()
-    recorded = Recorded(_function, recorder)
+    recorder = RecomputingCapture()
+    recorded = GraphedFunction(_function, recorder)
     for seed in range(3):
         for size, third in ((4, True), (5, True), (4, False)):
             given = _arguments(size, seed, third)
@@ -45,7 +45,7 @@ def test_a_graph_is_reused_for_equal_shapes_only() -> None:
 
 
 def test_inputs_and_earlier_results_do_not_change() -> None:
-    recorded = Recorded(_function, RecomputingRecorder())
+    recorded = GraphedFunction(_function, RecomputingCapture())
     given = _arguments(4, 0)
     before = [given[0].clone(), given[1][0].clone()]
     first = recorded(*given)
@@ -57,7 +57,7 @@ def test_inputs_and_earlier_results_do_not_change() -> None:
 
 
 def test_graphs_work_under_no_grad_and_inference_mode() -> None:
-    recorded = Recorded(_function, RecomputingRecorder())
+    recorded = GraphedFunction(_function, RecomputingCapture())
     for mode in (torch.inference_mode, torch.no_grad, torch.inference_mode):
         with mode():
             given = _arguments(4, 2)
@@ -73,30 +73,30 @@ def test_a_failed_capture_is_not_repeated() -> None:
         tried.append(function)
         raise RuntimeError("operation not permitted when stream is capturing")
 
-    recorded = Recorded(_function, refuse)
+    recorded = GraphedFunction(_function, refuse)
     for seed in range(3):
         given = _arguments(4, seed)
         assert recorded(*given).sum.equal(_function(*given).sum)
     assert len(tried) == 1
     assert recorded.shapes == 0
-    assert recorded.refused == "operation not permitted when stream is capturing"
+    assert recorded.error == "operation not permitted when stream is capturing"
 
 
 def test_shapes_beyond_the_limit_are_computed_without_a_graph() -> None:
-    recorder = RecomputingRecorder()
-    recorded = Recorded(_function, recorder)
-    for size in range(1, MOST_RECORDINGS + 4):
+    recorder = RecomputingCapture()
+    recorded = GraphedFunction(_function, recorder)
+    for size in range(1, MAX_GRAPHS + 4):
         given = _arguments(size, size)
         assert recorded(*given).sum.equal(_function(*given).sum)
-    assert recorder.made == MOST_RECORDINGS
+    assert recorder.made == MAX_GRAPHS
 
 
 def test_other_arguments_are_part_of_the_key() -> None:
     def scaled(x: Tensor, by: int) -> tuple[str, Tensor]:
         return f"by {by}", by * x
 
-    recorder = RecomputingRecorder()
-    recorded = Recorded(scaled, recorder)
+    recorder = RecomputingCapture()
+    recorded = GraphedFunction(scaled, recorder)
     for by in (2, 3, 2, 3):
         x = torch.rand(4)
         name, found = recorded(x, by)
@@ -106,7 +106,7 @@ def test_other_arguments_are_part_of_the_key() -> None:
 
 
 def test_uncopied_results_are_overwritten_by_the_next_call() -> None:
-    recorded = Recorded(_function, RecomputingRecorder(), copies=False)
+    recorded = GraphedFunction(_function, RecomputingCapture(), copies=False)
     first = recorded(*_arguments(4, 0))
     second = recorded(*_arguments(4, 1))
     assert first.sum is second.sum

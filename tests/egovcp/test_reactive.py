@@ -10,7 +10,7 @@ from safetensors.torch import load_file, save_file
 
 from egovcp import spec
 from egovcp.errors import ArtifactError, UsageError
-from egovcp.reactive import SCHEMA, Eyes, ReactiveConfig, ReactiveNetwork, ReactivePolicy
+from egovcp.reactive import SCHEMA, FrameStack, ReactiveConfig, ReactiveNetwork, ReactivePolicy
 from tests.support.models import toy_reactive
 
 ROWS, COLS = spec.DEPTH_ROWS, spec.DEPTH_COLS
@@ -22,23 +22,23 @@ def _flat(metres: list[float]) -> np.ndarray:
     return np.broadcast_to(depth, (len(metres), ROWS, COLS)).astype(np.uint16)
 
 
-def _seen(eyes: Eyes, metres: list[float], fresh: list[bool]) -> list[list[float]]:
-    pictures = eyes.look(_flat(metres), np.array(fresh))
+def _seen(stack: FrameStack, metres: list[float], fresh: list[bool]) -> list[list[float]]:
+    pictures = stack.push(_flat(metres), np.array(fresh))
     return [[round(float(x.mean()), 3) for x in robot] for robot in pictures]
 
 
 def test_frames_are_newest_first_and_repeat_after_a_reset() -> None:
-    eyes = Eyes(2, ReactiveConfig(frames=3, depth_max_m=5.0))
-    assert _seen(eyes, [1.0, 2.0], [True, True]) == [[0.8] * 3, [0.6] * 3]
-    assert _seen(eyes, [2.0, 3.0], [False, False]) == [[0.6, 0.8, 0.8], [0.4, 0.6, 0.6]]
-    assert _seen(eyes, [3.0, 4.0], [False, True]) == [[0.4, 0.6, 0.8], [0.2] * 3]
+    stack = FrameStack(2, ReactiveConfig(frames=3, depth_max_m=5.0))
+    assert _seen(stack, [1.0, 2.0], [True, True]) == [[0.8] * 3, [0.6] * 3]
+    assert _seen(stack, [2.0, 3.0], [False, False]) == [[0.6, 0.8, 0.8], [0.4, 0.6, 0.6]]
+    assert _seen(stack, [3.0, 4.0], [False, True]) == [[0.4, 0.6, 0.8], [0.2] * 3]
 
 
 def test_frames_are_copied() -> None:
-    eyes = Eyes(1, ReactiveConfig(frames=2))
-    first = eyes.look(_flat([1.0]), np.array([True]))
+    stack = FrameStack(1, ReactiveConfig(frames=2))
+    first = stack.push(_flat([1.0]), np.array([True]))
     before = first.clone()
-    eyes.look(_flat([3.0]), np.array([True]))
+    stack.push(_flat([3.0]), np.array([True]))
     assert torch.equal(first, before)
 
 

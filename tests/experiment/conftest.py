@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from egovcp.safe_files import sha256
+from egovcp.files import sha256
 from egovcp_experiment.cell import Cell, Tool
 from egovcp_experiment.tools import read_json
 

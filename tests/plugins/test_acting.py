@@ -16,8 +16,7 @@ from egovcp import spec
 from egovcp.artifact import CONFIG, WEIGHTS, load_artifact
 from egovcp.data import DatasetWriter, Provenance
 from egovcp.errors import ArtifactError, DataError, UsageError
-from egovcp.manifest import MANIFEST
-from egovcp.processors import PROCESSORS
+from egovcp.manifest import MANIFEST, PROCESSORS
 from egovcp.testing import random_episode
 from lerobot_policy_egovcp import EgovcpConfig, EgovcpPolicy, make_egovcp_pre_post_processors
 

@@ -14,7 +14,7 @@ from huggingface_hub import HfApi
 
 from egovcp.artifact import load_artifact
 from egovcp.checks import check_artifact
-from egovcp.processors import PROCESSORS
+from egovcp.manifest import PROCESSORS
 from egovcp.robot.stance import StanceController
 from lerobot_policy_egovcp import EgovcpPolicy
 from tests.support.hub import FakeHub, environment, in_this_process

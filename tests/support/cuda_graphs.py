@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.utils._pytree import tree_leaves
 
 
-class RecomputingRecorder:
+class RecomputingCapture:
     """Records nothing: a replay calls the function again and copies its results into the first
     ones."""
 
@@ -21,7 +21,7 @@ class RecomputingRecorder:
     def __call__(
         self, function: Callable[[], Any], device: torch.device
     ) -> tuple[Callable[[], object], Any]:
-        """See `egovcp.cuda_graphs.Record`."""
+        """See `egovcp.cuda_graphs.Capture`."""
         self.made += 1
         results = function()
 

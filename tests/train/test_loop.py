@@ -7,13 +7,13 @@ from typing import Any, Literal
 import pytest
 import torch
 
-from egovcp.cuda_graphs import Recorded
+from egovcp.cuda_graphs import GraphedFunction
 from egovcp.errors import DataError
 from egovcp.model import PRESETS, Batch
 from egovcp.testing import random_batch, toy_model
 from egovcp_train.config import OptimizerConfig
 from egovcp_train.loop import Budget, Learner
-from tests.support.cuda_graphs import RecomputingRecorder
+from tests.support.cuda_graphs import RecomputingCapture
 
 CONFIG = OptimizerConfig(warmup_steps=0)
 
@@ -103,8 +103,10 @@ def test_recorded_steps_learn_the_same_bit_for_bit(
     loss = dataclasses.replace(PRESETS["debug"].loss, q_target=q_target, decode_every=2)
     config = dataclasses.replace(PRESETS["debug"], dynamics=dynamics, loss=loss)
     plain, recorded = (Learner(toy_model(config), CONFIG, seed=0) for _ in range(2))
-    recorder = RecomputingRecorder()
-    recorded._gradients = Recorded(recorded._compute_gradients, recorder, most=64, copies=False)
+    recorder = RecomputingCapture()
+    recorded._gradients = GraphedFunction(
+        recorded._compute_gradients, recorder, max_graphs=64, copies=False
+    )
     for seed in range(12):
         expected = plain.update(random_batch(2, 6, seed), 0.0)
         found = recorded.update(random_batch(2, 6, seed), 0.0)
@@ -121,7 +123,7 @@ def test_a_step_that_cannot_be_recorded_is_made_and_says_why() -> None:
 
     learner, plain = _learner(), _learner()
     assert not learner.unrecorded
-    learner._gradients = Recorded(learner._compute_gradients, refuse, copies=False)
+    learner._gradients = GraphedFunction(learner._compute_gradients, refuse, copies=False)
     for seed in range(3):
         learner.update(random_batch(2, 3, seed), 0.0)
         plain.update(random_batch(2, 3, seed), 0.0)
@@ -134,7 +136,7 @@ def test_a_step_that_cannot_be_recorded_is_made_and_says_why() -> None:
 @pytest.mark.parametrize("bf16", [False, True])
 def test_on_a_gpu_steps_are_recorded_and_the_same(bf16: bool) -> None:
     recorded, plain = (Learner(toy_model().cuda(), CONFIG, seed=0, bf16=bf16) for _ in range(2))
-    assert isinstance(recorded._gradients, Recorded)
+    assert isinstance(recorded._gradients, GraphedFunction)
     plain._gradients = plain._compute_gradients
     for seed in range(24):
         batch = Batch(*(x.cuda() for x in random_batch(4, 8, seed)))

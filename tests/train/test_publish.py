@@ -13,8 +13,8 @@ import yaml
 from egovcp.artifact import load_artifact, save_artifact
 from egovcp.checks import check_artifact
 from egovcp.hub import RetryPolicy
+from egovcp.manifest import PROCESSORS
 from egovcp.plan import PlannerConfig
-from egovcp.processors import PROCESSORS
 from egovcp.testing import toy_model
 from egovcp_train import publish as publishing
 from egovcp_train.publish import main as push

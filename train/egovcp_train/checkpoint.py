@@ -19,14 +19,13 @@ from typing import IO, Any, Final
 
 import torch
 
-from egovcp.atomic import removed_on_error
 from egovcp.data.files import sync, sync_tree
 from egovcp.errors import ArtifactError, UsageError
+from egovcp.files import UnsafeFileError, open_regular, read_text, removed_on_error, sha256
 from egovcp.flags import read_config
 from egovcp.model.weights import MAX_WEIGHT_BYTES
 from egovcp.outputs import require_writable
 from egovcp.removed_options import RemovedOptionError, refuse_removed_options
-from egovcp.safe_files import UnsafeFileError, open_regular, read_text, sha256
 from egovcp.values import build
 
 CONFIG_FILE: Final = "train_config.yaml"

@@ -34,14 +34,13 @@ from torch import Tensor, nn
 
 from egovcp import spec
 from egovcp.artifact import WEIGHTS, Artifact, load_artifact
-from egovcp.atomic import removed_on_error, write_bytes
 from egovcp.cli import run_command
 from egovcp.errors import ArtifactError, UsageError
+from egovcp.files import removed_on_error, sha256, write_bytes
 from egovcp.manifest import MANIFEST
 from egovcp.model import Carry, WorldModel
 from egovcp.packages import require_packages
 from egovcp.policy_options import PolicyOptions
-from egovcp.safe_files import sha256
 from egovcp.terminal import echo
 from egovcp_train.checkpoint import prepare_output
 

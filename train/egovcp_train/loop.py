@@ -12,7 +12,7 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from egovcp.cuda_graphs import Recorded
+from egovcp.cuda_graphs import GraphedFunction
 from egovcp.errors import DataError
 from egovcp.model import Batch, StepNoise, WorldModel, sample_step_noise, world_model_gradients
 from egovcp.model.parallel import data_parallel
@@ -62,12 +62,14 @@ class Learner:
         self._parameters = list(model.parameters())
         self._gradients: Callable[[Batch, StepNoise], Gradients] = self._compute_gradients
         if device.type == "cuda" and group.count == 1:
-            self._gradients = Recorded(self._compute_gradients, most=_MOST_GRAPHS, copies=False)
+            self._gradients = GraphedFunction(
+                self._compute_gradients, max_graphs=_MOST_GRAPHS, copies=False
+            )
 
     @property
     def unrecorded(self) -> str:
         """Why a step could not be captured on this GPU; empty if it was."""
-        return self._gradients.refused if isinstance(self._gradients, Recorded) else ""
+        return self._gradients.error if isinstance(self._gradients, GraphedFunction) else ""
 
     def update(self, batch: Batch, progress: float) -> dict[str, Tensor]:
         """One gradient step at ``progress`` in [0, 1] of the run; returns scalar metrics."""

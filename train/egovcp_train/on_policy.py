@@ -15,7 +15,7 @@ import torch
 from tqdm import tqdm
 
 from egovcp.bounds import bounded
-from egovcp.stop_signals import stop_on_signal
+from egovcp.workers import stop_on_signal
 from egovcp_train.checkpoint import checkpoint_dir, new_checkpoint
 from egovcp_train.loop import Budget
 from egovcp_train.records import TensorBoardRecorder

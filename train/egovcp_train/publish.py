@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.artifact import FILES, Artifact, load_artifact
-from egovcp.atomic import write_text
 from egovcp.cli import run_command
 from egovcp.errors import EgovcpError, EnvironmentFailure, UsageError
+from egovcp.files import write_text
 from egovcp.hub import (
     Content,
     Publication,

@@ -21,8 +21,8 @@ from egovcp.manifest import finite_or_null
 from egovcp.model import WorldModel
 from egovcp.model.weights import tensor_shapes
 from egovcp.plan.backends import make_evaluator
-from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo, one_line
+from egovcp.workers import stop_on_signal
 from egovcp_train.checkpoint import (
     CONFIG_FILE,
     checkpoint_dir,
@@ -64,9 +64,7 @@ _UNRECORDED = (
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    return run_command(
-        TrainConfig, train, argv, prog=PROG, epilog=EPILOG, defaults=option_defaults
-    )
+    return run_command(TrainConfig, train, argv, prog=PROG, epilog=EPILOG, defaults=option_defaults)
 
 
 def option_defaults(argv: Sequence[str]) -> dict[str, Any]:

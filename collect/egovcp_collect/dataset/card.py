@@ -12,9 +12,9 @@ from typing import Any, Final
 from huggingface_hub import DatasetCard, DatasetCardData
 
 from egovcp import spec
-from egovcp.atomic import write_text
 from egovcp.data import DatasetConfig, DatasetReader, ReturnConfig, schema
 from egovcp.errors import UsageError
+from egovcp.files import write_text
 from egovcp.outputs import output_file
 from egovcp.terminal import echo
 from egovcp_collect.dataset import card_tables

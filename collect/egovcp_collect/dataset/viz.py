@@ -13,9 +13,9 @@ import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from egovcp.atomic import removed_on_error
 from egovcp.data import DatasetConfig, DatasetReader
 from egovcp.errors import UsageError
+from egovcp.files import removed_on_error
 from egovcp.outputs import output_file, require_writable
 from egovcp.packages import require_packages
 from egovcp.rollouts import POSE, run_info, ticks_of

@@ -12,8 +12,8 @@ import torch
 from tqdm import tqdm
 
 from egovcp.artifact import Artifact
-from egovcp.atomic import write_json
 from egovcp.errors import EgovcpError, SafetyStop, UsageError
+from egovcp.files import write_json
 from egovcp.hardware import available_cores
 from egovcp.log.tick import CameraView, RunInfo, Tick
 from egovcp.robot.controllers import make_controller

@@ -8,7 +8,7 @@ from functools import partial
 import torch
 from torch import Tensor
 
-from egovcp.cuda_graphs import Recorded
+from egovcp.cuda_graphs import GraphedFunction
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.backends import library
@@ -66,12 +66,14 @@ class FloatEvaluator:
         self._plan_value: Callable[[SharedPrefix, Tensor, Tensor | None], Tensor]
         self._plan_value = PlanningNetwork(model, config).plan_value
         if model.state_mean.device.type == "cuda":
-            self._prefix, self._plan_value = Recorded(self._prefix), Recorded(self._plan_value)
+            self._prefix = GraphedFunction(self._prefix)
+            self._plan_value = GraphedFunction(self._plan_value)
 
     @property
     def shapes(self) -> int:
         """Number of captured CUDA graphs."""
-        return sum(f.shapes for f in (self._prefix, self._plan_value) if isinstance(f, Recorded))
+        parts = (self._prefix, self._plan_value)
+        return sum(f.shapes for f in parts if isinstance(f, GraphedFunction))
 
     @torch.no_grad()
     def at(self, carry: Carry) -> PlanValue:

@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Final
 
-from egovcp.atomic import write_json, write_text
+from egovcp.files import write_json, write_text
 from egovcp_experiment.report.document import Report, Table
 from egovcp_experiment.report.html import page
 from egovcp_experiment.report.markdown import drawings, markdown

@@ -23,7 +23,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from egovcp.artifact import Artifact
+from egovcp.artifact import Artifact, returns_of
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
@@ -33,7 +33,6 @@ from egovcp.sim.env import StepResult, VectorEnv
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM, ACTION_ETA
-from egovcp.trained import returns_of
 from egovcp_experiment.studies.study import finish
 from egovcp_experiment.studies.watching import Moment, WatchConfig, Watcher, watch
 from egovcp_experiment.variance import Residuals, analysis

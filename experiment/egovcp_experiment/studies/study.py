@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.artifact import Artifact
-from egovcp.atomic import write_json
 from egovcp.errors import UsageError
+from egovcp.files import write_json
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp_experiment.tools import RESULT
 

@@ -6,9 +6,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from egovcp.atomic import write_json
 from egovcp.data.metadata import hashed_files
-from egovcp.safe_files import sha256
+from egovcp.files import sha256, write_json
 from tests.support.policy_mutations.editing import Random
 
 from .damage import (

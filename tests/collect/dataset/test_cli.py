@@ -26,7 +26,7 @@ def test_every_subcommand_explains_its_options(
         main([name, "--help"])
     assert ended.value.code == 0
     out = capsys.readouterr().out
-    assert f"usage: egovcp-dataset {name}" in out
+    assert f"egovcp-dataset {name}: " in out
     assert "--dataset.root" in out
 
 

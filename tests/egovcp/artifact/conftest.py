@@ -11,9 +11,8 @@ import pytest
 
 from egovcp.artifact import CONFIG, WEIGHTS, save_artifact
 from egovcp.hub import RetryPolicy
-from egovcp.manifest import MANIFEST, sealed
+from egovcp.manifest import MANIFEST, PROCESSORS, sealed
 from egovcp.plan import PlannerConfig
-from egovcp.processors import PROCESSORS
 from egovcp.testing import toy_model
 
 PLANNER = PlannerConfig(samples=32, elites=4, iterations=1, termination_rule="survival")

@@ -9,9 +9,8 @@ import torch
 
 from egovcp.artifact import CONFIG, WEIGHTS, load_artifact, read_options
 from egovcp.errors import ArtifactError
-from egovcp.manifest import MANIFEST
+from egovcp.manifest import MANIFEST, PROCESSORS
 from egovcp.model import PRESETS
-from egovcp.processors import PROCESSORS
 
 from .conftest import FILES, PLANNER, Json, edit, sign
 

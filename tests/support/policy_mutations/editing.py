@@ -15,8 +15,7 @@ import torch
 from safetensors.torch import load, save
 
 from egovcp.artifact import CONFIG, WEIGHTS
-from egovcp.manifest import MANIFEST, sealed
-from egovcp.processors import PROCESSORS
+from egovcp.manifest import MANIFEST, PROCESSORS, sealed
 
 type Json = dict[str, Any]
 type Random = np.random.Generator

@@ -13,8 +13,7 @@ import torch
 from safetensors.torch import load, save
 
 from egovcp.artifact import CONFIG, FILES, WEIGHTS
-from egovcp.manifest import MANIFEST, SEAL
-from egovcp.processors import PROCESSORS
+from egovcp.manifest import MANIFEST, PROCESSORS, SEAL
 from tests.support.policy_mutations.editing import (
     MARKER,
     Json,

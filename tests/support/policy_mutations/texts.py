@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from egovcp.artifact import CONFIG, WEIGHTS
-from egovcp.processors import PROCESSORS
+from egovcp.manifest import PROCESSORS
 from tests.support.policy_mutations.editing import (
     JSON_FILES,
     MARKER,

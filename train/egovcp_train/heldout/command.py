@@ -12,17 +12,16 @@ from typing import Any, Final
 
 import torch
 
-from egovcp.artifact import Artifact, load_artifact
-from egovcp.atomic import write_text
+from egovcp.artifact import Artifact, load_artifact, returns_of
 from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore
 from egovcp.errors import ArtifactError, UsageError
+from egovcp.files import write_text
 from egovcp.outputs import require_writable
 from egovcp.policy_options import PolicyOptions
-from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
-from egovcp.trained import returns_of
+from egovcp.workers import stop_on_signal
 from egovcp_train.datasets import EVALUATION_EPISODES, ReturnScale, on_task_scales
 from egovcp_train.device import choose_device
 from egovcp_train.heldout.pictures import draw, record, table

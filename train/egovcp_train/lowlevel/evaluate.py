@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from egovcp.atomic import write_json
 from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
+from egovcp.files import write_json
 from egovcp.hardware import available_cores
 from egovcp.intervals import wilson
 from egovcp.outputs import require_writable
@@ -23,8 +23,8 @@ from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import JOINT_NAMES
-from egovcp.stop_signals import stop_on_signal
 from egovcp.terminal import echo
+from egovcp.workers import stop_on_signal
 from egovcp_train.lowlevel.config import DisturbanceConfig
 from egovcp_train.lowlevel.skills import SKILLS, Skill
 

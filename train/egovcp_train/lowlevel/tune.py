@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from egovcp.atomic import write_json
 from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import run_command
+from egovcp.files import write_json
 from egovcp.hardware import available_cores
 from egovcp.outputs import require_writable
 from egovcp.packages import SIMULATOR_MODULES, require_packages

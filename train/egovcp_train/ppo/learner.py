@@ -14,7 +14,7 @@ from rsl_rl.env import VecEnv
 from tensordict import TensorDict
 from torch import nn
 
-from egovcp.reactive import KERNELS, STRIDES, Eyes, Layer, ReactiveConfig, ReactiveNetwork
+from egovcp.reactive import KERNELS, STRIDES, FrameStack, Layer, ReactiveConfig, ReactiveNetwork
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import Observation, VectorEnv
 from egovcp.sim.scenario import Scenario
@@ -45,7 +45,7 @@ class ContactEnv(VecEnv):  # type: ignore[misc]
         self.cfg = asdict(config)
         self.episodes = first
         self._tasks, self._seed = tuple(tasks), seed
-        self._eyes = Eyes(robots, network)
+        self._frames = FrameStack(robots, network)
         self._returns = np.zeros(robots)
         self._observe(self.env.reset(self._scenarios(robots)), np.ones(robots, dtype=np.bool_))
 
@@ -95,7 +95,7 @@ class ContactEnv(VecEnv):  # type: ignore[misc]
 
     def _observe(self, observation: Observation, fresh: NDArray[np.bool_]) -> None:
         groups = {
-            "depth": self._eyes.look(observation.depth, fresh),
+            "depth": self._frames.push(observation.depth, fresh),
             "state": torch.from_numpy(observation.state),
         }
         self._observations = TensorDict(groups, batch_size=[self.num_envs])

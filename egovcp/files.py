@@ -1,9 +1,10 @@
-"""Reads files that somebody else wrote: regular files of bounded size, JSON of bounded depth.
+"""Safe reading and atomic writing of files.
 
-A downloaded dataset or policy may hold a FIFO that never ends, a link to a device, gigabytes of
-JSON, or JSON nested so deeply that the parser overflows. The functions here refuse them with
-`UnsafeFileError`, whose message says what was found and what was expected but not the path: the
-caller turns it into its own error, which names the file.
+Reading: a downloaded dataset or policy may hold a FIFO that never ends, a link to a device,
+gigabytes of JSON, or deeply nested JSON that overflows the parser. These are refused with
+`UnsafeFileError`. Its message has no path: callers turn it into an error that names the file.
+
+Writing: a file or folder is complete or absent, also after a crash.
 """
 
 from __future__ import annotations
@@ -13,8 +14,10 @@ import json
 import math
 import os
 import re
+import shutil
 import stat
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any, Final, NoReturn
 
@@ -40,13 +43,13 @@ _DEPTH_CHANGE[list(b"]}")] = -1
 
 
 class UnsafeFileError(ValueError):
-    """A file is not regular, too large, or holds JSON that must not be parsed or used."""
+    """A file is not a regular file, is too large, or holds invalid or unsafe JSON."""
 
 
 def require_regular(path: Path, limit_bytes: int | None = None) -> os.stat_result:
     """Raise unless ``path`` is a regular file of bounded size; links are followed.
 
-    For libraries that open the file themselves. The file is not opened.
+    The file is not opened; for libraries that open it themselves.
 
     Args:
         path: the file.
@@ -54,7 +57,7 @@ def require_regular(path: Path, limit_bytes: int | None = None) -> os.stat_resul
 
     Raises:
         UnsafeFileError: it is not a regular file, or larger.
-        OSError: it is missing, or cannot be looked at.
+        OSError: it is missing, or its folder cannot be read.
     """
     found = path.stat()
     _check(found, limit_bytes)
@@ -71,7 +74,7 @@ def open_regular(path: Path, limit_bytes: int | None = None) -> IO[bytes]:
     require_regular(path, limit_bytes)  # before opening: opening a device can have effects
     file = os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOCTTY | os.O_CLOEXEC), "rb")
     try:
-        _check(os.fstat(file.fileno()), limit_bytes)  # it may have been replaced in between
+        _check(os.fstat(file.fileno()), limit_bytes)  # in case it was replaced
     except BaseException:
         file.close()
         raise
@@ -86,7 +89,7 @@ def read_bytes(path: Path, limit_bytes: int) -> bytes:
         OSError: it is missing, or cannot be read.
     """
     with open_regular(path, limit_bytes) as file:
-        content = file.read(limit_bytes + 1)  # a file of /proc says that its size is 0
+        content = file.read(limit_bytes + 1)  # files of /proc have size 0
     if len(content) > limit_bytes:
         raise UnsafeFileError(_too_large("more", limit_bytes))
     return content
@@ -128,7 +131,7 @@ def read_json(
 
 
 def parse_json(text: str, limit_depth: int = JSON_LIMIT_DEPTH, allow_nan: bool = False) -> Any:
-    """The value of a JSON text that somebody else wrote; see `read_json`.
+    """The value of an untrusted JSON text; see `read_json`.
 
     Raises:
         UnsafeFileError: it is not JSON, nested more deeply than ``limit_depth``, or holds a number
@@ -159,12 +162,12 @@ def require_bounded(
 ) -> None:
     """Raise unless a parsed value has a bounded depth and a bounded number of items.
 
-    The aliases of YAML repeat a value: 1 kB of text can stand for 10^9 items.
+    With YAML aliases 1 kB of text can describe 10^9 items.
 
     Raises:
         UnsafeFileError: it has more.
     """
-    sizes: dict[int, int] = {}  # by identity: each value is visited once, but counted each time
+    sizes: dict[int, int] = {}  # by id: each value is visited once but counted each time
 
     def size(item: object, depth: int) -> int:
         if depth > limit_depth:
@@ -218,7 +221,7 @@ def _too_deep(limit: int) -> str:
 
 
 def _check_depth(text: str, limit: int) -> None:
-    """Counts the brackets outside strings; much faster than a walk over the parsed value."""
+    """Count the brackets outside strings, which is faster than walking the parsed value."""
     bare = np.frombuffer(_STRING.sub("", text).encode("utf-8", "replace"), dtype=np.uint8)
     if len(bare) and _DEPTH_CHANGE[bare].cumsum(dtype=np.int32).max() > limit:
         raise UnsafeFileError(_too_deep(limit))
@@ -233,3 +236,50 @@ def _finite(text: str) -> float:
 
 def _refuse_constant(name: str) -> NoReturn:
     raise UnsafeFileError(f"holds {name}, expected finite numbers")
+
+
+# --- writing ----------------------------------------------------------------------
+@contextmanager
+def removed_on_error(path: Path) -> Iterator[Path]:
+    """Yield ``path``; remove that file or folder if the block raises, also on Ctrl-C."""
+    try:
+        yield path
+    except BaseException:
+        if path.is_dir() and not path.is_symlink():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                path.unlink(missing_ok=True)
+        raise
+
+
+def partial_path(path: Path) -> Path:
+    """The temporary file of `write_bytes`."""
+    return path.with_name(f".{path.name}.partial")
+
+
+def write_bytes(path: Path, content: bytes, durable: bool = True) -> None:
+    """Create or replace a file; on an error the old file stays and no other file is left.
+
+    The mode follows the umask (`tempfile` would make it readable by its owner only).
+
+    Args:
+        durable: call fsync.
+    """
+    with removed_on_error(partial_path(path)) as temporary:
+        with temporary.open("wb") as file:
+            file.write(content)
+            file.flush()
+            if durable:
+                os.fsync(file.fileno())
+        temporary.replace(path)
+
+
+def write_text(path: Path, text: str, durable: bool = True) -> None:
+    """Create or replace a UTF-8 text file; see `write_bytes`."""
+    write_bytes(path, text.encode(), durable)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write ``content`` as strict JSON: NaN and infinities raise `ValueError`."""
+    write_text(path, json.dumps(content, indent=2, allow_nan=False) + "\n")

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from egovcp import safe_files
-from egovcp.safe_files import UnsafeFileError
+from egovcp import files
+from egovcp.files import UnsafeFileError
 from tests.support.limited import run_limited
 
 
@@ -19,11 +19,11 @@ def test_a_regular_file_is_read(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     content = {"a": [1, 2.5, "ü[{", None, True], "b": {"c": "\U0001f600"}}
     path.write_text(json.dumps(content), encoding="utf-8")
-    assert safe_files.read_json(path) == content
-    assert safe_files.read_bytes(path, 1000) == path.read_bytes()
-    assert safe_files.sha256(path) == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert files.read_json(path) == content
+    assert files.read_bytes(path, 1000) == path.read_bytes()
+    assert files.sha256(path) == hashlib.sha256(path.read_bytes()).hexdigest()
     (tmp_path / "link").symlink_to(path)
-    assert safe_files.read_json(tmp_path / "link") == content
+    assert files.read_json(tmp_path / "link") == content
 
 
 @pytest.mark.parametrize(
@@ -49,7 +49,7 @@ def test_special_files_are_refused(
         path = Path("link")
 
     def refused() -> int:
-        for read in (safe_files.read_json, safe_files.sha256, safe_files.require_regular):
+        for read in (files.read_json, files.sha256, files.require_regular):
             with pytest.raises(UnsafeFileError, match=f"{words}, expected a regular file"):
                 read(path)
         return 0
@@ -63,14 +63,14 @@ def test_a_file_over_the_limit_is_refused_without_reading_it(tmp_path: Path) -> 
     with path.open("wb") as file:
         file.truncate(1 << 40)  # sparse
     with pytest.raises(UnsafeFileError, match=r"too large: 1099511627776 bytes, expected at most"):
-        safe_files.read_json(path)
+        files.read_json(path)
     with pytest.raises(UnsafeFileError, match="too large: 1099511627776 bytes"):
-        safe_files.sha256(path, 10)
+        files.sha256(path, 10)
 
 
 def test_a_file_that_hides_its_size_is_refused() -> None:
     with pytest.raises(UnsafeFileError, match="too large: more bytes, expected at most 10"):
-        safe_files.read_bytes(Path("/proc/self/status"), 10)
+        files.read_bytes(Path("/proc/self/status"), 10)
 
 
 @pytest.mark.parametrize(
@@ -93,42 +93,42 @@ def test_json_that_must_not_be_used_is_refused(text: str, words: str, tmp_path: 
     path = tmp_path / "a.json"
     path.write_text(text)
     with pytest.raises(UnsafeFileError, match=words):
-        safe_files.read_json(path)
+        files.read_json(path)
 
 
 def test_brackets_in_strings_do_not_count(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     content = ["[" * 100, '"[' * 100, "\\" + "{" * 100]
     path.write_text(json.dumps(content))
-    assert safe_files.read_json(path) == content
+    assert files.read_json(path) == content
     path.write_text("[" * 32 + "]" * 32)
-    safe_files.read_json(path)
+    files.read_json(path)
 
 
 def test_nan_can_be_allowed(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_text("[NaN, 1e999]")
-    assert safe_files.read_json(path, allow_nan=True)[1] == float("inf")
+    assert files.read_json(path, allow_nan=True)[1] == float("inf")
 
 
 def test_other_encodings_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.json"
     path.write_bytes(b'{"a": "\xff"}')
     with pytest.raises(UnsafeFileError, match="byte 7 is not UTF-8"):
-        safe_files.read_json(path)
+        files.read_json(path)
 
 
 def test_repeated_values_count_each_time() -> None:
     value: list[object] = [0] * 10
-    safe_files.require_bounded(value, limit_items=11)
+    files.require_bounded(value, limit_items=11)
     for _ in range(8):
         value = [value] * 10  # 10^9 numbers, as the aliases of YAML can write them in 500 bytes
     with pytest.raises(UnsafeFileError, match="more than 100000 values"):
-        safe_files.require_bounded(value)
+        files.require_bounded(value)
 
 
 def test_a_recursive_value_is_refused() -> None:
     value: list[object] = []
     value.append({"inner": value})
     with pytest.raises(UnsafeFileError, match="nested more than 32 levels"):
-        safe_files.require_bounded(value)
+        files.require_bounded(value)
