@@ -47,7 +47,7 @@ class ActionResult:
 
 
 class LockstepRobot(Protocol):
-    """A robot with a running low-level controller that takes actions at 25 Hz of its own time."""
+    """A robot with a running low-level controller; `act` advances it by one tick of 40 ms."""
 
     @property
     def controller_id(self) -> str:

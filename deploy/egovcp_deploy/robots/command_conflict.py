@@ -1,7 +1,7 @@
 """Detects whether another program commands the motors.
 
-LeRobot's bridge forwards the commands of all clients and does not report who they are. It does
-report the torque of every motor. A motor that obeys our commands applies
+LeRobot's bridge forwards the commands of all clients and does not identify them. It does
+report the torque of every motor. A motor that follows our commands applies
 
     kp (q* - q) - kd dq        with q*, kp, kd as sent, all zero before the first command
 
@@ -75,7 +75,7 @@ class CommandConflictDetector:
         self._listened_s += elapsed
 
     def _expected_torque(self, state: LowState) -> Array:
-        """(29,) N m if every motor obeys us."""
+        """(29,) N m if every motor follows our command."""
         sent = self._command
         torque = sent.stiffness * (sent.position - state.joint_position)
         torque -= sent.damping * state.joint_velocity

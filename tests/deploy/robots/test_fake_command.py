@@ -50,7 +50,7 @@ def test_it_executes_console_commands_and_writes_outcomes(tmp_path: Path) -> Non
     body.connect()
     body.close()
     assert process.stdin is not None
-    process.stdin.write("nonsense\nrelease\n")  # nobody holds it: it falls
+    process.stdin.write("nonsense\nrelease\n")  # without commands it falls
     process.stdin.flush()
     text, _ = process.communicate(timeout=60)
     assert process.returncode == 0

@@ -154,9 +154,9 @@ def test_random_readings_within_bounds_are_rejected() -> None:
 
 def test_a_position_jump_is_accepted_after_the_damping_limit() -> None:
     found = problems(position(0.5), duration=200)
-    believed = found.index("")
-    assert 0.2 < believed * STEP_NS * 1e-9 < 2 * RESYNC_S
-    assert not any(found[believed:])
+    accepted = found.index("")
+    assert 0.2 < accepted * STEP_NS * 1e-9 < 2 * RESYNC_S
+    assert not any(found[accepted:])
 
 
 def test_a_speed_jump_is_accepted_once_positions_follow() -> None:
@@ -167,9 +167,9 @@ def test_a_speed_jump_is_accepted_once_positions_follow() -> None:
         reading.position[KNEE] += 25.0 * next(ticks) * STEP_NS * 1e-9
 
     found = problems(moved, duration=12)
-    believed = found.index("")
-    assert 0 < believed * STEP_NS * 1e-9 <= JUMP_RESYNC_S + STEP_NS * 1e-9
-    assert not any(found[believed:])
+    accepted = found.index("")
+    assert 0 < accepted * STEP_NS * 1e-9 <= JUMP_RESYNC_S + STEP_NS * 1e-9
+    assert not any(found[accepted:])
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from egovcp_deploy.pilot.states import Request
 from egovcp_deploy.robots.wire import DISCONNECTED
 
 from . import fault_messages as m
-from .fault_messages import Alteration
+from .fault_messages import Alteration, Edit
 from .fault_rig import FaultRig, Planner, constant_plan, constant_reply
 from .stream_proxy import StreamFault
 
@@ -77,6 +77,21 @@ def _stateful(make: Callable[[], Alteration]) -> Begin:
     return lambda rig: setattr(rig.fake, "alter_state", make())
 
 
+def _edited(edit: Edit) -> Begin:
+    """Edit every state."""
+    return _states(m.edited(edit))
+
+
+def _edited_once(edit: Edit) -> Begin:
+    """Edit the first state."""
+    return _stateful(lambda: m.once(m.edited(edit)))
+
+
+def _edited_at_50_hz(edit: Edit) -> Begin:
+    """Edit every fourth state."""
+    return _stateful(lambda: m.every(4, m.edited(edit)))
+
+
 def _replaced(*messages: bytes) -> Begin:
     return _states(lambda message: messages)
 
@@ -87,7 +102,7 @@ def _generated(messages: Callable[[], Iterable[bytes]]) -> Begin:
 
 def _knee(name: str, value: object) -> Begin:
     """The motor of the left knee reports ``value`` in the field ``name``."""
-    return _states(m.edited(m.motor(m.KNEE, name, lambda usual: value)))
+    return _edited(m.motor(m.KNEE, name, lambda usual: value))
 
 
 def _dropped(status: int, mode: int) -> Begin:
@@ -140,73 +155,55 @@ _STATES: Final = (
     FaultKind("state: position null", _D, _number("null")),
     FaultKind("state: position a string", _D, _number('"0.3"')),
     FaultKind("state: position true", _D, _number("true")),
-    FaultKind("state: no motors", _D, _states(m.edited(m.without_field("motor_state")))),
+    FaultKind("state: no motors", _D, _edited(m.without_field("motor_state"))),
     FaultKind(
         "state: 29 motor slots",
         _D,
-        _states(m.edited(lambda d: d.__setitem__("motor_state", d["motor_state"][:29]))),
+        _edited(lambda d: d.__setitem__("motor_state", d["motor_state"][:29])),
     ),
-    FaultKind("state: no IMU", _D, _states(m.edited(m.without_field("imu_state")))),
-    FaultKind("state: no mode machine", _D, _states(m.edited(m.without_field("mode_machine")))),
-    FaultKind(
-        "state: remote control not base64",
-        _D,
-        _states(m.edited(m.set_field("wireless_remote", "%"))),
-    ),
-    FaultKind(
-        "state: quaternion zero", _D, _states(m.edited(m.imu("quaternion", lambda q: [0.0] * 4)))
-    ),
+    FaultKind("state: no IMU", _D, _edited(m.without_field("imu_state"))),
+    FaultKind("state: no mode machine", _D, _edited(m.without_field("mode_machine"))),
+    FaultKind("state: remote control not base64", _D, _edited(m.set_field("wireless_remote", "%"))),
+    FaultKind("state: quaternion zero", _D, _edited(m.imu("quaternion", lambda q: [0.0] * 4))),
     FaultKind(
         "state: quaternion of length 2",
         _D,
-        _states(m.edited(m.imu("quaternion", lambda q: [2 * v for v in q]))),
+        _edited(m.imu("quaternion", lambda q: [2 * v for v in q])),
     ),
 )
-_gyro: Final = m.edited(m.gyroscope(150.0))
-_speed: Final = m.edited(m.motor(m.KNEE, "dq", lambda v: 190.0))
-_jump: Final = m.edited(m.motor(m.KNEE, "q", lambda q: q + 0.5))
+_GYRO: Final = m.gyroscope(150.0)
+_SPEED: Final = m.motor(m.KNEE, "dq", lambda v: 190.0)
+_JUMP: Final = m.motor(m.KNEE, "q", lambda q: q + 0.5)
 _IMPLAUSIBLE: Final = (
-    FaultKind("gyroscope: 150 rad/s", _D, _states(_gyro)),
-    FaultKind("gyroscope: 150 rad/s once", _R, _stateful(lambda: m.once(_gyro))),
-    FaultKind("gyroscope: 150 rad/s at 50 Hz", _R, _stateful(lambda: m.every(4, _gyro))),
-    FaultKind("gyroscope: 20 rad/s", _D, _states(m.edited(m.gyroscope(20.0)))),
-    FaultKind("joint speed: 190 rad/s", _D, _states(_speed)),
-    FaultKind("joint speed: 190 rad/s once", _R, _stateful(lambda: m.once(_speed))),
-    FaultKind("joint speed: 190 rad/s at 50 Hz", _R, _stateful(lambda: m.every(4, _speed))),
+    FaultKind("gyroscope: 150 rad/s", _D, _edited(_GYRO)),
+    FaultKind("gyroscope: 150 rad/s once", _R, _edited_once(_GYRO)),
+    FaultKind("gyroscope: 150 rad/s at 50 Hz", _R, _edited_at_50_hz(_GYRO)),
+    FaultKind("gyroscope: 20 rad/s", _D, _edited(m.gyroscope(20.0))),
+    FaultKind("joint speed: 190 rad/s", _D, _edited(_SPEED)),
+    FaultKind("joint speed: 190 rad/s once", _R, _edited_once(_SPEED)),
+    FaultKind("joint speed: 190 rad/s at 50 Hz", _R, _edited_at_50_hz(_SPEED)),
     FaultKind("joint speed: 25 rad/s", _D, _knee("dq", 25.0)),
     FaultKind(
         "joint speed: all +-190 rad/s",
         _D,
-        _states(m.edited(m.all_motors("dq", lambda i, v: 190.0 * (-1) ** i))),
+        _edited(m.all_motors("dq", lambda i, v: 190.0 * (-1) ** i)),
     ),
     FaultKind("joint position: 9 rad", _D, _knee("q", 9.0)),
-    FaultKind("joint position: jumps by 0.5 rad", _D, _states(_jump)),
-    FaultKind("joint position: jumps by 0.5 rad once", _R, _stateful(lambda: m.once(_jump))),
-    FaultKind(
-        "joint position: all zero", _D, _states(m.edited(m.all_motors("q", lambda i, q: 0.0)))
-    ),
-    FaultKind("joints: random within bounds", _D, _states(m.edited(m.random_joints))),
+    FaultKind("joint position: jumps by 0.5 rad", _D, _edited(_JUMP)),
+    FaultKind("joint position: jumps by 0.5 rad once", _R, _edited_once(_JUMP)),
+    FaultKind("joint position: all zero", _D, _edited(m.all_motors("q", lambda i, q: 0.0))),
+    FaultKind("joints: random within bounds", _D, _edited(m.random_joints)),
     FaultKind("torque: 900 N m", _D, _knee("tau_est", 900.0)),
     FaultKind(
-        "torque: 900 N m once",
-        _R,
-        _stateful(lambda: m.once(m.edited(m.motor(m.KNEE, "tau_est", lambda t: 900.0)))),
+        "torque: 900 N m once", _R, _edited_once(m.motor(m.KNEE, "tau_est", lambda t: 900.0))
     ),
+    FaultKind("orientation: jumps by 0.8 rad", _D, _edited(m.imu("quaternion", m.rolled))),
     FaultKind(
-        "orientation: jumps by 0.8 rad", _D, _states(m.edited(m.imu("quaternion", m.rolled)))
-    ),
-    FaultKind(
-        "orientation: jumps by 0.8 rad once",
-        _R,
-        _stateful(lambda: m.once(m.edited(m.imu("quaternion", m.rolled)))),
+        "orientation: jumps by 0.8 rad once", _R, _edited_once(m.imu("quaternion", m.rolled))
     ),
     FaultKind("mode machine: 5 to 6", _D, _fault("mode", 6)),
     FaultKind("mode machine: 5 to 4", _D, _fault("mode", 4)),
-    FaultKind(
-        "mode machine: 0 once",
-        _R,
-        _stateful(lambda: m.once(m.edited(m.set_field("mode_machine", 0)))),
-    ),
+    FaultKind("mode machine: 0 once", _R, _edited_once(m.set_field("mode_machine", 0))),
 )
 _OVERHEATED: Final = 0x200  # status bits, see `wire.MOTOR_STATUS_BITS`
 
@@ -222,25 +219,22 @@ _MOTORS: Final = (
     _motor(
         "one temperature, 85 deg C",
         _H,
-        _states(m.edited(m.all_motors("temperature", lambda i, v: 85 if i == m.KNEE else 35))),
+        _edited(m.all_motors("temperature", lambda i, v: 85 if i == m.KNEE else 35)),
         "is too hot",
         1.0,
     ),
     _motor("status overheated", _H, _knee("motorstate", _OVERHEATED), "winding overheating", 1.0),
-    _motor("no temperatures", _R, _states(m.edited(m.without_motor_fields("temperature")))),
+    _motor("no temperatures", _R, _edited(m.without_motor_fields("temperature"))),
     _motor("temperature 900 deg C", _R, _knee("temperature", [900, 900])),
     _motor(
         "no status, mode and temperature",
         _R,
-        _states(m.edited(m.without_motor_fields("motorstate", "mode", "lost", "temperature"))),
+        _edited(m.without_motor_fields("motorstate", "mode", "lost", "temperature")),
     ),
     _motor("dropped, status disconnected", _D, _dropped(DISCONNECTED, 1), "lost the connection"),
     _motor("dropped, mode off", _D, _dropped(0, 0), "its mode says that it is off"),
     _motor(
-        "dropped without a report",
-        Reaction.LATER,
-        _dropped(0, 1),
-        "does not follow its target",
+        "dropped without a report", Reaction.LATER, _dropped(0, 1), "does not follow its target"
     ),
 )
 _FLOODS: Final = (
@@ -366,7 +360,7 @@ _OTHERS: Final = (
     _other(
         "remote control: sticks NaN",
         _R,
-        _states(m.edited(m.set_field("wireless_remote", "VVEAAP" + "/" * 46))),
+        _edited(m.set_field("wireless_remote", "VVEAAP" + "/" * 46)),
     ),
     _other("robot: pushed", _R, _fault("push", (0.2, 0.0))),
     _other("robot: pushed over", Reaction.LATER, _fault("push", (-2.5, 1.0)), 3.0),
@@ -388,13 +382,5 @@ _PROCESSES: Final = (
     _other("control process: SIGTERM", _D, _signal(signal.SIGTERM)),
 )
 
-FAULTS: Final = (
-    *_STATES,
-    *_IMPLAUSIBLE,
-    *_MOTORS,
-    *_FLOODS,
-    *_IMAGES,
-    *_OTHERS,
-    *_PROCESSES,
-)
+FAULTS: Final = (*_STATES, *_IMPLAUSIBLE, *_MOTORS, *_FLOODS, *_IMAGES, *_OTHERS, *_PROCESSES)
 """All faults; names are unique."""
