@@ -38,7 +38,7 @@ def running(fake: FakeBridge) -> Iterator[FakeG1Thread]:
 
 
 @pytest.fixture
-def body(running: FakeG1Thread) -> Iterator[BridgeRobot]:
+def robot(running: FakeG1Thread) -> Iterator[BridgeRobot]:
     """Connected to the running fake."""
     found = BridgeRobot(bridge_config(running.fake))
     found.connect(TIMEOUT_S)

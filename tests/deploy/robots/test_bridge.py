@@ -24,128 +24,128 @@ ZERO = np.zeros(29)
 DAMP = MotorCommand(ZERO, ZERO, DAMPING, MODE)
 
 
-def hold(body: BridgeRobot) -> MotorCommand:
+def hold(robot: BridgeRobot) -> MotorCommand:
     """A command that holds the current pose."""
-    state = body.read()
+    state = robot.read()
     assert state is not None
     return MotorCommand(state.joint_position, STIFFNESS, DAMPING, state.mode)
 
 
-def test_readings_have_their_time_of_arrival(body: BridgeRobot, running: FakeG1Thread) -> None:
-    first = body.read()
+def test_readings_have_their_time_of_arrival(robot: BridgeRobot, running: FakeG1Thread) -> None:
+    first = robot.read()
     assert first is not None
-    assert eventually(lambda: body.read() is not first)
-    second = body.read()
+    assert eventually(lambda: robot.read() is not first)
+    second = robot.read()
     assert second is not None
     assert first.time_ns < second.time_ns <= time.monotonic_ns()
     running.stop()
     joints = running.fake.robot.robot.data.qpos[running.fake.robot.robot.index.joint_qpos]
-    np.testing.assert_allclose(body.read().joint_position, joints, atol=0.05)
+    np.testing.assert_allclose(robot.read().joint_position, joints, atol=0.05)
     assert second.mode == MODE
 
 
-def test_commands_reach_the_motors(body: BridgeRobot, running: FakeG1Thread) -> None:
+def test_commands_reach_the_motors(robot: BridgeRobot, running: FakeG1Thread) -> None:
     fake = running.fake
 
     def commanded() -> bool:
-        body.write(hold(body))
+        robot.write(hold(robot))
         return fake.commanded
 
     assert eventually(commanded)
-    assert body.counters.sent > 0
+    assert robot.counters.sent > 0
     assert fake.counters.ignored == fake.counters.malformed == 0
 
 
-def test_write_still_works_after_stop_receiving(body: BridgeRobot, running: FakeG1Thread) -> None:
-    body.stop_receiving()
-    last, readings = body.read(), body.counters.readings
+def test_write_still_works_after_stop_receiving(robot: BridgeRobot, running: FakeG1Thread) -> None:
+    robot.stop_receiving()
+    last, readings = robot.read(), robot.counters.readings
     before = running.fake.counters.commands
 
     def commanded() -> bool:
-        body.write(hold(body))
+        robot.write(hold(robot))
         return running.fake.counters.commands > before + 20
 
     assert eventually(commanded)
-    assert body.read() is last
-    assert body.counters.readings == readings
+    assert robot.read() is last
+    assert robot.counters.readings == readings
     assert running.fake.counters.ignored == 0  # it knows the robot's mode
-    body.close()
+    robot.close()
 
 
 def test_read_returns_the_last_reading_without_messages(
-    body: BridgeRobot, running: FakeG1Thread
+    robot: BridgeRobot, running: FakeG1Thread
 ) -> None:
     running.fake.faults.mute_state = True
     time.sleep(0.1)
-    last = body.read()
+    last = robot.read()
     time.sleep(0.1)
-    assert body.read() is last
+    assert robot.read() is last
 
 
 def test_repeated_readings_are_counted_and_ignored(
-    body: BridgeRobot, running: FakeG1Thread
+    robot: BridgeRobot, running: FakeG1Thread
 ) -> None:
     running.fake.faults.freeze_state = True
-    assert eventually(lambda: body.counters.repeated > 3)
-    last = body.read()
-    seen = body.counters.repeated
-    assert eventually(lambda: body.counters.repeated > seen + 3)
-    assert body.read() is last
+    assert eventually(lambda: robot.counters.repeated > 3)
+    last = robot.read()
+    seen = robot.counters.repeated
+    assert eventually(lambda: robot.counters.repeated > seen + 3)
+    assert robot.read() is last
 
 
 def test_truncated_messages_are_dropped_and_counted(
-    body: BridgeRobot, running: FakeG1Thread
+    robot: BridgeRobot, running: FakeG1Thread
 ) -> None:
     running.fake.faults.truncate_state = True
-    assert eventually(lambda: body.counters.malformed > 3)
-    good = body.counters.readings
-    assert eventually(lambda: body.counters.readings > good + 3)
-    assert "JSON" in body.counters.problem
+    assert eventually(lambda: robot.counters.malformed > 3)
+    good = robot.counters.readings
+    assert eventually(lambda: robot.counters.readings > good + 3)
+    assert "JSON" in robot.counters.problem
 
 
-def test_an_invalid_command_is_not_sent(body: BridgeRobot) -> None:
-    body.write(MotorCommand(np.full(29, np.nan), STIFFNESS, DAMPING, MODE))
-    body.write(MotorCommand(ZERO, -STIFFNESS, DAMPING, MODE))
-    assert body.counters.invalid == 2
-    assert body.counters.sent == 0
+def test_an_invalid_command_is_not_sent(robot: BridgeRobot) -> None:
+    robot.write(MotorCommand(np.full(29, np.nan), STIFFNESS, DAMPING, MODE))
+    robot.write(MotorCommand(ZERO, -STIFFNESS, DAMPING, MODE))
+    assert robot.counters.invalid == 2
+    assert robot.counters.sent == 0
 
 
 def test_commands_without_a_connection_are_dropped_and_counted(
-    body: BridgeRobot, running: FakeG1Thread
+    robot: BridgeRobot, running: FakeG1Thread
 ) -> None:
     running.stop()
     ports = running.fake.ports
     running.fake.close()
 
     def dropped() -> bool:
-        body.write(DAMP)
-        return body.counters.dropped > 0
+        robot.write(DAMP)
+        return robot.counters.dropped > 0
 
     assert eventually(dropped)
-    with zmq.Context() as context, context.socket(zmq.PULL) as robot:
-        robot.bind(f"tcp://{ports.host}:{ports.command_port}")
-        assert not robot.poll(500), "an old command must not reach a restarted bridge"
-        before = body.counters.sent
+    with zmq.Context() as context, context.socket(zmq.PULL) as bridge:
+        bridge.bind(f"tcp://{ports.host}:{ports.command_port}")
+        assert not bridge.poll(500), "an old command must not reach a restarted bridge"
+        before = robot.counters.sent
 
         def sent() -> bool:
-            body.write(DAMP)
-            return body.counters.sent > before
+            robot.write(DAMP)
+            return robot.counters.sent > before
 
         assert eventually(sent)
-        assert robot.poll(2000)
+        assert bridge.poll(2000)
 
 
 def test_readings_resume_after_a_restart_of_the_bridge(
-    body: BridgeRobot, running: FakeG1Thread
+    robot: BridgeRobot, running: FakeG1Thread
 ) -> None:
     running.stop()
     fake, ports = running.fake, running.fake.ports
     fake.close()
-    last = body.read()
+    last = robot.read()
     revived = FakeBridge(fake.robot, ports)
     again = FakeG1Thread(revived)
     try:
-        assert eventually(lambda: body.read() is not last)
+        assert eventually(lambda: robot.read() is not last)
     finally:
         again.stop()
         revived.close()
@@ -153,11 +153,11 @@ def test_readings_resume_after_a_restart_of_the_bridge(
 
 def test_connect_reports_a_missing_bridge() -> None:
     port = free_port()
-    body = BridgeRobot(BridgeConfig(state_port=port, command_port=port))
+    robot = BridgeRobot(BridgeConfig(state_port=port, command_port=port))
     with pytest.raises(EnvironmentFailure, match=rf"nothing at 127.0.0.1:{port}.*run_g1_server"):
-        body.connect(0.1)
-    assert body.read() is None
-    body.close()
+        robot.connect(0.1)
+    assert robot.read() is None
+    robot.close()
 
 
 @pytest.fixture
@@ -178,34 +178,34 @@ def test_connect_reports_a_bridge_without_states(publisher: zmq.Socket[bytes]) -
 
 
 def test_connect_reports_another_service(publisher: zmq.Socket[bytes]) -> None:
-    body = BridgeRobot(config_for(publisher))
-    body._open()
+    robot = BridgeRobot(config_for(publisher))
+    robot._open()
     count = iter(range(100_000))
 
     def garbled() -> bool:
         publisher.send(b'{"images": %d}' % next(count))
-        return body.counters.malformed > 0
+        return robot.counters.malformed > 0
 
     assert eventually(garbled)
-    assert "none a state of a G1" in body._timeout_reason(1.0)
-    body.close()
+    assert "none a state of a G1" in robot._timeout_reason(1.0)
+    robot.close()
 
 
 def test_readings_resume_after_oversized_messages(
     publisher: zmq.Socket[bytes], fake: FakeBridge
 ) -> None:
-    body = BridgeRobot(config_for(publisher))
-    body._open()
+    robot = BridgeRobot(config_for(publisher))
+    robot._open()
     for _ in range(100):
         publisher.send(b"x" * 1_000_000)
         time.sleep(0.005)
 
     def heard() -> bool:
         publisher.send(fake._encode_state())
-        return body.read() is not None
+        return robot.read() is not None
 
     assert eventually(heard)
-    body.close()
+    robot.close()
 
 
 def test_connect_reports_an_unknown_host() -> None:
@@ -231,19 +231,19 @@ def test_another_mode_is_refused(running: FakeG1Thread) -> None:
         BridgeRobot(bridge_config(running.fake, mode=4)).connect()
 
 
-def test_a_changed_mode_refuses_arming(body: BridgeRobot, running: FakeG1Thread) -> None:
-    assert eventually(lambda: not body.refusal)
+def test_a_changed_mode_refuses_arming(robot: BridgeRobot, running: FakeG1Thread) -> None:
+    assert eventually(lambda: not robot.refusal)
     running.fake.faults.mode = 9
-    assert eventually(lambda: "mode machine 9" in body.refusal)
+    assert eventually(lambda: "mode machine 9" in robot.refusal)
 
 
-def test_a_lasting_mode_change_is_a_fault(body: BridgeRobot, running: FakeG1Thread) -> None:
-    assert eventually(lambda: body.read() is not None)
-    assert not body.fault
+def test_a_lasting_mode_change_is_a_fault(robot: BridgeRobot, running: FakeG1Thread) -> None:
+    assert eventually(lambda: robot.read() is not None)
+    assert not robot.fault
     running.fake.faults.mode = 4
-    assert eventually(lambda: body.fault == f"the mode machine changed from {MODE} to 4")
+    assert eventually(lambda: robot.fault == f"the mode machine changed from {MODE} to 4")
     running.fake.faults.mode = None
-    assert eventually(lambda: not body.fault)
+    assert eventually(lambda: not robot.fault)
 
 
 @pytest.mark.parametrize("mode", [4, 6, 9])
@@ -257,10 +257,10 @@ def test_a_robot_without_29_joints_or_with_a_locked_waist_is_refused(
 
 def test_a_locked_waist_is_accepted_if_it_is_named(running: FakeG1Thread) -> None:
     running.fake.faults.mode = 6
-    body = BridgeRobot(bridge_config(running.fake, mode=6))
-    body.connect()
-    assert "the waist is locked" in body.warning
-    body.close()
+    robot = BridgeRobot(bridge_config(running.fake, mode=6))
+    robot.connect()
+    assert "the waist is locked" in robot.warning
+    robot.close()
 
 
 @pytest.mark.parametrize(
@@ -271,33 +271,33 @@ def test_a_locked_waist_is_accepted_if_it_is_named(running: FakeG1Thread) -> Non
     ],
 )
 def test_implausible_readings_are_rejected_and_counted(
-    body: BridgeRobot, running: FakeG1Thread, edit: Edit, words: str
+    robot: BridgeRobot, running: FakeG1Thread, edit: Edit, words: str
 ) -> None:
-    assert eventually(lambda: body.read() is not None)
+    assert eventually(lambda: robot.read() is not None)
     unaltered, running.fake.alter_state = running.fake.alter_state, edited(edit)
-    assert eventually(lambda: body.counters.implausible > 3)
-    seen = body.read()
-    assert words in body.rejected
-    assert eventually(lambda: body.counters.implausible > 6)
-    assert body.read() is seen
+    assert eventually(lambda: robot.counters.implausible > 3)
+    seen = robot.read()
+    assert words in robot.rejected
+    assert eventually(lambda: robot.counters.implausible > 6)
+    assert robot.read() is seen
     running.fake.alter_state = unaltered
-    assert eventually(lambda: not body.rejected)
+    assert eventually(lambda: not robot.rejected)
 
 
-def test_arming_is_allowed_without_commands(body: BridgeRobot) -> None:
-    assert "listening" in body.refusal
-    assert eventually(lambda: not body.refusal)
+def test_arming_is_allowed_without_commands(robot: BridgeRobot) -> None:
+    assert "listening" in robot.refusal
+    assert eventually(lambda: not robot.refusal)
 
 
-def test_arming_is_allowed_if_motors_follow_our_commands(body: BridgeRobot) -> None:
+def test_arming_is_allowed_if_motors_follow_our_commands(robot: BridgeRobot) -> None:
     for _ in range(60):
-        body.write(hold(body))
+        robot.write(hold(robot))
         time.sleep(0.02)
-    assert body.refusal == ""
+    assert robot.refusal == ""
 
 
 def test_arming_is_refused_if_another_program_commands(
-    body: BridgeRobot, running: FakeG1Thread
+    robot: BridgeRobot, running: FakeG1Thread
 ) -> None:
     other = BridgeRobot(bridge_config(running.fake))
     other.connect()
@@ -306,46 +306,46 @@ def test_arming_is_refused_if_another_program_commands(
 
     def noticed() -> bool:
         other.write(askew)
-        return "does not follow our commands" in body.refusal
+        return "does not follow our commands" in robot.refusal
 
     assert eventually(noticed)
     other.close()
 
 
-def test_alternating_publishers_are_detected(body: BridgeRobot, running: FakeG1Thread) -> None:
+def test_alternating_publishers_are_detected(robot: BridgeRobot, running: FakeG1Thread) -> None:
     other = BridgeRobot(bridge_config(running.fake))
     other.connect()
     askew = hold(other)
     askew = MotorCommand(askew.position + 0.3, askew.stiffness, askew.damping, askew.mode)
 
     def noticed() -> bool:
-        body.write(DAMP)
+        robot.write(DAMP)
         time.sleep(0.01)
         other.write(askew)
         time.sleep(0.01)
-        return "does not follow our commands" in body.refusal
+        return "does not follow our commands" in robot.refusal
 
     assert eventually(noticed)
     other.close()
 
 
-def test_a_constant_publisher_is_detected(body: BridgeRobot, running: FakeG1Thread) -> None:
+def test_a_constant_publisher_is_detected(robot: BridgeRobot, running: FakeG1Thread) -> None:
     running.fake.faults.other_publisher = True
-    assert eventually(lambda: "does not follow our commands" in body.refusal)
+    assert eventually(lambda: "does not follow our commands" in robot.refusal)
 
 
-def test_reported_command_sources_refuse_arming(body: BridgeRobot, running: FakeG1Thread) -> None:
+def test_reported_command_sources_refuse_arming(robot: BridgeRobot, running: FakeG1Thread) -> None:
     running.fake.faults.announce = True
 
     def noticed() -> bool:
-        body.write(DAMP)
-        return "1 other program(s)" in body.refusal
+        robot.write(DAMP)
+        return "1 other program(s)" in robot.refusal
 
     assert eventually(noticed)
     running.fake.faults.announce = False
-    assert eventually(lambda: not body.refusal)
+    assert eventually(lambda: not robot.refusal)
 
 
-def test_close_may_be_called_twice(body: BridgeRobot) -> None:
-    body.close()
-    body.close()
+def test_close_may_be_called_twice(robot: BridgeRobot) -> None:
+    robot.close()
+    robot.close()

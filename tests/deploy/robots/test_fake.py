@@ -30,27 +30,27 @@ NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
 class LockstepDriver:
     """Steps a fake G1 and a controller in turn, over real sockets."""
 
-    def __init__(self, fake: FakeBridge, body: BridgeRobot) -> None:
-        self.fake, self.body = fake, body
+    def __init__(self, fake: FakeBridge, robot: BridgeRobot) -> None:
+        self.fake, self.robot = fake, robot
         self.controller = make_controller("stance")
         self.controller.reset(self._state()[None])
 
     def _state(self) -> np.ndarray:
-        body = self.body.read()
-        assert body is not None
-        return proprioception(body, NEUTRAL)
+        state = self.robot.read()
+        assert state is not None
+        return proprioception(state, NEUTRAL)
 
     def tick(self, episodes: EpisodeSequencer) -> None:
-        """20 ms of the robot's life, after which the controller answers to its newest state."""
+        """Advance by 20 ms, then send the controller's command for the newest state."""
         for _ in range(4):
-            seen = self.body.counters.readings
+            seen = self.robot.counters.readings
             self._send_until(
-                episodes.step, lambda n=seen: episodes.finished or self.body.counters.readings > n
+                episodes.step, lambda n=seen: episodes.finished or self.robot.counters.readings > n
             )
         target = self.controller.step(self._state()[None])[0]
         c, received = self.controller, self.fake.counters.commands
         command = MotorCommand(target, c.stiffness, c.damping, MODE)
-        self._send_until(lambda: self.body.write(command), lambda: self._received(received))
+        self._send_until(lambda: self.robot.write(command), lambda: self._received(received))
 
     def _send_until(self, send: Callable[[], object], arrived: Callable[[], bool]) -> None:
         """Send until it arrives: a reader that joins anew, as after a second of silence on a busy
@@ -67,9 +67,9 @@ class LockstepDriver:
 
 
 @pytest.fixture
-def driver(running: FakeG1Thread, body: BridgeRobot) -> LockstepDriver:
+def driver(running: FakeG1Thread, robot: BridgeRobot) -> LockstepDriver:
     running.stop()
-    return LockstepDriver(running.fake, body)
+    return LockstepDriver(running.fake, robot)
 
 
 def test_a_controller_plays_all_episodes_over_the_bridge(driver: LockstepDriver) -> None:
@@ -86,7 +86,7 @@ def test_a_controller_plays_all_episodes_over_the_bridge(driver: LockstepDriver)
         driver.tick(episodes)
         if driver.fake.robot.phase is not Phase.OVER:
             heights.append(driver.fake.robot.robot.pelvis_height)
-        assert "does not follow" not in driver.body.refusal
+        assert "does not follow" not in driver.robot.refusal
     assert [outcome.scenario for outcome in episodes.outcomes] == scenarios
     assert [outcome.ticks for outcome in episodes.outcomes] == [20, 20]
     assert not episodes.outcomes[0].fallen
@@ -165,10 +165,10 @@ def test_malformed_commands_are_counted(fake: FakeBridge) -> None:
     assert (fake.counters.malformed, fake.counters.commands) == (1, 0)
 
 
-def test_ignored_commands_are_not_counted(body: BridgeRobot, running: FakeG1Thread) -> None:
+def test_ignored_commands_are_not_counted(robot: BridgeRobot, running: FakeG1Thread) -> None:
     running.fake.faults.ignore_commands = True
     for _ in range(20):
-        body.write(MotorCommand(np.zeros(29), STIFFNESS, DAMPING, MODE))
+        robot.write(MotorCommand(np.zeros(29), STIFFNESS, DAMPING, MODE))
         time.sleep(0.005)
     assert running.fake.counters.commands == 0
 
@@ -185,14 +185,14 @@ def test_a_push_makes_the_robot_fall(driver: LockstepDriver) -> None:
     assert [outcome.fallen for outcome in episodes.outcomes] == [True]
 
 
-def test_dropped_messages_do_not_arrive(body: BridgeRobot, running: FakeG1Thread) -> None:
+def test_dropped_messages_do_not_arrive(robot: BridgeRobot, running: FakeG1Thread) -> None:
     running.fake.faults.drop = 1.0
     time.sleep(0.1)
-    last = body.read()
+    last = robot.read()
     time.sleep(0.1)
-    assert body.read() is last
+    assert robot.read() is last
     running.fake.faults.drop = 0.5
-    assert eventually(lambda: body.read() is not last)
+    assert eventually(lambda: robot.read() is not last)
 
 
 @pytest.fixture
@@ -231,8 +231,8 @@ def test_command_sources_are_counted(live: LiveRobot) -> None:
     running = FakeG1Thread(fake)
     one, two = BridgeRobot(bridge_config(fake)), BridgeRobot(bridge_config(fake))
     try:
-        for body in (one, two):
-            body.connect(TIMEOUT_S)
+        for robot in (one, two):
+            robot.connect(TIMEOUT_S)
         damp = MotorCommand(np.zeros(29), np.zeros(29), DAMPING, MODE)
 
         def noticed() -> bool:

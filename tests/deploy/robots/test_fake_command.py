@@ -46,9 +46,9 @@ def ports_of(process: subprocess.Popen[str]) -> BridgeConfig:
 def test_it_executes_console_commands_and_writes_outcomes(tmp_path: Path) -> None:
     out = tmp_path / "outcomes.json"
     process = start("--episodes=1", "--settle=0", "--pause=0", f"--json={out}")
-    body = BridgeRobot(ports_of(process))
-    body.connect()
-    body.close()
+    robot = BridgeRobot(ports_of(process))
+    robot.connect()
+    robot.close()
     assert process.stdin is not None
     process.stdin.write("nonsense\nrelease\n")  # without commands it falls
     process.stdin.flush()

@@ -19,24 +19,24 @@ NEUTRAL = np.concatenate([np.zeros(3), ACTION_BOX.neutral])
 def play(live: LiveRobot) -> tuple[list[EpisodeOutcome], list[np.ndarray]]:
     """One ball, under a controller at 50 Hz."""
     live.start(Scenario("ball", 4, 0))
-    body = SimLowLevelRobot(live)
+    robot = SimLowLevelRobot(live)
     episodes = EpisodeSequencer(
-        body,
+        robot,
         lambda n: Scenario("ball", 4, 0) if n == 0 else None,
         EpisodeSchedule(gantry=0.3, settle=0.3, pause=0.0),
     )
     clock = SimClock(episodes.step)
     rate = FixedRate(50, clock)
     controller = make_controller("stance")
-    controller.reset(proprioception(body.read(), NEUTRAL)[None])
+    controller.reset(proprioception(robot.read(), NEUTRAL)[None])
     rate.start()
     trace: list[np.ndarray] = []
     while not episodes.finished:
-        state = body.read()
-        assert state.time_ns == clock.now_ns() == body.time_ns
+        state = robot.read()
+        assert state.time_ns == clock.now_ns() == robot.time_ns
         target = controller.step(proprioception(state, NEUTRAL)[None])[0]
-        body.write(MotorCommand(target, controller.stiffness, controller.damping, mode=state.mode))
-        picture = body.camera.read()
+        robot.write(MotorCommand(target, controller.stiffness, controller.damping, mode=state.mode))
+        picture = robot.camera.read()
         age = clock.now_ns() - picture.time_ns
         assert 0 <= age <= (25_000_000 if clock.now_ns() > 200_000_000 else 200_000_000)
         trace += [state.joint_position, picture.depth]
@@ -56,12 +56,12 @@ def test_a_rollout_in_lockstep_repeats_bit_for_bit(live: LiveRobot) -> None:
 
 def test_a_reading_is_measured_once_per_step(live: LiveRobot) -> None:
     live.start(Scenario("ball", 0, 0))
-    body = SimLowLevelRobot(live)
-    first = body.read()
-    assert body.read() is first
-    body.step()
-    assert body.read() is not first
-    assert body.read().time_ns == 5_000_000
+    robot = SimLowLevelRobot(live)
+    first = robot.read()
+    assert robot.read() is first
+    robot.step()
+    assert robot.read() is not first
+    assert robot.read().time_ns == 5_000_000
 
 
 def test_sim_clock_takes_whole_steps() -> None:
