@@ -1,4 +1,4 @@
-"""Return and success of the planner in simulation, while the model is still being trained."""
+"""Return and success of the planner in simulation during training."""
 
 from __future__ import annotations
 

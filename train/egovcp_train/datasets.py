@@ -196,14 +196,8 @@ def mix_of(config: TrainConfig) -> Mix:
 
 def stream_config(config: TrainConfig) -> SamplerConfig:
     """How windows are drawn."""
-    sampling = config.sampling
-    return SamplerConfig(
-        batch_size=config.batch_size,
-        length=sampling.length,
-        burn_in=sampling.burn_in,
-        mirror=sampling.mirror,
-        seed=config.seed,
-    )
+    own = config.sampling
+    return SamplerConfig(config.batch_size, own.length, own.burn_in, own.mirror, seed=config.seed)
 
 
 def _resolved(

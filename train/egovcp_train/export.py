@@ -20,7 +20,7 @@ import math
 import os
 import shutil
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -105,7 +105,7 @@ def write_export(artifact: Artifact, folder: Path) -> dict[str, float]:
     model = artifact.world_model
     _require_exportable(artifact)
     for name, network in networks_of(model).items():
-        write_graph(network(model), golden_inputs(model, _TRACED_ROWS, 1), folder / f"{name}.onnx")
+        write_graph(network, golden_inputs(model, _TRACED_ROWS, 1), folder / f"{name}.onnx")
     inputs = golden_inputs(model, _ROWS)
     golden = {f"inputs/{name}": tensor for name, tensor in inputs.items()}
     for name, outputs in reference(model, inputs).items():
@@ -140,8 +140,9 @@ def verify(folder: Path) -> dict[str, float]:
     require_packages("egovcp-train", PROG, "onnx", "onnxruntime")
     golden = load_file(folder / GOLDEN)
     errors: dict[str, float] = {}
-    present = REWARD if (folder / "reward.onnx").exists() else {}
-    for name in {**NETWORKS, **present}:
+    for name in NETWORKS:
+        if name == "reward" and not (folder / "reward.onnx").exists():
+            continue
         errors[name] = _largest_error(folder, name, golden)
         if not errors[name] <= TOLERANCE:  # NaN is more, too
             raise ArtifactError(
@@ -166,22 +167,17 @@ def _largest_error(folder: Path, name: str, golden: Mapping[str, torch.Tensor]) 
     whole = session.run(names, inputs)
     single = [session.run(names, {k: v[i : i + 1] for k, v in inputs.items()}) for i in range(rows)]
     found = [whole, [np.concatenate(parts) for parts in zip(*single, strict=True)]]
-    return float(
-        np.max(
-            [
-                np.max(np.abs(a - b) / np.maximum(1.0, np.abs(b)))
-                for answer in found
-                for a, b in zip(answer, expected, strict=True)
-            ]
-        )
-    )
+    errors = [
+        np.max(np.abs(a - b) / np.maximum(1.0, np.abs(b)))
+        for answer in found
+        for a, b in zip(answer, expected, strict=True)
+    ]
+    return float(np.max(errors))
 
 
 def _report(artifact: Artifact, folder: Path, golden: dict[str, torch.Tensor]) -> dict[str, Any]:
     """What another runtime needs besides the graphs."""
-
     model = artifact.world_model
-    networks = {name: network(model) for name, network in networks_of(model).items()}
 
     def described(key: str) -> dict[str, Any]:
         tensor = golden[key]
@@ -198,11 +194,11 @@ def _report(artifact: Artifact, folder: Path, golden: dict[str, torch.Tensor]) -
                 "inputs": {key: described(f"inputs/{key}") for key in network.inputs},
                 "outputs": {key: described(f"outputs/{name}/{key}") for key in network.outputs},
             }
-            for name, network in networks.items()
+            for name, network in networks_of(model).items()
         },
         "golden": {"file": GOLDEN, "sha256": sha256(folder / GOLDEN), "tolerance": TOLERANCE},
-        "min_return": float(artifact.world_model.min_return),
-        "discount": float(artifact.world_model.discount),
+        "min_return": float(model.min_return),
+        "discount": float(model.discount),
         "planner": draccus.encode(artifact.planner),
         "controller_id": artifact.controller_id,
         "features": artifact.manifest["features"],
@@ -218,82 +214,53 @@ def _report(artifact: Artifact, folder: Path, golden: dict[str, torch.Tensor]) -
 type Tensors = dict[str, Tensor]
 
 
+def _observe(
+    model: WorldModel,
+    h: Tensor,
+    z: Tensor,
+    action: Tensor,
+    depth: Tensor,
+    state: Tensor,
+    is_first: Tensor,
+) -> Carry:
+    """`WorldModel.observe`: depth (B, 48, 64) mm as float32, whole numbers, 0 = not measured."""
+    near = pooled_nearness(depth, model.config.depth_max_m)
+    return model.observe_near(Carry(h, z), action, near, state, is_first)
+
+
+_STEP: Final = ("h", "z", "action")
+_NEXT: Final = ("h_next", "z_next")
+#: Name -> inputs, outputs, function of the model and the inputs.
+NETWORKS: Final[Mapping[str, tuple[tuple[str, ...], tuple[str, ...], Callable[..., Any]]]] = {
+    "observe": ((*_STEP, "depth", "state", "is_first"), _NEXT, _observe),
+    "imagine": (_STEP, _NEXT, lambda model, h, z, a: model.imagine(Carry(h, z), a)),
+    "value": (_STEP, ("value",), lambda model, h, z, a: model.value(Carry(h, z), a)),
+    "termination": (
+        ("h", "z"),
+        ("termination",),
+        lambda model, h, z: model.termination(Carry(h, z)),
+    ),
+    "reward": (_STEP, ("reward",), lambda model, h, z, a: model.reward(Carry(h, z), a)),
+}
+
+
 class ExportedNetwork(nn.Module):
-    """A network as a graph, with inputs and outputs in the order of the names."""
+    """An entry of `NETWORKS`."""
 
-    inputs: tuple[str, ...] = ()
-    outputs: tuple[str, ...] = ()
-
-    def __init__(self, model: WorldModel) -> None:
+    def __init__(self, model: WorldModel, name: str) -> None:
         super().__init__()
         self.model = model
+        self.inputs, self.outputs, self._function = NETWORKS[name]
+
+    def forward(self, *tensors: Tensor) -> Tensor | Carry:
+        found: Tensor | Carry = self._function(self.model, *tensors)
+        return found
 
 
-class Observe(ExportedNetwork):
-    """`WorldModel.observe`: depth (B, 48, 64) mm as float32, whole numbers, 0 = not measured."""
-
-    inputs = ("h", "z", "action", "depth", "state", "is_first")
-    outputs = ("h_next", "z_next")
-
-    def forward(
-        self, h: Tensor, z: Tensor, action: Tensor, depth: Tensor, state: Tensor, is_first: Tensor
-    ) -> Carry:
-        near = pooled_nearness(depth, self.model.config.depth_max_m)
-        return self.model.observe_near(Carry(h, z), action, near, state, is_first)
-
-
-class Imagine(ExportedNetwork):
-    """`WorldModel.imagine`."""
-
-    inputs = ("h", "z", "action")
-    outputs = ("h_next", "z_next")
-
-    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Carry:
-        return self.model.imagine(Carry(h, z), action)
-
-
-class Value(ExportedNetwork):
-    """`WorldModel.value`, (B,)."""
-
-    inputs = ("h", "z", "action")
-    outputs = ("value",)
-
-    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
-        return self.model.value(Carry(h, z), action)
-
-
-class Termination(ExportedNetwork):
-    """`WorldModel.termination`, (B,)."""
-
-    inputs = ("h", "z")
-    outputs = ("termination",)
-
-    def forward(self, h: Tensor, z: Tensor) -> Tensor:
-        return self.model.termination(Carry(h, z))
-
-
-class Reward(ExportedNetwork):
-    """`WorldModel.reward`, (B,)."""
-
-    inputs = ("h", "z", "action")
-    outputs = ("reward",)
-
-    def forward(self, h: Tensor, z: Tensor, action: Tensor) -> Tensor:
-        return self.model.reward(Carry(h, z), action)
-
-
-NETWORKS: Final[Mapping[str, type[ExportedNetwork]]] = {
-    "observe": Observe,
-    "imagine": Imagine,
-    "value": Value,
-    "termination": Termination,
-}
-REWARD: Final[Mapping[str, type[ExportedNetwork]]] = {"reward": Reward}
-
-
-def networks_of(model: WorldModel) -> Mapping[str, type[ExportedNetwork]]:
-    """The networks of this model, by name."""
-    return {**NETWORKS, **({} if model.reward_head is None else REWARD)}
+def networks_of(model: WorldModel) -> dict[str, ExportedNetwork]:
+    """The networks of this model, by name; reward only if it is predicted."""
+    names = [name for name in NETWORKS if name != "reward" or model.reward_head is not None]
+    return {name: ExportedNetwork(model, name) for name in names}
 
 
 def pooled_nearness(depth_mm: Tensor, max_m: float) -> Tensor:
@@ -336,18 +303,14 @@ def reference(model: WorldModel, inputs: Tensors) -> dict[str, Tensors]:
     observed = model.observe(carry, action, depth, state, is_first)
     imagined = model.imagine(carry, action)
     answers = {
-        "observe": _named(observed),
-        "imagine": _named(imagined),
+        "observe": dict(zip(_NEXT, observed, strict=True)),
+        "imagine": dict(zip(_NEXT, imagined, strict=True)),
         "value": {"value": model.value(carry, action)},
         "termination": {"termination": model.termination(carry)},
     }
     if model.reward_head is not None:
         answers["reward"] = {"reward": model.reward(carry, action)}
     return answers
-
-
-def _named(carry: Carry) -> Tensors:
-    return {"h_next": carry.h, "z_next": carry.z}
 
 
 def write_graph(network: ExportedNetwork, inputs: Tensors, path: Path) -> None:

@@ -109,15 +109,16 @@ def train(config: TrainConfig) -> None:
     learner = Learner(model.to(device), config.optimizer, config.seed, group, bf16)
     spent = _restore(output, learner, data) if config.resume else 0.0
     provenance = _provenance(data)
+    simulation = None
     if group.is_first:
-        simulation = _simulation(config, provenance, learner.model)
+        if config.eval_closed_loop:
+            make_evaluator(model, config.planner)  # refuses a backend that cannot be used here
+            tasks, controller = provenance["tasks"], provenance["controller_id"]
+            simulation = ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
         reserve_policy(config.policy)
         output.mkdir(parents=True, exist_ok=True)
         save_config(dataclasses.replace(config, resume=False), str(output / CONFIG_FILE))
-    else:
-        simulation = None
-    run = TrainingRun(config, output, learner, data, device, provenance, simulation, spent)
-    run.execute()
+    TrainingRun(config, output, learner, data, device, provenance, simulation, spent).execute()
 
 
 def _require_batch_memory(config: TrainConfig, group: ProcessGroup, device: torch.device) -> None:
@@ -171,9 +172,9 @@ class TrainingRun:
             raise KeyboardInterrupt if self.group.is_first else SystemExit(130)
 
     def _conclude(self, final: Path, finished: bool) -> None:
-        """Say where everything is, and publish what is finished."""
+        """Print the result, write the card, and publish a finished policy."""
         artifact = final / "pretrained_model"
-        echo(self._last_words(final, stopped=not finished))
+        echo(self._final_message(artifact, stopped=not finished))
         write_card(artifact, self.output, self.config.policy.repo_id)
         if finished:
             self.recorder.policy(self.learner.step, artifact)
@@ -182,8 +183,7 @@ class TrainingRun:
             publish_trained(artifact, self.config.policy)
 
     def _learn(self, stopped: list[int]) -> bool:
-        """Step until the budget is spent, or ``stopped`` fills here or in another process; returns
-        whether the budget is spent."""
+        """Step until the budget is spent or a process is stopped; returns whether it is spent."""
         config, learner, start = self.config, self.learner, self.learner.step
         ticks = config.sampling.length + config.sampling.burn_in
         frames = self.group.count * config.batch_size * ticks
@@ -216,7 +216,7 @@ class TrainingRun:
                         bar.write(one_line(_UNRECORDED.format(reason=learner.unrecorded)))
 
     def _pause(self) -> None:
-        """Between two steps: measure, save and show, in this order, what is due after the first."""
+        """Measure, save and record what is due between two steps."""
         config, learner, report = self.config, self.learner, None
         if self.group.is_first and config.eval_freq and learner.step % config.eval_freq == 0:
             report = self.measure(learner.averaged)
@@ -226,20 +226,20 @@ class TrainingRun:
             self.show(report)
 
     def finish(self, finished: bool) -> None:
-        """Measure the model, save it, and show what was measured.
+        """Measure and save the model, and record the measurements.
 
-        A launcher leaves its processes 30 s to stop: there an unfinished model is only saved.
+        A launcher gives its processes 30 s to stop, so it only saves an unfinished model.
         """
         shipped, report = self.learner.averaged, None
         if self.group.is_first and (finished or self.group.count == 1):
             report = self.measure(shipped)
         self.save(shipped)
-        if report is not None:  # after the model is safe: pictures may fail, of a full disk or else
+        if report is not None:  # after saving: drawing may fail
             self.show(report)
             record(report, self.output, shipped.config.depth_max_m)
 
     def measure(self, model: WorldModel) -> HeldoutReport:
-        """Measure a model on held-out episodes, and in simulation if that is asked for."""
+        """Measure a model on held-out episodes, and in simulation if configured."""
         heldout = self.data.heldout
         report = measure(model, episode_batches(heldout, self.device, EVALUATION_EPISODES))
         self.metrics, self.tasks = report.metrics, report.tasks
@@ -248,7 +248,7 @@ class TrainingRun:
         return report
 
     def show(self, report: HeldoutReport) -> None:
-        """Record what the last measurement found, and draw it where something takes pictures."""
+        """Record the last measurements and their pictures."""
         step, heldout = self.learner.step, self.metrics | scalars(self.tasks)
         found = {f"heldout/{k}": v for k, v in heldout.items()}
         self.recorder.scalars(step, found | {f"closed_loop/{k}": v for k, v in self.played.items()})
@@ -268,10 +268,12 @@ class TrainingRun:
             return
         found = {"heldout": self.metrics, "heldout_tasks": self.tasks, "closed_loop": self.played}
         provenance = self.provenance | {"step": self.learner.step, **finite_or_null(found)}
-        spent = {"seconds": self.budget.spent}
-        digests = [reader.content_digest for reader in self.data.readers]
-        learned = {"learner": self.learner.state_dict(), "streams": streams}
-        state = {**learned, "datasets": digests, **spent}
+        state = {
+            "learner": self.learner.state_dict(),
+            "streams": streams,
+            "datasets": [reader.content_digest for reader in self.data.readers],
+            "seconds": self.budget.spent,
+        }
         with new_checkpoint(self.output, self.learner.step, state) as folder:
             save_artifact(folder, model, self.config.planner, provenance)
 
@@ -283,11 +285,10 @@ class TrainingRun:
             summary["heldout_r2"] = f"{self.metrics['value/r2']:.3f}"
         return summary
 
-    def _last_words(self, final: Path, stopped: bool) -> str:
+    def _final_message(self, artifact: Path, stopped: bool) -> str:
         found = self.metrics | {f"closed_loop/{k}": v for k, v in self.played.items()}
         lines = [f"  {name:<20} {value:.4f}" for name, value in sorted(found.items())]
         state = "stopped early" if stopped else "done"
-        artifact = final / "pretrained_model"
         return "\n".join(
             [
                 f"{PROG}: {state} at step {self.learner.step}; on held-out episodes:",
@@ -301,18 +302,13 @@ class TrainingRun:
         )
 
 
-def _require_loadable(config: TrainConfig) -> None:
-    """Raise `UsageError` for networks so large that their artifact would be refused."""
+def _prepare_output(config: TrainConfig, group: ProcessGroup) -> Path:
+    """Check packages, sizes and folders before any work starts; returns the output folder."""
+    require_wandb(config.wandb)
     try:
         tensor_shapes(config.policy.world_model())
     except ValueError as error:
         raise UsageError(f"--policy: {error}; make the networks smaller") from error
-
-
-def _prepare_output(config: TrainConfig, group: ProcessGroup) -> Path:
-    """Refuse what makes no sense, or cannot be done here, before any work starts."""
-    require_wandb(config.wandb)
-    _require_loadable(config)
     if config.eval_closed_loop:
         require_simulator()
     if not group.is_first:
@@ -321,16 +317,6 @@ def _prepare_output(config: TrainConfig, group: ProcessGroup) -> Path:
     if config.resume:
         require_datasets(config, saved_options(TrainConfig, output))
     return output
-
-
-def _simulation(
-    config: TrainConfig, provenance: dict[str, Any], model: WorldModel
-) -> ClosedLoop | None:
-    if not config.eval_closed_loop:
-        return None
-    make_evaluator(model, config.planner)  # refuse a backend that cannot be used here before work
-    tasks, controller = provenance["tasks"], provenance["controller_id"]
-    return ClosedLoop(tasks, config.eval_closed_loop, config.seed, controller)
 
 
 def _records(config: TrainConfig, output: Path) -> Records:
@@ -343,12 +329,12 @@ def _records(config: TrainConfig, output: Path) -> Records:
 
 
 def _restore(output: Path, learner: Learner, data: TrainingData) -> float:
-    """Continue from the last checkpoint; returns the seconds that the run has taken so far.
+    """Restore the last checkpoint; returns the seconds that the run has taken so far.
 
     Raises:
-        ArtifactError: its networks are not those of the options.
-        DataError: the dataset is another one.
-        UsageError: the windows or the processes are others.
+        ArtifactError: the networks have changed.
+        DataError: the dataset has changed.
+        UsageError: the windows or the number of processes have changed.
     """
     state, stream = load_training_state(output), data.stream
     if "datasets" in state:  # not in checkpoints of earlier versions

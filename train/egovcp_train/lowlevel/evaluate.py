@@ -119,7 +119,11 @@ def evaluate(config: LowLevelEvalConfig) -> None:
             }
             echo(table(figures))
             if not complete:
-                echo(f"INCOMPLETE: {_counts(config, skills, figures)} robots have played")
+                played = {skill.name: figures.get(skill.name, {}) for skill in skills}
+                counts = (
+                    f"{k} {f.get('episodes', 0)} of {config.episodes}" for k, f in played.items()
+                )
+                echo(f"INCOMPLETE: {', '.join(counts)} robots have played")
             output.mkdir(parents=True, exist_ok=True)
             write_json(output / RESULT, figures | loads | {"_run": run})
             echo(f"figures: {output / RESULT}")
@@ -145,15 +149,7 @@ def _play_all(
                 _play(config, skill, bar, parts, lambda: bool(received))
             finally:
                 if parts:
-                    figures[skill.name] = _figures(skill, _joined(parts), config.episodes)
-
-
-def _counts(
-    config: LowLevelEvalConfig, skills: Sequence[Skill], figures: dict[str, dict[str, Any]]
-) -> str:
-    """``rest 400 of 400, squat 200 of 400``."""
-    played = {name: row["episodes"] for name, row in figures.items()}
-    return ", ".join(f"{s.name} {played.get(s.name, 0)} of {config.episodes}" for s in skills)
+                    figures[skill.name] = _figures(skill, parts, config.episodes)
 
 
 def _chosen(names: str) -> list[Skill]:
@@ -171,7 +167,7 @@ def _play(
     parts: list[Any],
     stopped: Callable[[], bool],
 ) -> None:
-    """The outcomes of one batch of robots after the other, into ``parts``."""
+    """Play a skill with batches of robots; appends the outcomes to ``parts``."""
     from egovcp_train.lowlevel.trial import play  # MuJoCo; --help needs none
 
     threads = config.threads or available_cores()
@@ -193,13 +189,14 @@ def _play(
         bar.update(robots)
 
 
-def _joined(parts: Sequence[Any]) -> dict[str, NDArray[Any]]:
-    names = ("survived", "torque_rms", *_FIGURES.values(), *_CAMERA.values())
-    return {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
+def _figures(skill: Skill, parts: Sequence[Any], requested: int) -> dict[str, Any]:
+    """One row of the table, from the outcomes of batches."""
 
+    def finite(name: str) -> NDArray[Any]:
+        values = np.concatenate([getattr(part, name) for part in parts])
+        return np.asarray(values[np.isfinite(values).reshape(len(values), -1).all(axis=1)])
 
-def _figures(skill: Skill, outcome: dict[str, NDArray[Any]], requested: int) -> dict[str, Any]:
-    survived = outcome["survived"]
+    survived = finite("survived")
     low, high = wilson(int(survived.sum()), len(survived))
     out: dict[str, Any] = {
         "about": skill.about,
@@ -209,17 +206,12 @@ def _figures(skill: Skill, outcome: dict[str, NDArray[Any]], requested: int) -> 
     }
     if len(survived) < requested:
         out |= {"incomplete": True, "episodes_requested": requested}
-    for key, name in _FIGURES.items():
-        known = outcome[name][np.isfinite(outcome[name])]
-        out[key] = float(known.mean()) if len(known) else None
-    for key, name in _CAMERA.items():
-        turned = outcome[name][np.isfinite(outcome[name]).all(axis=1)]
-        out[key] = turned.mean(axis=0).tolist() if len(turned) else None
-    torque = outcome["torque_rms"]
-    torque = torque[np.isfinite(torque).all(axis=1)]
-    out["torque_rms_relative"] = (
-        dict(zip(JOINT_NAMES, torque.mean(axis=0).tolist(), strict=True)) if len(torque) else None
-    )
+    for key, name in {**_FIGURES, **_CAMERA}.items():
+        known = finite(name)
+        out[key] = known.mean(axis=0).tolist() if len(known) else None
+    torque = finite("torque_rms")
+    by_joint = zip(JOINT_NAMES, torque.mean(axis=0).tolist(), strict=True) if len(torque) else None
+    out["torque_rms_relative"] = dict(by_joint) if by_joint else None
     return out
 
 
@@ -229,15 +221,10 @@ def _standing_load(config: LowLevelEvalConfig) -> dict[str, Any]:
 
     load = standing_load(make_controller(config.controller), config.feet)
     echo(describe(load))
+    columns = (load.mean.tolist(), load.needed.tolist(), load.excess.tolist())
     joints = {
-        name: {"mean_nm": mean, "needed_nm": needed, "excess_relative": excess}
-        for name, mean, needed, excess in zip(
-            JOINT_NAMES,
-            load.mean.tolist(),
-            load.needed.tolist(),
-            load.excess.tolist(),
-            strict=True,
-        )
+        name: dict(zip(("mean_nm", "needed_nm", "excess_relative"), row, strict=True))
+        for name, *row in zip(JOINT_NAMES, *columns, strict=True)
     }
     within = bool((load.excess <= 0.0).all())
     return {"_standing_load": {"within_bar": within, "joints": joints}}

@@ -97,12 +97,10 @@ def env_cfg(
         commands={LOGIC: term},
         actions={"targets": TargetsCfg(disturbances=task.disturbances)},
         observations={
-            "policy": ObservationGroupCfg(
-                {"walk": ObservationTermCfg(func=terms.policy_observation)}
-            ),
-            "privileged": ObservationGroupCfg(
-                {"truth": ObservationTermCfg(func=terms.privileged_observation)}
-            ),
+            name: ObservationGroupCfg(
+                {"walk": ObservationTermCfg(func=terms.observation, params={"which": which})}
+            )
+            for which, name in enumerate(("policy", "privileged"))
         },
         events=_events(task.disturbances),
         rewards={

@@ -16,6 +16,7 @@ from mjlab.managers.command_manager import CommandTerm, CommandTermCfg
 from numpy.typing import NDArray
 
 from egovcp.errors import UsageError
+from egovcp.robot.geometry import rotation_matrix
 from egovcp.robot.walking import ACTIONS, WalkConfig
 from egovcp.sim.config import SensorConfig
 from egovcp.spec import CONTROLLER_HZ, JOINT_NAMES
@@ -160,7 +161,7 @@ class MjlabRobot:
             joint_rates=rates,
             feet=_numpy(data.body_link_pos_w[:, self._feet]) - origin[:, None],
             feet_velocity=_numpy(data.body_link_lin_vel_w[:, self._feet]),
-            feet_forward=_forward(_numpy(data.body_link_quat_w[:, self._feet])),
+            feet_forward=rotation_matrix(_numpy(data.body_link_quat_w[:, self._feet]))[..., 0],
             palms=_numpy(data.site_pos_w[:, self._palms]) - origin[:, None],
             torque=_numpy(self._sim.data.actuator_force[:, self._actuators]),
             head_top=_numpy(data.geom_pos_w[:, self._head, 2]) + self._radius,
@@ -175,13 +176,6 @@ class MjlabRobot:
 
 def _numpy(x: torch.Tensor) -> Array:
     return x.detach().cpu().numpy().astype(np.float64)
-
-
-def _forward(quaternion: Array) -> Array:
-    """(..., 4) wxyz -> (..., 3) x axes."""
-    w, x, y, z = np.moveaxis(quaternion, -1, 0)
-    axes = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
-    return np.stack(axes, axis=-1)
 
 
 @dataclass(kw_only=True)
@@ -251,14 +245,9 @@ def logic_term(env: ManagerBasedRlEnv) -> TaskLogicTerm:
     return term
 
 
-def policy_observation(env: ManagerBasedRlEnv) -> torch.Tensor:
-    """(N, 95)."""
-    return logic_term(env).observation(0)
-
-
-def privileged_observation(env: ManagerBasedRlEnv) -> torch.Tensor:
-    """(N, 16)."""
-    return logic_term(env).observation(1)
+def observation(env: ManagerBasedRlEnv, which: int) -> torch.Tensor:
+    """See `TaskLogicTerm.observation`."""
+    return logic_term(env).observation(which)
 
 
 def fallen(env: ManagerBasedRlEnv) -> torch.Tensor:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Callable
 from contextlib import closing
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,32 +65,32 @@ class _Series:
     """Time series (T, N, ...) of one trial."""
 
     def __init__(self) -> None:
-        self.hands: list[Array] = []
-        self.targets: list[Array] = []
-        self.height: list[Array] = []
-        self.torso: list[Array] = []  # of planner ticks
-        self.velocity: list[Array] = []
-        self.head: list[Array] = []
-        self.stepping: list[NDArray[np.bool_]] = []
-        self.torque: list[Array] = []
+        self._found: dict[str, list[NDArray[Any]]] = defaultdict(list)
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        return np.array(self._found[name])
 
     def add(self, x: Snapshot, command: Array, stepping: NDArray[np.bool_]) -> None:
+        """Add a tick."""
         turn = rotation_matrix(x.quaternion)
         forward = heading(turn)
         to_heading = _heading_from_world(forward)
-        palms = (to_heading[:, None] @ (x.palms - x.position[:, None])[..., None])[..., 0]
         pelvis = to_heading @ turn
         torso = torso_rotation(pelvis, x.joints[:, WAIST])
-        self.hands.append(palms)
-        self.targets.append(nearest_reachable(command[:, 3:9].reshape(-1, 2, 3), pelvis, torso))
-        self.height.append(x.position[:, 2].copy())
-        if len(self.height) % CONTROLLER_TICKS_PER_PLAN == 1:
-            self.torso.append(np.nan_to_num(sensing.torso(x)))
+        hands = command[:, 3:9].reshape(-1, 2, 3)
         planar = in_heading(x.velocity, forward)
-        self.velocity.append(np.concatenate([planar, x.angular_velocity[:, 2:]], axis=1))
-        self.head.append(x.head_top.copy())
-        self.stepping.append(stepping)
-        self.torque.append(x.torque.copy())
+        if len(self._found["height"]) % CONTROLLER_TICKS_PER_PLAN == 0:
+            self._found["torso"].append(np.nan_to_num(sensing.torso(x)))
+        for name, value in {
+            "hands": (to_heading[:, None] @ (x.palms - x.position[:, None])[..., None])[..., 0],
+            "targets": nearest_reachable(hands, pelvis, torso),
+            "height": x.position[:, 2],
+            "velocity": np.concatenate([planar, x.angular_velocity[:, 2:]], axis=1),
+            "head": x.head_top,
+            "stepping": stepping,
+            "torque": x.torque,
+        }.items():
+            self._found[name].append(value.copy())
 
 
 def play(
@@ -168,41 +169,33 @@ def _heading_from_world(forward: Array) -> Array:
 def _measure(
     skill: Skill, commands: Array, series: _Series, alive: NDArray[np.bool_]
 ) -> SkillOutcome:
-    hands, targets = np.array(series.hands), np.array(series.targets)  # (T, N, 2, 3)
-    height, velocity = np.array(series.height), np.array(series.velocity)
+    hands, targets, velocity = series["hands"], series["targets"], series["velocity"]
     moves = commands[..., :3].any()
+    reaches = np.ptp(commands[..., 3:9], axis=0).any() and not skill.settled_only
     counted = alive.copy()
     if skill.settled_only:
         counted &= (np.arange(len(commands)) % HOLD >= SETTLED)[:, None]
     elif moves:
         counted[:_WARM_UP] = False
-    torso = np.array(series.torso)
     planned = (counted if moves else alive)[::CONTROLLER_TICKS_PER_PLAN]
-    apart = np.linalg.norm(hands - targets, axis=-1).mean(axis=-1)
-    off = np.abs(height - commands[..., -1])
+    none = np.full(alive.shape[1], np.nan)
     return SkillOutcome(
         survived=alive[-1],
-        hand_error=_mean(apart, counted),
-        hand_lag=_lag(hands, targets, counted)
-        if np.ptp(commands[..., 3:9], axis=0).any() and not skill.settled_only
-        else _nan(alive),
-        height_error=_mean(off, counted),
+        hand_error=_mean(np.linalg.norm(hands - targets, axis=-1).mean(axis=-1), counted),
+        hand_lag=_lag(hands, targets, counted) if reaches else none,
+        height_error=_mean(np.abs(series["height"] - commands[..., -1]), counted),
         velocity_error=_velocity_error(velocity[..., :2], commands[..., :2], counted)
         if moves
-        else _nan(alive),
+        else none,
         turning_error=_velocity_error(velocity[..., 2:], commands[..., 2:3], counted)
         if moves
-        else _nan(alive),
-        head_top=_highest(np.array(series.head), counted) if moves else _nan(alive),
-        stepping=_mean(np.array(series.stepping), alive),
-        camera=_rotation(torso, planned, 1),
-        camera_8=_rotation(torso, planned, 8),
-        torque_rms=relative_rms(np.array(series.torque), alive),
+        else none,
+        head_top=_highest(series["head"], counted) if moves else none,
+        stepping=_mean(series["stepping"], alive),
+        camera=_rotation(series["torso"], planned, 1),
+        camera_8=_rotation(series["torso"], planned, 8),
+        torque_rms=relative_rms(series["torque"], alive),
     )
-
-
-def _nan(alive: NDArray[np.bool_]) -> Array:
-    return np.full(alive.shape[1], np.nan)
 
 
 def _mean(series: Array, counted: NDArray[np.bool_]) -> Array:
@@ -229,7 +222,7 @@ def _highest(series: Array, counted: NDArray[np.bool_]) -> Array:
 def _velocity_error(velocity: Array, wanted: Array, counted: NDArray[np.bool_]) -> Array:
     """Distance of the mean velocity of each stride to the mean of what was commanded."""
     if len(velocity) <= _STRIDE:
-        return _nan(counted)
+        return np.full(counted.shape[1], np.nan)
     kernel = np.cumsum(np.concatenate([np.zeros_like(velocity[:1]), velocity - wanted]), axis=0)
     mean = (kernel[_STRIDE:] - kernel[:-_STRIDE]) / _STRIDE
     return _mean(np.linalg.norm(mean, axis=-1), counted[_STRIDE - 1 :])
