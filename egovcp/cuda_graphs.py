@@ -99,7 +99,6 @@ class GraphedFunction:
 
     @property
     def shapes(self) -> int:
-        """Number of shapes that have a graph."""
         return sum(graph is not None for graph in self._graphs.values())
 
     @torch.inference_mode(False)  # buffers are written under both modes
@@ -116,7 +115,6 @@ class GraphedFunction:
 
 
 def _tensors(tree: Any) -> Iterator[Tensor]:
-    """The tensors in nested tuples, in order."""
     if isinstance(tree, Tensor):
         yield tree
     elif isinstance(tree, tuple):

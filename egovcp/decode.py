@@ -88,7 +88,6 @@ def _is_required(field: dataclasses.Field[Any]) -> bool:
 
 
 def _decode(hint: Any, value: object, name: str) -> Any:
-    """``value`` as the type ``hint``."""
     while isinstance(hint, TypeAliasType):
         hint = hint.__value__
     if hint is Any:
@@ -142,7 +141,6 @@ def _number(value: float, name: str) -> float:
 
 
 def _described(hint: Any) -> str:
-    """Name of a type in JSON terms."""
     return " or ".join(dict.fromkeys(_words(hint)))
 
 

@@ -60,7 +60,6 @@ class _Group:
 
     @property
     def is_short(self) -> bool:
-        """Whether ``--help`` shows the options."""
         return not self.name or ("." not in self.name and len(self.options) <= _SMALL_GROUP)
 
 

@@ -33,7 +33,6 @@ def command(program: str, *arguments: str) -> list[str]:
 
 
 def main() -> None:
-    """Entry point."""
     parent, program, *arguments = sys.argv[1:]
     die_with_parent(int(parent))
     os.execv(program, [program, *arguments])

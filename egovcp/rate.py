@@ -52,7 +52,6 @@ class LockstepClock:
         self.time_ns = max(self.time_ns, deadline_ns)
 
     def advance(self, duration_ns: int) -> None:
-        """Add ``duration_ns`` to the time."""
         self.time_ns += duration_ns
 
 
@@ -92,7 +91,6 @@ class FixedRate:
 
     @property
     def period_ns(self) -> int:
-        """Length of one tick in nanoseconds."""
         return round(NS_PER_S / self.hz)
 
     def start(self) -> None:

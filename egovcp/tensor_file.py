@@ -137,8 +137,6 @@ def _tensors(names: Collection[str]) -> str:
 
 @dataclass(frozen=True)
 class _Entry:
-    """A tensor in the header."""
-
     dtype: str
     shape: tuple[int, ...]
     data_offsets: tuple[int, int]

@@ -70,7 +70,6 @@ class TrustedCache:
         self.close()
 
     def close(self) -> None:
-        """Close the folder."""
         os.close(self._descriptor)
 
     def read(self, name: str) -> bytes | None:

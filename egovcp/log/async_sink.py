@@ -299,7 +299,6 @@ class _WriterProcess:
         poll.poll(min(seconds, 1.0) * 1e3)
 
     def exit_text(self) -> str:
-        """How the process ended."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(_KILL_TIMEOUT_S)
         code = self._process.poll()

@@ -99,7 +99,6 @@ def _curves(origins: dict[str, str], name: str | None = None) -> rrb.Container:
 
 
 def _robot_tab() -> rrb.Container:
-    """Motors and connection."""
     last = _curves(
         {
             "connection, image age, mode machine": paths.LINK,

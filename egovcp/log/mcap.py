@@ -85,7 +85,7 @@ class AppendFile:
         return self._size + len(self._pending)
 
     def flush(self) -> None:
-        """Append the buffer; on OSError the file is as before."""
+        """Append the buffer; on OSError the file is unchanged."""
         try:
             _write_all(self._file.fileno(), self._pending)
         except OSError:
@@ -98,7 +98,6 @@ class AppendFile:
             self._sync()
 
     def close(self) -> None:
-        """Append the buffer, call fsync, and close the file."""
         try:
             self.flush()
             self._sync()
@@ -187,7 +186,6 @@ class McapFile:
         self.flush()
 
     def add(self, topic: RecordedTopic, index: int, time_ns: int, data: bytes) -> None:
-        """Add a message of tick ``index``."""
         self._writer.add_message(
             channel_id=self._channel(topic),
             log_time=time_ns,
@@ -215,7 +213,6 @@ class McapFile:
             self._writer.finish()  # type: ignore[no-untyped-call]
 
     def discard(self) -> None:
-        """Close and remove the file."""
         file, self._file = self._file, None
         if file is not None:
             file.abandon()
@@ -269,11 +266,9 @@ class McapSink:
         self._file.flush()
 
     def close(self) -> None:
-        """Write the index and close the file."""
         self._file.close()
 
     def discard(self) -> None:
-        """Close and remove the file."""
         self._file.discard()
 
 

@@ -310,7 +310,6 @@ class RecordingReader:
         )
 
     def _first_records(self) -> Iterator[McapRecord | Damage]:
-        """The records before the first tick."""
         for record in self._file.records():
             if isinstance(record, Message | Channel | Schema):
                 return

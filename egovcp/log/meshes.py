@@ -135,7 +135,6 @@ def _normals(vertices: NDArray[np.float32], triangles: NDArray[np.uint32]) -> ND
 
 
 def _merge(parts: list[LinkMesh]) -> LinkMesh:
-    """Several meshes as one."""
     starts = np.cumsum([0, *[len(part.vertices) for part in parts[:-1]]])
     return LinkMesh(
         np.concatenate([part.vertices for part in parts]),

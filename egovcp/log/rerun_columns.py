@@ -115,7 +115,6 @@ def _depths(ticks: Sequence[Tick], imagined: Sequence[int]) -> Iterator[Columns]
 
 
 def _frame_at(k: int) -> Callable[[Tick], NDArray[np.uint16]]:
-    """A function from a tick to the depth it imagined ``k`` ticks ahead, mm."""
 
     def pick(tick: Tick) -> NDArray[np.uint16]:
         images = tick.depth_imagined

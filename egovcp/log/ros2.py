@@ -87,36 +87,30 @@ class Cdr:
         self._buffer += bytes(-(len(self._buffer) - _HEADER_BYTES) % size)
 
     def u8(self, value: int) -> Self:
-        """One unsigned byte, or a boolean."""
         self._buffer.append(value)
         return self
 
     def i32(self, value: int) -> Self:
-        """Signed 32-bit integer."""
         self._align(4)
         self._buffer += struct.pack("<i", value)
         return self
 
     def u32(self, *values: int) -> Self:
-        """Unsigned 32-bit integers."""
         self._align(4)
         self._buffer += struct.pack(f"<{len(values)}I", *values)
         return self
 
     def string(self, text: str) -> Self:
-        """UTF-8 string."""
         self._align(4)
         self._buffer += _string(text)
         return self
 
     def strings(self, texts: tuple[str, ...]) -> Self:
-        """Sequence of strings."""
         self._align(4)
         self._buffer += _strings(texts)
         return self
 
     def octets(self, data: bytes) -> Self:
-        """Sequence of bytes."""
         self.u32(len(data))
         self._buffer += data
         return self
@@ -140,7 +134,6 @@ class Cdr:
         return self
 
     def done(self) -> bytes:
-        """The finished message."""
         return bytes(self._buffer)
 
 

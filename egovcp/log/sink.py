@@ -37,12 +37,10 @@ class Fanout:
         self._sinks = tuple(sinks)
 
     def open(self, info: RunInfo) -> None:
-        """Open every sink."""
         for sink in self._sinks:
             sink.open(info)
 
     def write(self, tick: Tick) -> None:
-        """Write ``tick`` to every sink."""
         for sink in self._sinks:
             sink.write(tick)
 

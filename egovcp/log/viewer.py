@@ -90,7 +90,6 @@ class Viewer:
 
     @property
     def address(self) -> tuple[str, int]:
-        """Host and port."""
         match = _URL.fullmatch(self.url)
         assert match is not None
         return match[1], int(match[2])

@@ -107,7 +107,6 @@ def _picklable(error: Exception) -> Exception:
 
 
 def main() -> None:
-    """Run the process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles it and closes the log
     with suppress(OSError):
         os.nice(NICENESS)
