@@ -15,7 +15,7 @@ from pathlib import Path
 
 from report import parser, publish
 
-from egovcp_deploy.live.priority import raise_priority
+from egovcp_deploy.live.control_process import raise_priority
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests.support
 

@@ -26,9 +26,9 @@ from egovcp.intervals import Interval, wilson
 from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import EnvConfig, evaluation_config
 from egovcp.sim.scenario import Scenario
-from egovcp_deploy.constant_search import Action, search_constant
-from egovcp_deploy.episodes import Group, Setup, Stage
-from egovcp_deploy.scenarios import held_out
+from egovcp_deploy.controllers import Action, search_constant
+from egovcp_deploy.episodes import EpisodeGroup, EpisodePool, EpisodeSetup
+from egovcp_deploy.options import held_out
 from egovcp_deploy.scores import EpisodeScore, reward_interval, reward_per_step, success_rate
 
 PLAYERS = ("hold", "constant", "random", "oracle")
@@ -71,33 +71,28 @@ def measure(
 ) -> dict[str, Result]:
     """Player -> figures."""
     scenarios = [held_out(task, seed, i) for i in range(episodes)]
-    with closing(Stage(Setup(env, seed=seed), workers)) as stage:
+    with closing(EpisodePool(EpisodeSetup(env, seed=seed), workers)) as pool:
 
         def hold_each(
             actions: Sequence[Action], scenarios: Sequence[Scenario]
-        ) -> list[EpisodeScore]:
-            parts = batched(zip(actions, scenarios, strict=True), ENVS)
-            return _play(
-                stage,
-                [Group("constant", tuple(s for _, s in p), tuple(a for a, _ in p)) for p in parts],
-            )
+        ) -> list[list[EpisodeScore]]:
+            parts = list(batched(scenarios, ENVS))
+            groups = [EpisodeGroup("constant", part, a) for a in actions for part in parts]
+            return [list(scores) for scores in batched(_play(pool, groups), len(scenarios))]
 
         found = {}
         for name in players:
             action: Action = ()
             if name == "constant":
                 action = search_constant(task, seed, hold_each).action
-            groups = [
-                Group(name, part, (action,) * len(part) if action else ())
-                for part in batched(scenarios, ENVS)
-            ]
-            found[name] = result(_play(stage, groups), action)
+            groups = [EpisodeGroup(name, part, action) for part in batched(scenarios, ENVS)]
+            found[name] = result(_play(pool, groups), action)
     return found
 
 
-def _play(stage: Stage, groups: Sequence[Group]) -> list[EpisodeScore]:
+def _play(pool: EpisodePool, groups: Sequence[EpisodeGroup]) -> list[EpisodeScore]:
     """Scores in the order of the groups' scenarios."""
-    parts = dict(stage.play(groups))
+    parts = dict(pool.play(groups))
     return [score for i in sorted(parts) for score in parts[i]]
 
 

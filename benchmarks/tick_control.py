@@ -18,14 +18,14 @@ from egovcp.rate import FixedRate, MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.spec import CONTROLLER_HZ
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.control import ControlLoop, Wishes
+from egovcp_deploy.live.control import ControlLoop
+from egovcp_deploy.live.control_process import CONTROL, RECEIVING, raise_priority, raised_priority
 from egovcp_deploy.live.hardware import Hardware, open_hardware
-from egovcp_deploy.live.priority import CONTROL, RECEIVING, raise_priority, raised_priority
-from egovcp_deploy.live.simulated import simulated
-from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.live.processes import simulated_robot
 from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch
 from egovcp_deploy.pilot.pilot import Pilot
-from egovcp_deploy.pilot.states import Request, State
+from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
+from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import LowState, MotorCommand
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
 
@@ -53,7 +53,7 @@ class _Unwatched(MotorWatch):
 
 def _loop(hardware: Hardware, clock: MonotonicClock, checked: bool) -> ControlLoop:
     body = hardware.body
-    pilot = Pilot(InlineDesk(Thinker(Unplanned()), clock), state=State.ARMED)
+    pilot = Pilot(InlinePlanner(PlannerRunner(Unplanned()), clock), state=State.ARMED)
     controller = make_controller(_CONTROLLER)
     if not checked:
         loop = ControlLoop(body, hardware.eye, controller, pilot)
@@ -80,7 +80,7 @@ def control_figures(rounds: int) -> dict[str, object]:
     with ExitStack() as stack:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         with raised_priority(RECEIVING):  # for the robot too, which has computers of its own
-            options = stack.enter_context(simulated(config, folder / "outcomes.json"))
+            options = stack.enter_context(simulated_robot(config, folder / "outcomes.json"))
             hardware = open_hardware(options)
         granted = raise_priority(CONTROL)
         try:
@@ -107,7 +107,7 @@ def _measure(loop: ControlLoop, late: list[float], interval: list[float]) -> Non
     rate.start()
     begin, previous = time.monotonic(), 0.0
     for k in range(CONTROLLER_HZ + _SETTLE_TICKS):
-        loop.tick(rate.clock.now_ns(), Wishes(Request.RUN if k == 0 else None))
+        loop.tick(rate.clock.now_ns(), OperatorCommand(OperatorRequest.RUN if k == 0 else None))
         done = time.monotonic()
         if k >= _SETTLE_TICKS:
             late.append(done - begin - k / CONTROLLER_HZ)

@@ -15,9 +15,9 @@ from egovcp.model import WorldModel, WorldModelConfig
 from egovcp.plan import PlannerConfig, Policy, PolicyStep
 from egovcp.rate import LockstepClock
 from egovcp.spec import ACTION_DIM, PLANNER_HZ, STATE_DIM, STATE_SLICES
-from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.pilot import Pilot
-from egovcp_deploy.pilot.states import State
+from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
+from egovcp_deploy.pilot.states import Facts, State
 
 
 class Unplanned:
@@ -48,7 +48,7 @@ def filter_figures(rounds: int) -> dict[str, object]:
     torch.set_num_threads(1)
     policy = Policy(WorldModel(WorldModelConfig()), PlannerConfig(), 1)
     clock = LockstepClock()
-    pilot = Pilot(InlineDesk(Thinker(Unplanned()), clock), state=State.ARMED)
+    pilot = Pilot(InlinePlanner(PlannerRunner(Unplanned()), clock), state=State.ARMED)
     rng = np.random.default_rng(0)
     observe, judge = list[float](), list[float]()
     for _ in range(rounds * PLANNER_HZ):
@@ -58,10 +58,10 @@ def filter_figures(rounds: int) -> dict[str, object]:
         policy.advance(np.zeros((1, ACTION_DIM)))
         filtered = time.perf_counter()
         pilot.sense(clock.now_ns(), state, depth)
-        pilot.judge(clock.now_ns())
-        pilot.report(clock.now_ns(), depth, state)
-        pilot.collect(clock.now_ns())
-        pilot.decide()
+        pilot.update_state(Facts(clock.now_ns()))
+        pilot.send_observation(clock.now_ns(), depth, state)
+        pilot.receive_plans(clock.now_ns())
+        pilot.next_action()
         judge.append(time.perf_counter() - filtered)
         observe.append(filtered - begin)
         clock.advance(_TICK_NS)

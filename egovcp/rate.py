@@ -116,3 +116,22 @@ class FixedRate:
         self.counters.overruns += late > 0
         self.counters.skipped += -(-late // self.period_ns)
         self.counters.worst_lateness_ns = max(self.counters.worst_lateness_ns, late)
+
+
+class RateLimiter:
+    """Allows an action at most once per period.
+
+    Args:
+        period_s: shortest time between two actions, s.
+    """
+
+    def __init__(self, period_s: float) -> None:
+        self._period_ns = round(period_s * NS_PER_S)
+        self._next_ns: int | None = None
+
+    def ready(self, now_ns: int) -> bool:
+        """Whether the action may be done now; if so, the next period begins."""
+        if self._next_ns is not None and now_ns < self._next_ns:
+            return False
+        self._next_ns = now_ns + self._period_ns
+        return True

@@ -50,6 +50,7 @@ RENAMED_OPTIONS: Final[Mapping[str, str]] = {
     "policy.loss.foresight_ahead": "policy.loss.multistep_horizons",
     "policy.loss.foresight_every": "policy.loss.multistep_stride",
     "planner.process": "planner.action_parameterization",
+    "robot.limits.picture_hold_s": "robot.limits.image_hold_s",
 }
 _INDEX: Final = re.compile(r"\[\d+\]")
 

@@ -7,7 +7,7 @@ import importlib
 import os
 import signal
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Final
 
 from egovcp.errors import EnvironmentFailure
@@ -34,8 +34,12 @@ def inherited_by_workers() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def stop_on_signal(echo_s: float = 0.0) -> Iterator[list[int]]:
-    """A list that is empty until SIGINT or SIGTERM arrives; a second signal raises at once.
+def stop_on_signal(
+    echo_s: float = 0.0,
+    signals: Sequence[signal.Signals] = (signal.SIGINT, signal.SIGTERM),
+    interrupt: bool = True,
+) -> Iterator[list[int]]:
+    """A list that is empty until one of ``signals`` arrives; a second signal raises at once.
 
     Enter it on the main thread. The block checks the list, saves its results, and raises
     KeyboardInterrupt.
@@ -43,19 +47,21 @@ def stop_on_signal(echo_s: float = 0.0) -> Iterator[list[int]]:
     Args:
         echo_s: seconds after the first signal in which further signals are ignored: a launcher
             forwards the Ctrl-C that the terminal has already sent to its processes.
+        signals: which signals.
+        interrupt: whether a second signal raises KeyboardInterrupt; else it is added to the list.
     """
     received: list[int] = []
     ignored_until = 0.0
 
     def note(number: int, frame: object) -> None:
         nonlocal ignored_until
-        if not received:
+        if not received or not interrupt:
             received.append(number)
             ignored_until = time.monotonic() + echo_s
         elif time.monotonic() >= ignored_until:
             raise KeyboardInterrupt
 
-    previous = {s: signal.signal(s, note) for s in (signal.SIGINT, signal.SIGTERM)}
+    previous = {s: signal.signal(s, note) for s in signals}
     try:
         yield received
     finally:

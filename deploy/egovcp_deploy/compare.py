@@ -11,9 +11,9 @@ from egovcp.cli import run_command
 from egovcp.errors import DataError, UsageError, suggest
 from egovcp.files import read_json
 from egovcp.terminal import echo
-from egovcp_deploy.report import aligned
 from egovcp_deploy.scores import (
     EpisodeScore,
+    aligned,
     paired,
     reward_gain,
     reward_per_step,
@@ -24,15 +24,14 @@ from egovcp_deploy.scores import (
 PROG: Final = "egovcp-compare"
 _FILE: Final = "eval_run.json"
 _LIMIT_BYTES: Final = 256 << 20
-#: Options that say where something is or who computes it.
-_PLACES: Final = ("output_dir", "num_envs", "num_workers", "episodes", "constant.path")
+#: Options that do not change the results.
+_IRRELEVANT: Final = ("output_dir", "num_envs", "num_workers", "episodes", "constant.path")
 _EPILOG: Final = (
-    "Both must have been played on the same scenarios: same --task and --seed of egovcp-eval. "
-    "Differences are RUN - OTHER, and their 95 % intervals come from drawing scenarios again, each "
-    "with both of its episodes, so that how hard it is does not count. An interval without 0 is a "
-    "difference that chance hardly explains. Options in which the runs differ are listed first: "
-    "with other `egovcp-eval --env.*` the scenes are not the same. With one run, compare two of "
-    "its controllers: --other_controller=hold."
+    "Both runs must have the same scenarios: the same --task and --seed of egovcp-eval. "
+    "Differences are RUN - OTHER. Their 95 % intervals are from a bootstrap over scenarios, each "
+    "with both of its episodes, so that the difficulty of a scenario cancels. Options in which the "
+    "runs differ are listed first: with different `egovcp-eval --env.*` the scenes are not the "
+    "same. With one run, compare two of its controllers: --other_controller=hold."
 )
 _HEAD: Final = (
     *("task", "episodes", "success", "other", "points", "95 %"),
@@ -42,16 +41,16 @@ _HEAD: Final = (
 
 @dataclass(frozen=True)
 class CompareConfig:
-    """Say by how much one evaluation is better than another, and whether that may be chance."""
+    """Compare two evaluations on the same scenarios, with confidence intervals."""
 
     run: str = ""
     """Folder that egovcp-eval wrote."""
     other: str = ""
-    """Another one, on the same scenarios; empty: the same."""
+    """Another folder, with the same scenarios; empty: the same folder."""
     controller: str = "planner"
-    """Whose episodes."""
+    """Controller in RUN."""
     other_controller: str = ""
-    """Whose of the other; empty: the same."""
+    """Controller in OTHER; empty: the same."""
 
     def check(self) -> None:
         """Raise `UsageError` for values that make no sense."""
@@ -63,26 +62,19 @@ class CompareConfig:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """What `egovcp-eval` keeps of one run."""
+    """Results of one run of `egovcp-eval`."""
 
     folder: str
-    config: Mapping[str, Any]
-    """Options of egovcp-eval."""
-    episodes: Mapping[str, Mapping[str, Sequence[EpisodeScore]]]
-    """Task -> controller -> episodes."""
-    complete: bool = True
-    """Whether all episodes that were asked for were played."""
+    config: Mapping[str, Any]  # options of egovcp-eval
+    episodes: Mapping[str, Mapping[str, Sequence[EpisodeScore]]]  # task -> controller -> episodes
+    complete: bool = True  # whether all episodes were played
 
-    def played_by(self, task: str, controller: str) -> dict[int, EpisodeScore]:
-        """Number of the scenario -> episode.
-
-        Raises:
-            UsageError: the controller was not played.
-        """
+    def played_by(self, task: str, controller: str) -> Sequence[EpisodeScore]:
+        """Episodes of ``controller``; raises `UsageError` if it did not play."""
         row = self.episodes[task]
         if controller not in row:
             raise UsageError(f"{self.folder} has no {controller}{suggest(controller, row)}")
-        return {score.episode: score for score in row[controller]}
+        return row[controller]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -91,12 +83,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def compare(config: CompareConfig) -> None:
-    """Print a line for each task that both runs have played.
-
-    Raises:
-        UsageError: an option makes no sense, or the runs have no scenario in common.
-        DataError: a folder has no readable eval_run.json.
-    """
+    """Print one line for each task that both runs have played; raises `UsageError` if they cannot
+    be compared, `DataError` if an eval_run.json cannot be read."""
     config.check()
     run = load_evaluation(Path(config.run))
     other = load_evaluation(Path(config.other or config.run))
@@ -119,17 +107,14 @@ def compare(config: CompareConfig) -> None:
     for each in dict.fromkeys(e.folder for e in (run, other) if not e.complete):
         echo(f"{each} is incomplete: egovcp-eval was interrupted")
     for name, ours, others in _differences(run.config, other.config):
-        if name not in _PLACES:
+        if name not in _IRRELEVANT:
             echo(f"--{name}={ours}, of the other {others}")
-    echo(aligned([_HEAD, *lines], words=1))
+    echo(aligned([_HEAD, *lines], text_columns=1))
 
 
 def load_evaluation(folder: Path) -> Evaluation:
-    """What egovcp-eval has written to ``folder``.
-
-    Raises:
-        DataError: no such file, or not one of ours.
-    """
+    """Read the results of egovcp-eval in ``folder``; raises `DataError` if eval_run.json is missing
+    or of another format."""
     path = folder / _FILE
     try:
         content = read_json(path, _LIMIT_BYTES)
@@ -154,13 +139,13 @@ def _score(entry: Mapping[str, Any]) -> EpisodeScore:
 
 
 def _line(
-    task: str, ours: Mapping[int, EpisodeScore], theirs: Mapping[int, EpisodeScore]
+    task: str, scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]
 ) -> tuple[str, ...]:
-    a, b = paired(tuple(ours.values()), tuple(theirs.values()))
+    a, b = paired(scores, others)
     if not a:
         raise UsageError(f"no scenario of {task} was played by both")
     low, high = success_gain(a, b)
-    least, most = reward_gain(a, b)
+    reward_low, reward_high = reward_gain(a, b)
     return (
         task,
         str(len(a)),
@@ -171,7 +156,7 @@ def _line(
         f"{reward_per_step(a):+.5f}",
         f"{reward_per_step(b):+.5f}",
         f"{reward_per_step(a) - reward_per_step(b):+.5f}",
-        f"{least:+.5f} to {most:+.5f}",
+        f"{reward_low:+.5f} to {reward_high:+.5f}",
     )
 
 

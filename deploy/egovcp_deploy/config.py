@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Any
-
-import draccus
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 from egovcp.bounds import bounded
 from egovcp.policy_options import PlannerOptions, PolicyOptions
 from egovcp.robot.controllers import absolute_controller
 from egovcp.sim.config import EnvConfig, evaluation_config
-from egovcp_deploy.live.gamepad import GamepadOptions
 from egovcp_deploy.live.hardware import CameraOptions
-from egovcp_deploy.options import PLANNER, absolute_path
+from egovcp_deploy.live.operators import GamepadOptions
+from egovcp_deploy.options import encoded
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.recording import LogOptions
 from egovcp_deploy.robots.bridge import BridgeConfig
@@ -21,19 +19,19 @@ from egovcp_deploy.robots.bridge import BridgeConfig
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """Which robot."""
+    """The robot."""
 
-    type: str = "sim"
+    type: Literal["sim", "unitree_g1", "replay"] = "sim"
     """sim: the simulated G1, in lock-step with the planner, or with --realtime on the wall clock.
-    unitree_g1: a G1, or egovcp-fake-g1, behind LeRobot's bridge, on the wall clock. replay: what
-    was recorded once; the policy watches it again, and nothing is driven."""
+    unitree_g1: a G1, or egovcp-fake-g1, behind LeRobot's bridge, on the wall clock. replay:
+    recorded observations; the policy plans again, and nothing is driven."""
     recordings: str = ""
-    """Of a replay: an MCAP file, a folder of them, or a LeRobot dataset on disk."""
+    """For replay: an MCAP file, a folder of them, or a LeRobot dataset on disk."""
     controller: str = "walk"
-    """Low-level controller of a unitree_g1: walk, stance, or the file of a trained one; the one of
-    the policy's data. The simulated robot has --env.controller."""
+    """Low-level controller of a unitree_g1: walk, stance, or the file of a trained one; it must be
+    that of the policy's data. The simulated robot uses --env.controller."""
     bridge: BridgeConfig = field(default_factory=BridgeConfig)
-    """Where the bridge of a unitree_g1 is."""
+    """Address of the bridge of a unitree_g1."""
     camera: CameraOptions = field(default_factory=CameraOptions)
     """The depth camera of a unitree_g1."""
     limits: Limits = field(default_factory=Limits)
@@ -42,13 +40,14 @@ class RobotOptions:
 
 @dataclass(frozen=True)
 class OperatorOptions:
-    """Who says when to stand, arm, run, hold and stop; on a G1 its remote control always may."""
+    """Source of the requests to stand, arm, run, hold and stop; the remote control of a G1 works in
+    addition."""
 
-    type: str = "auto"
-    """auto: stands up, arms and runs by itself. keyboard: the keys of this terminal. gamepad: one
-    at this machine, on Linux."""
+    type: Literal["auto", "keyboard", "gamepad"] = "auto"
+    """auto: stands up, arms and runs automatically. keyboard: the keys of this terminal. gamepad:
+    a gamepad at this machine, on Linux."""
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """What auto asks for while running: vx, vy (m/s), yaw rate (rad/s)."""
+    """Velocity of auto while running: vx, vy (m/s), yaw rate (rad/s)."""
     duration: float = bounded(0.0, least=0)
     """How long auto runs before it holds and ends, s; 0: until interrupted."""
     gamepad: GamepadOptions = field(default_factory=GamepadOptions)
@@ -59,27 +58,27 @@ class OperatorOptions:
 class DeployConfig:
     """Drive a robot with a policy artifact at 25 Hz and record each rollout.
 
-    --controller=oracle shows how a task is solved, with no artifact at all.
+    --controller=oracle shows how a task is solved, without an artifact.
     """
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
-    """The policy artifact; not needed without the controller `planner`."""
-    controller: str = PLANNER
-    """Who drives: planner, or in simulation a reference that needs no artifact: hold (neutral
-    pose), random (the paper's walk) or oracle (scripted, sees the truth)."""
+    """The policy artifact; only for the controller `planner`."""
+    controller: Literal["planner", "hold", "random", "oracle"] = "planner"
+    """What drives the robot: planner, or in simulation a reference without an artifact: hold
+    (neutral pose), random (the paper's walk) or oracle (scripted, uses the simulator's state)."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     """Changes to the artifact's planner."""
     robot: RobotOptions = field(default_factory=RobotOptions)
     """The robot."""
     operator: OperatorOptions = field(default_factory=OperatorOptions)
-    """Who drives a unitree_g1."""
+    """The operator on the wall clock."""
     realtime: bool = False
-    """Run the simulated robot on the wall clock, behind the same wire as a real one."""
+    """Run the simulated robot on the wall clock, with the messages of a real one."""
     dry_run: bool = False
-    """Only check what a run needs, line by line, and say go or no-go; nothing moves."""
+    """Only check what a run needs, and print go or no-go per check; nothing moves."""
     task: str = "ball"
     """Scene of the simulated robot: ball, wall, arch, or sequence (several in one episode,
-    --env.sequence.parts). The policy is not told."""
+    --env.sequence.parts). It is not an input of the policy."""
     episodes: int = bounded(3, least=1, most=1_000_000)
     """Number of rollouts."""
     seed: int = bounded(0, least=0)
@@ -87,25 +86,14 @@ class DeployConfig:
     output_dir: str = ""
     """New folder for recordings and summary."""
     log: LogOptions = field(default_factory=LogOptions)
-    """What is recorded, and shown live."""
+    """Logs besides the MCAP file."""
     imagine: int = bounded(16, least=0, most=1000)
-    """How far ahead the world model imagines depth for the recordings, ticks of 40 ms; 0: not at
-    all."""
+    """How far ahead the world model predicts depth for the recordings, ticks of 40 ms; 0: not."""
     env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation of the simulated robot."""
 
     def encoded(self) -> dict[str, Any]:
-        """The options as they are recorded: JSON values, with absolute paths."""
-        robot = replace(
-            self.robot,
-            recordings=absolute_path(self.robot.recordings),
-            controller=absolute_controller(self.robot.controller),
-        )
-        config = replace(
-            self,
-            policy=replace(self.policy, path=absolute_path(self.policy.path)),
-            robot=robot,
-            output_dir=absolute_path(self.output_dir),
-        )
-        options: dict[str, Any] = draccus.encode(config)
+        """The options as JSON values, with absolute paths."""
+        options = encoded(self, "policy.path", "robot.recordings", "output_dir")
+        options["robot"]["controller"] = absolute_controller(self.robot.controller)
         return options

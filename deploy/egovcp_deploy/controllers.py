@@ -1,128 +1,67 @@
-"""The controllers that are compared: the planner, and references that need no learning."""
+"""Controllers that are compared with the planner: references that need no learning, and the search
+for the best constant action."""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Sequence
-from typing import Final, Protocol
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from egovcp.plan import PolicyStep, blank_observation
-from egovcp.sim.env import Observation, VectorEnv
-from egovcp.sim.policies import EnvPolicy as ReferencePolicy
-from egovcp.sim.policies import Hold, Oracle, RandomWalk
+from egovcp.errors import DataError
+from egovcp.files import UnsafeFileError, read_json
+from egovcp.plan import PolicyStep
+from egovcp.sim.env import VectorEnv
+from egovcp.sim.policies import Constant, Hold, Oracle, RandomWalk
+from egovcp.sim.policies import EnvPolicy as SimPolicy
 from egovcp.sim.scenario import Scenario
-from egovcp_deploy.options import PLANNER
-from egovcp_deploy.policy import RolloutPolicy
-from egovcp_deploy.robots.sim import SimRobot
+from egovcp.spec import ACTION_DIM
+from egovcp_deploy.options import PLANNER, for_search
+from egovcp_deploy.scores import EpisodeScore, reward_per_step
 
-Array = NDArray[np.float64]
+type Action = tuple[float, ...]
+#: Plays all scenarios with each action; returns the scores of each action.
+type PlayConstants = Callable[[Sequence[Action], Sequence[Scenario]], list[list[EpisodeScore]]]
 
-CONTROLLERS: Final = (PLANNER, "hold", "constant", "random", "oracle")
+CONSTANT: Final = "constant"
 PPO: Final = "ppo"
+CONTROLLERS: Final = (PLANNER, "hold", CONSTANT, "random", "oracle")
+
+#: Box units per task: forward, outward (left hand's y; the right hand mirrors it), up, height.
+_GRIDS: Final[dict[str, tuple[tuple[float, ...], ...]]] = {
+    "ball": ((0.2, 0.45, 0.8), (0.0, -0.3, -0.6), (0.35, 0.6, 0.85), (0.0,)),
+    "wall": ((0.4, 0.8, 1.0), (0.0, -0.3), (0.3, 0.55, 0.8), (0.0,)),
+    "arch": ((0.0,), (0.0,), (0.0,), (0.0, -0.2, -0.4, -0.6, -0.8, -1.0)),
+    "sequence": ((0.2, 0.45), (0.0, -0.3), (0.35, 0.6), (0.0, -0.6, -1.0)),
+}
+_REDUCTION: Final = 4  # a quarter of the candidates advances to the next round
+_FIRST_ROUND: Final = 6  # scenarios that every candidate plays
 
 
-class Controller(Protocol):
-    """Decides for a batch of robots, one per scenario."""
-
-    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
-        """Every row has just begun an episode."""
-        ...
-
-    def act(self, env: VectorEnv, observation: Observation) -> NDArray[np.floating]:
-        """(E, 7) planned actions; any value, safety comes after."""
-        ...
-
-    def advance(self, sent: Array) -> None:
-        """(E, 7) what the robots were really sent."""
-        ...
+def reference(name: str, action: Action = ()) -> SimPolicy:
+    """``hold``, ``random``, ``oracle``, or ``constant`` with its ``action``."""
+    if name == CONSTANT:
+        return Constant(action)
+    policies: dict[str, type[SimPolicy]] = {"hold": Hold, "random": RandomWalk, "oracle": Oracle}
+    return policies[name]()
 
 
-class Planned:
-    """A policy that was learned; it sees the observation and nothing else."""
+class ReferencePolicy:
+    """A policy of the simulator, which sees the environment instead of the observations;
+    ``scenarios()`` are those of the present episodes."""
 
-    def __init__(self, policy: RolloutPolicy) -> None:
-        self._policy = policy
-        self.skipped: NDArray[np.bool_] = np.zeros(0, np.bool_)
-        """(E,) observations that the policy did not use in its last `act`; empty: unknown."""
-
-    def warm_up(self, robots: int) -> None:
-        """Act for nothing and forget it: the first calls compile, pack and allocate."""
-        for _ in range(2):
-            self._policy.act(*blank_observation(robots))
-        self._policy.reset()
-
-    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
-        """Forget the past of every row."""
-        self._policy.reset()
-
-    def act(self, env: VectorEnv, observation: Observation) -> NDArray[np.floating]:
-        """The first action of every row's plan."""
-        step = self._policy.act(observation.depth, observation.state)
-        self.skipped = step.skipped
-        return step.action
-
-    def advance(self, sent: Array) -> None:
-        """Advance the recurrence with what was sent."""
-        self._policy.advance(sent)
-
-
-class Reference:
-    """A policy of the simulator package."""
-
-    def __init__(self, policy: ReferencePolicy) -> None:
-        self._policy = policy
-
-    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
-        """Hand the scenarios on."""
-        self._policy.reset(env, scenarios)
-
-    def act(self, env: VectorEnv, observation: Observation) -> NDArray[np.floating]:
-        """The reference's actions."""
-        return self._policy.act(env)
-
-    def advance(self, sent: Array) -> None:
-        """References keep no state of what was sent."""
-
-
-class Constants:
-    """A fixed action for each row."""
-
-    def __init__(self, actions: NDArray[np.floating]) -> None:
-        self._actions = np.asarray(actions, np.float64)
-
-    def reset(self, env: VectorEnv, scenarios: Sequence[Scenario]) -> None:
-        """Nothing to forget."""
-
-    def act(self, env: VectorEnv, observation: Observation) -> NDArray[np.floating]:
-        """(E, 7) the same actions always."""
-        return self._actions
-
-    def advance(self, sent: Array) -> None:
-        """Nothing to remember."""
-
-
-def reference(name: str) -> Controller:
-    """``hold``, ``random`` or ``oracle``."""
-    policies: dict[str, type[ReferencePolicy]] = {
-        "hold": Hold,
-        "random": RandomWalk,
-        "oracle": Oracle,
-    }
-    return Reference(policies[name]())
-
-
-class Scripted:
-    """A reference as the runner's policy for one simulated robot, whose truth it may see."""
-
-    def __init__(self, controller: Controller, robot: SimRobot) -> None:
-        self._controller = controller
-        self._robot = robot
+    def __init__(
+        self, policy: SimPolicy, env: VectorEnv, scenarios: Callable[[], Sequence[Scenario]]
+    ) -> None:
+        self._policy, self._env, self._scenarios = policy, env, scenarios
 
     def reset(self) -> None:
-        """The robot has just begun an episode."""
-        self._controller.reset(self._robot.env, [self._robot.scenario])
+        """Every robot has just begun an episode."""
+        self._policy.reset(self._env, self._scenarios())
 
     def act(
         self,
@@ -130,13 +69,72 @@ class Scripted:
         state: NDArray[np.floating],
         remaining: Callable[[], float] | None = None,
     ) -> PolicyStep:
-        """The reference's action, and no plan; it takes no time worth limiting."""
-        action = self._controller.act(self._robot.env, Observation(depth, state))
-        return PolicyStep(np.asarray(action, np.float32))
+        """The actions of the reference, without plans."""
+        return PolicyStep(self._policy.act(self._env))  # type: ignore[arg-type]  # float64
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
-        """References keep no state of what they saw."""
+        """Do nothing: a reference keeps no state."""
 
     def advance(self, sent: NDArray[np.floating]) -> None:
-        """Hand on what was sent."""
-        self._controller.advance(np.asarray(sent, np.float64))
+        """Do nothing."""
+
+
+# --- the best constant action ----------------------------------------------------------------
+@dataclass(frozen=True)
+class BestConstant:
+    """Result of the search."""
+
+    action: Action
+    reward_mean: float  # per step, on the scenarios of the search
+    success_rate: float
+    episodes: int  # scenarios that it played
+
+
+def grid(task: str) -> list[Action]:
+    """Candidates: left-right symmetric poses, the neutral pose among them."""
+    neutral = (0.0,) * ACTION_DIM
+    poses = [
+        (forward, outward, up, forward, 0.0 - outward, up, height)
+        for forward, outward, up, height in itertools.product(*_GRIDS[task])
+    ]
+    return [neutral, *[pose for pose in poses if pose != neutral]]
+
+
+def search_constant(task: str, seed: int, play: PlayConstants) -> BestConstant:
+    """The action of the grid with the highest mean reward per step, by successive halving.
+
+    Every candidate plays the same few scenarios; the best quarter play more of them, until one is
+    left. The scenarios are those of `options.for_search`, which no evaluation plays."""
+    scores: dict[Action, list[EpisodeScore]] = {action: [] for action in grid(task)}
+    left, count = list(scores), _FIRST_ROUND
+    while len(left) > 1:
+        first = len(scores[left[0]])
+        scenarios = [for_search(task, seed, first + i) for i in range(count)]
+        for action, played in zip(left, play(left, scenarios), strict=True):
+            scores[action] += played
+        left.sort(key=lambda action: -reward_per_step(scores[action]))
+        left, count = left[: max(1, len(left) // _REDUCTION)], count * 2
+    best = scores[left[0]]
+    rate = float(np.mean([score.success for score in best]))
+    return BestConstant(left[0], reward_per_step(best), rate, len(best))
+
+
+def load_constants(path: Path) -> dict[str, BestConstant]:
+    """Task -> result, from the ``constant.json`` of an earlier evaluation; raises `DataError` if
+    it is missing or of another format."""
+    try:
+        return {task: _parse(entry) for task, entry in read_json(path).items()}
+    except (OSError, UnsafeFileError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise DataError(f"cannot read --constant.path={path}: {reason}") from error
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DataError(
+            f"--constant.path={path} is not the constant.json of an evaluation: {error!r}"
+        ) from error
+
+
+def _parse(entry: dict[str, Any]) -> BestConstant:
+    action = tuple(float(value) for value in entry["action"])
+    if len(action) != ACTION_DIM or not np.all(np.abs(action) <= 1.0):
+        raise ValueError(f"expected {ACTION_DIM} numbers from -1 to 1, found {action}")
+    return BestConstant(**entry | {"action": action})

@@ -12,31 +12,28 @@ from egovcp.errors import EgovcpError, UsageError
 from egovcp.packages import SIMULATOR_MODULES, require_packages
 from egovcp.policy_options import load_policy
 from egovcp.sim.scenario import EPISODE_TASKS
-from egovcp_deploy import dry_run
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.drive import check_live, drive, drive_simulated
-from egovcp_deploy.live.preflight import examine_hardware
-from egovcp_deploy.options import (
-    PLANNER,
-    REFERENCES,
-    check_choice,
-    check_output_dir,
+from egovcp_deploy.dry_run import (
+    CheckResult,
+    check,
+    check_disk,
+    check_hardware,
+    check_plan_time,
+    conclude,
 )
+from egovcp_deploy.live.drive import drive, drive_simulated
+from egovcp_deploy.options import PLANNER, check_choice, check_output_dir, held_out
+from egovcp_deploy.robots.realsense_camera import require_realsense
 from egovcp_deploy.robots.replay import open_recordings
 from egovcp_deploy.rollouts import make_robot, play_rollouts, replay
-from egovcp_deploy.scenarios import held_out
 
 PROG: Final = "egovcp-deploy"
-SIM: Final = "sim"
-REPLAY: Final = "replay"
-ROBOTS: Final = (SIM, "unitree_g1", REPLAY)
-DRIVERS: Final = (PLANNER, *REFERENCES)
 _EPILOG: Final = (
     "In simulation rollout i plays held-out scenario i of --seed, the same that egovcp-eval plays. "
     "Writes rollout-<i>.mcap, rollout-<i>.rrd, a picture rollout-0.png, and deploy.json, which "
-    "sums up the rollouts that came to their end, also when the others were interrupted. On a "
-    "robot the first Ctrl-C holds it, the second damps its motors: a standing robot sinks. Exit "
-    "code 6: the motors were damped for safety."
+    "summarises the complete rollouts, also after an interrupt. On a robot the first Ctrl-C holds "
+    "it, the second damps its motors: a standing robot sinks. Exit code 6: the motors were damped "
+    "for safety."
 )
 
 
@@ -49,77 +46,71 @@ def deploy(config: DeployConfig) -> None:
     """Check everything, then drive the robot and record it.
 
     Raises:
-        UsageError: an option makes no sense, or the folder holds results.
+        UsageError: an option is wrong, or the folder holds results.
         ArtifactError: the artifact is missing, damaged, or not made for this robot.
         EnvironmentFailure: simulator, robot, camera or disk fail.
         SafetyStop: the motors were damped for safety.
     """
     _check(config)
     if config.dry_run:
-        dry_run.conclude(_findings(config))
+        conclude(_dry_run_checks(config))
         return
     planned = config.controller == PLANNER
     artifact = load_policy(config.policy, config.planner) if planned else None
-    if config.robot.type == SIM and not config.realtime:
+    if config.robot.type == "sim" and not config.realtime:
         play_rollouts(config, artifact)
         return
-    assert artifact is not None, "checked: all else is driven by the planner"
-    if config.robot.type == REPLAY:
-        replay(config, artifact)
-    elif config.robot.type == SIM:
-        drive_simulated(config, artifact)
-    else:
-        drive(config, artifact)
+    assert artifact is not None, "checked: only lock-step simulation runs without the planner"
+    run = {"replay": replay, "sim": drive_simulated, "unitree_g1": drive}
+    run[config.robot.type](config, artifact)
 
 
 def _check(config: DeployConfig) -> None:
+    robot = config.robot.type
     check_choice("--task", config.task, EPISODE_TASKS)
-    check_choice("--robot.type", config.robot.type, ROBOTS)
-    check_choice("--controller", config.controller, DRIVERS)
     held_out(config.task, config.seed, 0)
     if config.controller == PLANNER:
         config.policy.require("choose a reference that needs none, such as --controller=oracle")
-    elif config.robot.type != SIM or config.realtime:
+    elif robot != "sim" or config.realtime:
         raise UsageError(
             f"--controller={config.controller} needs the simulator in lock-step; on the wall clock "
-            "and in a replay there is the planner only"
+            "and in a replay only the planner can be used"
         )
-    if config.realtime and config.robot.type != SIM:
+    if config.realtime and robot != "sim":
         raise UsageError(
-            f"--realtime is for --robot.type=sim; --robot.type={config.robot.type} knows one pace"
+            f"--realtime is for --robot.type=sim; --robot.type={robot} has one pace only"
         )
-    if config.robot.type == REPLAY and not config.robot.recordings:
+    if robot == "replay" and not config.robot.recordings:
         raise UsageError(
             "--robot.recordings is missing; name an MCAP file, a folder of them, or a dataset"
         )
-    if config.robot.type == SIM:
+    if robot == "sim":
         require_packages("egovcp-deploy", "--robot.type=sim", *SIMULATOR_MODULES)
-    if config.imagine < 0:
-        raise UsageError(f"--imagine={config.imagine}: expected a number of ticks from 0")
-    check_live(config)
+    if config.robot.camera.type == "realsense":
+        require_realsense()
     check_output_dir(config.output_dir)
 
 
-def _findings(config: DeployConfig) -> Iterator[dry_run.Finding]:
-    """All that a run needs, each looked at even if another fails."""
-    yield dry_run.examine("disk", lambda: dry_run.disk(Path(config.output_dir)))
+def _dry_run_checks(config: DeployConfig) -> Iterator[CheckResult]:
+    """All checks; a failed one does not prevent the others."""
+    yield check("disk", lambda: check_disk(Path(config.output_dir)))
     artifact: Artifact | None = None
     if config.controller == PLANNER:
         try:
             artifact = load_policy(config.policy, config.planner)
         except EgovcpError as error:
-            yield dry_run.Finding("policy", "", error)
+            yield CheckResult("policy", "", error)
         else:
             made_for = f"{artifact.path}, for the controller {artifact.controller_id}"
             policy = artifact.make_policy(1, config.seed)
-            yield dry_run.Finding("policy", made_for)
-            yield dry_run.examine("planner", lambda: dry_run.plan_time(policy))
-    if config.robot.type == SIM:
-        yield dry_run.examine("robot", lambda: _simulated(config, artifact))
-    elif config.robot.type == REPLAY:
-        yield dry_run.examine("recordings", lambda: _recorded(config, artifact))
+            yield CheckResult("policy", made_for)
+            yield check("planner", lambda: check_plan_time(policy))
+    if config.robot.type == "sim":
+        yield check("robot", lambda: _simulated(config, artifact))
+    elif config.robot.type == "replay":
+        yield check("recordings", lambda: _recorded(config, artifact))
     else:
-        yield from examine_hardware(config, artifact)
+        yield from check_hardware(config, artifact)
 
 
 def _simulated(config: DeployConfig, artifact: Artifact | None) -> str:

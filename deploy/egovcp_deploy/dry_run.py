@@ -1,77 +1,105 @@
-"""`egovcp-deploy --dry_run=true`: is all there that a run needs? Go or no-go, line by line."""
+"""`egovcp-deploy --dry_run=true`: checks everything a run needs, one line of go or no-go each.
+
+Each check returns its finding, or raises `EnvironmentFailure` if no run is possible. Limits that
+are not those of the runner are unverified on hardware.
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
 import time
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from egovcp.artifact import Artifact
 from egovcp.errors import EgovcpError, EnvironmentFailure
 from egovcp.plan import blank_observation, until
-from egovcp_deploy.pilot.effort import BUDGET_S
+from egovcp.robot.controllers import make_controller
+from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER, LINK_NAMES, link_transforms
+from egovcp.robot.stance import pelvis_height
+from egovcp.robot.stance_table import standing_pose
+from egovcp.spec import ACTION_BOX, JOINT_NAMES
+from egovcp.terminal import echo
+from egovcp_deploy.config import DeployConfig
+from egovcp_deploy.live.hardware import open_eye
+from egovcp_deploy.pilot.motor_watch import MotorWatch, hottest
+from egovcp_deploy.pilot.planner import BUDGET_S
+from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.policy import RolloutPolicy, backend_of
+from egovcp_deploy.robots.base import DepthImage, LowState, projected_gravity
+from egovcp_deploy.robots.bridge import BridgeRobot
+from egovcp_deploy.robots.g1_variants import describe_variant
+from egovcp_deploy.robots.realsense_camera import RealSenseDepthCamera
+from egovcp_deploy.robots.subscriber import ArrivalStats
+from egovcp_deploy.robots.zmq_camera import ZmqDepthCamera
+
+Array = NDArray[np.float64]
+type AnyCamera = ZmqDepthCamera | RealSenseDepthCamera
 
 FREE_BYTES: Final = 1_000_000_000  # an hour of recording is about 0.6 GB
+_DISK_BYTES: Final = 4_000_000
+_DISK_MS: Final = 200.0
 PLAN_BUDGET_MS: Final = 36.0
 _PLANS: Final = 50
 _WARM_UP: Final = 5
-_PLANNING_S: Final = 5.0  # a slow machine is told so sooner
-_DISK_BYTES: Final = 4_000_000
-_DISK_MS: Final = 200.0
+_PLANNING_S: Final = 5.0  # fewer plans are timed on a slow machine
+LISTEN_S: Final = 5.0
+MAX_LOST: Final = 0.05  # share of the messages
+STATE_HZ: Final = 100.0
+IMAGE_HZ: Final = 15.0
+MAX_OFFSET: Final = 1.5  # rad from neutral: 3 s at half a radian per second
+RANGE_MARGIN: Final = 0.1  # rad beyond the joint range; more is a wrong zero
+MAX_TILT: Final = 0.35  # rad between pelvis and vertical; the runner damps at 1.0
+POSTURE_TOLERANCE: Final = 0.15  # rad between the IMU and a pelvis above flat feet
+_SHOWN_OFFSET: Final = 0.1  # rad
+_FEET: Final = [LINK_NAMES.index(f"{side}_ankle_roll_link") for side in ("left", "right")]
 
 
 @dataclass(frozen=True)
-class Finding:
-    """One line of the report."""
+class CheckResult:
+    """Result of one check."""
 
     name: str
-    found: str
-    error: EgovcpError | None = None
-    """What speaks against a run; None: nothing."""
+    finding: str
+    error: EgovcpError | None = None  # why no run is possible; None: go
 
     def __str__(self) -> str:
         if self.error is None:
-            return f"go     {self.name}: {self.found}"
+            return f"go     {self.name}: {self.finding}"
         return f"NO-GO  {self.name}: {self.error}"
 
 
-def examine(name: str, look: Callable[[], str]) -> Finding:
-    """What ``look`` finds, or the error that it raises."""
+def check(name: str, function: Callable[[], str]) -> CheckResult:
+    """The finding that ``function`` returns, or the `EgovcpError` that it raises."""
     try:
-        return Finding(name, look())
+        return CheckResult(name, function())
     except EgovcpError as error:
-        return Finding(name, "", error)
+        return CheckResult(name, "", error)
 
 
-def conclude(findings: Iterator[Finding], say: Callable[[str], None] = print) -> None:
-    """Say each finding as it comes, then go, or raise the first error.
-
-    Raises:
-        EgovcpError: of the first finding that speaks against a run.
-    """
+def conclude(results: Iterable[CheckResult]) -> None:
+    """Print each result as it comes, then go; raises the first error, if any."""
     errors = []
-    for finding in findings:
-        say(str(finding))
-        if finding.error is not None:
-            errors.append(finding.error)
+    for result in results:
+        echo(str(result))
+        if result.error is not None:
+            errors.append(result.error)
     if errors:
-        say(f"no-go: {len(errors)} of the above")
+        echo(f"no-go: {len(errors)} of the above")
         raise errors[0]
-    say("go")
+    echo("go")
 
 
-def disk(folder: Path) -> str:
-    """Room for a recording, and how fast it is written.
-
-    Raises:
-        EnvironmentFailure: too little room, or too slow.
-    """
+# --- this machine and the policy -------------------------------------------------------------
+def check_disk(folder: Path) -> str:
+    """Free space and write speed."""
     existing = next(p for p in (folder, *folder.absolute().parents) if p.exists())
     free = shutil.disk_usage(existing).free
     if free < FREE_BYTES:
@@ -79,7 +107,18 @@ def disk(folder: Path) -> str:
             f"{free / 1e9:.1f} GB free at {existing}, expected {FREE_BYTES / 1e9:.0f} GB; "
             "make room, or choose another --output_dir"
         )
-    ms = _write_ms(existing)
+    trial = existing / f".egovcp-dry-run-{os.getpid()}"
+    begin = time.perf_counter()
+    try:
+        with trial.open("wb") as file:
+            file.write(os.urandom(_DISK_BYTES))
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        raise EnvironmentFailure(f"cannot write to {existing}: {error.strerror}") from error
+    finally:
+        trial.unlink(missing_ok=True)
+    ms = (time.perf_counter() - begin) * 1e3
     if ms > _DISK_MS:
         raise EnvironmentFailure(
             f"writing {_DISK_BYTES / 1e6:.0f} MB to {existing} took {ms:.0f} ms, expected at most "
@@ -88,27 +127,8 @@ def disk(folder: Path) -> str:
     return f"{free / 1e9:.0f} GB free, {_DISK_BYTES / 1e3 / max(ms, 1e-3):.0f} MB/s"
 
 
-def _write_ms(folder: Path) -> float:
-    trial = folder / f".egovcp-dry-run-{os.getpid()}"
-    begin = time.perf_counter()
-    try:
-        with trial.open("wb") as file:
-            file.write(os.urandom(_DISK_BYTES))
-            file.flush()
-            os.fsync(file.fileno())
-    except OSError as error:
-        raise EnvironmentFailure(f"cannot write to {folder}: {error.strerror}") from error
-    finally:
-        trial.unlink(missing_ok=True)
-    return (time.perf_counter() - begin) * 1e3
-
-
-def plan_time(policy: RolloutPolicy) -> str:
-    """How long a plan takes here, on a made-up observation.
-
-    Raises:
-        EnvironmentFailure: too long for 25 Hz.
-    """
+def check_plan_time(policy: RolloutPolicy) -> str:
+    """Planning time on blank observations."""
     depth, state = blank_observation(1)
     policy.reset()
     times, iterations = list[float](), list[int]()
@@ -120,14 +140,211 @@ def plan_time(policy: RolloutPolicy) -> str:
         iterations.append(step.iterations)
     policy.reset()
     p50, p99 = np.percentile(times[_WARM_UP:], [50, 99])
+    backend = backend_of(policy)
     if p99 > PLAN_BUDGET_MS:
         raise EnvironmentFailure(
-            f"a plan of one iteration takes {p50:.0f} ms (p99 {p99:.0f}), computed by "
-            f"{backend_of(policy)}, expected at most {PLAN_BUDGET_MS:.0f} at 25 Hz; end other "
-            "programs, or use fewer --planner.samples"
+            f"a plan of one iteration takes {p50:.0f} ms (p99 {p99:.0f}), computed by {backend}, "
+            f"expected at most {PLAN_BUDGET_MS:.0f} at 25 Hz; end other programs, or use fewer "
+            "--planner.samples"
         )
     mean = np.mean(iterations[_WARM_UP:])
-    return (
-        f"{p50:.1f} ms per plan, p99 {p99:.1f}, with {mean:.1f} iterations, computed by "
-        f"{backend_of(policy)}"
+    return f"{p50:.1f} ms per plan, p99 {p99:.1f}, {mean:.1f} iterations, computed by {backend}"
+
+
+# --- robot and camera ------------------------------------------------------------------------
+@dataclass
+class Measurements:
+    """Messages received within `LISTEN_S`."""
+
+    reading: LowState | None = None  # the newest
+    refusal: str = ""  # why the motors forbid arming
+    motor_events: list[str] = field(default_factory=list)
+    image_ages_ms: list[float] = field(default_factory=list)  # at their arrival
+
+
+def check_hardware(config: DeployConfig, artifact: Artifact | None) -> Iterator[CheckResult]:
+    """Controller, robot and camera."""
+
+    def controller() -> str:
+        found = make_controller(config.robot.controller).id
+        if artifact is not None:
+            artifact.require_controller(found)
+        return found
+
+    yield check("controller", controller)
+    limits = config.robot.limits
+    with ExitStack() as stack:
+        body: BridgeRobot | None = None
+        eye: AnyCamera | None = None
+
+        def robot() -> str:
+            nonlocal body
+            connecting = BridgeRobot(config.robot.bridge)
+            connecting.connect()
+            body = connecting
+            stack.callback(body.close)
+            return f"answers at {body.config.host}"
+
+        def camera() -> str:
+            nonlocal eye
+            eye = open_eye(config.robot.camera)
+            stack.callback(eye.close)
+            return "answers"
+
+        yield check("robot", robot)
+        yield check("camera", camera)
+        measured = measure(body, eye, LISTEN_S)
+        now = time.monotonic_ns()
+        if body is not None and measured.reading is not None:
+            states = body.arrivals.stats(now, LISTEN_S)
+            yield from _check_robot(body, measured.reading, measured, states, limits)
+        if eye is not None:
+            images, gap_ms = eye.arrivals.stats(now, LISTEN_S), limits.image_hold_s * 1e3
+            yield check("images", lambda: arrivals(images, IMAGE_HZ, gap_ms, "images"))
+            max_ms = config.env.delay.image_age[1] * 1e3
+            yield check("image age", lambda: image_age(measured.image_ages_ms, max_ms))
+
+
+def _check_robot(
+    body: BridgeRobot,
+    reading: LowState,
+    measured: Measurements,
+    states: ArrivalStats,
+    limits: Limits,
+) -> Iterator[CheckResult]:
+    def publishers() -> str:
+        if body.refusal:
+            raise EnvironmentFailure(body.refusal)
+        return "none noticed"
+
+    yield CheckResult("mode", describe_variant(reading.mode))
+    yield check("joints", lambda: joint_offsets(reading.joint_position))
+    yield check("posture", lambda: posture(reading.joint_position, reading.quaternion_w))
+    yield check("motors", lambda: motors(reading, measured))
+    gap_ms = limits.state_hold_s * 1e3
+    yield check("states", lambda: arrivals(states, STATE_HZ, gap_ms, "states"))
+    yield check("other publishers", publishers)
+
+
+def measure(body: BridgeRobot | None, eye: AnyCamera | None, seconds: float) -> Measurements:
+    """Receive from both for ``seconds``; None: not connected."""
+    measured, watch = Measurements(), MotorWatch()
+    newest: DepthImage | None = None
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and (body is not None or eye is not None):
+        if body is not None and (reading := body.read()) is not None:
+            measured.reading = reading
+            verdict = watch.update(reading, None, standing=False)
+            measured.refusal = verdict.refusal
+            measured.motor_events += verdict.events
+        if eye is not None and (image := eye.read()) is not newest and image is not None:
+            newest = image
+            if image.captured_ns is not None:
+                age_ms = (time.monotonic_ns() - image.captured_ns) / 1e6
+                measured.image_ages_ms.append(age_ms)
+        time.sleep(0.001)
+    return measured
+
+
+def joint_offsets(position: Array) -> str:
+    """Offset of each joint (29,) rad from the neutral pose; too far from it to stand up, or outside
+    the joint's range, is a no-go."""
+    neutral = standing_pose(ACTION_BOX.neutral[-1]).joints
+    outside = np.maximum(JOINT_LOWER - position, position - JOINT_UPPER)
+    i = int(np.argmax(outside))
+    if outside[i] > RANGE_MARGIN:
+        raise EnvironmentFailure(
+            f"{JOINT_NAMES[i]} reports {position[i]:+.2f} rad, outside its range "
+            f"{JOINT_LOWER[i]:.2f} to {JOINT_UPPER[i]:.2f}; calibrate its zero in Unitree's app"
+        )
+    offset = position - neutral
+    i = int(np.argmax(np.abs(offset)))
+    if abs(offset[i]) > MAX_OFFSET:
+        raise EnvironmentFailure(
+            f"{JOINT_NAMES[i]} is {offset[i]:+.2f} rad from neutral, expected at most "
+            f"{MAX_OFFSET:g}; move it by hand to about {neutral[i]:+.2f} rad"
+        )
+    far = [
+        f"{name.removesuffix('_joint')} {value:+.2f}"
+        for name, value in zip(JOINT_NAMES, offset, strict=True)
+        if abs(value) >= _SHOWN_OFFSET
+    ]
+    near = f"{len(JOINT_NAMES) - len(far)} joints within {_SHOWN_OFFSET:g} rad of neutral"
+    return f"{near}; {', '.join(far)}" if far else near
+
+
+def posture(position: Array, quaternion_w: Array) -> str:
+    """The tilt of the pelvis according to the IMU, compared with a pelvis above flat feet. Feet
+    that hang in the air need not agree with the IMU, so that only a large tilt is a no-go.
+
+    Args:
+        position: (29,) rad.
+        quaternion_w: (4,) orientation of the pelvis by the IMU.
+    """
+    gravity = projected_gravity(quaternion_w)
+    up = -gravity
+    tilt = float(np.arccos(np.clip(up[2], -1.0, 1.0)))
+    if tilt > MAX_TILT:
+        raise EnvironmentFailure(
+            f"according to the IMU the pelvis is tilted by {tilt:.2f} rad, expected at most "
+            f"{MAX_TILT:g}; hang the robot up upright"
+        )
+    rotation = link_transforms(position[None])[1][0, _FEET]  # (2, 3, 3)
+    soles = rotation[:, :, 2]  # the feet's upward axes in the pelvis frame
+    height = float(pelvis_height(position[None], gravity[None])[0])
+    apart = np.arccos(np.clip(soles @ up, -1.0, 1.0))
+    finding = (
+        f"IMU {tilt:.2f} rad from upright, pelvis {height:.2f} m above the lower foot; a pelvis "
+        f"above flat feet would differ by {apart[0]:.2f} (left) and {apart[1]:.2f} rad (right)"
     )
+    if apart.max() <= POSTURE_TOLERANCE:
+        return finding
+    return (
+        f"{finding}; that is normal only while the feet hang in the air. If they stand flat on the "
+        "ground, calibrate the joints' zeros in Unitree's app"
+    )
+
+
+def motors(reading: LowState, measured: Measurements) -> str:
+    """The hottest motor, and the checks that are off."""
+    if measured.refusal:
+        raise EnvironmentFailure(measured.refusal)
+    joint = "" if reading.motors is None else hottest(reading.motors)
+    finding = f"the hottest is {joint}" if joint else "no temperatures are reported"
+    return "; ".join([finding, *measured.motor_events])
+
+
+def arrivals(stats: ArrivalStats, min_hz: float, max_gap_ms: float, what: str) -> str:
+    """Rate, jitter, gaps and loss of messages."""
+    finding = (
+        f"{stats.rate_hz:.0f} {what} per second, jitter {stats.jitter_ms:.1f} ms (p99), longest "
+        f"gap {stats.gap_ms:.0f} ms, {stats.lost:.1%} lost"
+    )
+    expected = ""
+    if stats.rate_hz < min_hz:
+        expected = f"at least {min_hz:.0f} per second"
+    elif stats.gap_ms > max_gap_ms:
+        expected = f"gaps of at most {max_gap_ms:.0f} ms"
+    elif stats.lost > MAX_LOST:
+        expected = f"at most {MAX_LOST:.0%} lost"
+    if expected:
+        raise EnvironmentFailure(
+            f"{finding}; expected {expected}: use a cable instead of wireless, and reduce the load "
+            "of both machines"
+        )
+    return finding
+
+
+def image_age(ages_ms: list[float], max_ms: float) -> str:
+    """Age of the images at their arrival; empty: not reported by the camera. ``max_ms`` is the
+    largest age in the training data."""
+    if not ages_ms:
+        return "not measured: the camera does not report when an image was taken"
+    median, p99 = np.percentile(ages_ms, [50, 99])
+    finding = f"{median:.0f} ms when they arrive, p99 {p99:.0f}; exposure and network not included"
+    if median > max_ms:
+        raise EnvironmentFailure(
+            f"{finding}; expected at most {max_ms:.0f}, the largest age in the training data: use "
+            "a cable, a smaller camera mode, or a faster machine at the camera"
+        )
+    return finding

@@ -19,13 +19,14 @@ from numpy.typing import NDArray
 from egovcp.artifact import Artifact
 from egovcp.errors import EnvironmentFailure
 from egovcp.hardware import available_cores
+from egovcp.plan import blank_observation
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
 from egovcp.reactive import ReactiveNetwork, ReactivePolicy
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.workers import inherited_by_workers
-from egovcp_deploy.controllers import PPO, Constants, Controller, Planned, reference
+from egovcp_deploy.controllers import PPO, ReferencePolicy, reference
 from egovcp_deploy.options import PLANNER
 from egovcp_deploy.policy import RolloutPolicy
 from egovcp_deploy.safety import SafetyFilter
@@ -35,58 +36,58 @@ _POLL_S: Final = 0.2
 
 
 @dataclass(frozen=True)
-class Setup:
-    """What every group needs; sent to each worker once."""
+class EpisodeSetup:
+    """What all groups share; sent to each worker once."""
 
     env: EnvConfig
-    policy: PolicyOptions = field(default_factory=PolicyOptions)
-    """Names nothing when no planner plays."""
+    policy: PolicyOptions = field(default_factory=PolicyOptions)  # of the controller `planner`
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     seed: int = 0
-    ppo: str = ""
-    """File of the controller `ppo`."""
+    ppo: str = ""  # file of the controller `ppo`
 
 
 @dataclass(frozen=True)
-class Group:
+class EpisodeGroup:
     """Scenarios of one task, played side by side by one controller."""
 
     controller: str
     scenarios: tuple[Scenario, ...]
-    actions: tuple[tuple[float, ...], ...] = ()
-    """For ``constant``: one action per scenario."""
+    action: tuple[float, ...] = ()  # of the controller `constant`
 
 
-class Player:
-    """Plays groups in this process; environments and the artifact are kept between groups."""
+class EpisodePlayer:
+    """Plays groups in this process; groups of equal size share environment and policy."""
 
-    def __init__(self, setup: Setup, artifact: Artifact | None = None) -> None:
+    def __init__(self, setup: EpisodeSetup, artifact: Artifact | None = None) -> None:
         self._setup = setup
         self._artifact = artifact
         self._envs: dict[int, VectorEnv] = {}
-        self._planned: dict[tuple[str, int], Planned] = {}
+        self._policies: dict[tuple[str, int], RolloutPolicy] = {}
 
-    def play(self, group: Group, stopped: Callable[[], bool] = lambda: False) -> list[EpisodeScore]:
+    def play(
+        self, group: EpisodeGroup, stopped: Callable[[], bool] = lambda: False
+    ) -> list[EpisodeScore]:
         """Scores in the order of the group's scenarios; see `play`."""
         if stopped():
             return []
         size = len(group.scenarios)
         if size not in self._envs:
             self._envs[size] = VectorEnv(self._setup.env, size)
-        return play(self._envs[size], self._controller(group), group.scenarios, stopped)
+        env = self._envs[size]
+        return play(env, self._policy(group, env), group.scenarios, stopped)
 
-    def _controller(self, group: Group) -> Controller:
-        if group.controller == "constant":
-            return Constants(np.array(group.actions))
+    def _policy(self, group: EpisodeGroup, env: VectorEnv) -> RolloutPolicy:
         if group.controller not in (PPO, PLANNER):
-            return reference(group.controller)
-        key = group.controller, len(group.scenarios)
-        if key not in self._planned:
-            self._planned[key] = Planned(self._policy(*key))
-            self._planned[key].warm_up(len(group.scenarios))  # else the first plan is timed
-        return self._planned[key]
+            policy = reference(group.controller, group.action)
+            return ReferencePolicy(policy, env, lambda: group.scenarios)
+        key = group.controller, env.num_envs
+        if key not in self._policies:
+            learned = self._policies[key] = self._learned(*key)
+            for _ in range(2):  # the first calls compile and allocate, and must not be timed
+                learned.act(*blank_observation(env.num_envs))
+        return self._policies[key]
 
-    def _policy(self, controller: str, robots: int) -> RolloutPolicy:
+    def _learned(self, controller: str, robots: int) -> RolloutPolicy:
         setup = self._setup
         if controller == PPO:
             return ReactivePolicy(ReactiveNetwork.load(Path(setup.ppo)), robots)
@@ -97,96 +98,72 @@ class Player:
 
 def play(
     env: VectorEnv,
-    controller: Controller,
+    policy: RolloutPolicy,
     scenarios: Sequence[Scenario],
     stopped: Callable[[], bool] = lambda: False,
 ) -> list[EpisodeScore]:
-    """One episode per row of ``env``, to the end of all of them.
-
-    Returns:
-        The scores of the episodes that ended: all of them, unless ``stopped`` became true.
-    """
+    """One episode per row of ``env``; returns the scores of the episodes that ended: all of them,
+    unless ``stopped()`` became true."""
     observation = env.reset(scenarios)
-    controller.reset(env, scenarios)
-    safety = SafetyFilter(env.num_envs)
-    tally = _Tally(env.num_envs)
+    policy.reset()
+    rows = env.num_envs
+    safety = SafetyFilter(rows)
+    rewards, plan_ms = np.zeros(rows), list[float]()
+    steps, skipped = np.zeros(rows, np.int64), np.zeros(rows, np.int64)
+    success: NDArray[np.bool_] = np.zeros(rows, np.bool_)
+    terminated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
+    parts: tuple[dict[str, bool], ...] = ({},) * rows
     while not env.done.all() and not stopped():
         live = ~env.done
         begin = time.perf_counter()
-        planned = controller.act(env, observation)
-        tally.plan_ms.append((time.perf_counter() - begin) * 1e3 / env.num_envs)
-        if isinstance(controller, Planned) and controller.skipped.size:
-            tally.skipped += live & controller.skipped
-        result = env.step(safety.filter(planned).action)
-        controller.advance(result.sent_action)
-        tally.rewards += np.where(live, result.reward, 0.0)
-        tally.steps += live
-        tally.success, tally.terminated = result.success, result.terminated
-        tally.parts = result.parts
+        step = policy.act(observation.depth, observation.state)
+        plan_ms.append((time.perf_counter() - begin) * 1e3 / rows)
+        if step.skipped.size:
+            skipped += live & step.skipped
+        result = env.step(safety.filter(step.action))
+        policy.advance(result.sent_action)
+        rewards += np.where(live, result.reward, 0.0)
+        steps += live
+        success, terminated, parts = result.success, result.terminated, result.parts
         observation = result.observation
-    return [score for score, done in zip(tally.scores(scenarios), env.done, strict=True) if done]
+    return [
+        EpisodeScore(
+            episode=scenario.episode,
+            steps=int(steps[i]),
+            reward=float(rewards[i]),
+            success=bool(success[i]),
+            terminated=bool(terminated[i]),
+            parts=parts[i],
+            skipped=int(skipped[i]),
+            plan_ms=plan_ms[: int(steps[i])],
+        )
+        for i, scenario in enumerate(scenarios)
+        if env.done[i]
+    ]
 
 
-class _Tally:
-    """Running sums of a group."""
-
-    def __init__(self, rows: int) -> None:
-        self.rewards = np.zeros(rows)
-        self.steps = np.zeros(rows, np.int64)
-        self.skipped = np.zeros(rows, np.int64)
-        self.success: NDArray[np.bool_] = np.zeros(rows, np.bool_)
-        self.terminated: NDArray[np.bool_] = np.zeros(rows, np.bool_)
-        self.parts: tuple[dict[str, bool], ...] = ({},) * rows
-        self.plan_ms: list[float] = []
-
-    def scores(self, scenarios: Sequence[Scenario]) -> list[EpisodeScore]:
-        """One score per row."""
-        return [
-            EpisodeScore(
-                episode=scenario.episode,
-                steps=int(self.steps[i]),
-                reward=float(self.rewards[i]),
-                success=bool(self.success[i]),
-                terminated=bool(self.terminated[i]),
-                parts=self.parts[i],
-                skipped=int(self.skipped[i]),
-                plan_ms=self.plan_ms[: int(self.steps[i])],
-            )
-            for i, scenario in enumerate(scenarios)
-        ]
-
-
-class Stage:
-    """Where groups are played: this process, or worker processes that stay until it closes.
-
-    Args:
-        setup: what all groups share.
-        num_workers: processes; 1 plays in this process, 0 takes one per processor core.
-        artifact: what `load_policy` makes of the setup; spares this process loading it again.
-        stopped: once it returns true, the episodes that are being played are given up.
-    """
+class EpisodePool:
+    """Plays groups in worker processes that last until `close`. ``num_workers`` 1 plays in this
+    process, with ``artifact`` if it is loaded already; 0 starts one worker per processor core. Once
+    ``stopped()`` is true, episodes in progress are abandoned."""
 
     def __init__(
         self,
-        setup: Setup,
+        setup: EpisodeSetup,
         num_workers: int = 0,
         artifact: Artifact | None = None,
         stopped: Callable[[], bool] = lambda: False,
     ) -> None:
         self._workers = num_workers or available_cores()
-        self._player = Player(setup, artifact)
+        self._player = EpisodePlayer(setup, artifact)
         self._setup = setup
         self._stopped = stopped
         self._executor: ProcessPoolExecutor | None = None
 
-    def play(self, groups: Sequence[Group]) -> Iterator[tuple[int, list[EpisodeScore]]]:
-        """Play ``groups``; yields (index of a group, its scores) as they finish.
-
-        When it is stopped, it yields the scores of the episodes that have ended, and no more.
-
-        Raises:
-            EnvironmentFailure: a worker was killed.
-        """
+    def play(self, groups: Sequence[EpisodeGroup]) -> Iterator[tuple[int, list[EpisodeScore]]]:
+        """Play ``groups``; yields (index of a group, its scores) as they finish. When stopped, it
+        yields the scores of the complete episodes. Raises `EnvironmentFailure` if a worker was
+        killed."""
         if self._workers == 1:
             for i, group in enumerate(groups):
                 if self._stopped():
@@ -194,25 +171,21 @@ class Stage:
                 yield i, self._player.play(group, self._stopped)
             return
         try:
-            yield from self._results(self._submit(groups))
+            index = self._submit(groups)
+            waiting = set(index)
+            while waiting:
+                if self._stopped() and not self._stop.is_set():
+                    self._stop.set()
+                    waiting = {future for future in waiting if not future.cancel()}
+                ended, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
+                for future in ended:
+                    yield index[future], future.result()
         except BrokenProcessPool as error:
             raise EnvironmentFailure(
                 "a worker process was killed (out of memory?); try fewer --num_workers"
             ) from error
 
-    def _results(
-        self, groups: dict[Future[list[EpisodeScore]], int]
-    ) -> Iterator[tuple[int, list[EpisodeScore]]]:
-        waiting = set(groups)
-        while waiting:
-            if self._stopped() and not self._stop.is_set():
-                self._stop.set()
-                waiting = {future for future in waiting if not future.cancel()}
-            ended, waiting = wait(waiting, _POLL_S, FIRST_COMPLETED)
-            for future in ended:
-                yield groups[future], future.result()
-
-    def _submit(self, groups: Sequence[Group]) -> dict[Future[list[EpisodeScore]], int]:
+    def _submit(self, groups: Sequence[EpisodeGroup]) -> dict[Future[list[EpisodeScore]], int]:
         with inherited_by_workers():
             if self._executor is None:
                 context = multiprocessing.get_context("spawn")
@@ -221,28 +194,25 @@ class Stage:
                     self._workers, context, initializer=_start, initargs=(self._setup, self._stop)
                 )
             executor = self._executor
-            return {executor.submit(_work, group): i for i, group in enumerate(groups)}
+            return {executor.submit(_play, group): i for i, group in enumerate(groups)}
 
     def close(self) -> None:
-        """Stop what is being played and end the workers."""
+        """Abandon episodes in progress and end the workers."""
         if self._executor is not None:
             self._stop.set()
             self._executor.shutdown(wait=True, cancel_futures=True)
             self._executor = None
 
 
-class _Worker:
-    """The state of a worker process."""
-
-    player: Player
+class _Worker:  # the state of a worker process
+    player: EpisodePlayer
     stop: Event
 
 
-def _start(setup: Setup, stop: Event) -> None:
+def _start(setup: EpisodeSetup, stop: Event) -> None:
     torch.set_num_threads(1)
-    _Worker.player, _Worker.stop = Player(setup), stop
+    _Worker.player, _Worker.stop = EpisodePlayer(setup), stop
 
 
-def _work(group: Group) -> list[EpisodeScore]:
-    """Runs in a worker."""
+def _play(group: EpisodeGroup) -> list[EpisodeScore]:
     return _Worker.player.play(group, _Worker.stop.is_set)

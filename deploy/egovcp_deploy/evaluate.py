@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import asdict, dataclass, field, replace
 from itertools import batched
 from pathlib import Path
 from typing import Any, Final
 
-import draccus
 from tqdm import tqdm
 
-from egovcp.artifact import Artifact
-from egovcp.bounds import MOST_PER_CORE, bounded, check_bounds
+from egovcp.bounds import MOST_PER_CORE, bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.files import write_json
@@ -27,33 +25,38 @@ from egovcp.sim.scenario import EPISODE_TASKS, Scenario
 from egovcp.spec import TASKS
 from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
-from egovcp_deploy.constant_search import Action, BestConstant, load_constants, search_constant
-from egovcp_deploy.controllers import CONTROLLERS, PPO
-from egovcp_deploy.episodes import Group, Setup, Stage
+from egovcp_deploy.controllers import (
+    CONSTANT,
+    CONTROLLERS,
+    PPO,
+    Action,
+    BestConstant,
+    load_constants,
+    search_constant,
+)
+from egovcp_deploy.episodes import EpisodeGroup, EpisodePool, EpisodeSetup
 from egovcp_deploy.options import (
-    absolute_path,
+    PLANNER,
     check_choice,
     check_output_dir,
+    encoded,
+    held_out,
     make_output_dir,
     versions,
 )
 from egovcp_deploy.policy import backend_of
-from egovcp_deploy.report import gains, summary, table
-from egovcp_deploy.scenarios import held_out
-from egovcp_deploy.scores import EpisodeScore
+from egovcp_deploy.scores import EpisodeScore, success_rate, summary, table
 
 PROG: Final = "egovcp-eval"
-_ALL: Final = "all"
 _EPILOG: Final = (
-    "All controllers play the same scenarios, which no collection ever plays (seeds are "
-    "offset), each with an event: no empty scenes unless --env.*_episode.empty_probability "
-    "says so. Success: ball blocked by a hand and not hit elsewhere; wall still up and touched "
-    "by hands only; arch passed untouched; sequence: all of its parts, whose shares stand "
-    "beneath. 'constant' is the best fixed action of a grid, "
-    "chosen on scenarios of its own. plan_ms is the time per robot when num_envs robots are "
-    "planned together; --num_envs=1 --num_workers=1 gives the latency of one. Writes eval.json "
-    "(figures), eval_run.json (config and every episode) and constant.json. Ctrl-C writes what was "
-    "played so far, marked as incomplete."
+    "All controllers play the same scenarios, which are never used for training data (their seeds "
+    "are offset), each with an event: no empty scenes unless --env.*_episode.empty_probability "
+    "is set. Success: ball blocked by a hand and not hit elsewhere; wall still up and touched "
+    "by hands only; arch passed untouched; sequence: all of its parts, whose rates are listed "
+    "below it. 'constant' is the best fixed action of a grid, found on other scenarios. plan_ms is "
+    "the time per robot when num_envs robots are planned together; --num_envs=1 --num_workers=1 "
+    "gives the latency of one. Writes eval.json (figures), eval_run.json (config and every "
+    "episode) and constant.json. Ctrl-C writes the complete episodes, marked as incomplete."
 )
 
 type Scores = dict[str, dict[str, list[EpisodeScore]]]
@@ -64,7 +67,7 @@ class ConstantOptions:
     """The reference `constant`."""
 
     path: str = ""
-    """constant.json of an earlier evaluation; spares the search. Empty: search."""
+    """constant.json of an earlier evaluation; empty: search the best action."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +83,7 @@ class EvalConfig:
     """Play held-out scenarios with the planner and with references; print and save figures."""
 
     policy: PolicyOptions = field(default_factory=PolicyOptions)
-    """The policy artifact; not needed without the controller `planner`."""
+    """The policy artifact; only for the controller `planner`."""
     planner: PlannerOptions = field(default_factory=PlannerOptions)
     """Changes to the artifact's planner."""
     task: str = "ball"
@@ -91,8 +94,8 @@ class EvalConfig:
     seed: int = bounded(0, least=0)
     """Which held-out scenarios."""
     controllers: str = ",".join(CONTROLLERS)
-    """Who plays, separated by commas: planner, hold (neutral pose), constant (best fixed action),
-    random (the paper's walk), oracle (scripted, sees the truth), ppo (learned without a model)."""
+    """Separated by commas: planner, hold (neutral pose), constant (best fixed action), random (the
+    paper's walk), oracle (scripted, uses the simulator's state), ppo (learned without a model)."""
     constant: ConstantOptions = field(default_factory=ConstantOptions)
     """The reference `constant`."""
     ppo: PpoOptions = field(default_factory=PpoOptions)
@@ -109,7 +112,7 @@ class EvalConfig:
     @property
     def tasks(self) -> tuple[str, ...]:
         """The tasks to play."""
-        return TASKS if self.task == _ALL else (self.task,)
+        return TASKS if self.task == "all" else (self.task,)
 
     @property
     def players(self) -> tuple[str, ...]:
@@ -119,15 +122,14 @@ class EvalConfig:
 
     def check(self) -> None:
         """Raise `UsageError` for values that make no sense."""
-        check_choice("--task", self.task, (*EPISODE_TASKS, _ALL))
+        check_choice("--task", self.task, (*EPISODE_TASKS, "all"))
         for name in self.players:
             check_choice("--controllers", name, (*CONTROLLERS, PPO))
-        check_bounds(self, "--")
         workers = self.num_workers or available_cores()
         robots = min(self.num_envs * workers, self.episodes * len(self.tasks))
         require_memory_for_robots("--num_envs", self.num_envs, robots)
         held_out(self.tasks[0], self.seed, 0)
-        if "planner" in self.players:
+        if PLANNER in self.players:
             self.policy.require("leave planner out of --controllers")
         if PPO in self.players and not self.ppo.path:
             raise UsageError(
@@ -143,53 +145,66 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def evaluate(config: EvalConfig) -> None:
-    """Check everything, play, print the table and write the files.
-
-    Whatever ends it early, the episodes that have ended are written, marked as incomplete.
+    """Check everything, play, print the table and write the files, also after an error or a signal:
+    the complete episodes are kept, marked as incomplete if some are missing.
 
     Raises:
-        UsageError: an option makes no sense, or the folder holds results.
-        DataError: ``--constant.path`` cannot be used.
-        ArtifactError: the artifact, or the policy of --ppo.path, is missing, damaged, or of another
-            low-level controller.
+        UsageError, DataError, ArtifactError: an option, file or policy cannot be used.
         EnvironmentFailure: the backend of the planner cannot be used here, or a worker was killed.
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
     config.check()
     config = replace(config, env=resolve_config(config.env))
+    controller_id = make_controller(config.env.controller).id
     constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
-    artifact = _load_policy(config)
-    ppo = _load_ppo(config)
-    backend = _prepare_planner(artifact, config.seed)
+    artifact, ppo, backend = None, None, ""
+    if PLANNER in config.players:
+        artifact = load_policy(config.policy, config.planner)
+        artifact.require_controller(controller_id)
+        policy = artifact.make_policy(1, config.seed)
+        policy.prepare()  # compile once, before workers need it
+        backend = backend_of(policy)
+    if PPO in config.players:
+        ppo = ReactiveNetwork.load(Path(config.ppo.path))
+        ppo.require_controller(controller_id)
     folder = make_output_dir(config.output_dir)
-    setup = Setup(config.env, config.policy, config.planner, config.seed, config.ppo.path)
+    setup = EpisodeSetup(config.env, config.policy, config.planner, config.seed, config.ppo.path)
     scores: Scores = {task: {name: [] for name in config.players} for task in config.tasks}
     try:
         with (
             stop_on_signal() as received,
-            closing(Stage(setup, config.num_workers, artifact, lambda: bool(received))) as stage,
+            closing(
+                EpisodePool(setup, config.num_workers, artifact, lambda: bool(received))
+            ) as pool,
         ):
-            if "constant" in config.players:
-                constants = _find_constants(config, stage, constants)
-                _require_going_on(received)
+            if CONSTANT in config.players:
+                constants = _find_constants(config, pool, constants)
                 found = {task: asdict(best) for task, best in constants.items()}
                 write_json(folder / "constant.json", found)
-            _play(config, stage, constants, scores)
-            _require_going_on(received)
+            _play(config, pool, constants, scores)
+            if received:
+                raise KeyboardInterrupt
     finally:
-        if played := _with_episodes(scores):
-            record = _record(config, artifact, ppo, constants, played)
-            _report(folder, config, {"backend": backend, **record}, played)
+        if played := _sorted_scores(scores):
+            record = {
+                "backend": backend,
+                "complete": not _missing(config, played),
+                "config": encoded(config, "policy.path", "constant.path", "ppo.path", "output_dir"),
+                "artifact": artifact.manifest if artifact else None,
+                "ppo": dict(ppo.provenance) if ppo else None,
+                "low_level_controller": controller_id,
+                "versions": versions(),
+                "constants": {task: asdict(best) for task, best in constants.items()},
+                "episodes": {
+                    task: {name: [_brief(score) for score in each] for name, each in row.items()}
+                    for task, row in played.items()
+                },
+            }
+            _report(folder, config, record, played)
 
 
-def _require_going_on(received: Sequence[int]) -> None:
-    """Raise KeyboardInterrupt if a signal has asked for the end."""
-    if received:
-        raise KeyboardInterrupt
-
-
-def _with_episodes(scores: Scores) -> Scores:
-    """Without controllers and tasks of which no episode has ended, the episodes in order."""
+def _sorted_scores(scores: Scores) -> Scores:
+    """The scores in the order of the scenarios, without tasks and controllers without episodes."""
     rows = {
         task: {
             name: sorted(played, key=lambda score: score.episode)
@@ -201,8 +216,20 @@ def _with_episodes(scores: Scores) -> Scores:
     return {task: row for task, row in rows.items() if row}
 
 
+def _missing(config: EvalConfig, scores: Scores) -> list[str]:
+    """``[ball hold 0 of 80, ...]``: what each controller has played, if episodes are missing."""
+    counts = {
+        f"{task} {name}": len(scores.get(task, {}).get(name, ()))
+        for task in config.tasks
+        for name in config.players
+    }
+    if all(count == config.episodes for count in counts.values()):
+        return []
+    return [f"{name} {count} of {config.episodes}" for name, count in counts.items()]
+
+
 def _report(folder: Path, config: EvalConfig, record: Mapping[str, Any], scores: Scores) -> None:
-    """Write the files and print the table, also of an evaluation that ended early."""
+    """Write the files and print the table."""
     figures = summary(scores, config.episodes)
     write_json(folder / "eval_run.json", record)
     write_json(folder / "eval.json", figures)
@@ -211,156 +238,71 @@ def _report(folder: Path, config: EvalConfig, record: Mapping[str, Any], scores:
         echo(f"plans computed by {backend}")
     if skipped := sum(s.skipped for row in scores.values() for each in row.values() for s in each):
         echo(f"{skipped} observations were not finite and were skipped; see eval_run.json")
-    if not record["complete"]:
-        echo(f"INCOMPLETE: {_counts(config, scores)} episodes played")
+    if missing := _missing(config, scores):
+        echo(f"INCOMPLETE: {', '.join(missing)} episodes played")
     echo(f"figures: {folder / 'eval.json'}")
 
 
-def _counts(config: EvalConfig, scores: Scores) -> str:
-    """``ball planner 12 of 80, ball hold 0 of 80``."""
-    return ", ".join(
-        f"{task} {name} {len(scores.get(task, {}).get(name, ()))} of {config.episodes}"
-        for task in config.tasks
-        for name in config.players
-    )
-
-
-def _is_complete(config: EvalConfig, scores: Scores) -> bool:
-    count = sum(len(played) for row in scores.values() for played in row.values())
-    return count == len(config.tasks) * len(config.players) * config.episodes
-
-
-def _load_policy(config: EvalConfig) -> Artifact | None:
-    if "planner" not in config.players:
-        return None
-    artifact = load_policy(config.policy, config.planner)
-    artifact.require_controller(make_controller(config.env.controller).id)
-    return artifact
-
-
-def _prepare_planner(artifact: Artifact | None, seed: int) -> str:
-    """What computes the plans; compiled here, once, before workers need it. Empty: no planner."""
-    if artifact is None:
-        return ""
-    policy = artifact.make_policy(1, seed)
-    policy.prepare()
-    return backend_of(policy)
-
-
-def _load_ppo(config: EvalConfig) -> ReactiveNetwork | None:
-    if PPO not in config.players:
-        return None
-    network = ReactiveNetwork.load(Path(config.ppo.path))
-    network.require_controller(make_controller(config.env.controller).id)
-    return network
-
-
 def _find_constants(
-    config: EvalConfig, stage: Stage, known: dict[str, BestConstant]
+    config: EvalConfig, pool: EpisodePool, known: dict[str, BestConstant]
 ) -> dict[str, BestConstant]:
-    """Task -> best constant action, searched for where it is not known yet."""
+    """Task -> best constant action, searched unless ``known``."""
     found = {}
     for task in config.tasks:
         with tqdm(unit="ep", desc=f"{task}: best constant action") as bar:
 
             def play(
                 actions: Sequence[Action], scenarios: Sequence[Scenario]
-            ) -> list[EpisodeScore]:
+            ) -> list[list[EpisodeScore]]:
                 groups = [
-                    Group("constant", tuple(s for _, s in part), tuple(a for a, _ in part))
-                    for part in batched(zip(actions, scenarios, strict=True), config.num_envs)
+                    EpisodeGroup(CONSTANT, part, action)
+                    for action in actions
+                    for part in batched(scenarios, config.num_envs)
                 ]
-                scores = _in_order(stage, groups, bar)
-                if len(scores) < len(scenarios):
+                parts: dict[int, list[EpisodeScore]] = {}
+                for i, part in pool.play(groups):
+                    parts[i] = part
+                    bar.update(len(part))
+                scores = [score for i in sorted(parts) for score in parts[i]]
+                if len(scores) < len(actions) * len(scenarios):
                     raise KeyboardInterrupt
-                return scores
+                return [list(each) for each in batched(scores, len(scenarios))]
 
             found[task] = known.get(task) or search_constant(task, config.seed, play)
     return found
 
 
-def _in_order(stage: Stage, groups: Sequence[Group], bar: Any) -> list[EpisodeScore]:
-    """Scores of all groups in the order of their scenarios."""
-    parts: dict[int, list[EpisodeScore]] = {}
-    for i, scores in stage.play(groups):
-        parts[i] = scores
-        bar.update(len(scores))
-    return [score for i in sorted(parts) for score in parts[i]]
-
-
 def _play(
-    config: EvalConfig, stage: Stage, constants: dict[str, BestConstant], scores: Scores
+    config: EvalConfig, pool: EpisodePool, constants: dict[str, BestConstant], scores: Scores
 ) -> None:
-    """Every controller on every task, into ``scores``; progress shows the success rates so far."""
+    """Play every controller on every task, and add the scores to ``scores``."""
     groups = list(_groups(config, constants))
     total = sum(len(group.scenarios) for group in groups)
     with tqdm(total=total, unit="ep", desc="evaluate") as bar:
-        for i, part in stage.play(groups):
+        for i, part in pool.play(groups):
             group = groups[i]
             scores[group.scenarios[0].task][group.controller] += part
-            bar.set_postfix_str(_so_far(scores), refresh=False)
+            rates = []
+            for name in config.players:
+                if played := [score for row in scores.values() for score in row[name]]:
+                    rates.append(f"{name} {success_rate(played):.0%}")
+            bar.set_postfix_str(", ".join(rates), refresh=False)
             bar.update(len(part))
 
 
-def _groups(config: EvalConfig, constants: dict[str, BestConstant]) -> Iterable[Group]:
-    """The planner's first, since they take longest."""
-    for name in sorted(config.players, key=lambda name: name != "planner"):
+def _groups(config: EvalConfig, constants: dict[str, BestConstant]) -> Iterator[EpisodeGroup]:
+    """The planner's groups first, since they take longest."""
+    for name in sorted(config.players, key=lambda name: name != PLANNER):
         for task in config.tasks:
             scenarios = [held_out(task, config.seed, i) for i in range(config.episodes)]
             for part in batched(scenarios, config.num_envs):
-                group = Group(name, part)
-                if name == "constant":
-                    group = replace(group, actions=(constants[task].action,) * len(part))
-                yield group
-
-
-def _so_far(scores: Scores) -> str:
-    """``planner 61%, hold 20%``: over all tasks."""
-    parts = []
-    for name in next(iter(scores.values())):
-        played = [score for task in scores.values() for score in task[name]]
-        if played:
-            parts.append(f"{name} {sum(s.success for s in played) / len(played):.0%}")
-    return ", ".join(parts)
-
-
-def _record(
-    config: EvalConfig,
-    artifact: Artifact | None,
-    ppo: ReactiveNetwork | None,
-    constants: dict[str, BestConstant],
-    scores: Scores,
-) -> dict[str, Any]:
-    """Content of ``eval_run.json``: what the figures came from."""
-    return {
-        "complete": _is_complete(config, scores),
-        "config": draccus.encode(_with_absolute_paths(config)),
-        "artifact": artifact.manifest if artifact else None,
-        "ppo": dict(ppo.provenance) if ppo else None,
-        "low_level_controller": make_controller(config.env.controller).id,
-        "versions": versions(),
-        "constants": {task: asdict(best) for task, best in constants.items()},
-        "success_gain_of_planner": gains(scores),
-        "episodes": {
-            task: {name: [_brief(score) for score in played] for name, played in row.items()}
-            for task, row in scores.items()
-        },
-    }
-
-
-def _with_absolute_paths(config: EvalConfig) -> EvalConfig:
-    return replace(
-        config,
-        policy=replace(config.policy, path=absolute_path(config.policy.path)),
-        constant=replace(config.constant, path=absolute_path(config.constant.path)),
-        ppo=replace(config.ppo, path=absolute_path(config.ppo.path)),
-        output_dir=absolute_path(config.output_dir),
-    )
+                action = constants[task].action if name == CONSTANT else ()
+                yield EpisodeGroup(name, part, action)
 
 
 def _brief(score: EpisodeScore) -> dict[str, Any]:
-    left_out = {"plan_ms"} if score.parts else {"plan_ms", "parts"}
-    return {name: value for name, value in asdict(score).items() if name not in left_out}
+    omitted = {"plan_ms"} if score.parts else {"plan_ms", "parts"}
+    return {name: value for name, value in asdict(score).items() if name not in omitted}
 
 
 if __name__ == "__main__":

@@ -1,20 +1,46 @@
-"""Options that the commands of this package share, and what is checked before any work."""
+"""Options that the commands of this package share, and their checks before any work starts."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable
+from functools import reduce
 from importlib.metadata import version
+from operator import getitem
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
+
+import draccus
 
 from egovcp.errors import EnvironmentFailure, UsageError, suggest
 from egovcp.hub import is_local_path
 from egovcp.outputs import require_writable
+from egovcp.sim.scenario import Scenario
 
 PLANNER: Final = "planner"
-REFERENCES: Final = ("hold", "random", "oracle")
 _PACKAGES: Final = ("egovcp", "egovcp-deploy", "torch", "numpy")
+# Offsets of the scenario seeds. Collection counts its seeds from 0, so that evaluation and
+# deployment never play a scenario of the training data, nor one of the search for the best
+# constant action.
+HELD_OUT: Final = 1_000_000_000
+SEARCH: Final = 2_000_000_000
+
+
+def held_out(task: str, seed: int, episode: int) -> Scenario:
+    """Scenario ``episode`` of evaluation and deployment for the user's ``seed``; raises
+    `UsageError` if the seed is negative or leaves the range of held-out scenarios."""
+    return Scenario(task, HELD_OUT + _checked(seed), episode)
+
+
+def for_search(task: str, seed: int, episode: int) -> Scenario:
+    """Scenario ``episode`` of the search for the best constant action; raises as `held_out`."""
+    return Scenario(task, SEARCH + _checked(seed), episode)
+
+
+def _checked(seed: int) -> int:
+    if not 0 <= seed < SEARCH - HELD_OUT:
+        raise UsageError(f"--seed={seed}: expected a number from 0 to {SEARCH - HELD_OUT - 1}")
+    return seed
 
 
 def check_choice(flag: str, value: str, valid: Iterable[str]) -> None:
@@ -24,15 +50,11 @@ def check_choice(flag: str, value: str, valid: Iterable[str]) -> None:
         raise UsageError(f"unknown value {flag}={value}{suggest(value, choices)}")
 
 
-def check_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
-    """The output folder; one that holds anything is refused. Creates nothing.
-
-    Args:
-        path: the folder of ``--output_dir``.
-        reusable: file names that may be there already.
+def check_output_dir(path: str) -> Path:
+    """The folder of ``--output_dir``, which must be new or empty; it is not created.
 
     Raises:
-        UsageError: no folder was named, or it holds other files.
+        UsageError: no folder is named, or it holds files.
         EnvironmentFailure: it cannot be created or written to.
     """
     if not path:
@@ -40,11 +62,10 @@ def check_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
     folder = Path(os.path.expanduser(path))
     if folder.exists() and not folder.is_dir():
         raise UsageError(f"--output_dir={path} is a file; name a new folder")
-    present = [entry.name for entry in folder.iterdir()] if folder.exists() else []
-    foreign = sorted(name for name in present if name not in reusable)
-    if foreign:
+    present = sorted(entry.name for entry in folder.iterdir()) if folder.exists() else []
+    if present:
         raise UsageError(
-            f"--output_dir={path} holds {foreign[0]} already; results are never overwritten: "
+            f"--output_dir={path} holds {present[0]} already; results are never overwritten: "
             "name another folder or remove this one"
         )
     try:
@@ -54,31 +75,26 @@ def check_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
     return folder
 
 
-def make_output_dir(path: str, reusable: tuple[str, ...] = ()) -> Path:
-    """Create the folder that `check_output_dir` accepts.
-
-    Raises:
-        UsageError: as `check_output_dir`.
-        EnvironmentFailure: it cannot be created or written to.
-    """
-    folder = check_output_dir(path, reusable)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise EnvironmentFailure(f"cannot create {path}: {error.strerror}") from error
-    if not os.access(folder, os.W_OK | os.X_OK):
-        raise EnvironmentFailure(f"cannot write to {path}: permission denied")
+def make_output_dir(path: str) -> Path:
+    """Create the folder of ``--output_dir``; raises as `check_output_dir`."""
+    folder = check_output_dir(path)
+    folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
-def absolute_path(path: str) -> str:
-    """A file or folder as it is recorded: found again from any working directory.
-
-    An empty path stays empty, an id on the Hub is none.
-    """
-    return os.path.abspath(os.path.expanduser(path)) if path and is_local_path(path) else path
+def encoded(config: object, *paths: str) -> dict[str, Any]:
+    """The options as JSON values; local paths in the options ``paths`` become absolute, so that
+    they are valid in any working directory."""
+    options: dict[str, Any] = draccus.encode(config)
+    for option in paths:
+        *sections, name = option.split(".")
+        section = reduce(getitem, sections, options)
+        path = section[name]
+        if path and is_local_path(path):
+            section[name] = os.path.abspath(os.path.expanduser(path))
+    return options
 
 
 def versions() -> dict[str, str]:
-    """Distribution -> version of what shaped the results."""
+    """Distribution -> version, of the packages that determine the results."""
     return {name: version(name) for name in _PACKAGES}

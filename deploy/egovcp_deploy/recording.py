@@ -1,12 +1,12 @@
-"""What a run leaves behind: its log, and what describes it at the beginning of each log."""
+"""Logs of a rollout, and the records that describe it."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from egovcp.artifact import Artifact
 from egovcp.log.async_sink import AsyncFanout, AsyncSink
@@ -19,37 +19,38 @@ from egovcp.packages import is_installed
 from egovcp.terminal import echo
 from egovcp_deploy.options import versions
 
+if TYPE_CHECKING:
+    from egovcp_deploy.config import DeployConfig
+
 
 @dataclass(frozen=True)
 class LogOptions:
-    """What is recorded beside the MCAP, and who is looking."""
+    """Logs besides the MCAP file."""
 
     live: str = ""
     """Also show the run as it happens: spawn (the Rerun viewer), web (a page for browsers, on the
-    loopback), or the address of a viewer that runs, rerun+http://127.0.0.1:9876/proxy."""
+    loopback), or the address of a running viewer, rerun+http://127.0.0.1:9876/proxy."""
     rrd: bool = True
-    """Write a Rerun file too; egovcp-deploy's MCAP alone can be opened in Rerun as well."""
+    """Write a Rerun file too; Rerun also opens the MCAP file."""
 
 
 @contextmanager
 def recording(
-    folder: Path, episode: int, info: RunInfo, options: LogOptions, waits: bool
+    folder: Path, episode: int, info: RunInfo, options: LogOptions, blocking: bool
 ) -> Iterator[Sink]:
-    """Sinks of one rollout; the first rollout leaves a picture too.
-
-    Args:
-        folder: where the files go.
-        episode: number of the rollout.
-        info: the first record.
-        options: which logs.
-        waits: whether the loop may wait for the disk, as simulated time may. On the wall clock
-            each sink has a process of its own. A viewer always has: it may die or hang.
-    """
+    """Sinks of rollout number ``episode``; the first one also gets a picture. If ``blocking``, the
+    loop may wait for the disk, as in simulated time; else each sink runs in a separate process. A
+    viewer always does: it may die or hang."""
     with ExitStack() as stack:
-        files = _files(folder / f"rollout-{episode}", episode, options)
-        viewers = list(_viewers(options, stack))
+        files = _file_sinks(folder / f"rollout-{episode}", episode, options)
+        viewers = list[AsyncSink]()
+        if options.live:
+            live = stack.enter_context(LiveRerun.of(options.live))
+            if live.page:
+                echo(f"look at it: {live.page}")
+            viewers.append(AsyncSink(RerunSink(live.viewer), "Rerun"))
         sink: Sink
-        if waits:
+        if blocking:
             sink = Fanout([*files.values(), *viewers])
         else:
             writers = [AsyncSink(file, name) for name, file in files.items()]
@@ -60,14 +61,13 @@ def recording(
 
 
 def missing_ticks(sink: Sink) -> dict[str, int]:
-    """Log -> ticks that are not in it, or may not be, once it is closed; only of `recording` on
-    the wall clock, which drops rather than waits."""
+    """Log -> ticks that it lacks or may lack, of a closed `recording` that was not blocking."""
     sinks = sink.sinks if isinstance(sink, AsyncFanout) else ()
     return {each.name: each.dropped + each.lost for each in sinks}
 
 
-def _files(stem: Path, episode: int, options: LogOptions) -> dict[str, Sink]:
-    """File name -> what writes it."""
+def _file_sinks(stem: Path, episode: int, options: LogOptions) -> dict[str, Sink]:
+    """File name -> its sink."""
     mcap, rrd, png = (stem.with_suffix(suffix) for suffix in (".mcap", ".rrd", ".png"))
     sinks: dict[str, Sink] = {mcap.name: McapSink(mcap)}
     if options.rrd:
@@ -79,33 +79,36 @@ def _files(stem: Path, episode: int, options: LogOptions) -> dict[str, Sink]:
     return sinks
 
 
-def _viewers(options: LogOptions, stack: ExitStack) -> Iterator[AsyncSink]:
-    if options.live:
-        live = stack.enter_context(LiveRerun.of(options.live))
-        if live.page:
-            echo(f"look at it: {live.page}")
-        yield AsyncSink(RerunSink(live.viewer), "Rerun")
-
-
 def run_info(
-    task: str,
-    seed: int,
-    episode: int,
-    camera: CameraView,
-    config: Mapping[str, Any],
+    config: DeployConfig,
     controller_id: str,
     artifact: Artifact | None,
     backend: str,
+    episode: int = 0,
+    camera: CameraView | None = None,
 ) -> RunInfo:
-    """The first record of a log. ``config`` holds JSON values, ``backend`` see `backend_of`."""
+    """The first record of a log; ``backend`` see `backend_of`."""
     files = artifact.manifest["files"] if artifact else {}
     return RunInfo(
-        task=task,
-        seed=seed,
+        task=config.task,
+        seed=config.seed,
         episode=episode,
-        camera=camera,
-        config=config,
+        camera=camera or CameraView(),
+        config=config.encoded(),
         hashes={"low_level_controller": controller_id, **files},
         versions=versions(),
         backend=backend,
     )
+
+
+def provenance(
+    config: DeployConfig, controller_id: str, artifact: Artifact | None, backend: str
+) -> dict[str, Any]:
+    """The part of ``deploy.json`` that says what produced the results."""
+    return {
+        "config": config.encoded(),
+        "artifact": artifact.manifest["files"] if artifact else None,
+        "low_level_controller": controller_id,
+        "backend": backend,
+        "versions": versions(),
+    }

@@ -1,69 +1,193 @@
-"""Rollouts of the simulated robot, in lock-step with the planner."""
+"""Rollouts in lock-step with the planner, of the simulated robot or of recorded observations.
+
+    o_t -> pilot -> planner -> pilot -> a_t -> robot.act -> a_t as sent -> o_{t+1}
+
+With o_{t+1} the planner receives the action that was sent, and advances its recurrence with it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from tqdm import tqdm
 
 from egovcp.artifact import Artifact
 from egovcp.files import write_json
-from egovcp.log.tick import RunInfo, Tick
-from egovcp.rate import FixedRate, LockstepClock
+from egovcp.log.sink import Sink
+from egovcp.log.tick import Tick
+from egovcp.rate import NS_PER_S, LockstepClock
 from egovcp.spec import PLANNER_HZ
 from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.options import make_output_dir, versions
-from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.options import make_output_dir
+from egovcp_deploy.pilot.pilot import REJECTED, Pilot
+from egovcp_deploy.pilot.planner import (
+    SKIPPED,
+    InlinePlanner,
+    PlanMessage,
+    PlannerClient,
+    PlannerRunner,
+    planner_fields,
+)
+from egovcp_deploy.pilot.states import Facts, Limits, OperatorRequest, State
 from egovcp_deploy.policy import RolloutPolicy, backend_of
-from egovcp_deploy.recording import recording, run_info
-from egovcp_deploy.robots import LockstepRobot
+from egovcp_deploy.recording import provenance, recording, run_info
+from egovcp_deploy.robots import LockstepRobot, RobotObservation
 from egovcp_deploy.robots.replay import open_recordings
-from egovcp_deploy.runner import RolloutSummary, Runner
 
 if TYPE_CHECKING:
     from egovcp_deploy.robots.sim import SimRobot
 
+_PERIOD_NS: Final = NS_PER_S // PLANNER_HZ
+
+
+@dataclass
+class RolloutSummary:
+    """Result of one rollout."""
+
+    steps: int = 0
+    reward: float = 0.0  # sum over the rollout
+    success: bool = False
+    terminated: bool = False
+    truncated: bool = False
+    rejected: int = 0  # plans that were not finite and were not used
+    skipped: int = 0  # observations whose state was not finite, so that the policy did not use them
+    held: int = 0  # ticks in HOLD
+    damped: str = ""  # why the motors were damped; empty: they were not
+    plan_ms: list[float] = field(default_factory=list)  # time to filter and plan, per plan
+
+    def add(self, tick: Tick) -> None:
+        """Count one more tick."""
+        self.steps += 1
+        self.reward += tick.reward
+        self.success = tick.success
+        self.terminated, self.truncated = tick.terminated, tick.truncated
+        self.rejected += REJECTED in tick.events
+        self.skipped += tick.events.count(SKIPPED)
+        self.held += tick.mode == State.HOLD
+        if "plan" in tick.timing_ms:
+            self.plan_ms.append(tick.timing_ms["plan"])
+
+
+class LockstepRunner:
+    """Drives one robot with one planner on the same simulated ``clock``, until the robot ends the
+    rollout. ``operator`` maps each tick to a request."""
+
+    def __init__(
+        self,
+        planner: PlannerClient,
+        robot: LockstepRobot,
+        clock: LockstepClock,
+        limits: Limits | None = None,
+        operator: Callable[[int], OperatorRequest | None] = lambda tick: None,
+    ) -> None:
+        self._planner, self._limits = planner, limits
+        self._robot = robot
+        self._clock = clock
+        self._operator = operator
+
+    def run(
+        self, sink: Sink, on_tick: Callable[[Tick], None] = lambda tick: None
+    ) -> RolloutSummary:
+        """Play the episode that the robot has started; ``sink`` is open."""
+        self._pilot = Pilot(self._planner, self._limits, State.ARMED)
+        summary = RolloutSummary()
+        while not (summary.terminated or summary.truncated):
+            tick = self._tick(summary.steps)
+            sink.write(tick)
+            summary.add(tick)
+            on_tick(tick)
+            self._clock.advance(_PERIOD_NS)
+        if self._pilot.supervisor.state is State.DAMP:
+            summary.damped = self._pilot.supervisor.reason
+        return summary
+
+    def _tick(self, index: int) -> Tick:
+        begin = time.perf_counter()
+        sensed = self._robot.observe()
+        observed = time.perf_counter()
+        plan = self._plan(index, sensed)
+        planned = time.perf_counter()
+        wanted = self._pilot.next_action()
+        outcome = self._robot.act(wanted)
+        self._pilot.sent = outcome.sent
+        ended = time.perf_counter()
+        timing = {
+            "observe": observed - begin,
+            "think": planned - observed,
+            "robot": ended - planned,
+        }
+        timing_ms = {name: 1e3 * seconds for name, seconds in timing.items()}
+        if plan is not None:
+            timing_ms["plan"] = plan.plan_ms
+        return Tick(
+            index=index,
+            time_ns=index * _PERIOD_NS,
+            depth=sensed.depth,
+            state=sensed.state,
+            action_planned=wanted if plan is None else plan.step.action[0],
+            action_sent=outcome.sent,
+            mode=self._pilot.supervisor.state,
+            reward=outcome.reward,
+            reward_terms=outcome.reward_terms,
+            terminated=outcome.terminated,
+            truncated=outcome.truncated,
+            success=outcome.success,
+            base=sensed.base,
+            scene=sensed.scene,
+            events=(*self._pilot.take_events(), *outcome.events),
+            timing_ms=timing_ms,
+            **planner_fields(plan),
+        )
+
+    def _plan(self, index: int, sensed: RobotObservation) -> PlanMessage | None:
+        """Update the state machine and plan; None: no plan within the tick."""
+        pilot, now = self._pilot, self._clock.now_ns()
+        pilot.sense(now, sensed.state, sensed.depth)
+        before = pilot.supervisor.state
+        request = OperatorRequest.RUN if index == 0 else self._operator(index)
+        state = pilot.update_state(Facts(now), request)
+        if index == 0 and state is State.RUN:
+            pilot.take_events()  # every simulated rollout starts in RUN: not worth a log line
+        if state is State.DAMP and before is not State.DAMP:
+            self._robot.damp()
+        pilot.send_observation(now, sensed.depth, sensed.state)
+        return pilot.receive_plans(now + _PERIOD_NS)
+
 
 def play_rollouts(config: DeployConfig, artifact: Artifact | None) -> None:
-    """Play and record; whatever ends it, the rollouts that came to their end are summed up.
-
-    Raises:
-        ArtifactError: the artifact is not made for this robot.
-        EnvironmentFailure: the simulator is not installed.
-    """
+    """Play and record rollouts of the simulated robot; complete ones are summarised in any case.
+    Raises as `deploy`."""
     robot = make_robot(config)
     try:
-        config = replace(config, env=robot.env.config)  # as decided for its controller
-        _play(config, artifact, robot, _make_policy(config, artifact, robot))
+        config = replace(config, env=robot.env.config)  # as resolved for its controller
+        policy: RolloutPolicy
+        if artifact is None:
+            from egovcp_deploy.controllers import ReferencePolicy, reference
+
+            policy = ReferencePolicy(
+                reference(config.controller), robot.env, lambda: [robot.scenario]
+            )
+        else:
+            artifact.require_controller(robot.controller_id)
+            policy = artifact.make_policy(1, config.seed)
+        _play(config, artifact, robot, policy)
     finally:
         robot.close()
 
 
 def replay(config: DeployConfig, artifact: Artifact) -> None:
-    """Let the policy watch what was recorded; at most ``episodes`` of the recordings.
-
-    Raises:
-        ArtifactError: the artifact is not made for the robot that was recorded.
-        UsageError, DataError: there is nothing to play back, or it is damaged.
-    """
+    """Plan again on recorded observations, of at most ``episodes`` recordings. Raises as `deploy`,
+    and `DataError` if a recording is damaged."""
     robot = open_recordings(Path(config.robot.recordings))
     artifact.require_controller(robot.controller_id)
     config = replace(config, episodes=min(config.episodes, robot.count))
     _play(config, artifact, robot, artifact.make_policy(1, config.seed))
-
-
-def _make_policy(config: DeployConfig, artifact: Artifact | None, robot: SimRobot) -> RolloutPolicy:
-    if artifact is None:
-        from egovcp_deploy.controllers import Scripted, reference
-
-        return Scripted(reference(config.controller), robot)
-    artifact.require_controller(robot.controller_id)
-    return artifact.make_policy(1, config.seed)
 
 
 def make_robot(config: DeployConfig) -> SimRobot:
@@ -76,75 +200,40 @@ def make_robot(config: DeployConfig) -> SimRobot:
 def _play(
     config: DeployConfig, artifact: Artifact | None, robot: LockstepRobot, policy: RolloutPolicy
 ) -> None:
-    """Record one rollout after the other and, whatever ends them, sum up the complete ones."""
-    thinker = Thinker(policy, config.imagine)
+    planner = PlannerRunner(policy, config.imagine)
     if artifact is not None:
-        thinker.warm_up()
+        planner.warm_up()
     folder = make_output_dir(config.output_dir)
-    clock = LockstepClock()
-    desk = InlineDesk(thinker, clock)
-    backend = backend_of(policy)
-    runner = Runner(desk, robot, FixedRate(PLANNER_HZ, clock), limits=config.robot.limits)
+    clock, backend = LockstepClock(), backend_of(policy)
+    runner = LockstepRunner(InlinePlanner(planner, clock), robot, clock, config.robot.limits)
     summaries: list[RolloutSummary] = []
     try:
         with tqdm(total=config.episodes, unit="rollout", desc=config.task) as bar:
             for episode in range(config.episodes):
                 robot.start(episode)
-                info = _info(config, artifact, robot, episode, backend)
-                with recording(folder, episode, info, config.log, waits=True) as sink:
+                info = run_info(
+                    config, robot.controller_id, artifact, backend, episode, robot.camera
+                )
+                with recording(folder, episode, info, config.log, blocking=True) as sink:
                     summaries.append(runner.run(sink, lambda tick: _show(bar, tick)))
                 bar.update(1)
     finally:
         if summaries:
-            report = _report(config, artifact, robot, backend, summaries)
+            report = {
+                "task": config.task,
+                "seed": config.seed,
+                "success_rate": float(np.mean([summary.success for summary in summaries])),
+                "rollouts": [_row(i, summary) for i, summary in enumerate(summaries)],
+                **provenance(config, robot.controller_id, artifact, backend),
+            }
             write_json(folder / "deploy.json", report)
             _print(summaries, folder)
-
-
-def _info(
-    config: DeployConfig,
-    artifact: Artifact | None,
-    robot: LockstepRobot,
-    episode: int,
-    backend: str,
-) -> RunInfo:
-    return run_info(
-        config.task,
-        config.seed,
-        episode,
-        robot.camera,
-        config.encoded(),
-        robot.controller_id,
-        artifact,
-        backend,
-    )
 
 
 def _show(bar: Any, tick: Tick) -> None:
     plan = f", plan {tick.timing_ms['plan']:.0f} ms" if "plan" in tick.timing_ms else ""
     bar.set_postfix_str(f"tick {tick.index}, {tick.mode}{plan}", refresh=False)
     bar.update(0)
-
-
-def _report(
-    config: DeployConfig,
-    artifact: Artifact | None,
-    robot: LockstepRobot,
-    backend: str,
-    summaries: Sequence[RolloutSummary],
-) -> dict[str, Any]:
-    """Content of ``deploy.json``."""
-    return {
-        "task": config.task,
-        "seed": config.seed,
-        "success_rate": float(np.mean([summary.success for summary in summaries])),
-        "rollouts": [_row(i, summary) for i, summary in enumerate(summaries)],
-        "config": config.encoded(),
-        "artifact": artifact.manifest["files"] if artifact else None,
-        "low_level_controller": robot.controller_id,
-        "backend": backend,
-        "versions": versions(),
-    }
 
 
 def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
@@ -159,7 +248,6 @@ def _row(episode: int, summary: RolloutSummary) -> dict[str, Any]:
         "skipped_observations": summary.skipped,
         "held_ticks": summary.held,
         "damped": summary.damped,
-        "overruns": summary.overruns,
         "plan_ms_p50": float(p50),
         "plan_ms_p99": float(p99),
         "mcap": f"rollout-{episode}.mcap",

@@ -1,48 +1,50 @@
-"""Statistics of played episodes: rates, means and their 95 % confidence intervals."""
+"""Figures of evaluated episodes: rates and means with 95 % confidence intervals, and tables."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.intervals import Interval, bootstrap, wilson
+from egovcp.terminal import one_line
+
+#: Task -> controller -> episodes.
+type ScoreTable = Mapping[str, Mapping[str, Sequence[EpisodeScore]]]
+
+_HEAD: Final = ("task", "controller", "success", "95 %", "reward/step", "95 %", "plan ms", "p99")
 
 
 @dataclass(frozen=True)
 class EpisodeScore:
     """One episode, played by one controller."""
 
-    episode: int
-    """Index of the scenario."""
-    steps: int
-    """Planner ticks until the time limit or the fall."""
-    reward: float
-    """Sum over the episode."""
+    episode: int  # index of the scenario
+    steps: int  # planner ticks until the time limit or the fall
+    reward: float  # sum over the episode
     success: bool
     terminated: bool
     plan_ms: list[float] = field(default_factory=list)
     """Time per tick to decide on one action, ms; shared by robots planned together."""
-    skipped: int = 0
-    """Observations that the policy did not use, because their state was not finite."""
+    skipped: int = 0  # observations whose state was not finite, so that the policy did not use them
     parts: dict[str, bool] = field(default_factory=dict)
-    """Success of each part of a sequence of tasks; of a single task, nothing."""
+    """Success of each part of a sequence of tasks; empty for a single task."""
 
 
 def paired(
     scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]
 ) -> tuple[list[EpisodeScore], list[EpisodeScore]]:
-    """The episodes of the scenarios that are in both, in the order of the scenarios."""
-    ours, theirs = ({s.episode: s for s in each} for each in (scores, others))
-    common = sorted(ours.keys() & theirs.keys())
-    return [ours[i] for i in common], [theirs[i] for i in common]
+    """The episodes of the scenarios that both have played, in the order of the scenarios."""
+    a, b = ({score.episode: score for score in each} for each in (scores, others))
+    common = sorted(a.keys() & b.keys())
+    return [a[i] for i in common], [b[i] for i in common]
 
 
 def success_rate(scores: Sequence[EpisodeScore]) -> float:
-    """Share of the episodes that succeeded."""
+    """Share of successful episodes."""
     return sum(score.success for score in scores) / len(scores)
 
 
@@ -53,25 +55,25 @@ def reward_per_step(scores: Sequence[EpisodeScore]) -> float:
 
 def reward_interval(scores: Sequence[EpisodeScore]) -> Interval:
     """Bootstrap interval of `reward_per_step` over episodes."""
-    return bootstrap(_reward_per_step(scores), len(scores))
+    return bootstrap(_resampled_reward(scores), len(scores))
 
 
 def reward_gain(scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]) -> Interval:
     """Bootstrap interval of the difference in `reward_per_step` on the *same* scenarios."""
-    theirs = {score.episode: score for score in others}
-    ours, paired = _reward_per_step(scores), _reward_per_step([theirs[s.episode] for s in scores])
-    return bootstrap(lambda i: ours(i) - paired(i), len(scores))
+    pairs = paired(scores, others)
+    a, b = map(_resampled_reward, pairs)
+    return bootstrap(lambda i: a(i) - b(i), len(pairs[0]))
 
 
-def _reward_per_step(
+def _resampled_reward(
     scores: Sequence[EpisodeScore],
 ) -> Callable[[NDArray[np.int64]], NDArray[np.float64]]:
-    """Picks (R, E) of the episodes -> (R,) `reward_per_step` of each row."""
+    """Indices (R, E) of episodes -> (R,) `reward_per_step` of each row."""
     rewards = np.array([score.reward for score in scores], np.float64)
     steps = np.array([score.steps for score in scores], np.float64)
 
-    def of(picks: NDArray[np.int64]) -> NDArray[np.float64]:
-        rates: NDArray[np.float64] = rewards[picks].sum(axis=1) / steps[picks].sum(axis=1)
+    def of(indices: NDArray[np.int64]) -> NDArray[np.float64]:
+        rates: NDArray[np.float64] = rewards[indices].sum(axis=1) / steps[indices].sum(axis=1)
         return rates
 
     return of
@@ -79,14 +81,15 @@ def _reward_per_step(
 
 def success_gain(scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]) -> Interval:
     """Bootstrap interval of the difference in success rate on the *same* scenarios."""
-    theirs = {score.episode: score.success for score in others}
-    gains = np.array([float(s.success) - float(theirs[s.episode]) for s in scores])
+    pairs = zip(*paired(scores, others), strict=True)
+    gains = np.array([float(a.success) - float(b.success) for a, b in pairs])
     return bootstrap(lambda i: gains[i].mean(axis=1), len(gains))
 
 
+# --- eval.json -------------------------------------------------------------------------------
 def summarise(scores: Sequence[EpisodeScore]) -> dict[str, Any]:
-    """The figures of one controller on one task, under the keys of ``eval.json``; of a sequence
-    also ``parts``: part -> ``success_rate`` and ``success_ci95``."""
+    """Figures of one controller on one task, with the keys of ``eval.json``; for a sequence also
+    ``parts``: part -> ``success_rate`` and ``success_ci95``."""
     plan_ms = np.concatenate([score.plan_ms for score in scores])
     parts = {name: _successes([score.parts[name] for score in scores]) for name in scores[0].parts}
     return {
@@ -100,9 +103,64 @@ def summarise(scores: Sequence[EpisodeScore]) -> dict[str, Any]:
     }
 
 
-def _successes(each: Sequence[bool]) -> dict[str, Any]:
-    count = sum(each)
+def _successes(successes: Sequence[bool]) -> dict[str, Any]:
+    count, total = sum(successes), len(successes)
+    return {"success_rate": count / total, "success_ci95": list(wilson(count, total))}
+
+
+def summary(scores: ScoreTable, requested: int) -> dict[str, dict[str, dict[str, Any]]]:
+    """``{task: {controller: figures}}``, the content of ``eval.json``.
+
+    Figures of fewer than ``requested`` episodes also hold ``incomplete`` (true) and
+    ``episodes_requested``.
+    """
+    missing = {"incomplete": True, "episodes_requested": requested}
     return {
-        "success_rate": count / len(each),
-        "success_ci95": list(wilson(count, len(each))),
+        task: {
+            name: summarise(played) | (missing if len(played) < requested else {})
+            for name, played in row.items()
+        }
+        for task, row in scores.items()
     }
+
+
+# --- tables ----------------------------------------------------------------------------------
+def table(figures: Mapping[str, Mapping[str, Mapping[str, Any]]]) -> str:
+    """The content of ``eval.json`` as text: one line per task and controller."""
+    lines: list[tuple[str, ...]] = [_HEAD]
+    for task, row in figures.items():
+        for name, f in row.items():
+            low, high = f["reward_ci95"]
+            lines.append(
+                (
+                    task,
+                    name,
+                    *_success_cells(f),
+                    f"{f['reward_mean']:+.5f}",
+                    f"{low:+.5f} to {high:+.5f}",
+                    f"{f['plan_ms_p50']:.2f}",
+                    f"{f['plan_ms_p99']:.2f}",
+                )
+            )
+            for part, successes in f.get("parts", {}).items():
+                lines.append(("", f"- {part}", *_success_cells(successes), "", "", "", ""))
+    return aligned(lines, text_columns=2)
+
+
+def _success_cells(figures: Mapping[str, Any]) -> tuple[str, str]:
+    low, high = figures["success_ci95"]
+    return f"{figures['success_rate']:.1%}", f"{low:.1%} to {high:.1%}"
+
+
+def aligned(lines: Sequence[Sequence[str]], text_columns: int) -> str:
+    """A table with columns of equal width: the first ``text_columns`` left-aligned, the others
+    right-aligned."""
+    lines = [[one_line(cell) for cell in line] for line in lines]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join(
+        "  ".join(
+            cell.ljust(width) if i < text_columns else cell.rjust(width)
+            for i, (cell, width) in enumerate(zip(line, widths, strict=True))
+        ).rstrip()
+        for line in lines
+    )

@@ -26,7 +26,7 @@ def write(folder: Path, rewards: list[float], task: str = "ball", **options: Any
     return str(folder)
 
 
-def test_what_is_paired_is_not_blurred_by_how_hard_scenarios_are(
+def test_pairing_removes_the_variance_between_scenarios(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Rewards spread by 1, one run is 0.1 better in each: 0.01 a step without any doubt."""
@@ -78,7 +78,7 @@ def test_two_controllers_of_one_run(tmp_path: Path, capsys: pytest.CaptureFixtur
         (["--run=a", "--other=a", "--controller=planer"], 2, "did you mean 'planner'"),
     ],
 )
-def test_what_cannot_be_compared_is_refused(
+def test_runs_that_cannot_be_compared_are_refused(
     flags: list[str],
     code: int,
     message: str,

@@ -60,7 +60,7 @@ def test_rollouts_are_recorded_and_summed_up(
     assert "rollout-0.rrd" in text
 
 
-def test_a_recording_obeys_the_contract_of_the_data(
+def test_a_recording_has_the_format_of_the_data(
     tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:
     out = tmp_path / "out"
@@ -118,7 +118,7 @@ def test_results_are_never_overwritten(
     assert (tmp_path / "rollout-0.mcap").read_bytes() == b"precious"
 
 
-def test_an_artifact_of_another_controller_drives_nothing(
+def test_an_artifact_of_another_controller_is_refused(
     tmp_path: Path, foreign_artifact_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -127,7 +127,7 @@ def test_an_artifact_of_another_controller_drives_nothing(
     assert not out.exists()
 
 
-def test_each_event_of_an_episode_is_told_once(tmp_path: Path, artifact_dir: Path) -> None:
+def test_each_event_of_an_episode_is_logged_once(tmp_path: Path, artifact_dir: Path) -> None:
     out = tmp_path / "out"
     flags = ["--env.ball_episode.ticks=40", "--env.ball_episode.event_ticks=[2,2]", "--imagine=0"]
     flags.append("--env.controller=stance")
@@ -158,7 +158,7 @@ def test_the_events_of_a_sequence_are_those_of_its_parts(tmp_path: Path) -> None
     ]
 
 
-def test_a_reference_needs_no_artifact_and_leaves_no_plan(
+def test_a_reference_needs_no_artifact_and_logs_no_plan(
     tmp_path: Path, short: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -173,7 +173,7 @@ def test_a_reference_needs_no_artifact_and_leaves_no_plan(
     assert report["low_level_controller"].startswith("g1-stance")
 
 
-def test_records_say_what_the_controller_has_decided(
+def test_the_resolved_environment_is_recorded(
     tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:
     out = tmp_path / "out"
@@ -185,7 +185,7 @@ def test_records_say_what_the_controller_has_decided(
     assert read_recording(out / "rollout-0.mcap").info.config == report["config"]
 
 
-def test_a_changed_planner_is_the_one_that_plans(
+def test_planner_options_change_the_planner(
     tmp_path: Path, artifact_dir: Path, short: list[str]
 ) -> None:
     out = tmp_path / "out"
@@ -215,7 +215,7 @@ def interrupted_in(monkeypatch: pytest.MonkeyPatch) -> Callable[[int], None]:
     return arrange
 
 
-def test_an_interrupt_leaves_the_summary_of_what_was_complete(
+def test_an_interrupt_leaves_the_summary_of_complete_rollouts(
     tmp_path: Path,
     short: list[str],
     interrupted_in: Callable[[int], None],
@@ -245,7 +245,7 @@ def test_an_interrupt_in_the_first_rollout_leaves_no_summary(
     assert not (out / "deploy.json").exists()
 
 
-def test_a_computer_without_the_simulator_is_told_what_to_install(tmp_path: Path) -> None:
+def test_without_the_simulator_the_error_names_the_package(tmp_path: Path) -> None:
     """All that does not need the simulator is loaded without it."""
     code = (
         "import sys; sys.modules['mujoco'] = None\n"
@@ -259,7 +259,9 @@ def test_a_computer_without_the_simulator_is_told_what_to_install(tmp_path: Path
     assert "Traceback" not in ended.stderr
 
 
-def test_an_unknown_driver_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_controller_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert run("--controller=orcale", f"--output_dir={tmp_path / 'x'}") == 2
     assert "oracle" in capsys.readouterr().err
     assert not (tmp_path / "x").exists()

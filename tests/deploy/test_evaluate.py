@@ -20,9 +20,9 @@ from egovcp.sim.env import VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
 from egovcp_deploy import episodes
-from egovcp_deploy.controllers import reference
+from egovcp_deploy.controllers import ReferencePolicy, reference
 from egovcp_deploy.deploy import main as deploy
-from egovcp_deploy.episodes import Group, Setup, Stage
+from egovcp_deploy.episodes import EpisodeGroup, EpisodePool, EpisodeSetup
 from egovcp_deploy.evaluate import EvalConfig, main
 from egovcp_deploy.scores import EpisodeScore
 from tests.support.models import toy_reactive
@@ -117,7 +117,7 @@ def test_results_do_not_depend_on_how_episodes_are_grouped(
             assert a["reward"] == pytest.approx(b["reward"], rel=1e-3, abs=1e-6)
 
 
-def test_a_sequence_is_played_by_all_and_its_parts_are_told_apart(
+def test_a_sequence_reports_the_success_of_each_part(
     tmp_path: Path, artifact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     best = {"action": [0.2] * ACTION_DIM, "reward_mean": 0.0, "success_rate": 0.5, "episodes": 9}
@@ -192,7 +192,7 @@ def test_one_artifact_is_played_by_every_objective(
     assert len(played(tmp_path / "out")["ball"]["planner"]) == 2
 
 
-def test_rewards_that_a_model_does_not_foresee_are_not_added_up(
+def test_objective_td_needs_a_model_with_a_reward_head(
     tmp_path: Path, artifact_dir: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = ["--controllers=planner", "--env.controller=stance", "--planner.objective=td"]
@@ -275,9 +275,9 @@ def test_int8_is_refused_before_any_work_where_it_cannot_be_used(
         assert {"evaluate": main, "deploy": deploy}[command]([*flags, *short]) == 5
     finally:
         library.library.cache_clear()
-    told = capsys.readouterr().err
-    assert "there is no C compiler" in told
-    assert "plan with --planner.backend=float32" in told
+    message = capsys.readouterr().err
+    assert "there is no C compiler" in message
+    assert "plan with --planner.backend=float32" in message
     assert not out.exists()
 
 
@@ -305,7 +305,7 @@ def _interrupt_at_group(monkeypatch: pytest.MonkeyPatch, number: int, signals: i
 
 
 @pytest.mark.parametrize("signals", [1, 2])
-def test_an_interrupted_evaluation_keeps_what_was_played(
+def test_an_interrupted_evaluation_keeps_complete_episodes(
     signals: int,
     tmp_path: Path,
     short: list[str],
@@ -339,7 +339,7 @@ def test_an_evaluation_interrupted_at_its_start_writes_no_figures(
     assert list((tmp_path / "out").iterdir()) == []
 
 
-def test_an_error_keeps_what_was_played_before_it(
+def test_an_error_keeps_complete_episodes(
     tmp_path: Path, short: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     original, groups = episodes.play, itertools.count(1)
@@ -359,7 +359,7 @@ def test_an_error_keeps_what_was_played_before_it(
 def test_episodes_that_have_ended_in_an_interrupted_group_count(config: EnvConfig) -> None:
     env, ticks = VectorEnv(config, 2, render_depth=False), itertools.count()
     scenarios = [Scenario("ball", 0, number) for number in range(2)]
-    toppled = reference("hold")
+    toppled = ReferencePolicy(reference("hold"), env, lambda: scenarios)
     advance = toppled.advance
 
     def push(sent: Any) -> None:
@@ -371,12 +371,12 @@ def test_episodes_that_have_ended_in_an_interrupted_group_count(config: EnvConfi
     assert (score.episode, score.terminated) == (1, True)
 
 
-def test_workers_that_are_stopped_give_up_what_they_play(config: EnvConfig) -> None:
+def test_stopped_workers_abandon_their_episodes(config: EnvConfig) -> None:
     received: list[int] = []
-    groups = [Group("hold", (Scenario("ball", 0, number),)) for number in range(40)]
-    with closing(Stage(Setup(config), 2, stopped=lambda: bool(received))) as stage:
+    groups = [EpisodeGroup("hold", (Scenario("ball", 0, number),)) for number in range(40)]
+    with closing(EpisodePool(EpisodeSetup(config), 2, stopped=lambda: bool(received))) as pool:
         played = []
-        for _, scores in stage.play(groups):
+        for _, scores in pool.play(groups):
             played += scores
             received.append(1)
     assert 1 <= len(played) < 40

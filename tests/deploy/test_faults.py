@@ -11,19 +11,20 @@ from numpy.typing import NDArray
 
 from egovcp.log.tick import CameraView, Tick
 from egovcp.plan import PolicyStep
-from egovcp.rate import FixedRate, LockstepClock
+from egovcp.rate import LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.spec import ACTION_DIM, ACTION_RATE_LIMIT
-from egovcp_deploy.pilot.desk import InlineDesk, Thinker
-from egovcp_deploy.pilot.states import Request, State
+from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
+from egovcp_deploy.pilot.states import OperatorRequest, State
 from egovcp_deploy.robots import ActionResult, RobotObservation
 from egovcp_deploy.robots.sim import SimRobot
-from egovcp_deploy.runner import Runner
+from egovcp_deploy.rollouts import LockstepRunner
 from egovcp_deploy.safety import HOLD_RATE
 from tests.support.sinks import MemorySink
 
 MS = 1_000_000
 TICK_MS = 40
+TICKS = 75
 
 
 class Steady:
@@ -82,7 +83,8 @@ class Disturbed:
         assert np.abs(action).max() <= 1.0
         self.tick += 1
         outcome = self._robot.act(action)
-        return replace(outcome, terminated=False)  # a real robot has no task that ends
+        # A real robot has no task that ends; the rollout ends after 3 s.
+        return replace(outcome, terminated=False, truncated=self.tick >= TICKS)
 
     def damp(self) -> None:
         self.damped_at = self.tick
@@ -99,7 +101,7 @@ def untouched(tick: int, sensed: RobotObservation, robot: SimRobot) -> RobotObse
 @pytest.fixture(scope="module")
 def sim() -> Iterator[SimRobot]:
     """Nothing is thrown, and an episode lasts 3 s."""
-    quiet = EpisodeConfig(ticks=75, event_ticks=(70, 70), empty_probability=1.0)
+    quiet = EpisodeConfig(ticks=TICKS, event_ticks=(70, 70), empty_probability=1.0)
     robot = SimRobot(EnvConfig(controller="stance", ball_episode=quiet), "ball", seed=0)
     yield robot
     robot.close()
@@ -110,12 +112,12 @@ def play(
     policy: Steady,
     tamper: Callable[[int, RobotObservation, SimRobot], RobotObservation] = untouched,
     delay_ms: Callable[[int], int] = lambda tick: 0,
-    operator: Callable[[int], Request | None] = lambda tick: None,
+    operator: Callable[[int], OperatorRequest | None] = lambda tick: None,
 ) -> tuple[list[Tick], Disturbed]:
     clock, robot, memory = LockstepClock(), Disturbed(sim, tamper), MemorySink()
-    desk = InlineDesk(Thinker(policy), clock, lambda tick: delay_ms(tick) * MS)
+    planner = InlinePlanner(PlannerRunner(policy), clock, lambda tick: delay_ms(tick) * MS)
     robot.start(0)
-    Runner(desk, robot, FixedRate(25, clock), max_ticks=75, operator=operator).run(memory)
+    LockstepRunner(planner, robot, clock, operator=operator).run(memory)
     return memory.ticks, robot
 
 
@@ -131,9 +133,7 @@ def assert_gentle(ticks: list[Tick]) -> None:
 
 
 @pytest.mark.parametrize("delay", [0, 20, 40, 60, 100, 200, 400])
-def test_a_planner_that_is_late_by_so_much_is_run_through_or_held(
-    sim: SimRobot, delay: int
-) -> None:
+def test_a_late_planner_is_bridged_or_held(sim: SimRobot, delay: int) -> None:
     ticks, robot = play(sim, Steady(), delay_ms=lambda tick: delay)
     assert_gentle(ticks)
     assert robot.damped_at == -1
@@ -210,7 +210,7 @@ def test_frozen_readings(sim: SimRobot, what: str, repeats: int, worst: State) -
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30, -1e30])
-def test_numbers_that_are_no_plan_are_never_sent(sim: SimRobot, value: float) -> None:
+def test_plans_that_are_not_finite_are_never_sent(sim: SimRobot, value: float) -> None:
     rng = np.random.default_rng(1)
     bad = rng.random(200) < 0.3
     ticks, robot = play(sim, Steady(broken=lambda k: value if bad[k] else None))
@@ -218,7 +218,7 @@ def test_numbers_that_are_no_plan_are_never_sent(sim: SimRobot, value: float) ->
     assert robot.damped_at == -1
 
 
-def test_nothing_but_nan_is_held(sim: SimRobot) -> None:
+def test_only_nan_plans_hold_the_robot(sim: SimRobot) -> None:
     ticks, _ = play(sim, Steady(broken=lambda k: np.nan))
     assert ticks[-1].mode == State.HOLD
     assert_gentle(ticks)
@@ -228,7 +228,7 @@ def test_a_robot_that_is_pushed_over_is_damped_within_60_ms_of_tilting(sim: SimR
     tilts: list[float] = []
 
     def push(tick: int, sensed: RobotObservation, robot: SimRobot) -> RobotObservation:
-        body = robot.env.lanes[0].robot
+        body = robot.env.instances[0].robot
         if tick == 20:
             body.data.qvel[:3] += (0.0, 3.0, 0.0)
             body.data.qvel[3:6] += (-4.0, 0.0, 0.0)
@@ -241,11 +241,11 @@ def test_a_robot_that_is_pushed_over_is_damped_within_60_ms_of_tilting(sim: SimR
     assert modes(ticks)[robot.damped_at :] == [State.DAMP] * (len(ticks) - robot.damped_at)
 
 
-def test_damped_motors_do_not_hold_the_robot_up_and_the_next_episode_is_whole(
+def test_a_damped_robot_sinks_and_the_next_episode_is_normal(
     sim: SimRobot,
 ) -> None:
     ticks, robot = play(
-        sim, Steady(0.0), operator=lambda tick: Request.ESTOP if tick == 10 else None
+        sim, Steady(0.0), operator=lambda tick: OperatorRequest.ESTOP if tick == 10 else None
     )
     assert robot.damped_at == 10
     assert ticks[-1].base is not None
@@ -256,8 +256,8 @@ def test_damped_motors_do_not_hold_the_robot_up_and_the_next_episode_is_whole(
     assert ticks[-1].base.position_w[2] > 0.7
 
 
-def test_the_operator_holds_and_goes_on(sim: SimRobot) -> None:
-    script = {20: Request.HOLD, 40: Request.RUN}
+def test_the_operator_holds_and_resumes(sim: SimRobot) -> None:
+    script = {20: OperatorRequest.HOLD, 40: OperatorRequest.RUN}
     ticks, _ = play(sim, Steady(), operator=script.get)
     assert modes(ticks)[19] == State.RUN
     assert modes(ticks)[20] == State.HOLD

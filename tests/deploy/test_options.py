@@ -17,9 +17,10 @@ from egovcp_deploy.evaluate import EvalConfig
 from egovcp_deploy.options import (
     check_choice,
     check_output_dir,
+    for_search,
+    held_out,
     make_output_dir,
 )
-from egovcp_deploy.scenarios import for_search, held_out
 
 
 def test_an_empty_folder_is_accepted_and_a_new_one_created(tmp_path: Path) -> None:
@@ -36,7 +37,6 @@ def test_a_folder_with_results_is_refused_by_name(tmp_path: Path) -> None:
     (tmp_path / "eval.json").write_text("{}")
     with pytest.raises(UsageError, match=r"eval\.json"):
         make_output_dir(str(tmp_path))
-    make_output_dir(str(tmp_path), reusable=("eval.json",))
 
 
 def test_missing_flag_and_file_in_the_way_are_refused(tmp_path: Path) -> None:
@@ -49,7 +49,7 @@ def test_missing_flag_and_file_in_the_way_are_refused(tmp_path: Path) -> None:
         make_output_dir("")
 
 
-def test_unknown_choices_name_the_near_one() -> None:
+def test_unknown_choices_suggest_the_closest_one() -> None:
     check_choice("--task", "ball", ("ball", "wall"))
     with pytest.raises(UsageError, match=r"--task=bal; did you mean 'ball'"):
         check_choice("--task", "bal", ("ball", "wall"))
@@ -72,7 +72,7 @@ def test_planner_options_change_only_what_they_name() -> None:
         PlannerOptions(min_std=-1).apply(own)
 
 
-def test_played_scenarios_are_never_collected_ones_and_search_sees_none_of_them() -> None:
+def test_scenario_seeds_of_collection_evaluation_and_search_are_disjoint() -> None:
     seeds = {held_out("ball", seed, 0).seed for seed in (0, 1, 10**8)}
     searched = {for_search("ball", seed, 0).seed for seed in (0, 1, 10**8)}
     assert min(seeds | searched) >= 10**9

@@ -1,4 +1,4 @@
-"""The statistics say what textbooks say."""
+"""Statistics of episodes and their tables."""
 
 from __future__ import annotations
 
@@ -7,13 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from egovcp_deploy.report import gains, summary, table
 from egovcp_deploy.scores import (
     EpisodeScore,
     reward_interval,
     reward_per_step,
     success_gain,
     summarise,
+    summary,
+    table,
 )
 
 
@@ -26,7 +27,7 @@ def test_reward_per_step_weighs_episodes_by_their_length() -> None:
     assert reward_per_step(scores) == pytest.approx(0.01)
 
 
-def test_the_reward_interval_covers_the_mean_about_as_often_as_it_says() -> None:
+def test_the_reward_interval_has_its_nominal_coverage() -> None:
     rng = np.random.default_rng(1)
     covered = 0
     for _ in range(60):
@@ -66,7 +67,7 @@ def test_the_table_has_one_aligned_line_per_controller() -> None:
     assert len({len(line) for line in lines}) == 1
 
 
-def test_parts_of_a_sequence_have_shares_of_their_own() -> None:
+def test_parts_of_a_sequence_have_success_rates() -> None:
     won = [replace(score(i, i > 1), parts={"arch": i > 0, "ball": i > 1}) for i in range(4)]
     figures = summary({"sequence": {"hold": won}}, 4)
     parts = figures["sequence"]["hold"]["parts"]
@@ -81,9 +82,3 @@ def test_parts_of_a_sequence_have_shares_of_their_own() -> None:
         ["-", "arch", "75.0%"],
         ["-", "ball", "50.0%"],
     ]
-
-
-def test_gains_compare_the_planner_with_every_reference() -> None:
-    played = {"ball": {"planner": [score(0, True)], "hold": [score(0, False)]}}
-    assert gains(played) == {"ball": {"hold": {"gain": 1.0, "ci95": [1.0, 1.0]}}}
-    assert gains({"ball": {"hold": [score(0, True)]}}) == {"ball": {}}

@@ -1,4 +1,4 @@
-"""A reading that is not a number: the run goes on, says so, counts it, and is not frozen after."""
+"""A state that is not finite is skipped, logged and counted, and the run continues."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from egovcp.spec import ACTION_DIM, STATE_DIM
 from egovcp.testing import toy_model
 from egovcp_deploy.deploy import main as deploy
 from egovcp_deploy.evaluate import main as evaluate
-from egovcp_deploy.live.link import encode_report
-from egovcp_deploy.live.operators import Auto
-from egovcp_deploy.live.planner import PlannerLoop
-from egovcp_deploy.pilot.desk import SKIPPED, Report, Thinker
+from egovcp_deploy.live.link import encode_observation
+from egovcp_deploy.live.operators import AutomaticOperator
+from egovcp_deploy.live.planner_loop import PlannerLoop
+from egovcp_deploy.pilot.planner import SKIPPED, ObservationMessage, PlannerRunner
 from tests.support.sinks import MemorySink
 
 BAD_TICK, TICK_NS = 5, 40_000_000
@@ -45,7 +45,7 @@ def one_nan(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("one_nan")
-def test_a_rollout_counts_it_and_goes_on(
+def test_a_rollout_counts_skipped_observations(
     tmp_path: Path, artifact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "out"
@@ -63,7 +63,7 @@ def test_a_rollout_counts_it_and_goes_on(
 
 
 @pytest.mark.usefixtures("one_nan")
-def test_an_evaluation_counts_it_for_the_robot_that_sensed_it(
+def test_an_evaluation_counts_skipped_observations_per_robot(
     tmp_path: Path, artifact_dir: Path, short: list[str], capsys: pytest.CaptureFixture[str]
 ) -> None:
     flags = [
@@ -99,17 +99,19 @@ class _Control:
             state[5] = np.nan if self._tick in self._bad else -1.0
             depth, sent = np.zeros((48, 64), np.uint16), np.zeros(ACTION_DIM)
             now, first = self._clock.now_ns(), self._tick == 0
-            yield encode_report(Report(self._tick, now, depth, state, sent, first, "run"))
+            yield encode_observation(
+                ObservationMessage(self._tick, now, depth, state, sent, first, "run")
+            )
             self._tick += 1
 
 
 @pytest.mark.parametrize("together", [1, 3])
-def test_the_live_planner_counts_it_also_where_it_did_not_plan(together: int) -> None:
+def test_the_live_planner_counts_skipped_observations(together: int) -> None:
     clock, sink = LockstepClock(), MemorySink()
-    thinker = Thinker(Policy(toy_model(), PLANNER, 1))
+    runner = PlannerRunner(Policy(toy_model(), PLANNER, 1))
     control = _Control(clock, {4, 8}, together)
-    operator = Auto((0.0, 0.0, 0.0), 0.0)
-    loop = PlannerLoop(thinker, control, operator, sink, clock, control.alive)  # type: ignore[arg-type]
+    operator = AutomaticOperator()
+    loop = PlannerLoop(runner, control, operator, sink, clock, control.alive)  # type: ignore[arg-type]
     summary = loop.run()
     assert summary.failure is None
     assert summary.skipped == 2

@@ -14,7 +14,7 @@ from egovcp.plan import Policy, PolicyStep
 from egovcp_deploy import episodes
 from egovcp_deploy.deploy import main as deploy
 from egovcp_deploy.evaluate import main as evaluate
-from egovcp_deploy.pilot import desk
+from egovcp_deploy.pilot import planner
 
 FIRST_PLAN_S, PLAN_S = 1.0, 0.008
 
@@ -31,7 +31,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> None:
         return act(self, *args)
 
     monkeypatch.setattr(Policy, "act", timed)
-    for module in (episodes, desk):
+    for module in (episodes, planner):
         monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: now[0]))
 
 

@@ -44,7 +44,7 @@ _EPISODES = re.compile(r"(episodes[=:] ?\"?0:)\d+")
 _ELSEWHERE = {
     "--backend=ray": "tests/collect/test_cluster.py",
     "--robot.type=unitree_g1": "tests/deploy/robots/test_fake_command.py",
-    "--realtime": "tests/deploy/live/test_run.py",
+    "--realtime": "tests/deploy/live/test_drive.py",
     "--controllers=planner,ppo": "tests/experiment/test_ppo.py",
     "egovcp-dataset audit": "tests/collect/dataset/test_audit.py",
 }

@@ -1,25 +1,24 @@
-"""The 50 Hz loop beneath the planner: read the body, judge, command the motors. It never waits.
+"""The 50 Hz control loop: read the body, update the state machine, command the motors.
 
-Every second control tick t is a planner tick: o_t goes to the planner, whose plan is taken as soon
-as it is there, at the latest when o_{t+1} is due. So an action takes effect one or two control
-ticks after its observation, as it did in the data.
+Every second control tick is a planner tick t: o_t goes to the planner, whose plan is taken as soon
+as it arrives, at the latest when o_{t+1} is due. So an action takes effect one or two control ticks
+after its observation, as in the training data. The loop never blocks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot.controllers import LowLevelController
-from egovcp.spec import ACTION_BOX, CONTROLLER_TICKS_PER_PLAN
-from egovcp_deploy.live import motors
+from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
+from egovcp.spec import ACTION_BOX, CONTROLLER_TICKS_PER_PLAN, NUM_JOINTS
 from egovcp_deploy.pilot.motor_watch import MotorVerdict, MotorWatch
 from egovcp_deploy.pilot.pilot import Pilot
-from egovcp_deploy.pilot.states import Request, State
-from egovcp_deploy.pilot.velocity import VelocityCommand
+from egovcp_deploy.pilot.states import Facts, OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import (
     DepthCamera,
     LowLevelRobot,
@@ -30,33 +29,82 @@ from egovcp_deploy.robots.base import (
 
 Array = NDArray[np.float64]
 
-_BLIND: Final = np.zeros((48, 64), np.uint16)
+#: N m s/rad in DAMP: legs and waist let a standing robot sink in about a second.
+DAMPED: Final = np.concatenate([np.full(15, 8.0), np.full(NUM_JOINTS - 15, 2.0)])
+#: Bounds of vx, vy (m/s) and yaw rate (rad/s) in the heading frame, and of their change per s.
+VELOCITY_LOW: Final = (-0.3, -0.2, -0.5)
+VELOCITY_HIGH: Final = (0.6, 0.2, 0.5)
+VELOCITY_RAMP: Final = (1.0, 1.0, 2.0)
+_VELOCITY_TIMEOUT_S: Final = 0.5  # an older target counts as zero
+_MIDDLE: Final = (TARGET_LOW + TARGET_HIGH) / 2
+_NO_IMAGE: Final = np.zeros((48, 64), np.uint16)
+_NO_COMMAND: Final = OperatorCommand()
 
 
-class Wishes(NamedTuple):
-    """What the operator wants at a control tick."""
+# --- motor commands: all targets are finite and within `TARGET_LOW` and `TARGET_HIGH` -----------
+def _bounded(position: NDArray[np.floating]) -> Array:
+    """(29,) rad; numbers that are not finite become the middle of the joint's range."""
+    p = np.asarray(position, np.float64)
+    return np.clip(np.where(np.isfinite(p), p, _MIDDLE), TARGET_LOW, TARGET_HIGH)
 
-    request: Request | None = None
-    velocity: tuple[float, float, float] | None = None
-    """vx, vy (m/s), yaw rate (rad/s); None: nothing new."""
+
+def damping_command(position: NDArray[np.floating] | None, mode: int) -> MotorCommand:
+    """Damping without stiffness; ``position`` (29,) rad of the joints, None: unknown."""
+    where = np.zeros(NUM_JOINTS) if position is None else position
+    return MotorCommand(_bounded(where), np.zeros(NUM_JOINTS), DAMPED, mode)
 
 
-NOTHING: Final = Wishes()
+def position_command(target: Array, stiffness: Array, damping: Array, mode: int) -> MotorCommand:
+    """Full gains towards ``target`` (29,) rad."""
+    return MotorCommand(_bounded(target), stiffness, damping, mode)
+
+
+def ramp_command(
+    start: Array, target: Array, stiffness: Array, damping: Array, share: float, mode: int
+) -> MotorCommand:
+    """Ramp of the gains: at ``share`` 0 damped at ``start``, at 1 `position_command`."""
+    share = min(max(share, 0.0), 1.0)
+    position = (1 - share) * _bounded(start) + share * _bounded(target)
+    return MotorCommand(position, share * stiffness, (1 - share) * DAMPED + share * damping, mode)
+
+
+# --- base velocity -----------------------------------------------------------------------
+class VelocityCommand:
+    """The operator's base velocity: bounded, ramped, and zero when the operator falls silent."""
+
+    def __init__(self) -> None:
+        self._target: Array = np.zeros(3)
+        self._target_ns: int | None = None
+        self._command: Array = np.zeros(3)
+        self._last_ns: int | None = None
+
+    def set_target(self, time_ns: int, velocity: NDArray[np.floating] | tuple[float, ...]) -> None:
+        """Request ``velocity`` (3,); one of another shape or not finite is ignored."""
+        target = np.asarray(velocity, np.float64)
+        if target.shape == (3,) and np.isfinite(target).all():
+            self._target = np.clip(target, VELOCITY_LOW, VELOCITY_HIGH)
+            self._target_ns = time_ns
+
+    def at(self, time_ns: int, allowed: bool = True) -> Array:
+        """(3,) the velocity to command now; ``allowed``: whether the robot may move."""
+        timeout_ns = _VELOCITY_TIMEOUT_S * 1e9
+        silent = self._target_ns is None or time_ns - self._target_ns > timeout_ns
+        target = np.zeros(3) if silent or not allowed else self._target
+        elapsed = 0.0 if self._last_ns is None else max(0.0, (time_ns - self._last_ns) / 1e9)
+        step = np.asarray(VELOCITY_RAMP) * elapsed
+        self._command = self._command + np.clip(target - self._command, -step, step)
+        self._last_ns = time_ns
+        return self._command.copy()
 
 
 class ControlLoop:
-    """One robot's loop; `tick` is called at 50 Hz.
+    """The loop of one robot; call `tick` at 50 Hz.
 
     Args:
-        body: motors and IMU.
-        eye: depth camera.
-        controller: turns commands into joint targets.
-        pilot: the state machine and the way to the planner.
-        velocity: bounds on what the operator may ask for.
-        refusal: why the robot must not be armed; asked at every tick, empty: nothing.
+        refusal: why the robot must not be armed, called at every tick; empty: no reason.
         fault: why the motors must be damped, likewise.
-        skipped: what was wrong with the readings since the newest that was used, likewise.
-        link: figures about the connection for the log, `Tick.link`; asked at every planner tick.
+        skipped: fault of the readings rejected since the last valid one, likewise.
+        link: `Tick.link` for the log, called at every planner tick.
     """
 
     def __init__(
@@ -65,7 +113,6 @@ class ControlLoop:
         eye: DepthCamera,
         controller: LowLevelController,
         pilot: Pilot,
-        velocity: VelocityCommand | None = None,
         refusal: Callable[[], str] = lambda: "",
         fault: Callable[[], str] = lambda: "",
         skipped: Callable[[], str] = lambda: "",
@@ -74,107 +121,102 @@ class ControlLoop:
         self._body, self._eye = body, eye
         self._controller = controller
         self.pilot = pilot
-        self._velocity = velocity or VelocityCommand()
         self._refusal, self._fault, self._skipped = refusal, fault, skipped
         self._link = link
+        self._velocity = VelocityCommand()
         self._motor_watch = MotorWatch()
         self._command: MotorCommand | None = None  # the last one written
         self._count = 0
-        self._open = False  # o_t is out, a_t is not decided
+        self._pending = False  # o_t has been sent, a_t is not decided
         self._reading: LowState | None = None
-        self._rising_from: Array | None = None
-        self._moving: Array = np.zeros(3)
+        self._ramp_start: Array | None = None
 
     @property
     def state(self) -> State:
-        """Where the state machine is."""
+        """State of the state machine."""
         return self.pilot.supervisor.state
 
-    def tick(self, now_ns: int, wishes: Wishes = NOTHING) -> None:
-        """One control tick at ``now_ns``; the motors are told something in every one."""
-        reading, picture = self._read(), self._eye.read()
-        self._close_planner_tick(now_ns)
-        self._steer(now_ns, wishes)
-        sent = np.concatenate([self._moving, ACTION_BOX.to_metric(self.pilot.sent)])
+    def tick(self, now_ns: int, command: OperatorCommand = _NO_COMMAND) -> None:
+        """One control tick at ``now_ns``; it always writes a motor command."""
+        reading, image = self._read(), self._eye.read()
+        planner_tick = self._count % CONTROLLER_TICKS_PER_PLAN == 0
+        self.pilot.receive_plans(now_ns)
+        if self._pending and (planner_tick or self.pilot.has_plan):
+            self.pilot.next_action()
+            self._pending = False
+        if command.velocity is not None:
+            self._velocity.set_target(now_ns, command.velocity)
+        velocity = self._velocity.at(now_ns, allowed=self.state is State.RUN)
+        sent = np.concatenate([velocity, ACTION_BOX.to_metric(self.pilot.sent)])
         state = None if reading is None else proprioception(reading, sent)
-        depth = None if picture is None else picture.depth
+        depth = None if image is None else image.depth
         state_ns = None if reading is None else reading.time_ns
-        depth_ns = None if picture is None else picture.time_ns
-        self.pilot.sense(now_ns, state, depth, state_ns, depth_ns)
+        self.pilot.sense(now_ns, state, depth, state_ns, None if image is None else image.time_ns)
         before = self.state
-        self._judge(now_ns, wishes.request, reading)
-        if state is not None and self._count % CONTROLLER_TICKS_PER_PLAN == 0:
-            seen = _BLIND if depth is None else depth
-            events = self.pilot.events()
-            reported = None if reading is None else reading.motors
-            self.pilot.report(
-                now_ns, seen, state.astype(np.float32), events, reported, self._link(now_ns)
+        self._update_state(now_ns, command.request, reading)
+        if reading is not None and state is not None and planner_tick:
+            self.pilot.send_observation(
+                now_ns,
+                _NO_IMAGE if depth is None else depth,
+                state.astype(np.float32),
+                self.pilot.take_events(),
+                reading.motors,
+                self._link(now_ns),
             )
-            self._open = True
-        self._command = self._motors(now_ns, before, reading, state)
+            self._pending = True
+        self._command = self._motor_command(now_ns, before, reading, state)
         self._body.write(self._command)
         self._count += 1
 
-    def _judge(self, now_ns: int, request: Request | None, reading: LowState | None) -> None:
-        """Move the state machine on by what the motors report and the operator wants."""
-        verdict = MotorVerdict()
-        if reading is not None:
-            standing = self.state not in (State.INIT, State.DAMP)
-            verdict = self._motor_watch.update(reading, self._command, standing)
-        self.pilot.note(verdict.events)
-        self.pilot.judge(
-            now_ns,
-            request,
-            refusal=self._refusal() or verdict.refusal,
-            hold=verdict.hold,
-            damp=self._fault() or verdict.damp,
-            skipped=self._skipped(),
-        )
-
     def _read(self) -> LowState | None:
-        """The newest reading that is all numbers; a broken one would poison the controller."""
+        """The newest finite reading; others would corrupt the state of the controller."""
         reading = self._body.read()
         if reading is not None and is_finite(reading):
             self._reading = reading
         return self._reading
 
-    def _close_planner_tick(self, now_ns: int) -> None:
-        """Take the plan if it is there, or do without once the next observation is due."""
-        self.pilot.collect(now_ns)
-        due = self._count % CONTROLLER_TICKS_PER_PLAN == 0
-        if self._open and (due or self.pilot.answered):
-            self.pilot.decide()
-            self._open = False
+    def _update_state(
+        self, now_ns: int, request: OperatorRequest | None, reading: LowState | None
+    ) -> None:
+        verdict = MotorVerdict()
+        if reading is not None:
+            standing = self.state not in (State.INIT, State.DAMP)
+            verdict = self._motor_watch.update(reading, self._command, standing)
+        self.pilot.add_events(verdict.events)
+        facts = Facts(
+            now_ns,
+            refusal=self._refusal() or verdict.refusal,
+            hold=verdict.hold,
+            damp=self._fault() or verdict.damp,
+            skipped=self._skipped(),
+        )
+        self.pilot.update_state(facts, request)
 
-    def _steer(self, now_ns: int, wishes: Wishes) -> None:
-        if wishes.velocity is not None:
-            self._velocity.wish(now_ns, wishes.velocity)
-        self._moving = self._velocity.at(now_ns, allowed=self.state is State.RUN)
-
-    def _motors(
+    def _motor_command(
         self, now_ns: int, before: State, reading: LowState | None, state: Array | None
     ) -> MotorCommand:
-        mode = 0 if reading is None else reading.mode
-        position = None if reading is None else reading.joint_position
-        if self.state in (State.INIT, State.DAMP) or state is None or position is None:
-            return motors.damped(position, mode)
+        if reading is None or state is None:
+            return damping_command(None, 0)
+        position, mode = reading.joint_position, reading.mode
+        if self.state in (State.INIT, State.DAMP):
+            return damping_command(position, mode)
         if self.state is State.STAND and before is not State.STAND:
-            self._rising_from = np.array(position)
+            self._ramp_start = np.array(position)
             self._controller.reset(state[None])
         target = self._controller.step(state[None])[0]
         if not np.isfinite(target).all():
-            self.pilot.judge(now_ns, controller_ok=False)
-            return motors.damped(position, mode)
+            self.pilot.update_state(Facts(now_ns, controller_ok=False))
+            return damping_command(position, mode)
         gains = self._controller.stiffness, self._controller.damping
-        if self.state is State.STAND and self._rising_from is not None:
+        if self.state is State.STAND and self._ramp_start is not None:
             supervisor = self.pilot.supervisor
             share = supervisor.time_in_state_s(now_ns) / supervisor.limits.stand_s
-            return motors.coming_in(self._rising_from, target, *gains, share, mode)
-        return motors.following(target, *gains, mode)
+            return ramp_command(self._ramp_start, target, *gains, share, mode)
+        return position_command(target, *gains, mode)
 
 
 def is_finite(reading: LowState) -> bool:
-    """Whether a reading is all numbers, with a quaternion that is a rotation."""
+    """Whether a reading is finite and its quaternion a rotation."""
     q = np.asarray(reading.quaternion_w)
     parts = (reading.joint_position, reading.joint_velocity, reading.angular_velocity)
     return abs(float(q @ q) - 1.0) < 0.1 and all(np.isfinite(part).all() for part in parts)

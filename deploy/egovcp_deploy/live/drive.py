@@ -1,8 +1,9 @@
-"""`egovcp-deploy` on the wall clock: a G1 behind LeRobot's bridge, or the fake of one."""
+"""`egovcp-deploy` on the wall clock: a G1 behind LeRobot's bridge, or a simulated one."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
@@ -12,132 +13,117 @@ import torch
 from tqdm import tqdm
 
 from egovcp.artifact import Artifact
-from egovcp.errors import EgovcpError, SafetyStop, UsageError
+from egovcp.errors import EgovcpError, SafetyStop
 from egovcp.files import write_json
 from egovcp.hardware import available_cores
-from egovcp.log.tick import CameraView, RunInfo, Tick
+from egovcp.log.sink import Sink
+from egovcp.log.tick import RunInfo, Tick
+from egovcp.rate import MonotonicClock
 from egovcp.robot.controllers import make_controller
 from egovcp.terminal import echo, one_line
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.hardware import CAMERAS, REALSENSE, HardwareOptions
-from egovcp_deploy.live.operators import OPERATORS, operator
-from egovcp_deploy.live.planner import LiveSummary, failure_words
-from egovcp_deploy.live.run import LiveSetup, run_live
-from egovcp_deploy.live.simulated import simulated
-from egovcp_deploy.options import check_choice, make_output_dir
-from egovcp_deploy.pilot.desk import Thinker
-from egovcp_deploy.pilot.states import Limits
+from egovcp_deploy.live.hardware import ControlSetup, HardwareOptions
+from egovcp_deploy.live.operators import Operator, open_operator
+from egovcp_deploy.live.planner_loop import LiveSummary, PlannerLoop, describe_failure
+from egovcp_deploy.live.processes import running_control, simulated_robot, stop_control
+from egovcp_deploy.options import make_output_dir
+from egovcp_deploy.pilot.planner import PlannerRunner
 from egovcp_deploy.policy import backend_of
-from egovcp_deploy.recording import missing_ticks, recording, run_info
-from egovcp_deploy.robots.realsense_camera import require_realsense
+from egovcp_deploy.recording import missing_ticks, provenance, recording, run_info
 
-SIMULATED_S: Final = 15.0  # in RUN: the crane lets go, the robot settles, the episode
-
-
-def check_live(config: DeployConfig) -> None:
-    """Refuse options that make no sense on the wall clock.
-
-    Raises:
-        UsageError: names the option.
-        MissingPackage: the driver of the camera is not installed.
-    """
-    check_choice("--operator.type", config.operator.type, OPERATORS)
-    check_choice("--robot.camera.type", config.robot.camera.type, CAMERAS)
-    if config.robot.camera.type == REALSENSE:
-        require_realsense()
-    if not np.isfinite(config.operator.velocity).all():
-        raise UsageError(f"--operator.velocity={config.operator.velocity}: expected numbers")
-    if not config.operator.duration >= 0:
-        raise UsageError(f"--operator.duration={config.operator.duration}: expected s from 0")
+SIMULATED_S: Final = 15.0  # in RUN: release from the crane, settling, the episode
 
 
 def drive(config: DeployConfig, artifact: Artifact) -> None:
-    """One run of a robot, recorded as rollout 0.
-
-    Raises:
-        ArtifactError: the artifact is not made for the low-level controller.
-        EnvironmentFailure: robot, camera or disk fail.
-        SafetyStop: the motors were damped for safety.
-    """
+    """One run of a robot, recorded as rollout 0; raises as `deploy`."""
     hardware = HardwareOptions(config.robot.bridge, config.robot.camera)
-    folder = _prepare(config, artifact)
+    artifact.require_controller(make_controller(config.robot.controller).id)
+    folder = make_output_dir(config.output_dir)
     stays = config.operator.type != "auto" or not config.operator.duration
-    _run(config, artifact, folder, LiveSetup(hardware, *_how(config), stays))
+    _run(config, artifact, folder, hardware, stays=stays, stands=True)
 
 
 def drive_simulated(config: DeployConfig, artifact: Artifact) -> None:
-    """The same with the simulator on the wall clock, for one episode.
-
-    Raises:
-        ArtifactError, EnvironmentFailure, SafetyStop: as `drive`.
-    """
-    operator_options = config.operator
-    if operator_options.type == "auto" and not operator_options.duration:
-        operator_options = replace(operator_options, duration=SIMULATED_S)
+    """One episode of the simulated robot on the wall clock; raises as `deploy`."""
+    operator = config.operator
+    if operator.type == "auto" and not operator.duration:
+        operator = replace(operator, duration=SIMULATED_S)
     robot = replace(config.robot, controller=config.env.controller)
-    config = replace(config, robot=robot, operator=operator_options)
-    folder = _prepare(config, artifact)
-    with simulated(config, folder / "task.json") as hardware:
-        _run(config, artifact, folder, LiveSetup(hardware, *_how(config), False, simulated=True))
-
-
-def _prepare(config: DeployConfig, artifact: Artifact) -> Path:
+    config = replace(config, robot=robot, operator=operator)
     artifact.require_controller(make_controller(config.robot.controller).id)
-    return make_output_dir(config.output_dir)
+    folder = make_output_dir(config.output_dir)
+    with simulated_robot(config, folder / "task.json") as hardware:
+        _run(config, artifact, folder, hardware, stays=False, stands=False)
 
 
-def _how(config: DeployConfig) -> tuple[str, Limits]:
-    return config.robot.controller, config.robot.limits
-
-
-def _run(config: DeployConfig, artifact: Artifact, folder: Path, setup: LiveSetup) -> None:
-    controller_id = make_controller(setup.controller).id
-    _leave_a_core()
+def _run(
+    config: DeployConfig,
+    artifact: Artifact,
+    folder: Path,
+    hardware: HardwareOptions,
+    stays: bool,
+    stands: bool,
+) -> None:
+    """Drive, report, raise what ended the run early; ``stays``, ``stands``: see `PlannerLoop`."""
+    if "OMP_NUM_THREADS" not in os.environ:
+        # The control process and the logs need a core: planning threads that wait for one that was
+        # preempted are slower than fewer threads.
+        torch.set_num_threads(max(1, available_cores() - 1))
     policy = artifact.make_policy(1, config.seed)
-    thinker = Thinker(policy, config.imagine)
-    thinker.warm_up()
-    info = run_info(
-        config.task,
-        config.seed,
-        0,
-        CameraView(),
-        config.encoded(),
-        controller_id,
-        artifact,
-        backend_of(policy),
-    )
+    runner = PlannerRunner(policy, config.imagine)
+    runner.warm_up()
+    controller_id = make_controller(config.robot.controller).id
+    info = run_info(config, controller_id, artifact, backend_of(policy))
+    setup = ControlSetup(hardware, config.robot.controller, config.robot.limits)
     try:
-        summary = _drive(config, folder, setup, thinker, info)
+        with (
+            open_operator(config.operator) as operator,
+            recording(folder, 0, info, config.log, blocking=False) as sink,
+            tqdm(unit="tick", desc="live") as bar,
+        ):
+            summary = run_live(
+                setup, runner, operator, sink, lambda tick: _show(bar, tick), stays, stands
+            )
+        summary.missing_ticks = missing_ticks(sink)
     except EgovcpError:
-        _clear(folder)
+        for path in folder.glob("rollout-0.*"):  # so that the same command can be repeated
+            path.unlink()
         raise
-    write_json(folder / "deploy.json", _report(config, artifact, info, summary))
-    _print(summary, info.backend, folder)
-    _judge(summary, folder)
+    report = _report(config, summary) | provenance(config, controller_id, artifact, info.backend)
+    write_json(folder / "deploy.json", report)
+    _print(summary, info, folder)
+    _raise_failure(summary, folder)
 
 
-def _drive(
-    config: DeployConfig, folder: Path, setup: LiveSetup, thinker: Thinker, info: RunInfo
+def run_live(
+    setup: ControlSetup,
+    runner: PlannerRunner,
+    operator: Operator,
+    sink: Sink,
+    on_tick: Callable[[Tick], None],
+    stays: bool,
+    stands: bool,
 ) -> LiveSummary:
-    options = config.operator
-    with (
-        operator(options.type, options.velocity, options.duration, options.gamepad) as who,
-        recording(folder, 0, info, config.log, waits=False) as sink,
-        tqdm(unit="tick", desc="live") as bar,
-    ):
-        summary = run_live(setup, thinker, who, sink, lambda tick: _show(bar, tick))
-    summary.missing_ticks = missing_ticks(sink)
-    return summary
+    """Drive the robot until the operator ends the run or its motors are damped; raises
+    `EnvironmentFailure` if the robot does not answer or the control process does not start."""
+    with running_control(setup) as control:
+        process, watchdog = control.process, control.watchdog
+        loop = PlannerLoop(
+            runner, control.link, operator, sink, MonotonicClock(), process.is_alive, stays, stands
+        )
+        watchdog.expected = lambda: loop.quitting
+        summary = loop.run(on_tick)
+        stop_control(process, loop)
+        watchdog.join_if_ended()
+        if watchdog.acted and summary.ticks:
+            summary.damped = f"the control process died (exit code {process.exitcode})"
+        elif not summary.ticks and summary.failure is None:
+            control.check_alive()
+        return summary
 
 
-def _clear(folder: Path) -> None:
-    """Take back the logs of a run that did not begin, so that the same command can be repeated."""
-    for path in folder.glob("rollout-0.*"):
-        path.unlink()
-
-
-def _judge(summary: LiveSummary, folder: Path) -> None:
-    """Raise what kept the run from coming to its own end."""
+def _raise_failure(summary: LiveSummary, folder: Path) -> None:
+    """Raise what ended the run early, if anything."""
     if summary.damped:
         raise SafetyStop(
             f"the motors were damped: {summary.damped}. The log is in {folder}; "
@@ -147,16 +133,9 @@ def _judge(summary: LiveSummary, folder: Path) -> None:
         raise summary.failure
     if summary.failure is not None:
         raise SafetyStop(
-            f"the planner failed and the robot was held: {failure_words(summary.failure)}. The log "
-            f"is in {folder}; --debug prints the traceback"
+            f"the planner failed and the robot was held: {describe_failure(summary.failure)}. The "
+            f"log is in {folder}; --debug prints the traceback"
         ) from summary.failure
-
-
-def _leave_a_core() -> None:
-    """Plan on all cores but one, which the control process and the logs need: threads that wait
-    for one that was put aside plan slower than fewer threads."""
-    if "OMP_NUM_THREADS" not in os.environ:
-        torch.set_num_threads(max(1, available_cores() - 1))
 
 
 def _show(bar: Any, tick: Tick) -> None:
@@ -167,10 +146,8 @@ def _show(bar: Any, tick: Tick) -> None:
     bar.update(1)
 
 
-def _report(
-    config: DeployConfig, artifact: Artifact, info: RunInfo, summary: LiveSummary
-) -> dict[str, Any]:
-    """Content of ``deploy.json``."""
+def _report(config: DeployConfig, summary: LiveSummary) -> dict[str, Any]:
+    """Content of ``deploy.json`` besides its `provenance`."""
     return {
         "robot": config.robot.type,
         "ticks": summary.ticks,
@@ -184,13 +161,8 @@ def _report(
         "iterations_mean": float(np.mean(summary.iterations or [0])),
         "missing_ticks": summary.missing_ticks,
         "damped": summary.damped,
-        "failure": "" if summary.failure is None else failure_words(summary.failure),
+        "failure": "" if summary.failure is None else describe_failure(summary.failure),
         "events": summary.events,
-        "config": config.encoded(),
-        "artifact": artifact.manifest["files"],
-        "low_level_controller": info.hashes["low_level_controller"],
-        "backend": info.backend,
-        "versions": dict(info.versions),
     }
 
 
@@ -199,12 +171,12 @@ def _percentiles(name: str, values: list[float]) -> dict[str, float]:
     return {f"{name}_p50": float(p50), f"{name}_p99": float(p99)}
 
 
-def _print(summary: LiveSummary, backend: str, folder: Path) -> None:
+def _print(summary: LiveSummary, info: RunInfo, folder: Path) -> None:
     latency = _percentiles("ms", summary.latency_ms)
     echo(
         f"{summary.ticks} ticks, {summary.running} running, {summary.held} held; observation to "
         f"plan {latency['ms_p50']:.0f} ms, p99 {latency['ms_p99']:.0f}, {summary.late} late; plans "
-        f"computed by {backend}"
+        f"computed by {info.backend}"
         + (f"; {summary.skipped} observations skipped" if summary.skipped else "")
     )
     echo(f"look at it:  rerun {folder / 'rollout-0.rrd'}")

@@ -1,27 +1,25 @@
-"""Body and camera of a robot on the wall clock, from the options that name them."""
+"""Connections to body and camera of a robot on the wall clock, and the options that select them."""
 
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
-from typing import Final
+from typing import Literal
 
+from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
 from egovcp_deploy.robots.realsense_camera import RealSenseConfig, RealSenseDepthCamera
 from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig, ZmqDepthCamera
 
-REALSENSE: Final = "realsense"
-CAMERAS: Final = ("server", REALSENSE)
-
 
 @dataclass(frozen=True)
 class CameraOptions:
-    """Which depth camera."""
+    """The depth camera."""
 
-    type: str = "server"
-    """server: one that sends pictures, egovcp-depth-server or egovcp-fake-g1. realsense: one at
-    this machine."""
+    type: Literal["server", "realsense"] = "server"
+    """server: a camera server, egovcp-depth-server or egovcp-fake-g1. realsense: a RealSense
+    camera connected to this machine."""
     server: ZmqCameraConfig = field(default_factory=ZmqCameraConfig)
-    """Where the server is."""
+    """Address of the server."""
     realsense: RealSenseConfig = field(default_factory=RealSenseConfig)
     """Which RealSense camera."""
 
@@ -37,6 +35,17 @@ class HardwareOptions:
 
 
 @dataclass(frozen=True)
+class ControlSetup:
+    """Configuration of the control process; picklable."""
+
+    hardware: HardwareOptions
+    controller: str  # low-level controller, see `make_controller`
+    limits: Limits
+    address: str = ""  # of the link to the planner's process; set when the process is started
+    parent: int = 0  # process id of the planner; set when the process is started
+
+
+@dataclass(frozen=True)
 class Hardware:
     """What the control loop reads and writes."""
 
@@ -44,30 +53,26 @@ class Hardware:
     eye: ZmqDepthCamera | RealSenseDepthCamera
 
     def link(self, now_ns: int) -> dict[str, float]:
-        """How the messages of the last second arrived, for the log: `Tick.link`."""
+        """Statistics of the messages of the last second, for the log: `Tick.link`."""
         states, images = self.body.arrivals.stats(now_ns), self.eye.arrivals.stats(now_ns)
-        reading, picture = self.body.read(), self.eye.read()
-        found = {
+        reading, image = self.body.read(), self.eye.read()
+        figures = {
             "mode_machine": 0.0 if reading is None else float(reading.mode),
             **{f"state_{name}": value for name, value in asdict(states).items()},
             **{f"image_{name}": value for name, value in asdict(images).items()},
         }
-        if picture is not None and picture.captured_ns is not None:
-            found["image_age_ms"] = (now_ns - picture.captured_ns) / 1e6
-        return found
+        if image is not None and image.captured_ns is not None:
+            figures["image_age_ms"] = (now_ns - image.captured_ns) / 1e6
+        return figures
 
     def close(self) -> None:
-        """Let go of both."""
+        """Close both connections."""
         self.eye.close()
         self.body.close()
 
 
 def open_hardware(options: HardwareOptions) -> Hardware:
-    """Connect to both.
-
-    Raises:
-        EnvironmentFailure: one does not answer.
-    """
+    """Connect to body and camera; raises `EnvironmentFailure` if one does not answer."""
     body = BridgeRobot(options.bridge)
     body.connect()
     try:
@@ -78,12 +83,8 @@ def open_hardware(options: HardwareOptions) -> Hardware:
 
 
 def open_eye(options: CameraOptions) -> ZmqDepthCamera | RealSenseDepthCamera:
-    """Connect to the camera.
-
-    Raises:
-        EnvironmentFailure: it does not answer.
-    """
-    if options.type == REALSENSE:
+    """Connect to the camera; raises `EnvironmentFailure` if it does not answer."""
+    if options.type == "realsense":
         return RealSenseDepthCamera.connect(options.realsense)
     eye = ZmqDepthCamera(options.server)
     eye.connect()

@@ -1,165 +1,128 @@
-"""Between the control process and the planner process: messages of numbers, never code.
+"""Messages between the control process and the planner's process: numbers and text, never code.
 
-A message is one JSON header and the raw bytes of its arrays. Neither end ever waits for the
-other: what cannot be sent at once is dropped, and what arrives damaged is dropped too.
+A message is one JSON header and the raw bytes of its arrays. Neither end waits for the other:
+messages that cannot be sent at once, or arrive damaged, are dropped.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
-from typing import Any, Final
+from collections.abc import Iterator, Sequence
+from typing import Final
 
 import numpy as np
 import zmq
-from numpy.typing import NDArray
 
 from egovcp.log.tick import MotorReadings
 from egovcp.plan import PolicyStep
 from egovcp.spec import ACTION_DIM, DEPTH_COLS, DEPTH_ROWS, NUM_JOINTS, STATE_DIM
-from egovcp_deploy.pilot.desk import BACKLOG, Reply, Report
-from egovcp_deploy.pilot.states import Request
+from egovcp_deploy.pilot.planner import BACKLOG, ObservationMessage, PlanMessage
+from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest
 
-_REPLY_PARTS: Final = 2
-_MOST_RECEIVED: Final = 4 * BACKLOG  # messages per call
+#: Field of `MotorReadings` -> type on the wire.
+_MOTOR_DTYPES: Final = {
+    "torque": "<f8",
+    "temperature": "<f8",
+    "faults": "<i8",
+    "lost": "<i8",
+    "enabled": "?",
+}
+_PLAN_PARTS: Final = 2
+_MAX_RECEIVED: Final = 4 * BACKLOG  # messages per call
+_DAMAGED: Final = (ValueError, LookupError, TypeError, AttributeError, OverflowError)
 
 
-@dataclass(frozen=True)
-class Order:
-    """What the operator wants, sent from the planner's process, where the keyboard is."""
-
-    request: Request | None = None
-    velocity: tuple[float, float, float] | None = None
-    quit: bool = False
-    """End the control process; it damps the motors first."""
-
-
-def encode_report(report: Report) -> list[bytes]:
-    """One observation."""
+def encode_observation(observation: ObservationMessage) -> list[bytes]:
+    """Encode one observation."""
+    motors = observation.motors
+    reported = [name for name in _MOTOR_DTYPES if getattr(motors, name, None) is not None]
     header = {
-        "tick": report.tick,
-        "time_ns": report.time_ns,
-        "first": report.first,
-        "mode": report.mode,
-        "events": report.events,
-        "link": dict(report.link),
-        "motors": None,
+        "tick": observation.tick,
+        "time_ns": observation.time_ns,
+        "first": observation.first,
+        "mode": observation.mode,
+        "events": observation.events,
+        "link": dict(observation.link),
+        "motors": reported,
     }
-    motors: NDArray[np.float64] = np.zeros(0)
-    if report.motors is not None:
-        header["motors"], motors = _pack_motors(report.motors)
-    arrays = (
-        np.ascontiguousarray(report.depth, "<u2"),
-        np.ascontiguousarray(report.state, "<f4"),
-        np.ascontiguousarray(report.sent, "<f8"),
-        np.ascontiguousarray(motors, "<f8"),
-    )
+    arrays = [
+        np.ascontiguousarray(observation.depth, "<u2"),
+        np.ascontiguousarray(observation.state, "<f4"),
+        np.ascontiguousarray(observation.sent, "<f8"),
+        *(np.ascontiguousarray(getattr(motors, name), _MOTOR_DTYPES[name]) for name in reported),
+    ]
     return [json.dumps(header).encode(), *(array.tobytes() for array in arrays)]
 
 
-def decode_report(parts: Sequence[bytes]) -> Report | None:
-    """The inverse; None for anything else."""
+def decode_observation(parts: Sequence[bytes]) -> ObservationMessage | None:
+    """Inverse of `encode_observation`; None: damaged, or another message."""
     try:
-        raw, depth, state, sent, motors = parts
+        raw, depth, state, sent, *motors = parts
         header = json.loads(raw)
-        return Report(
+        reported = {
+            name: np.frombuffer(part, _MOTOR_DTYPES[name]).reshape(
+                (NUM_JOINTS, -1) if name == "temperature" else NUM_JOINTS
+            )
+            for name, part in zip(header["motors"], motors, strict=True)
+        }
+        return ObservationMessage(
             tick=int(header["tick"]),
             time_ns=int(header["time_ns"]),
             depth=np.frombuffer(depth, "<u2").reshape(DEPTH_ROWS, DEPTH_COLS),
-            state=np.frombuffer(state, "<f4").reshape(STATE_DIM).copy(),  # torch wants to own it
+            state=np.frombuffer(state, "<f4").reshape(STATE_DIM).copy(),  # torch needs to own it
             sent=np.frombuffer(sent, "<f8").reshape(ACTION_DIM),
             first=bool(header["first"]),
             mode=str(header["mode"]),
             events=tuple(map(str, header["events"])),
-            motors=_unpack_motors(header["motors"], np.frombuffer(motors, "<f8")),
+            motors=MotorReadings(**reported) if reported else None,
             link={str(name): float(value) for name, value in header["link"].items()},
         )
-    except (ValueError, LookupError, TypeError, AttributeError):
+    except _DAMAGED:
         return None
 
 
-def _pack_motors(motors: MotorReadings) -> tuple[dict[str, int], NDArray[np.float64]]:
-    """Field -> number of its rows, and all rows (n, 29) in that order."""
-    values = {f.name: getattr(motors, f.name) for f in fields(motors)}
-    blocks = {
-        k: np.asarray(v, np.float64).T.reshape(-1, NUM_JOINTS)
-        for k, v in values.items()
-        if v is not None
-    }
-    return {name: len(block) for name, block in blocks.items()}, np.concatenate([*blocks.values()])
+def encode_plan(plan: PlanMessage) -> list[bytes]:
+    """Encode the actions of a plan, without what only the log needs."""
+    header = {"tick": plan.tick, "plan_ms": plan.plan_ms, "events": plan.events}
+    return [json.dumps(header).encode(), np.ascontiguousarray(plan.actions, "<f4").tobytes()]
 
 
-def _unpack_motors(
-    rows: Mapping[str, int] | None, values: NDArray[np.float64]
-) -> MotorReadings | None:
-    """The inverse."""
-    if rows is None:
-        return None
-    ends = np.cumsum(list(rows.values()))
-    blocks = dict(zip(rows, np.split(values.reshape(-1, NUM_JOINTS), ends[:-1]), strict=True))
-    whole = {
-        name: blocks[name][0].astype(np.int64) for name in ("faults", "lost") if name in blocks
-    }
-    return MotorReadings(
-        torque=blocks["torque"][0],
-        temperature=blocks["temperature"].T if "temperature" in blocks else None,
-        faults=whole.get("faults"),
-        lost=whole.get("lost"),
-        enabled=blocks["enabled"][0] != 0.0 if "enabled" in blocks else None,
-    )
-
-
-def encode_reply(reply: Reply) -> list[bytes]:
-    """A plan: what the control process needs of a reply."""
-    plan = reply.step.plan if reply.step.plan.size else reply.step.action[:, None]
-    header = {"tick": reply.tick, "plan_ms": reply.plan_ms, "events": reply.events}
-    return [json.dumps(header).encode(), np.ascontiguousarray(plan[0], "<f4").tobytes()]
-
-
-def decode_reply(parts: Sequence[bytes]) -> Reply | None:
-    """The inverse; None for anything else."""
+def decode_plan(parts: Sequence[bytes]) -> PlanMessage | None:
+    """Inverse of `encode_plan`; None: damaged, or another message."""
     try:
-        raw, plan = parts
+        raw, actions = parts
         header = json.loads(raw)
-        steps = np.frombuffer(plan, "<f4").reshape(1, -1, ACTION_DIM)
+        steps = np.frombuffer(actions, "<f4").reshape(1, -1, ACTION_DIM)
         step = PolicyStep(steps[:, 0], steps)
         events = tuple(map(str, header["events"]))
-        return Reply(int(header["tick"]), step, float(header["plan_ms"]), events=events)
-    except (ValueError, KeyError, TypeError, IndexError):
+        return PlanMessage(int(header["tick"]), step, float(header["plan_ms"]), events=events)
+    except _DAMAGED:
         return None
 
 
-def encode_order(order: Order) -> list[bytes]:
-    """An order of the operator."""
-    header = {"request": order.request, "velocity": order.velocity, "quit": order.quit}
-    return [json.dumps(header).encode()]
+def encode_operator_command(command: OperatorCommand) -> list[bytes]:
+    """Encode one input of the operator."""
+    return [json.dumps(command._asdict()).encode()]
 
 
-def decode_order(parts: Sequence[bytes]) -> Order | None:
-    """The inverse; None for anything else."""
+def decode_operator_command(parts: Sequence[bytes]) -> OperatorCommand | None:
+    """Inverse of `encode_operator_command`; None: damaged, or another message."""
     try:
         (raw,) = parts
-        return _order(json.loads(raw))
-    except (ValueError, KeyError, TypeError):
+        header = json.loads(raw)
+        velocity, request = header["velocity"], header["request"]
+        if velocity is not None:
+            vx, vy, yaw_rate = map(float, velocity)
+            velocity = (vx, vy, yaw_rate)
+        request = None if request is None else OperatorRequest(request)
+        return OperatorCommand(request, velocity, header["quit"] is True)
+    except _DAMAGED:
         return None
-
-
-def _order(header: Mapping[str, Any]) -> Order:
-    velocity, request = header["velocity"], header["request"]
-    if velocity is not None:
-        vx, vy, yaw = map(float, velocity)
-        velocity = (vx, vy, yaw)
-    return Order(None if request is None else Request(request), velocity, header["quit"] is True)
 
 
 class Link:
-    """One end of a pair of sockets.
-
-    Args:
-        address: such as ``ipc:///run/user/1000/egovcp``; only processes of this machine.
-        serve: whether this end creates the address.
-    """
+    """One end of a pair of sockets at ``address``, such as ``ipc:///run/user/1000/egovcp``, which
+    the end with ``serve`` creates."""
 
     def __init__(self, address: str, serve: bool) -> None:
         self._socket: zmq.Socket[bytes] = zmq.Context.instance().socket(zmq.PAIR)
@@ -169,24 +132,20 @@ class Link:
             self._socket.bind(address)
         else:
             self._socket.connect(address)
-        self.dropped = 0
-        """Messages that could not be sent at once."""
 
-    def send(self, parts: Sequence[bytes]) -> bool:
-        """Send, or drop if the other end does not take it."""
+    def send(self, parts: Sequence[bytes]) -> None:
+        """Send a message, or drop it if the other end does not receive."""
         try:
             self._socket.send_multipart(parts, zmq.NOBLOCK)
         except zmq.Again:
-            self.dropped += 1
-            return False
-        return True
+            return
 
     def receive(self, timeout_s: float = 0.0) -> Iterator[list[bytes]]:
-        """Everything that is there, up to `_MOST_RECEIVED`, so that a sender cannot delay the
-        receiver for longer; waits for the first at most ``timeout_s``."""
+        """All waiting messages, at most `_MAX_RECEIVED`, so that a sender cannot delay the
+        receiver for longer; waits at most ``timeout_s`` for the first."""
         if timeout_s > 0 and not self._socket.poll(round(timeout_s * 1e3)):
             return
-        for _ in range(_MOST_RECEIVED):
+        for _ in range(_MAX_RECEIVED):
             try:
                 yield self._socket.recv_multipart(zmq.NOBLOCK)
             except zmq.Again:
@@ -197,30 +156,29 @@ class Link:
         self._socket.close()
 
 
-class RemoteDesk:
-    """The planner in another process, seen from the control process.
-
-    Args:
-        link: to the planner.
-    """
+class RemotePlanner:
+    """A `PlannerClient` whose planner runs in another process."""
 
     def __init__(self, link: Link) -> None:
         self._link = link
-        self.orders: list[Order] = []
-        """What the operator has ordered since this was last emptied, oldest first."""
-        self.alive = True
-        """Set to false by whoever learns that the planner's process has ended."""
+        self._commands: list[OperatorCommand] = []
+        self.alive = True  # set to false by the owner once the planner's process has ended
 
-    def submit(self, report: Report) -> None:
-        """Send o_t; a planner that does not listen loses it."""
-        self._link.send(encode_report(report))
+    def submit(self, observation: ObservationMessage) -> None:
+        """Send o_t; it is dropped if the planner does not receive."""
+        self._link.send(encode_observation(observation))
 
-    def poll(self, now_ns: int) -> list[Reply]:
-        """Plans that have arrived; orders are put aside."""
-        replies = []
+    def poll(self, now_ns: int) -> list[PlanMessage]:
+        """Plans that have arrived; operator commands are kept for `take_commands`."""
+        plans = []
         for parts in self._link.receive():
-            if len(parts) == _REPLY_PARTS and (reply := decode_reply(parts)) is not None:
-                replies.append(reply)
-            elif (order := decode_order(parts)) is not None:
-                self.orders.append(order)
-        return replies
+            if len(parts) == _PLAN_PARTS and (plan := decode_plan(parts)) is not None:
+                plans.append(plan)
+            elif (command := decode_operator_command(parts)) is not None:
+                self._commands.append(command)
+        return plans
+
+    def take_commands(self) -> list[OperatorCommand]:
+        """Operator commands since the last call, oldest first."""
+        commands, self._commands = self._commands, []
+        return commands

@@ -1,9 +1,7 @@
-"""Watches the motors: heat, reported faults, and motors that no longer obey.
+"""Watches the motors: temperatures, reported faults, and motors that do not follow commands.
 
-The result of each tick is a `MotorVerdict`: what forbids arming, what holds the robot and what
-damps it. Pure: no clock and no I/O of its own.
-
-All limits are unverified on hardware. Those with a source name it.
+The result of each tick is a `MotorVerdict`: what forbids arming, and what requires HOLD or DAMP.
+No clock and no I/O. All limits are unverified on hardware; those with a source name it.
 """
 
 from __future__ import annotations
@@ -15,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log.tick import MotorReadings
-from egovcp.rate import NS_PER_S
+from egovcp.rate import NS_PER_S, RateLimiter
 from egovcp.robot.g1 import EFFORT_LIMIT
 from egovcp.spec import JOINT_NAMES, NUM_JOINTS
 from egovcp_deploy.robots.base import LowState, MotorCommand
@@ -25,7 +23,7 @@ Array = NDArray[np.floating]
 
 
 class HeatLimits(NamedTuple):
-    """Temperatures, deg C, at which to warn, to refuse to arm, and to hold."""
+    """Temperatures, deg C, at which to warn, to refuse arming, and to hold."""
 
     warn: float
     refuse: float
@@ -38,269 +36,222 @@ CASING: Final = HeatLimits(65.0, 75.0, 85.0)
 #: GR00T-WholeBodyControl. `refuse`: halfway.
 WINDING: Final = HeatLimits(90.0, 105.0, 120.0)
 #: Mean of casing and winding, as LeRobot's bridge sends it: the winding's limits with a casing of
-#: 40 deg C, which is the coldest that it stays beside a hot winding.
+#: 40 deg C, the coldest that it stays beside a hot winding.
 SINGLE: Final = HeatLimits(65.0, 72.0, 80.0)
 
-#: Status bits (`wire.MOTOR_STATUS_BITS`) that forbid to go on standing under load.
+#: Status bits (`wire.MOTOR_STATUS_BITS`) that forbid standing under load.
 OVERLOAD_BITS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x10 | 0x20 | 0x80 | 0x200
-#: Status bits of a motor that does not know its position or is not connected: it does not obey.
+#: Status bits of a motor that does not know its position or is not connected.
 DROPPED_BITS: Final = 0x400 | 0x800 | 0x1000 | 0x4000 | 0x40000000 | 0x80000000
 
 HEAT_PERSISTS_S: Final = 0.5  # motors warm up slowly: a shorter excess is a bad reading
 STATUS_PERSISTS_S: Final = 0.06  # three readings at 50 Hz
 NO_TORQUE_PERSISTS_S: Final = 0.14
-_MOST_ELAPSED_S: Final = 0.04  # what one reading proves, after a gap in the readings too
-_COOLED_K: Final = 5.0  # below a limit before its warning is given again
-_REMIND_S: Final = 10.0  # how often the operator is asked again to let the robot down
-_LOST_PER_S: Final = 50.0  # packets per second of one motor, of about 500; worth a warning
-#: A command that asks for more than this is large, N m: friction and the estimate's noise are
-#: smaller. A torque below `_TORQUE_SHARE` of it is near zero.
+_MAX_ELAPSED_S: Final = 0.04  # counted for one reading, also after a gap in the readings
+_HYSTERESIS_K: Final = 5.0  # below a limit before its warning is given again
+_REMINDER_S: Final = 10.0  # between two requests to let the robot down
+_MAX_LOST_PER_S: Final = 50.0  # packets per second of one motor, of about 500
+#: N m; a larger command exceeds friction and the noise of the torque estimate. A torque below
+#: `_TORQUE_SHARE` of the command is near zero.
 LARGE_TORQUE: Final = np.maximum(1.0, 0.1 * EFFORT_LIMIT)
 _TORQUE_SHARE: Final = 0.15
 _LET_DOWN: Final = "let the robot down onto its crane, damp it (L1 + B) and let it cool"
-
-
-@dataclass(frozen=True)
-class MotorVerdict:
-    """What the motors' readings ask for; empty: nothing."""
-
-    refusal: str = ""
-    """Why the robot must not be armed."""
-    hold: str = ""
-    """Why it must be held."""
-    damp: str = ""
-    """Why its motors must be damped."""
-    events: tuple[str, ...] = ()
-    """What is new, for the log and the operator."""
-
-
-class MotorWatch:
-    """Judges every reading of one robot; see the module's docstring."""
-
-    def __init__(self) -> None:
-        self._time_ns: int | None = None
-        self._known: set[str] | None = None  # optional fields that were reported so far
-        self._commands: tuple[MotorCommand, MotorCommand] | None = None
-        self._hot = _Persistence()
-        self._without_torque = _Persistence()
-        self._dropped = _Persistence()
-        self._was_enabled: NDArray[np.bool_] = np.zeros(NUM_JOINTS, np.bool_)
-        self._torque_seen = False
-        self._asked_for_torque_s = 0.0
-        self._warned: NDArray[np.bool_] = np.zeros(NUM_JOINTS, np.bool_)
-        self._faults: NDArray[np.integer] = np.zeros(NUM_JOINTS, np.int64)
-        self._lost: tuple[int, NDArray[np.integer]] | None = None
-        self._overheated = False
-        self._reminded_ns: int | None = None
-        self._last = MotorVerdict()
-
-    def update(
-        self, reading: LowState, command: MotorCommand | None, standing: bool = True
-    ) -> MotorVerdict:
-        """Judge the newest reading; the same one again changes nothing.
-
-        Args:
-            reading: of the robot's sensors.
-            command: what the motors had been sent when it arrived; None: nothing.
-            standing: whether the robot stands on its own, so that it can be let down.
-        """
-        motors = reading.motors
-        if motors is None or reading.time_ns == self._time_ns:
-            return MotorVerdict(self._last.refusal, self._last.hold, self._last.damp)
-        elapsed = 0.0 if self._time_ns is None else (reading.time_ns - self._time_ns) / NS_PER_S
-        elapsed = min(elapsed, _MOST_ELAPSED_S)
-        self._time_ns = reading.time_ns
-        events = self._missing_fields(motors)
-        damp = self._why_damp(reading, motors, command, elapsed, events)
-        hold = self._why_hold(motors, elapsed, events)
-        if hold and standing and self._may_remind(reading.time_ns):
-            events.append(hold)
-        refusal = damp or hold or self._why_refuse(motors)
-        events += self._lost_packets(motors, reading.time_ns)
-        self._last = MotorVerdict(refusal, hold, damp, tuple(events))
-        return self._last
-
-    # --- what is not reported ------------------------------------------------------------
-    def _missing_fields(self, motors: MotorReadings) -> list[str]:
-        """Which checks are off, once, and again for a field that is no longer reported."""
-        reported = {name for name in _FIELDS if getattr(motors, name) is not None}
-        before, self._known = self._known, reported
-        absent = _FIELDS.keys() - reported if before is None else before - reported
-        gone = "not reported by the robot" if before is None else "no longer reported by the robot"
-        names = ", ".join(_FIELDS[name] for name in _FIELDS if name in absent)
-        events = [f"checks that are off, as they are {gone}: {names}"] if names else []
-        if before is None and motors.temperature is not None and motors.temperature.shape[1] == 1:
-            events.append(
-                "one temperature per motor is reported, taken as the mean of casing and winding: "
-                f"limits {SINGLE.warn:.0f}, {SINGLE.refuse:.0f}, {SINGLE.hold:.0f} deg C"
-            )
-        return events
-
-    # --- motors that do not obey ---------------------------------------------------------
-    def _why_damp(
-        self,
-        reading: LowState,
-        motors: MotorReadings,
-        command: MotorCommand | None,
-        elapsed: float,
-        events: list[str],
-    ) -> str:
-        reasons = [self._why_status(motors, elapsed)]
-        if command is not None:
-            reasons.append(self._why_torque(reading, motors, command, elapsed, events))
-        return next(filter(None, reasons), "")
-
-    def _why_status(self, motors: MotorReadings, elapsed: float) -> str:
-        """A status that says that a motor does not obey."""
-        faults = np.zeros(NUM_JOINTS, np.int64) if motors.faults is None else motors.faults
-        disabled: NDArray[np.bool_] = np.zeros(NUM_JOINTS, np.bool_)
-        if motors.enabled is not None:
-            disabled = self._was_enabled & ~motors.enabled
-            self._was_enabled = np.asarray(self._was_enabled | motors.enabled)
-        joint = self._dropped.worst(
-            disabled | (faults & DROPPED_BITS > 0), elapsed, STATUS_PERSISTS_S
-        )
-        if joint is None:
-            return ""
-        bits = int(faults[joint])
-        what = f"it reports {fault_text(bits)}" if bits else "its mode says that it is off"
-        return f"the motor of {JOINT_NAMES[joint]} does not obey: {what}"
-
-    def _why_torque(
-        self,
-        reading: LowState,
-        motors: MotorReadings,
-        command: MotorCommand,
-        elapsed: float,
-        events: list[str],
-    ) -> str:
-        """A torque near zero although the command asks for a large one.
-
-        A motor applies kp (q* - q) - kd dq of this command or, as commands take a moment to
-        arrive, of the one before; only what both ask for counts.
-        """
-        before = command if self._commands is None else self._commands[1]
-        self._commands = (before, command)
-        now, then = _asked(command, reading), _asked(before, reading)
-        asked = np.where(now * then > 0, np.minimum(np.abs(now), np.abs(then)), 0.0)
-        self._listen_for_torque(motors, asked, elapsed, events)
-        near_zero = np.abs(motors.torque) < _TORQUE_SHARE * asked
-        silent = near_zero & (asked > LARGE_TORQUE) & self._torque_seen
-        joint = self._without_torque.worst(silent, elapsed, NO_TORQUE_PERSISTS_S)
-        if joint is None:
-            return ""
-        return (
-            f"the motor of {JOINT_NAMES[joint]} does not follow its target: torque "
-            f"{motors.torque[joint]:.1f} N m, {asked[joint]:.0f} N m commanded"
-        )
-
-    def _listen_for_torque(
-        self, motors: MotorReadings, asked: Array, elapsed: float, events: list[str]
-    ) -> None:
-        """A bridge that always sends zeros estimates no torque; that is not 29 dead motors."""
-        if self._torque_seen:
-            return
-        self._torque_seen = bool(motors.torque.any())
-        was = self._asked_for_torque_s
-        self._asked_for_torque_s += elapsed * bool((asked > LARGE_TORQUE).any())
-        if not self._torque_seen and was <= 1.0 < self._asked_for_torque_s:
-            events.append(
-                "no motor reports any torque: the check for motors that do not follow is off"
-            )
-
-    # --- heat and overload ---------------------------------------------------------------
-    def _why_hold(self, motors: MotorReadings, elapsed: float, events: list[str]) -> str:
-        overload = self._why_overload(motors, events)
-        heat = self._why_heat(motors, elapsed, events)
-        reason = overload or heat
-        return f"{reason}; {_LET_DOWN}" if reason else ""
-
-    def _may_remind(self, time_ns: int) -> bool:
-        due = self._reminded_ns is None or time_ns - self._reminded_ns > _REMIND_S * NS_PER_S
-        if due:
-            self._reminded_ns = time_ns
-        return due
-
-    def _why_overload(self, motors: MotorReadings, events: list[str]) -> str:
-        if motors.faults is None:
-            return ""
-        for joint in np.flatnonzero(motors.faults & ~self._faults):
-            bits = int(motors.faults[joint])
-            events.append(f"the motor of {JOINT_NAMES[joint]} reports: {fault_text(bits)}")
-        self._faults = motors.faults
-        overloaded = np.flatnonzero(motors.faults & OVERLOAD_BITS)
-        if not len(overloaded):
-            return ""
-        joint = int(overloaded[0])
-        return f"the motor of {JOINT_NAMES[joint]} reports {fault_text(int(motors.faults[joint]))}"
-
-    def _why_heat(self, motors: MotorReadings, elapsed: float, events: list[str]) -> str:
-        """Held once a motor has been too hot for a while, until all are cool enough to arm."""
-        if motors.temperature is None:
-            was_hot = "motors were too hot and no longer report temperatures"
-            return was_hot if self._overheated else ""
-        beyond = margins(motors.temperature)
-        joint = int(np.argmax(beyond.hold))
-        if self._hot.worst(beyond.hold >= 0.0, elapsed, HEAT_PERSISTS_S) is not None:
-            self._overheated = True
-        self._overheated &= bool((beyond.refuse >= 0.0).any())
-        self._warn(motors.temperature, beyond.warn, events)
-        if not self._overheated:
-            return ""
-        return (
-            f"the motor of {JOINT_NAMES[joint]} is too hot: {_degrees(motors.temperature[joint])}"
-        )
-
-    def _warn(self, temperature: Array, beyond: Array, events: list[str]) -> None:
-        for joint in np.flatnonzero((beyond >= 0.0) & ~self._warned):
-            words = _degrees(temperature[joint])
-            events.append(f"warning: the motor of {JOINT_NAMES[joint]} is hot: {words}")
-        self._warned = (beyond >= 0.0) | (self._warned & (beyond > -_COOLED_K))
-
-    def _why_refuse(self, motors: MotorReadings) -> str:
-        if motors.faults is not None and motors.faults.any():
-            joint = int(np.flatnonzero(motors.faults)[0])
-            words = fault_text(int(motors.faults[joint]))
-            return f"the motor of {JOINT_NAMES[joint]} reports {words}; see Unitree's app"
-        if motors.temperature is None:
-            return ""
-        beyond = margins(motors.temperature).refuse
-        joint = int(np.argmax(beyond))
-        if beyond[joint] < 0.0:
-            return ""
-        words = _degrees(motors.temperature[joint])
-        return f"the motor of {JOINT_NAMES[joint]} is at {words}; let it cool"
-
-    # --- lost packets --------------------------------------------------------------------
-    def _lost_packets(self, motors: MotorReadings, time_ns: int) -> list[str]:
-        """Once a second: motors that lose many packets."""
-        if motors.lost is None:
-            return []
-        if self._lost is None:
-            self._lost = (time_ns, motors.lost)
-        since, before = self._lost
-        seconds = (time_ns - since) / NS_PER_S
-        if seconds < 1.0:
-            return []
-        self._lost = (time_ns, motors.lost)
-        rates = (motors.lost - before) / seconds
-        joint = int(np.argmax(rates))
-        if rates[joint] < _LOST_PER_S:
-            return []
-        name = JOINT_NAMES[joint]
-        return [f"warning: the motor of {name} loses {rates[joint]:.0f} packets per second"]
-
-
-#: Optional field -> what it is.
+#: Optional field -> description.
 _FIELDS: Final = {
     "temperature": "motor temperatures",
     "faults": "motor status bits",
     "lost": "packets lost by motors",
     "enabled": "motor modes",
 }
-
-
 _NEVER: Final = -1.0
+
+
+@dataclass(frozen=True)
+class MotorVerdict:
+    """What the readings of the motors require; an empty reason requires nothing."""
+
+    refusal: str = ""  # why the robot must not be armed
+    hold: str = ""  # why it must be held
+    damp: str = ""  # why its motors must be damped
+    events: tuple[str, ...] = ()  # new log lines
+
+
+class MotorWatch:
+    """Evaluates every reading of one robot; see the module's docstring."""
+
+    def __init__(self) -> None:
+        self._time_ns: int | None = None
+        self._reported: set[str] | None = None  # optional fields of the last reading
+        self._last_command: MotorCommand | None = None
+        self._hot = _Persistence()
+        self._without_torque = _Persistence()
+        self._dropped = _Persistence()
+        self._was_enabled: NDArray[np.bool_] = np.zeros(NUM_JOINTS, np.bool_)
+        self._torque_seen = False
+        self._torque_commanded_s = 0.0
+        self._warned: NDArray[np.bool_] = np.zeros(NUM_JOINTS, np.bool_)
+        self._faults: NDArray[np.integer] = np.zeros(NUM_JOINTS, np.int64)
+        self._lost: tuple[int, NDArray[np.integer]] | None = None
+        self._overheated = False
+        self._reminder = RateLimiter(_REMINDER_S)
+        self._last = MotorVerdict()
+        self._events: list[str] = []
+
+    def update(
+        self, reading: LowState, command: MotorCommand | None, standing: bool = True
+    ) -> MotorVerdict:
+        """Evaluate the newest reading; a repeated reading changes nothing.
+
+        Args:
+            reading: of the robot's sensors.
+            command: the last command sent before it arrived; None: none.
+            standing: whether the robot stands, so that it can be let down.
+        """
+        motors = reading.motors
+        if motors is None or reading.time_ns == self._time_ns:
+            return MotorVerdict(self._last.refusal, self._last.hold, self._last.damp)
+        elapsed = 0.0 if self._time_ns is None else (reading.time_ns - self._time_ns) / NS_PER_S
+        elapsed = min(elapsed, _MAX_ELAPSED_S)
+        self._time_ns = reading.time_ns
+        self._events = []
+        self._check_fields(motors)
+        status = self._status_fault(motors, elapsed)
+        torque = "" if command is None else self._torque_fault(reading, motors, command, elapsed)
+        overload, heat = self._overload(motors), self._overheating(motors, elapsed)
+        damp, hold = status or torque, overload or heat
+        if hold:
+            hold = f"{hold}; {_LET_DOWN}"
+            if standing and self._reminder.ready(reading.time_ns):
+                self._events.append(hold)
+        refusal = damp or hold or self._arming_refusal(motors)
+        self._check_lost_packets(motors, reading.time_ns)
+        self._last = MotorVerdict(refusal, hold, damp, tuple(self._events))
+        return self._last
+
+    def _check_fields(self, motors: MotorReadings) -> None:
+        """Log once which checks are off, and again when a field is no longer reported."""
+        reported = {name for name in _FIELDS if getattr(motors, name) is not None}
+        before, self._reported = self._reported, reported
+        missing = (_FIELDS.keys() if before is None else before) - reported
+        since = "not reported" if before is None else "no longer reported"
+        if missing:
+            names = ", ".join(_FIELDS[name] for name in _FIELDS if name in missing)
+            self._events.append(f"checks that are off, as they are {since} by the robot: {names}")
+        if before is None and motors.temperature is not None and motors.temperature.shape[1] == 1:
+            self._events.append(
+                "one temperature per motor is reported, taken as the mean of casing and winding: "
+                f"limits {SINGLE.warn:.0f}, {SINGLE.refuse:.0f}, {SINGLE.hold:.0f} deg C"
+            )
+
+    def _status_fault(self, motors: MotorReadings, elapsed: float) -> str:
+        """A motor whose status says that it does not follow commands."""
+        faults = np.zeros(NUM_JOINTS, np.int64) if motors.faults is None else motors.faults
+        disabled: NDArray[np.bool_] = np.zeros(NUM_JOINTS, np.bool_)
+        if motors.enabled is not None:
+            disabled = self._was_enabled & ~motors.enabled
+            self._was_enabled = np.asarray(self._was_enabled | motors.enabled)
+        dropped = disabled | (faults & DROPPED_BITS > 0)
+        joint = self._dropped.longest(dropped, elapsed, STATUS_PERSISTS_S)
+        if joint is None:
+            return ""
+        bits = int(faults[joint])
+        what = f"it reports {fault_text(bits)}" if bits else "its mode says that it is off"
+        return f"the motor of {JOINT_NAMES[joint]} does not obey: {what}"
+
+    def _torque_fault(
+        self, reading: LowState, motors: MotorReadings, command: MotorCommand, elapsed: float
+    ) -> str:
+        """A torque near zero although the command requires a large one.
+
+        A motor applies kp (q* - q) - kd dq of this command or, because of the transport delay, of
+        the command before; the torque that both require is taken.
+        """
+        previous, self._last_command = self._last_command or command, command
+        now, then = _commanded_torque(command, reading), _commanded_torque(previous, reading)
+        wanted = np.where(now * then > 0, np.minimum(np.abs(now), np.abs(then)), 0.0)
+        large = wanted > LARGE_TORQUE
+        self._check_torque_estimates(motors, bool(large.any()), elapsed)
+        silent = (np.abs(motors.torque) < _TORQUE_SHARE * wanted) & large & self._torque_seen
+        joint = self._without_torque.longest(silent, elapsed, NO_TORQUE_PERSISTS_S)
+        if joint is None:
+            return ""
+        return (
+            f"the motor of {JOINT_NAMES[joint]} does not follow its target: torque "
+            f"{motors.torque[joint]:.1f} N m, {wanted[joint]:.0f} N m commanded"
+        )
+
+    def _check_torque_estimates(self, motors: MotorReadings, large: bool, elapsed: float) -> None:
+        """A bridge that always sends zeros estimates no torque; that is not 29 dead motors."""
+        if self._torque_seen:
+            return
+        self._torque_seen = bool(motors.torque.any())
+        before = self._torque_commanded_s
+        self._torque_commanded_s += elapsed * large
+        if not self._torque_seen and before <= 1.0 < self._torque_commanded_s:
+            self._events.append(
+                "no motor reports any torque: the check for motors that do not follow is off"
+            )
+
+    def _overload(self, motors: MotorReadings) -> str:
+        if motors.faults is None:
+            return ""
+        for joint in np.flatnonzero(motors.faults & ~self._faults):
+            self._events.append(_fault(motors.faults, int(joint), "reports:"))
+        self._faults = motors.faults
+        overloaded = np.flatnonzero(motors.faults & OVERLOAD_BITS)
+        return _fault(motors.faults, int(overloaded[0])) if len(overloaded) else ""
+
+    def _overheating(self, motors: MotorReadings, elapsed: float) -> str:
+        """A motor that was too hot for `HEAT_PERSISTS_S`, until all are cool enough to arm."""
+        if motors.temperature is None:
+            lost = "motors were too hot and no longer report temperatures"
+            return lost if self._overheated else ""
+        warn, refuse, hold = margins(motors.temperature)
+        if self._hot.longest(hold >= 0.0, elapsed, HEAT_PERSISTS_S) is not None:
+            self._overheated = True
+        self._overheated &= bool((refuse >= 0.0).any())
+        warm = warn >= 0.0
+        for joint in np.flatnonzero(warm & ~self._warned):
+            words = _degrees(motors.temperature[joint])
+            self._events.append(f"warning: the motor of {JOINT_NAMES[joint]} is hot: {words}")
+        self._warned = warm | (self._warned & (warn > -_HYSTERESIS_K))
+        if not self._overheated:
+            return ""
+        joint = int(np.argmax(hold))
+        words = _degrees(motors.temperature[joint])
+        return f"the motor of {JOINT_NAMES[joint]} is too hot: {words}"
+
+    def _arming_refusal(self, motors: MotorReadings) -> str:
+        if motors.faults is not None and motors.faults.any():
+            joint = int(np.flatnonzero(motors.faults)[0])
+            return f"{_fault(motors.faults, joint)}; see Unitree's app"
+        if motors.temperature is None:
+            return ""
+        _, refuse, _ = margins(motors.temperature)
+        joint = int(np.argmax(refuse))
+        if refuse[joint] < 0.0:
+            return ""
+        words = _degrees(motors.temperature[joint])
+        return f"the motor of {JOINT_NAMES[joint]} is at {words}; let it cool"
+
+    def _check_lost_packets(self, motors: MotorReadings, time_ns: int) -> None:
+        """Once a second, log the motor that loses most packets, if it loses many."""
+        if motors.lost is None:
+            return
+        if self._lost is None:
+            self._lost = (time_ns, motors.lost)
+        since, before = self._lost
+        seconds = (time_ns - since) / NS_PER_S
+        if seconds < 1.0:
+            return
+        self._lost = (time_ns, motors.lost)
+        rates = (motors.lost - before) / seconds
+        joint = int(np.argmax(rates))
+        if rates[joint] >= _MAX_LOST_PER_S:
+            self._events.append(
+                f"warning: the motor of {JOINT_NAMES[joint]} loses {rates[joint]:.0f} packets per "
+                "second"
+            )
 
 
 class _Persistence:
@@ -309,43 +260,41 @@ class _Persistence:
     def __init__(self) -> None:
         self._seconds: Array = np.full(NUM_JOINTS, _NEVER)
 
-    def worst(self, condition: NDArray[np.bool_], elapsed: float, limit: float) -> int | None:
-        """Add ``elapsed`` s where it holds; the joint that it has held longest for, if that is
-        ``limit`` s or more. The first reading of a condition counts from then on."""
+    def longest(self, condition: NDArray[np.bool_], elapsed: float, limit: float) -> int | None:
+        """Add ``elapsed`` s where ``condition`` (29,) holds; returns the joint for which it has
+        held longest, if that is ``limit`` s or more. Its first reading starts the count at 0."""
         longer = np.where(self._seconds >= 0.0, self._seconds + elapsed, 0.0)
         self._seconds = np.where(condition, longer, _NEVER)
         joint = int(np.argmax(self._seconds))
         return joint if self._seconds[joint] >= limit - 1e-9 else None
 
 
-def _asked(command: MotorCommand, reading: LowState) -> Array:
-    """(29,) N m that a command asks for, within what the motors can do."""
+def _commanded_torque(command: MotorCommand, reading: LowState) -> Array:
+    """(29,) N m that a command requires, within the limits of the motors."""
     torque = command.stiffness * (command.position - reading.joint_position)
     torque -= command.damping * reading.joint_velocity
     return np.asarray(np.clip(torque, -EFFORT_LIMIT, EFFORT_LIMIT))
 
 
-class Margins(NamedTuple):
-    """(29,) K above each limit, of the sensor that is nearest to its own; negative: below."""
-
-    warn: Array
-    refuse: Array
-    hold: Array
+def _fault(faults: NDArray[np.integer], joint: int, verb: str = "reports") -> str:
+    return f"the motor of {JOINT_NAMES[joint]} {verb} {fault_text(int(faults[joint]))}"
 
 
-def margins(temperature: Array) -> Margins:
-    """Of (29, 1) or (29, 2) temperatures; sensors that report none count as cold."""
+def margins(temperature: Array) -> tuple[Array, Array, Array]:
+    """Temperatures (29, 1) or (29, 2) -> (29,) K above the limits to warn, refuse and hold, of the
+    sensor closest to its own limit; negative: below. Missing values count as cold."""
     limits = np.array([SINGLE] if temperature.shape[1] == 1 else [CASING, WINDING])  # (k, 3)
     known = np.where(np.isfinite(temperature), temperature, -np.inf)
     beyond = (known[:, :, None] - limits).max(axis=1)  # (29, 3)
-    return Margins(*beyond.T)
+    warn, refuse, hold = beyond.T
+    return warn, refuse, hold
 
 
 def hottest(motors: MotorReadings) -> str:
-    """The motor that is nearest to its limit, with its temperatures; empty: none reports any."""
+    """The motor closest to its limit, with its temperatures; empty: none is reported."""
     if motors.temperature is None:
         return ""
-    joint = int(np.argmax(margins(motors.temperature).hold))
+    joint = int(np.argmax(margins(motors.temperature)[2]))
     return f"{JOINT_NAMES[joint]}, {_degrees(motors.temperature[joint])}"
 
 

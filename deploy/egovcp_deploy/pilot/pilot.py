@@ -1,15 +1,17 @@
-"""Decides, tick by tick, what a robot is sent: the planner's action, or what is safe instead.
+"""Decides each tick what a robot is sent: the planner's action, or a safe one.
 
-A planner tick t of 40 ms goes
+A planner tick t of 40 ms is
 
-    sense(readings) -> judge(operator) -> report(o_t) ... collect(replies) ... decide(a_t)
+    sense(readings) -> update_state(operator) -> send_observation(o_t)
+                                   ... receive_plans() ... next_action() = a_t
 
-On a robot, replies arrive while the tick lasts and `sense` and `judge` run at 50 Hz; in lock-step
-simulation all of it happens at once. Nothing here blocks, sleeps or does I/O of its own.
+On a robot, plans arrive during the tick, and `sense` and `update_state` run at 50 Hz; in lock-step
+simulation all calls follow at once. Nothing here blocks, sleeps or does I/O.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -19,50 +21,74 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.log.tick import MotorReadings
-from egovcp.spec import COMMAND_SLICE
-from egovcp_deploy.pilot.desk import Desk, Reply, Report
-from egovcp_deploy.pilot.freshness import Freshness
-from egovcp_deploy.pilot.plans import PlanBook
-from egovcp_deploy.pilot.posture import Posture, posture
-from egovcp_deploy.pilot.states import Facts, Limits, Request, State, Supervisor
-from egovcp_deploy.safety import SafetyFilter
+from egovcp.robot.stance import pelvis_height
+from egovcp.spec import COMMAND_SLICE, STATE_SLICES
+from egovcp_deploy.pilot.planner import ObservationMessage, PlanMessage, PlannerClient
+from egovcp_deploy.pilot.states import Facts, Limits, OperatorRequest, State, Supervisor
+from egovcp_deploy.safety import PlanBuffer, SafetyFilter
 
 Array = NDArray[np.float64]
 
 REJECTED: Final = "plan rejected: not finite"
-UNASKED: Final = "plan rejected: for a tick that was not reported"
-_UPRIGHT: Final = Posture(0.0, 0.74)
+UNREQUESTED: Final = "plan rejected: for a tick without an observation"
+
+
+class Freshness:
+    """Age of a reading, measured from when its content last changed.
+
+    A driver that has died behind a live connection repeats its last reading with new time stamps.
+    Real sensors are noisy: a reading that repeats bit for bit is not new. Depth images without a
+    valid pixel are the exception: with nothing in range all of them are equal.
+    """
+
+    def __init__(self) -> None:
+        self._content: bytes | None = None
+        self._time_ns: int | None = None
+        self._changed_ns: int | None = None
+
+    def update(self, time_ns: int, content: NDArray[np.generic] | None) -> None:
+        """Take the content read at ``time_ns``; None or content that is not finite is ignored."""
+        if content is None or not np.isfinite(content).all():
+            return
+        raw = content.tobytes()
+        if raw != self._content or (time_ns != self._time_ns and not content.any()):
+            self._content, self._changed_ns = raw, time_ns
+        self._time_ns = time_ns
+
+    def age_s(self, now_ns: int) -> float:
+        """Time since the content last changed, s; infinite before the first reading."""
+        return math.inf if self._changed_ns is None else (now_ns - self._changed_ns) / 1e9
+
+
+def posture(state: NDArray[np.floating]) -> tuple[float, float]:
+    """State (74,) -> angle between pelvis and vertical, rad, and height of the pelvis above the
+    sole of the lower foot along the vertical, m."""
+    s = np.asarray(state, np.float64)
+    gravity = s[STATE_SLICES["projected_gravity"]]
+    norm = math.sqrt(float(gravity @ gravity))
+    tilt = math.acos(min(max(-float(gravity[2]) / max(norm, 1e-9), -1.0), 1.0))
+    joints = s[None, STATE_SLICES["joint_position"]]
+    return tilt, float(pelvis_height(joints, gravity[None])[0])
 
 
 class Pilot:
-    """Between one robot and its planner.
+    """Connects one robot with its planner, for one run. ``limits`` and the initial ``state`` are
+    those of its `Supervisor`."""
 
-    Args:
-        desk: where the planner is.
-        limits: of the state machine.
-        state: where the machine begins; ARMED for a simulated robot that stands already.
-    """
-
-    def __init__(self, desk: Desk, limits: Limits | None = None, state: State = State.INIT) -> None:
-        self._desk = desk
-        self._limits = limits or Limits()
-        self._begin_in = state
-        self.restart()
-
-    def restart(self) -> None:
-        """A new run: tick 0 comes next, nothing has been sent, and the machine starts again."""
-        self.supervisor = Supervisor(self._limits, self._begin_in)
-        self.tick = 0
-        """The planner tick that is reported next, or that is being decided."""
-        self.sent: Array = np.zeros(7)
-        """a_{t-1}, (7,)."""
+    def __init__(
+        self, planner: PlannerClient, limits: Limits | None = None, state: State = State.INIT
+    ) -> None:
+        self._planner = planner
+        self.supervisor = Supervisor(limits, state)
+        self.tick = 0  # the planner tick of the next observation, or of the pending action
+        self.sent: Array = np.zeros(7)  # a_{t-1}, (7,)
         self._safety = SafetyFilter()
-        self._book = PlanBook()
-        self._proprioception, self._eye = Freshness(), Freshness()
-        self._posture = _UPRIGHT
-        self._unanswered: deque[Report] = deque(maxlen=64)
-        self._first = True  # the next report starts the recurrence
-        self._began = 0  # tick of that report; plans from before it are of another life
+        self._plans = PlanBuffer()
+        self._proprioception, self._image = Freshness(), Freshness()
+        self._tilt, self._height = 0.0, 0.74
+        self._unanswered: deque[ObservationMessage] = deque(maxlen=64)
+        self._first = True  # the next observation restarts the recurrence
+        self._restart_tick = 0  # tick of that observation; older plans are ignored
         self._events: list[str] = []
 
     # --- at every control tick -----------------------------------------------------------
@@ -78,62 +104,48 @@ class Pilot:
 
         Args:
             now_ns: now.
-            state: (74,) proprioception; None: there is none.
-            depth: (48, 64); None: there is none.
+            state: (74,) proprioception; None: not available.
+            depth: (48, 64); None: not available.
             state_ns: when the state arrived, on the clock of ``now_ns``; None: now.
-            depth_ns: likewise.
+            depth_ns: when the depth image arrived; None: now.
         """
         measured = None if state is None else np.delete(np.asarray(state), COMMAND_SLICE)
         self._proprioception.update(now_ns if state_ns is None else state_ns, measured)
-        self._eye.update(now_ns if depth_ns is None else depth_ns, depth)
+        self._image.update(now_ns if depth_ns is None else depth_ns, depth)
         if measured is not None and np.isfinite(measured).all():
-            self._posture = posture(np.asarray(state))
+            self._tilt, self._height = posture(np.asarray(state))
 
-    def judge(
-        self,
-        now_ns: int,
-        request: Request | None = None,
-        controller_ok: bool = True,
-        refusal: str = "",
-        hold: str = "",
-        damp: str = "",
-        skipped: str = "",
-    ) -> State:
-        """Move the state machine on; where it is now. Reasons: see `Facts`."""
-        before = self.supervisor.state
+    def update_state(self, facts: Facts, request: OperatorRequest | None = None) -> State:
+        """Update the state machine and return its state; ``facts`` are those that the pilot does
+        not measure: the time, and the results of other checks."""
+        before, now_ns, waiting = self.supervisor.state, facts.time_ns, self._unanswered
         facts = replace(
-            self._facts(now_ns, controller_ok),
-            refusal=refusal,
-            hold=hold,
-            damp=damp,
-            skipped=skipped,
+            facts,
+            state_age_s=self._proprioception.age_s(now_ns),
+            image_age_s=self._image.age_s(now_ns),
+            planner_silence_s=(now_ns - waiting[0].time_ns) / 1e9 if waiting else 0.0,
+            misses=self._plans.misses,
+            tilt=self._tilt,
+            height=self._height,
+            planner_alive=self._planner.alive,
         )
         self._events += self.supervisor.update(facts, request)
         if before is State.ARMED and self.supervisor.state is State.RUN:
             self._first = True
-            self._book.reset()
+            self._plans = PlanBuffer()
         return self.supervisor.state
 
-    def note(self, events: Iterable[str]) -> None:
-        """Add lines to the events."""
+    def add_events(self, events: Iterable[str]) -> None:
+        """Add lines to the log."""
         self._events += events
 
-    def _facts(self, now_ns: int, controller_ok: bool) -> Facts:
-        silence = (now_ns - self._unanswered[0].time_ns) / 1e9 if self._unanswered else 0.0
-        return Facts(
-            time_ns=now_ns,
-            state_age_s=self._proprioception.age_s(now_ns),
-            picture_age_s=self._eye.age_s(now_ns),
-            planner_silence_s=silence,
-            misses=self._book.misses,
-            tilt=self._posture.tilt,
-            height=self._posture.height,
-            controller_ok=controller_ok,
-            planner_alive=self._desk.alive,
-        )
+    def take_events(self) -> tuple[str, ...]:
+        """Log lines since the last call."""
+        events, self._events = tuple(self._events), []
+        return events
 
     # --- at every planner tick -----------------------------------------------------------
-    def report(
+    def send_observation(
         self,
         now_ns: int,
         depth: NDArray[np.uint16],
@@ -142,65 +154,61 @@ class Pilot:
         motors: MotorReadings | None = None,
         link: Mapping[str, float] | None = None,
     ) -> None:
-        """Hand o_t to the planner, and with it ``events``, ``motors`` and ``link`` for its log."""
-        mode = self.supervisor.state
-        sent = self.sent.copy()
+        """Send o_t to the planner, with ``events``, ``motors`` and ``link`` for its log."""
         if self._first:
-            self._began = self.tick
-        report = Report(
-            self.tick, now_ns, depth, state, sent, self._first, mode, events, motors, link or {}
+            self._restart_tick = self.tick
+        observation = ObservationMessage(
+            self.tick,
+            now_ns,
+            depth,
+            state,
+            self.sent.copy(),
+            self._first,
+            self.supervisor.state,
+            events,
+            motors,
+            link or {},
         )
         self._first = False
-        self._unanswered.append(report)
-        self._desk.submit(report)
+        self._unanswered.append(observation)
+        self._planner.submit(observation)
 
-    def collect(self, now_ns: int) -> Reply | None:
-        """Fetch what the planner has answered by ``now_ns``; the reply of this tick, if it came."""
-        fresh = None
-        for reply in self._desk.poll(now_ns):
-            if reply.tick > self.tick:  # of no report; it would outlast all that are
-                self._events.append(UNASKED)
+    def receive_plans(self, now_ns: int) -> PlanMessage | None:
+        """Take the plans that have arrived by ``now_ns``; returns that of this tick, if any."""
+        current = None
+        for plan in self._planner.poll(now_ns):
+            if plan.tick > self.tick:  # it would outlast all valid plans
+                self._events.append(UNREQUESTED)
                 continue
-            while self._unanswered and self._unanswered[0].tick <= reply.tick:
+            while self._unanswered and self._unanswered[0].tick <= plan.tick:
                 self._unanswered.popleft()
-            self._events += reply.events
-            if self._first or reply.tick < self._began:
+            self._events += plan.events
+            if self._first or plan.tick < self._restart_tick:
                 continue
-            if not self._book.offer(reply.tick, _plan(reply)):
+            if not self._plans.offer(plan.tick, plan.actions):
                 self._events.append(REJECTED)
-            if reply.tick == self.tick:
-                fresh = reply
-        return fresh
+            if plan.tick == self.tick:
+                current = plan
+        return current
 
     @property
     def misses(self) -> int:
-        """Ticks in a row without a plan in time."""
-        return self._book.misses
+        """Consecutive ticks without a plan in time."""
+        return self._plans.misses
 
     @property
-    def answered(self) -> bool:
-        """Whether a usable plan for this tick is there."""
-        return self._book.has(self.tick)
+    def has_plan(self) -> bool:
+        """Whether a usable plan for this tick has arrived."""
+        return self._plans.has(self.tick)
 
-    def decide(self) -> Array:
-        """a_t (7,), once per tick; the next tick begins."""
-        wanted = self._book.decide(self.tick)
+    def next_action(self) -> Array:
+        """a_t (7,); call it once per tick. The next tick begins."""
+        wanted = self._plans.action(self.tick)
         if self.supervisor.state is not State.RUN or self._first:
             self.sent = self._safety.ease()[0]
         elif wanted is None:
             self.sent = self._safety.repeat()[0]
         else:
-            self.sent = self._safety.filter(wanted[None]).action[0]
+            self.sent = self._safety.filter(wanted[None])[0]
         self.tick += 1
         return self.sent.copy()
-
-    def events(self) -> tuple[str, ...]:
-        """What has happened since the last call."""
-        events, self._events = tuple(self._events), []
-        return events
-
-
-def _plan(reply: Reply) -> Array:
-    """(N, 7); a policy that does not plan ahead knows one action."""
-    step = reply.step
-    return np.asarray(step.plan[0] if step.plan.size else step.action, np.float64)

@@ -1,10 +1,10 @@
-"""The state machine of the runner: which state the robot is in, and why.
+"""The safety state machine of a driven robot, a pure function of measured facts.
 
     INIT -> STAND -> ARMED -> RUN <-> HOLD          any -> DAMP, latched
 
-DAMP lets a standing robot sink to the ground, so it is for what standing cannot survive: lost
-proprioception, a controller that gives no numbers, a robot that is falling, the operator's
-emergency stop. Without planner or camera the robot can still stand: that is HOLD.
+DAMP lets a standing robot sink to the ground, so it is reserved for what standing cannot survive:
+lost proprioception, a controller without finite targets, a fall, the operator's emergency stop.
+A robot without planner or camera can still stand: that is HOLD.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 from egovcp.bounds import bounded
 
@@ -21,21 +21,21 @@ class State(StrEnum):
     """What the robot is doing."""
 
     INIT = "init"
-    """Waits for the first readings; motors damped."""
+    """Motors damped until the first readings arrive."""
     STAND = "stand"
-    """The gains come in and the controller takes the robot to its stance."""
+    """The gains ramp in and the controller moves the robot to its stance."""
     ARMED = "armed"
-    """Stands in the neutral pose; the planner runs along, but is not obeyed."""
+    """Stands in the neutral pose; plans are computed but not executed."""
     RUN = "run"
-    """The planner drives."""
+    """Executes the planner's actions."""
     HOLD = "hold"
     """Stands; the hands ease to neutral, the velocity to zero."""
     DAMP = "damp"
     """Motors damped until the program is started again."""
 
 
-class Request(StrEnum):
-    """What the operator asks for."""
+class OperatorRequest(StrEnum):
+    """A state change that the operator requests."""
 
     STAND = "stand"
     ARM = "arm"
@@ -44,202 +44,190 @@ class Request(StrEnum):
     ESTOP = "estop"
 
 
+class OperatorCommand(NamedTuple):
+    """One input of the operator."""
+
+    request: OperatorRequest | None = None
+    velocity: tuple[float, float, float] | None = None
+    """vx, vy (m/s), yaw rate (rad/s); None: unchanged."""
+    quit: bool = False  # end the control process; it damps the motors first
+
+
 @dataclass(frozen=True)
 class Limits:
-    """When the robot is held or damped."""
+    """Thresholds for HOLD and DAMP."""
 
     state_hold_s: float = bounded(0.1, above=0)
     """HOLD when proprioception is older, s."""
     state_damp_s: float = bounded(0.2, above=0)
     """DAMP when proprioception is older, s."""
-    picture_hold_s: float = bounded(0.2, above=0)
-    """HOLD when the picture is older than this, s."""
+    image_hold_s: float = bounded(0.2, above=0)
+    """HOLD when the depth image is older, s."""
     planner_hold_s: float = bounded(0.14, above=0)
-    """HOLD when the planner has not answered for so long, s."""
+    """HOLD when an observation has waited longer for its plan, s."""
     misses_hold: int = bounded(5, least=0, most=10_000)
-    """HOLD after more than so many ticks in a row without a plan in time."""
+    """HOLD after more consecutive ticks without a plan in time."""
     tilt_damp: float = bounded(1.0, above=0, most=math.pi / 2)
     """DAMP beyond this angle between pelvis and vertical, rad."""
     height_damp: float = bounded(0.40, least=0)
     """DAMP below this height of the pelvis above the lower foot, m; the lowest stance has 0.5."""
     recover_s: float = bounded(1.0, least=0)
-    """HOLD ends by itself when all has been well for so long, s."""
+    """HOLD ends after this time without a fault, s."""
     stand_s: float = bounded(3.0, above=0)
-    """Time in which the gains come in, s."""
+    """Time in which the gains ramp in, s."""
 
 
 @dataclass(frozen=True)
 class Facts:
-    """What the state machine judges by at one control tick."""
+    """Inputs of the state machine at one control tick."""
 
-    time_ns: int
-    """Now, monotonic."""
-    state_age_s: float = 0.0
-    """Since proprioception last brought something new."""
-    picture_age_s: float = 0.0
-    """Since the camera last brought something new."""
-    planner_silence_s: float = 0.0
-    """Since the planner last answered."""
-    misses: int = 0
-    """Ticks in a row without a plan in time."""
-    tilt: float = 0.0
-    """Angle between pelvis and vertical, rad."""
-    height: float = 0.74
-    """Pelvis above the lower foot, m."""
-    controller_ok: bool = True
-    """Whether the low-level controller's last targets were numbers."""
-    planner_alive: bool = True
-    """False once the planner is known to be gone."""
-    refusal: str = ""
-    """Why the robot must not be armed; empty: nothing speaks against it."""
-    hold: str = ""
-    """Why the robot must be held, found by a check outside the state machine; empty: nothing."""
-    damp: str = ""
-    """Why its motors must be damped, likewise."""
+    time_ns: int  # now, monotonic
+    state_age_s: float = 0.0  # time since proprioception last changed
+    image_age_s: float = 0.0  # time since the depth image last changed
+    planner_silence_s: float = 0.0  # age of the oldest observation without a plan
+    misses: int = 0  # consecutive ticks without a plan in time
+    tilt: float = 0.0  # angle between pelvis and vertical, rad
+    height: float = 0.74  # pelvis above the lower foot, m
+    controller_ok: bool = True  # whether the last targets of the low-level controller were finite
+    planner_alive: bool = True  # false once the planner is known to have ended
+    refusal: str = ""  # why the robot must not be armed; empty: no reason
+    hold: str = ""  # why another check requires HOLD; empty: no reason
+    damp: str = ""  # why another check requires DAMP; empty: no reason
     skipped: str = ""
-    """What was wrong with the proprioception since the newest that was used; empty: none came."""
+    """Fault of the readings rejected since the last valid one; empty: none was rejected."""
 
 
-def _stale(facts: Facts) -> str:
-    """That proprioception is too old, and why."""
-    words = f"no new proprioception for {facts.state_age_s * 1e3:.0f} ms"
-    return f"{words} ({facts.skipped})" if facts.skipped else words
-
-
-_NEXT: Final = {Request.STAND: State.INIT, Request.ARM: State.STAND, Request.RUN: State.ARMED}
+_TRANSITIONS: Final = {
+    OperatorRequest.STAND: (State.INIT, State.STAND),
+    OperatorRequest.ARM: (State.STAND, State.ARMED),
+    OperatorRequest.RUN: (State.ARMED, State.RUN),
+}
 
 
 class Supervisor:
-    """Holds the state; `update` moves it on, at every control tick.
-
-    Args:
-        limits: when to hold and to damp.
-        state: where to begin; a simulated robot that stands already begins ARMED.
-    """
+    """Holds the state; call `update` at every control tick. A simulated robot that stands already
+    begins in ARMED."""
 
     def __init__(self, limits: Limits | None = None, state: State = State.INIT) -> None:
         self.limits = limits or Limits()
         self.state = state
-        self.reason = "start"
-        """Why the machine is in this state."""
+        self.reason = "start"  # why the machine is in this state
         self._since_ns: int | None = None
-        self._well_since_ns: int | None = None
-        self._asked_to_hold = False
+        self._healthy_since_ns: int | None = None
+        self._hold_requested = False
 
-    def update(self, facts: Facts, request: Request | None = None) -> tuple[str, ...]:
-        """Judge ``facts`` and the operator's ``request``; what changed, for the log."""
+    def update(self, facts: Facts, request: OperatorRequest | None = None) -> tuple[str, ...]:
+        """Apply ``facts`` and the operator's ``request``; returns log lines of what changed."""
         if self._since_ns is None:
             self._since_ns = facts.time_ns
         before, self._events = self.state, list[str]()
         if self.state is not State.DAMP:
-            self._judge(facts, request)
+            self._step(facts, request)
         if self.state is not before:
             self._events.append(f"{before} -> {self.state}: {self.reason}")
         return tuple(self._events)
 
     def time_in_state_s(self, now_ns: int) -> float:
-        """Since the state was entered, s."""
+        """Time since the state was entered, s."""
         return 0.0 if self._since_ns is None else (now_ns - self._since_ns) / 1e9
 
-    def _judge(self, facts: Facts, request: Request | None) -> None:
-        if request is Request.ESTOP:
-            return self._enter(State.DAMP, "emergency stop", facts)
-        if self.state is not State.INIT and (why := self._why_damp(facts)):
-            return self._enter(State.DAMP, why, facts)
-        if self.state in (State.RUN, State.HOLD):
-            return self._run_or_hold(facts, request)
-        if request is not None:
+    def _step(self, facts: Facts, request: OperatorRequest | None) -> None:
+        if request is OperatorRequest.ESTOP:
+            self._enter(State.DAMP, "emergency stop", facts)
+        elif self.state is not State.INIT and (reason := self._damp_reason(facts)):
+            self._enter(State.DAMP, reason, facts)
+        elif self.state in (State.RUN, State.HOLD):
+            self._run_or_hold(facts, request)
+        elif request is not None:
             self._advance(facts, request)
-        return None
 
-    def _why_damp(self, facts: Facts) -> str:
+    def _damp_reason(self, facts: Facts) -> str:
         limits = self.limits
         if facts.damp:
             return facts.damp
         if facts.state_age_s > limits.state_damp_s:
-            return _stale(facts)
+            return _stale_state(facts)
         if not facts.controller_ok:
-            return "the low-level controller gave targets that are not numbers"
+            return "the targets of the low-level controller are not finite"
         if not facts.tilt <= limits.tilt_damp:
             return f"the pelvis is tilted by {facts.tilt:.2f} rad"
         if self.state is not State.STAND and not facts.height >= limits.height_damp:
             return f"the pelvis is {facts.height:.2f} m above the foot"
         return ""
 
-    def _why_hold(self, facts: Facts) -> str:
+    def _hold_reason(self, facts: Facts) -> str:
         limits = self.limits
         if facts.hold:
             return facts.hold
         if not facts.planner_alive:
-            return "the planner is gone"
+            return "the planner has ended"
         if facts.planner_silence_s > limits.planner_hold_s:
             return f"the planner has not answered for {facts.planner_silence_s * 1e3:.0f} ms"
         if facts.misses > limits.misses_hold:
             return f"{facts.misses} ticks in a row without a plan in time"
         if facts.state_age_s > limits.state_hold_s:
-            return _stale(facts)
-        if facts.picture_age_s > limits.picture_hold_s:
-            return f"no new picture for {facts.picture_age_s * 1e3:.0f} ms"
+            return _stale_state(facts)
+        if facts.image_age_s > limits.image_hold_s:
+            return f"no new depth image for {facts.image_age_s * 1e3:.0f} ms"
         return ""
 
-    def _run_or_hold(self, facts: Facts, request: Request | None) -> None:
-        if request is Request.HOLD:
-            self._asked_to_hold = True
-            self._well_since_ns = None
-            self._enter(State.HOLD, "the operator asked for it", facts)
-            return
-        if request is Request.RUN:
-            self._asked_to_hold = False
-        why = self._why_hold(facts)
-        if why:
-            self._well_since_ns = None
-            self._enter(State.HOLD, why, facts)
-        elif self.state is State.HOLD and not self._asked_to_hold:
+    def _run_or_hold(self, facts: Facts, request: OperatorRequest | None) -> None:
+        if request is OperatorRequest.HOLD:
+            self._hold_requested = True
+        elif request is OperatorRequest.RUN:
+            self._hold_requested = False
+        held = request is OperatorRequest.HOLD
+        if reason := "requested by the operator" if held else self._hold_reason(facts):
+            self._healthy_since_ns = None
+            self._enter(State.HOLD, reason, facts)
+        elif self.state is State.HOLD and not self._hold_requested:
             self._recover(facts)
 
     def _recover(self, facts: Facts) -> None:
-        """Back to RUN once all has been well for a while: no flicker between the two.
-
-        A single late plan is bridged by the one before and counts as well.
-        """
+        """Return to RUN after `Limits.recover_s` without a fault, so that the state does not
+        flicker. One late plan is bridged by the plan before it and is not a fault."""
         if facts.misses > 1:
-            self._well_since_ns = None
+            self._healthy_since_ns = None
             return
-        if self._well_since_ns is None:
-            self._well_since_ns = facts.time_ns
-        if facts.time_ns - self._well_since_ns >= self.limits.recover_s * 1e9:
-            self._enter(State.RUN, f"all well for {self.limits.recover_s:g} s", facts)
+        if self._healthy_since_ns is None:
+            self._healthy_since_ns = facts.time_ns
+        if facts.time_ns - self._healthy_since_ns >= self.limits.recover_s * 1e9:
+            self._enter(State.RUN, f"no fault for {self.limits.recover_s:g} s", facts)
 
-    def _advance(self, facts: Facts, request: Request) -> None:
-        """One step of INIT -> STAND -> ARMED -> RUN, if it is the next and nothing objects."""
-        if _NEXT.get(request) is not self.state:
-            if request is not Request.HOLD:
-                self._events.append(f"{request} refused: the robot is in {self.state}")
+    def _advance(self, facts: Facts, request: OperatorRequest) -> None:
+        """One step of INIT -> STAND -> ARMED -> RUN, if it is the next one and nothing objects."""
+        if request is OperatorRequest.HOLD:
             return
-        objection = self._objection(facts, request)
-        if objection:
+        source, target = _TRANSITIONS[request]
+        if source is not self.state:
+            self._events.append(f"{request} refused: the robot is in {self.state}")
+        elif objection := self._objection(facts, request):
             self._events.append(f"{request} refused: {objection}")
-            return
-        target = {Request.STAND: State.STAND, Request.ARM: State.ARMED, Request.RUN: State.RUN}
-        self._asked_to_hold = False
-        self._enter(target[request], "the operator asked for it", facts)
+        else:
+            self._hold_requested = False
+            self._enter(target, "requested by the operator", facts)
 
-    def _objection(self, facts: Facts, request: Request) -> str:
+    def _objection(self, facts: Facts, request: OperatorRequest) -> str:
         if facts.state_age_s > self.limits.state_hold_s:
             return "proprioception is not fresh"
         if facts.refusal:
             return facts.refusal
-        if request is Request.ARM:
+        if request is OperatorRequest.ARM:
             left = self.limits.stand_s - self.time_in_state_s(facts.time_ns)
             if left > 0:
                 return f"still standing up, {left:.1f} s to go"
             if facts.height < self.limits.height_damp:
                 return f"the pelvis is only {facts.height:.2f} m above the foot"
-        return self._why_hold(facts) if request is Request.RUN else ""
+        return self._hold_reason(facts) if request is OperatorRequest.RUN else ""
 
     def _enter(self, state: State, reason: str, facts: Facts) -> None:
         if state is self.state:
             return
         self.state, self.reason = state, reason
         self._since_ns = facts.time_ns
-        self._well_since_ns = None
+        self._healthy_since_ns = None
+
+
+def _stale_state(facts: Facts) -> str:
+    age = f"no new proprioception for {facts.state_age_s * 1e3:.0f} ms"
+    return f"{age} ({facts.skipped})" if facts.skipped else age

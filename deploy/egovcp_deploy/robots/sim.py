@@ -11,8 +11,8 @@ from egovcp.log.tick import BasePose, CameraView, SceneObject
 from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import Observation, VectorEnv
 from egovcp.sim.tasks.base import Solid
+from egovcp_deploy.options import held_out
 from egovcp_deploy.robots.base import ActionResult, RobotObservation
-from egovcp_deploy.scenarios import held_out
 
 _START_EVENTS: Final = {"ball": "ball thrown", "wall": "robot pushed", "arch": "passage begins"}
 #: Reward term -> event that is logged when the term is first nonzero in an episode.

@@ -12,9 +12,9 @@ from lerobot.utils.errors import DeviceAlreadyConnectedError, DeviceNotConnected
 
 from egovcp import spec
 from egovcp.errors import UsageError
-from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions
-from egovcp_deploy.live.puppet import Puppet
-from egovcp_deploy.live.run import LiveSetup
+from egovcp_deploy.live.external_policy import ExternalPolicyRobot
+from egovcp_deploy.live.hardware import CameraOptions, ControlSetup, HardwareOptions
+from egovcp_deploy.live.operators import AutomaticOperator
 from egovcp_deploy.pilot.states import Limits
 from egovcp_deploy.robots.bridge import BridgeConfig
 
@@ -39,10 +39,10 @@ class EgovcpG1Config(RobotConfig):  # type: ignore[misc]
     remote control: Y, A, start."""
 
     @property
-    def setup(self) -> LiveSetup:
+    def setup(self) -> ControlSetup:
         """Configuration of the control process."""
         hardware = HardwareOptions(self.bridge, self.camera)
-        return LiveSetup(hardware, self.controller, self.limits, stays=False)
+        return ControlSetup(hardware, self.controller, self.limits)
 
 
 class EgovcpG1(Robot):  # type: ignore[misc]
@@ -58,7 +58,7 @@ class EgovcpG1(Robot):  # type: ignore[misc]
     def __init__(self, config: EgovcpG1Config) -> None:
         super().__init__(config)
         self.config = config
-        self._puppet: Puppet | None = None
+        self._robot: ExternalPolicyRobot | None = None
 
     @cached_property
     def observation_features(self) -> dict[str, Any]:
@@ -78,20 +78,20 @@ class EgovcpG1(Robot):  # type: ignore[misc]
 
     @property
     def is_connected(self) -> bool:
-        return self._puppet is not None
+        return self._robot is not None
 
     @property
     def is_calibrated(self) -> bool:
         return True
 
     def connect(self, calibrate: bool = True) -> None:
-        """Stand up and run; see `Puppet.connect` for what can go wrong."""
-        if self._puppet is not None:
+        """Stand up and run; see `ExternalPolicyRobot.connect` for what can go wrong."""
+        if self._robot is not None:
             raise DeviceAlreadyConnectedError(f"{self} is connected already")
-        setup = self.config.setup
-        puppet = Puppet.by_itself(setup) if self.config.by_itself else Puppet(setup)
-        puppet.connect()
-        self._puppet = puppet
+        operator = AutomaticOperator() if self.config.by_itself else None
+        robot = ExternalPolicyRobot(self.config.setup, operator)
+        robot.connect()
+        self._robot = robot
 
     def calibrate(self) -> None:
         """Nothing to do."""
@@ -101,9 +101,9 @@ class EgovcpG1(Robot):  # type: ignore[misc]
 
     def get_observation(self) -> dict[str, Any]:
         """The next observation: `spec.STATE_NAMES`, and ``ego_depth`` (48, 64, 1) uint16 mm."""
-        report = self._running.observe()
-        state = dict(zip(spec.STATE_NAMES, report.state.tolist(), strict=True))
-        return {**state, _DEPTH: report.depth[..., None].copy()}
+        observation = self._running.observe()
+        state = dict(zip(spec.STATE_NAMES, observation.state.tolist(), strict=True))
+        return {**state, _DEPTH: observation.depth[..., None].copy()}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, Any]:
         """Send `spec.ACTION_NAMES`, each in [-1, 1]; returns the rate-limited action.
@@ -120,11 +120,11 @@ class EgovcpG1(Robot):  # type: ignore[misc]
 
     def disconnect(self) -> None:
         """Hold, then damp. Suspend the robot first."""
-        puppet, self._puppet = self._running, None
-        puppet.close()
+        robot, self._robot = self._running, None
+        robot.close()
 
     @property
-    def _running(self) -> Puppet:
-        if self._puppet is None:
+    def _running(self) -> ExternalPolicyRobot:
+        if self._robot is None:
             raise DeviceNotConnectedError(f"{self} is not connected; call connect()")
-        return self._puppet
+        return self._robot

@@ -17,10 +17,10 @@ from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import LiveRobot, ServoCommand
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM, JOINT_NAMES
-from egovcp_deploy.live.control import NOTHING, ControlLoop, Wishes
-from egovcp_deploy.pilot.desk import InlineDesk, Report, Thinker
+from egovcp_deploy.live.control import ControlLoop
 from egovcp_deploy.pilot.pilot import Pilot
-from egovcp_deploy.pilot.states import Limits, Request, State
+from egovcp_deploy.pilot.planner import InlinePlanner, ObservationMessage, PlannerRunner
+from egovcp_deploy.pilot.states import Limits, OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import DepthImage, LowState, MotorCommand
 
 TICK_NS = 20_000_000
@@ -32,7 +32,7 @@ QUICK = [
 PATIENT = [
     "--robot.limits.planner_hold_s=5",
     "--robot.limits.misses_hold=10000",
-    "--robot.limits.picture_hold_s=5",
+    "--robot.limits.image_hold_s=5",
     "--robot.limits.state_hold_s=5",
     "--robot.limits.state_damp_s=10",
 ]
@@ -158,14 +158,14 @@ class Reaching:
         self.sent.append(sent[0].copy())
 
 
-class EventDesk(InlineDesk):
+class EventPlanner(InlinePlanner):
     """Remembers the events of all reports."""
 
     events: list[str]
 
-    def submit(self, report: Report) -> None:
-        self.events += report.events
-        super().submit(report)
+    def submit(self, observation: ObservationMessage) -> None:
+        self.events += observation.events
+        super().submit(observation)
 
 
 @dataclass
@@ -186,15 +186,15 @@ class Rig:
     def run(
         self,
         seconds: float,
-        request: Request | None = None,
+        request: OperatorRequest | None = None,
         velocity: tuple[float, float, float] | None = None,
         each: Callable[[int], None] = lambda tick: None,
     ) -> None:
         """Let time pass; the operator's request comes at its first tick."""
         for k in range(round(seconds * 50)):
             each(k)
-            wishes = Wishes(request if k == 0 else None, velocity) if k == 0 else NOTHING
-            self.loop.tick(self.clock.now_ns(), wishes)
+            command = OperatorCommand(request, velocity) if k == 0 else OperatorCommand()
+            self.loop.tick(self.clock.now_ns(), command)
             self.states.append(self.loop.state)
             self.robot.advance(4)
             self.clock.advance(TICK_NS)
@@ -202,16 +202,16 @@ class Rig:
     def stand(self) -> None:
         """From the crane to ARMED, on its own feet."""
         self.run(0.1)
-        self.run(3.1, Request.STAND)
+        self.run(3.1, OperatorRequest.STAND)
         self.robot.release()
         self.run(0.5)
-        self.run(0.1, Request.ARM)
+        self.run(0.1, OperatorRequest.ARM)
         assert self.loop.state is State.ARMED
 
     def go(self) -> None:
         """From the crane to RUN."""
         self.stand()
-        self.run(0.5, Request.RUN)
+        self.run(0.5, OperatorRequest.RUN)
         assert self.loop.state is State.RUN
 
 
@@ -224,16 +224,17 @@ def make_rig() -> Callable[..., Rig]:
         robot.start(Scenario("ball", 0, 0))
         clock, faults, policy = LockstepClock(time_ns=10**12), Faults(), Reaching(level)
         body = SimBody(robot, clock, faults)
-        desk = EventDesk(Thinker(policy), clock, lambda tick: delay_ms(tick) * 1_000_000)
-        desk.events = []
+        runner = PlannerRunner(policy)
+        planner = EventPlanner(runner, clock, lambda tick: delay_ms(tick) * 1_000_000)
+        planner.events = []
         controller = StanceController()
         loop = ControlLoop(
             body,
             SimEye(robot, clock, faults),
             controller,
-            Pilot(desk, Limits()),
+            Pilot(planner, Limits()),
             refusal=lambda: faults.refusal,
         )
-        return Rig(robot, clock, faults, body, policy, controller, loop, desk.events)
+        return Rig(robot, clock, faults, body, policy, controller, loop, planner.events)
 
     return make

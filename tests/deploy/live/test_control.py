@@ -1,4 +1,4 @@
-"""The 50 Hz loop on a simulated body: what the motors are told, whatever goes wrong."""
+"""The 50 Hz control loop, its motor commands and its velocity on a simulated body."""
 
 from __future__ import annotations
 
@@ -8,11 +8,20 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW
+from egovcp.robot.kinematics import JOINT_LOWER, JOINT_UPPER, TARGET_HIGH, TARGET_LOW
 from egovcp.spec import ACTION_BOX, COMMAND_SLICE, STATE_SLICES
-from egovcp_deploy.pilot.states import Request, State
+from egovcp_deploy.live.control import (
+    VELOCITY_HIGH,
+    VELOCITY_LOW,
+    VELOCITY_RAMP,
+    VelocityCommand,
+    damping_command,
+    position_command,
+    ramp_command,
+)
+from egovcp_deploy.pilot.states import OperatorRequest, State
 from egovcp_deploy.robots.base import MotorCommand
-from egovcp_deploy.robots.wire import encode_command
+from egovcp_deploy.robots.wire import decode_command, encode_command
 
 from .conftest import Rig
 
@@ -35,7 +44,7 @@ def assert_sane(commands: list[MotorCommand]) -> None:
             assert (command.position <= TARGET_HIGH + 1e-9).all()
 
 
-def test_the_motors_are_damped_until_somebody_asks_to_stand(make_rig: Make) -> None:
+def test_the_motors_are_damped_until_stand_is_requested(make_rig: Make) -> None:
     rig = make_rig()
     rig.run(1.0)
     assert set(rig.states) == {State.INIT}
@@ -43,11 +52,11 @@ def test_the_motors_are_damped_until_somebody_asks_to_stand(make_rig: Make) -> N
     assert len(rig.body.commands) == 50
 
 
-def test_the_gains_come_in_without_a_jump(make_rig: Make) -> None:
+def test_the_gains_ramp_in_without_a_jump(make_rig: Make) -> None:
     rig = make_rig()
     rig.run(0.1)
     before = len(rig.body.commands)
-    rig.run(3.1, Request.STAND)
+    rig.run(3.1, OperatorRequest.STAND)
     gains = np.array([command.stiffness[0] for command in rig.body.commands[before:]])
     assert (np.diff(gains) >= 0).all()
     assert np.diff(gains).max() < gains[-1] / 100
@@ -56,7 +65,7 @@ def test_the_gains_come_in_without_a_jump(make_rig: Make) -> None:
     assert np.abs(np.diff(targets, axis=0)).max() < 0.2
 
 
-def test_it_stands_on_its_own_feet_and_reaches_where_the_planner_says(make_rig: Make) -> None:
+def test_the_robot_stands_and_reaches_the_planned_targets(make_rig: Make) -> None:
     rig = make_rig()
     rig.go()
     rig.run(2.0)
@@ -71,7 +80,7 @@ def test_it_stands_on_its_own_feet_and_reaches_where_the_planner_says(make_rig: 
 
 @pytest.mark.parametrize("offset", [0.0, 0.02])
 @pytest.mark.parametrize("delay_ms", [10, 30, 90])
-def test_the_recurrence_begins_at_run_and_hears_what_was_sent(
+def test_the_recurrence_begins_at_run_and_gets_the_sent_actions(
     make_rig: Make, delay_ms: int, offset: float
 ) -> None:
     slow = [10]
@@ -81,12 +90,12 @@ def test_the_recurrence_begins_at_run_and_hears_what_was_sent(
     rig.run(offset)
     resets = rig.policy.resets
     seen = len(rig.policy.seen)
-    rig.run(1.0, Request.RUN)
+    rig.run(1.0, OperatorRequest.RUN)
     assert rig.policy.resets == resets + 1
     states = np.stack(rig.policy.seen[seen:])
     commands = states[:, COMMAND_SLICE]
     np.testing.assert_allclose(commands[0, 3:], ACTION_BOX.neutral, atol=1e-6)
-    sent = np.stack(rig.policy.sent)[-len(states) + 1 :]  # none is told with the first
+    sent = np.stack(rig.policy.sent)[-len(states) + 1 :]  # the first observation has none
     np.testing.assert_allclose(commands[1:, 3:], ACTION_BOX.to_metric(sent), atol=1e-6)
 
 
@@ -102,7 +111,7 @@ def test_a_plan_that_is_ready_within_its_tick_is_never_missed(
 
 
 @pytest.mark.parametrize("delay_ms", [60, 100, 200, 400])
-def test_a_slow_planner_never_moves_the_robot_roughly(make_rig: Make, delay_ms: int) -> None:
+def test_a_slow_planner_holds_the_robot_and_never_damps_it(make_rig: Make, delay_ms: int) -> None:
     slow = [False]
     rig = make_rig(lambda tick: delay_ms if slow[0] else 10)
     rig.go()
@@ -117,7 +126,7 @@ def test_a_slow_planner_never_moves_the_robot_roughly(make_rig: Make, delay_ms: 
     assert rig.loop.state is State.RUN
 
 
-def test_a_silent_planner_is_held_within_200_ms_and_the_hands_go_home(make_rig: Make) -> None:
+def test_a_silent_planner_holds_within_200_ms_and_the_hands_ease(make_rig: Make) -> None:
     dead = [False]
     rig = make_rig(lambda tick: 10**6 if dead[0] else 10)
     rig.go()
@@ -148,7 +157,7 @@ def test_frozen_proprioception(make_rig: Make, ms: int, worst: State) -> None:
         assert rig.loop.state is State.RUN
 
 
-def test_readings_that_are_no_numbers_count_as_none_and_reach_nobody(make_rig: Make) -> None:
+def test_readings_that_are_not_finite_are_ignored(make_rig: Make) -> None:
     rig = make_rig(level=0.0)
     rig.go()
     rig.faults.nan = True
@@ -164,7 +173,7 @@ def test_readings_that_are_no_numbers_count_as_none_and_reach_nobody(make_rig: M
     assert_sane(rig.body.commands)
 
 
-def test_a_blind_camera_holds_and_sight_lets_it_go_on(make_rig: Make) -> None:
+def test_a_frozen_camera_holds_until_images_return(make_rig: Make) -> None:
     rig = make_rig()
     rig.go()
     rig.faults.blind = True
@@ -175,7 +184,7 @@ def test_a_blind_camera_holds_and_sight_lets_it_go_on(make_rig: Make) -> None:
     assert rig.loop.state is State.RUN
 
 
-def test_pushed_over_it_is_damped_within_60_ms_of_tilting_and_stays_so(make_rig: Make) -> None:
+def test_a_falling_robot_is_damped_within_60_ms_for_good(make_rig: Make) -> None:
     rig = make_rig(level=0.0)
     rig.go()
     start = len(rig.states)
@@ -191,13 +200,13 @@ def test_pushed_over_it_is_damped_within_60_ms_of_tilting_and_stays_so(make_rig:
     damped = rig.states[start:].index(State.DAMP)
     assert (damped - tilted) * 20 <= 60
     assert set(rig.states[start + damped :]) == {State.DAMP}
-    for request in Request:
+    for request in OperatorRequest:
         rig.run(0.1, request)
     assert rig.loop.state is State.DAMP
     assert all(limp(command) for command in rig.body.commands[start + damped :])
 
 
-def test_a_controller_without_numbers_damps_in_the_same_tick(
+def test_targets_that_are_not_finite_damp_in_the_same_tick(
     make_rig: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = make_rig()
@@ -215,7 +224,7 @@ def test_a_controller_without_numbers_damps_in_the_same_tick(
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_no_target_beyond_its_bounds_leaves_whatever_the_networks_give(
+def test_targets_stay_in_bounds_for_any_network_output(
     make_rig: Make, monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -241,11 +250,11 @@ def test_no_target_beyond_its_bounds_leaves_whatever_the_networks_give(
         encode_command(command)  # refuses what is beyond the bounds
 
 
-def test_it_is_not_armed_while_somebody_else_drives(make_rig: Make) -> None:
+def test_another_publisher_prevents_arming(make_rig: Make) -> None:
     rig = make_rig()
     rig.faults.refusal = "another publisher is alive"
     rig.run(0.1)
-    rig.run(0.5, Request.STAND)
+    rig.run(0.5, OperatorRequest.STAND)
     assert rig.loop.state is State.INIT
     assert all(limp(command) for command in rig.body.commands)
 
@@ -255,24 +264,24 @@ def test_the_operators_velocity_is_sent_only_while_running(make_rig: Make) -> No
     rig.stand()
     rig.run(0.4, velocity=(0.2, 0.0, 0.0))
     assert rig.policy.seen[-1][STATE_SLICES["command_velocity"]][0] == 0.0
-    rig.run(0.5, Request.RUN)
+    rig.run(0.5, OperatorRequest.RUN)
     rig.run(0.4, velocity=(0.2, 0.0, 0.0))
     assert rig.policy.seen[-1][STATE_SLICES["command_velocity"]][0] == pytest.approx(0.2)
     rig.run(1.5)  # the operator has fallen silent
     assert rig.policy.seen[-1][STATE_SLICES["command_velocity"]][0] == 0.0
 
 
-def test_a_hot_motor_is_not_armed_with(make_rig: Make) -> None:
+def test_a_hot_motor_prevents_arming(make_rig: Make) -> None:
     rig = make_rig()
     rig.faults.hot = 75.0
     rig.run(0.1)
-    rig.run(3.1, Request.STAND)
+    rig.run(3.1, OperatorRequest.STAND)
     assert rig.loop.state is State.INIT, "standing up is refused already"
     rig.faults.hot = 60.0
     rig.stand()
     rig.faults.hot = 75.0
     rig.run(0.2)
-    rig.run(0.5, Request.RUN)
+    rig.run(0.5, OperatorRequest.RUN)
     assert rig.loop.state is State.ARMED
     assert any("left_knee_joint is at 75 deg C" in line for line in events_of(rig))
 
@@ -305,7 +314,7 @@ def test_a_motor_that_drops_out_damps_the_robot_and_is_named(make_rig: Make) -> 
     assert_sane(rig.body.commands)
 
 
-def test_pushes_and_reaches_are_no_motor_faults(make_rig: Make) -> None:
+def test_pushes_and_reaches_raise_no_motor_faults(make_rig: Make) -> None:
     rig = make_rig(level=0.9)
     rig.faults.hot = 40.0
     rig.go()
@@ -318,4 +327,89 @@ def test_pushes_and_reaches_are_no_motor_faults(make_rig: Make) -> None:
 
 def events_of(rig: Rig) -> list[str]:
     """All that the loop has reported, and what it would report next."""
-    return [*rig.events, *rig.loop.pilot.events()]
+    return [*rig.events, *rig.loop.pilot.take_events()]
+
+
+Array = NDArray[np.float64]
+GAIN = np.full(29, 40.0)
+_EXTREMES = (np.nan, np.inf, -np.inf, 1e300, -1e300, 1e30, 1e9, -1e9, 3.0, -3.0, 0.0)
+
+
+def wild(rng: np.random.Generator) -> Array:
+    """(29,) random numbers, extremes among them."""
+    values = rng.normal(0, 10.0 ** rng.integers(-2, 4), 29)
+    return np.where(rng.random(29) < 0.3, rng.choice(_EXTREMES, 29), values)
+
+
+def sent(command: MotorCommand) -> Array:
+    """(29,) targets as they arrive."""
+    return decode_command(encode_command(command)).motors.position
+
+
+def test_targets_exceed_joint_ranges_by_0_1_to_0_6_rad() -> None:
+    below, above = JOINT_LOWER - TARGET_LOW, TARGET_HIGH - JOINT_UPPER
+    for slack in (below, above):
+        assert (slack >= 0.0999).all()
+        assert (slack <= 0.6001).all()
+    assert (np.minimum(below, above) < 0.11).sum() >= 18  # a range that is not needed is not given
+
+
+@pytest.mark.parametrize("make", ["position", "ramp", "damping"])
+def test_motor_commands_are_finite_and_bounded_for_any_input(make: str) -> None:
+    rng = np.random.default_rng(0)
+    build: dict[str, Callable[[], MotorCommand]] = {
+        "position": lambda: position_command(wild(rng), GAIN, GAIN, 5),
+        "ramp": lambda: ramp_command(wild(rng), wild(rng), GAIN, GAIN, float(rng.normal(0, 3)), 5),
+        "damping": lambda: damping_command(wild(rng), 5),
+    }
+    for _ in range(500):
+        position = sent(build[make]())
+        assert np.isfinite(position).all()
+        assert (position >= TARGET_LOW - 1e-6).all()
+        assert (position <= TARGET_HIGH + 1e-6).all()
+
+
+TICK_NS = 20_000_000
+
+
+def test_the_velocity_is_bounded_and_ramped() -> None:
+    command = VelocityCommand()
+    last = command.at(0)
+    for k in range(1, 101):
+        command.set_target(k * TICK_NS, (9.0, -9.0, 9.0))
+        now = command.at(k * TICK_NS)
+        assert (np.abs(now - last) <= np.array(VELOCITY_RAMP) * 0.02 + 1e-12).all()
+        last = now
+    np.testing.assert_allclose(last, (VELOCITY_HIGH[0], VELOCITY_LOW[1], VELOCITY_HIGH[2]))
+
+
+def test_silence_for_half_a_second_stops_the_robot() -> None:
+    command = VelocityCommand()
+    for k in range(50):
+        command.set_target(k * TICK_NS, (0.4, 0.0, 0.0))
+        command.at(k * TICK_NS)
+    silent = [command.at((50 + k) * TICK_NS)[0] for k in range(60)]
+    assert silent[0] == pytest.approx(0.4)
+    assert silent[-1] == 0.0
+    assert (np.diff(silent) <= 0).all()
+
+
+def test_a_disallowed_velocity_ramps_to_zero() -> None:
+    command = VelocityCommand()
+    for k in range(50):
+        command.set_target(k * TICK_NS, (0.4, 0.0, 0.0))
+        command.at(k * TICK_NS)
+    command.set_target(50 * TICK_NS, (0.4, 0.0, 0.0))
+    assert 0.0 < command.at(50 * TICK_NS, allowed=False)[0] < 0.4
+    for k in range(51, 90):
+        command.set_target(k * TICK_NS, (0.4, 0.0, 0.0))
+        last = command.at(k * TICK_NS, allowed=False)
+    np.testing.assert_array_equal(last, 0.0)
+
+
+@pytest.mark.parametrize("wish", [(np.nan, 0.0, 0.0), (np.inf, 0.0, 0.0), (0.1, 0.1)])
+def test_an_invalid_velocity_is_ignored(wish: tuple[float, ...]) -> None:
+    command = VelocityCommand()
+    command.at(0)
+    command.set_target(TICK_NS, wish)
+    np.testing.assert_array_equal(command.at(TICK_NS), 0.0)

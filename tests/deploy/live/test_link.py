@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from egovcp.log.tick import MotorReadings
-from egovcp_deploy.live.link import decode_report, encode_report
-from egovcp_deploy.pilot.desk import Report
+from egovcp_deploy.live.link import decode_observation, encode_observation
+from egovcp_deploy.pilot.planner import ObservationMessage
 
 COUNT = np.arange(29)
 BARE = MotorReadings(torque=COUNT / 3.0)
@@ -24,11 +24,13 @@ FULL = MotorReadings(
 
 
 @pytest.mark.parametrize("motors", [None, BARE, ONE_TEMPERATURE, FULL])
-def test_motors_and_link_survive(motors: MotorReadings | None) -> None:
+def test_motors_and_link_are_decoded_as_encoded(motors: MotorReadings | None) -> None:
     depth, state = np.full((48, 64), 1500, np.uint16), np.arange(74, dtype=np.float32)
     link = {"state_rate_hz": 200.0, "image_age_ms": 31.5}
-    report = Report(3, 10**12, depth, state, np.ones(7), False, "run", ("a", "b"), motors, link)
-    back = decode_report(encode_report(report))
+    observation = ObservationMessage(
+        3, 10**12, depth, state, np.ones(7), False, "run", ("a", "b"), motors, link
+    )
+    back = decode_observation(encode_observation(observation))
     assert back is not None
     assert (back.link, back.events, back.mode) == (link, ("a", "b"), "run")
     if motors is None:
@@ -43,9 +45,11 @@ def test_motors_and_link_survive(motors: MotorReadings | None) -> None:
             assert found.dtype == sent.dtype
 
 
-def test_a_torn_report_is_none() -> None:
+def test_a_damaged_observation_is_none() -> None:
     depth, state = np.zeros((48, 64), np.uint16), np.zeros(74, np.float32)
-    parts = encode_report(Report(3, 1, depth, state, np.ones(7), False, "run", (), FULL, {}))
-    assert decode_report(parts[:-1]) is None
-    assert decode_report([*parts[:-1], parts[-1][:-8]]) is None
-    assert decode_report([parts[0].replace(b"torque", b"torpor"), *parts[1:]]) is None
+    parts = encode_observation(
+        ObservationMessage(3, 1, depth, state, np.ones(7), False, "run", (), FULL, {})
+    )
+    assert decode_observation(parts[:-1]) is None
+    assert decode_observation([*parts[:-1], parts[-1][:-8]]) is None
+    assert decode_observation([parts[0].replace(b"torque", b"torpor"), *parts[1:]]) is None

@@ -65,14 +65,14 @@ def torques(joint: int, torque: float) -> MotorReadings:
     return replace(HEALTHY, torque=values)
 
 
-def test_healthy_motors_say_nothing() -> None:
+def test_healthy_motors_give_no_events() -> None:
     rig = WatchRig()
     assert rig.run(30.0) == MotorVerdict()
     assert rig.events == []
 
 
 @pytest.mark.parametrize(("column", "limits"), [(0, CASING), (1, WINDING)])
-def test_a_motor_that_heats_up_is_warned_of_then_not_armed_with_then_held(
+def test_a_heating_motor_is_warned_of_then_refused_then_held(
     column: int, limits: tuple[float, float, float]
 ) -> None:
     rig = WatchRig()
@@ -105,7 +105,7 @@ def test_a_single_hot_reading_holds_nothing() -> None:
     assert not rig.run(1.0).hold
 
 
-def test_one_temperature_per_motor_has_its_own_limits_and_is_told_once() -> None:
+def test_one_temperature_per_motor_has_its_own_limits_and_is_logged_once() -> None:
     rig = WatchRig()
     temperature = np.full((29, 1), 35.0)
     single = replace(HEALTHY, temperature=temperature)
@@ -136,7 +136,7 @@ def test_heat_is_warned_of_while_a_motor_is_overloaded() -> None:
     assert any("is hot" in event for event in rig.events)
 
 
-def test_what_is_not_reported_is_said_once_and_the_rest_goes_on() -> None:
+def test_missing_fields_are_logged_once_and_other_checks_continue() -> None:
     rig = WatchRig()
     bare = MotorReadings(torque=HEALTHY.torque)
     assert rig.run(5.0, bare) == MotorVerdict()
@@ -147,7 +147,7 @@ def test_what_is_not_reported_is_said_once_and_the_rest_goes_on() -> None:
     assert rig.watch.update(replace(reading(10**12, bare), motors=None), None) == MotorVerdict()
 
 
-def test_a_field_that_disappears_is_said() -> None:
+def test_a_field_that_disappears_is_logged() -> None:
     rig = WatchRig()
     rig.run(1.0)
     rig.run(1.0, replace(HEALTHY, temperature=None))
@@ -199,21 +199,21 @@ def test_an_overloaded_motor_is_held_and_a_sensor_fault_forbids_arming_only() ->
 def test_a_motor_without_torque_although_much_is_commanded_is_damped_with_its_name() -> None:
     rig = WatchRig()
     rig.run(1.0)
-    asked = replace(HOLD_STILL, position=np.where(np.arange(29) == KNEE, 0.4, 0.0))
+    command = replace(HOLD_STILL, position=np.where(np.arange(29) == KNEE, 0.4, 0.0))
     dead = torques(KNEE, 0.3)
-    assert not rig.run(0.1, dead, asked).damp
-    damp = rig.run(0.1, dead, asked).damp
+    assert not rig.run(0.1, dead, command).damp
+    damp = rig.run(0.1, dead, command).damp
     assert "left_knee_joint does not follow its target: torque 0.3 N m" in damp
 
 
 @pytest.mark.parametrize("torque", [40.0, 10.0, -20.0])
 def test_a_motor_that_works_against_a_load_is_not_damped(torque: float) -> None:
     rig = WatchRig()
-    asked = replace(HOLD_STILL, position=np.where(np.arange(29) == KNEE, 0.4, 0.0))
-    assert rig.run(5.0, torques(KNEE, torque), asked) == MotorVerdict()
+    command = replace(HOLD_STILL, position=np.where(np.arange(29) == KNEE, 0.4, 0.0))
+    assert rig.run(5.0, torques(KNEE, torque), command) == MotorVerdict()
 
 
-def test_a_target_that_changes_its_side_each_tick_accuses_nobody() -> None:
+def test_a_target_that_alternates_each_tick_is_no_fault() -> None:
     rig = WatchRig()
     rig.run(1.0)
     for k in range(100):
@@ -223,19 +223,19 @@ def test_a_target_that_changes_its_side_each_tick_accuses_nobody() -> None:
 
 def test_a_robot_that_estimates_no_torque_is_not_29_dead_motors() -> None:
     rig = WatchRig()
-    asked = replace(HOLD_STILL, position=np.full(29, 0.4))
-    assert rig.run(5.0, replace(HEALTHY, torque=ZERO), asked) == MotorVerdict()
+    command = replace(HOLD_STILL, position=np.full(29, 0.4))
+    assert rig.run(5.0, replace(HEALTHY, torque=ZERO), command) == MotorVerdict()
     assert rig.events == [
         "no motor reports any torque: the check for motors that do not follow is off"
     ]
 
 
-def test_the_same_reading_again_proves_nothing() -> None:
+def test_a_repeated_reading_changes_nothing() -> None:
     watch = MotorWatch()
-    asked = replace(HOLD_STILL, position=np.full(29, 0.4))
-    watch.update(reading(1, HEALTHY), asked)
+    command = replace(HOLD_STILL, position=np.full(29, 0.4))
+    watch.update(reading(1, HEALTHY), command)
     late = reading(2, torques(KNEE, 0.0))
-    assert not any(watch.update(late, asked).damp for _ in range(100))
+    assert not any(watch.update(late, command).damp for _ in range(100))
 
 
 def test_a_motor_that_loses_packets_is_warned_of_once_a_second() -> None:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from egovcp.log.tick import MODES
-from egovcp_deploy.pilot.states import Facts, Limits, Request, State, Supervisor
+from egovcp_deploy.pilot.states import Facts, Limits, OperatorRequest, State, Supervisor
 
 TICK_NS = 20_000_000
 WELL = Facts(time_ns=0)
 
 
-def test_the_states_are_those_that_logs_know() -> None:
+def test_the_states_are_those_of_the_log() -> None:
     assert tuple(State) == MODES
 
 
@@ -31,47 +31,49 @@ def feed(machine: Supervisor, facts: Facts, seconds: float, start_ns: int = 0) -
     return start_ns + ticks * TICK_NS
 
 
-def test_the_way_from_start_to_run() -> None:
+def test_requests_lead_from_init_to_run() -> None:
     machine = Supervisor()
     assert machine.update(WELL) == ()
     assert machine.state is State.INIT
-    assert machine.update(WELL, Request.STAND) == ("init -> stand: the operator asked for it",)
-    (refused,) = machine.update(WELL, Request.ARM)
+    assert machine.update(WELL, OperatorRequest.STAND) == (
+        "init -> stand: requested by the operator",
+    )
+    (refused,) = machine.update(WELL, OperatorRequest.ARM)
     assert refused == "arm refused: still standing up, 3.0 s to go"
     now = feed(machine, WELL, 3.0)
-    machine.update(replace(WELL, time_ns=now), Request.ARM)
+    machine.update(replace(WELL, time_ns=now), OperatorRequest.ARM)
     assert machine.state is State.ARMED
-    machine.update(replace(WELL, time_ns=now), Request.RUN)
+    machine.update(replace(WELL, time_ns=now), OperatorRequest.RUN)
     assert machine.state is State.RUN
 
 
-@pytest.mark.parametrize("request_", [Request.ARM, Request.RUN])
-def test_no_step_is_left_out(request_: Request) -> None:
+@pytest.mark.parametrize("request_", [OperatorRequest.ARM, OperatorRequest.RUN])
+def test_no_state_can_be_skipped(request_: OperatorRequest) -> None:
     machine = Supervisor()
     (refused,) = machine.update(WELL, request_)
     assert refused.startswith(f"{request_} refused: the robot is in init")
     assert machine.state is State.INIT
 
 
-def test_nothing_moves_before_the_first_reading() -> None:
+def test_stand_is_refused_before_the_first_reading() -> None:
     machine = Supervisor()
-    (refused,) = machine.update(replace(WELL, state_age_s=math.inf), Request.STAND)
+    (refused,) = machine.update(replace(WELL, state_age_s=math.inf), OperatorRequest.STAND)
     assert "proprioception" in refused
     assert machine.state is State.INIT
 
 
-def test_a_refusal_of_the_robot_keeps_it_from_being_armed() -> None:
+def test_a_refusal_prevents_arming() -> None:
     machine = at(State.STAND)
     now = feed(machine, WELL, 4.0)
     (refused,) = machine.update(
-        replace(WELL, time_ns=now, refusal="another publisher is alive"), Request.ARM
+        replace(WELL, time_ns=now, refusal="another publisher is alive"), OperatorRequest.ARM
     )
     assert refused == "arm refused: another publisher is alive"
 
 
-def test_run_is_refused_without_a_picture() -> None:
+def test_run_is_refused_without_a_depth_image() -> None:
     machine = at(State.ARMED)
-    machine.update(replace(WELL, picture_age_s=math.inf), Request.RUN)
+    machine.update(replace(WELL, image_age_s=math.inf), OperatorRequest.RUN)
     assert machine.state is State.ARMED
 
 
@@ -87,15 +89,13 @@ DAMPS = [
 
 @pytest.mark.parametrize("state", [State.ARMED, State.RUN, State.HOLD])
 @pytest.mark.parametrize("fault", DAMPS, ids=str)
-def test_what_standing_cannot_survive_damps_at_once_and_for_good(
-    state: State, fault: dict[str, float]
-) -> None:
+def test_critical_faults_damp_at_once_and_for_good(state: State, fault: dict[str, float]) -> None:
     machine = at(state)
     machine.update(replace(WELL, **fault))
     assert machine.state is State.DAMP
     reason = machine.reason
     now = feed(machine, WELL, 5.0)
-    for request in Request:
+    for request in OperatorRequest:
         machine.update(replace(WELL, time_ns=now), request)
     assert machine.state is State.DAMP
     assert machine.reason == reason
@@ -104,13 +104,13 @@ def test_what_standing_cannot_survive_damps_at_once_and_for_good(
 @pytest.mark.parametrize("state", list(State))
 def test_the_emergency_stop_works_in_every_state(state: State) -> None:
     machine = at(state)
-    machine.update(WELL, Request.ESTOP)
+    machine.update(WELL, OperatorRequest.ESTOP)
     assert machine.state is State.DAMP
 
 
 HOLDS = [
     {"state_age_s": 0.101},
-    {"picture_age_s": 0.201},
+    {"image_age_s": 0.201},
     {"planner_silence_s": 0.141},
     {"misses": 6},
     {"planner_alive": False},
@@ -118,7 +118,7 @@ HOLDS = [
 
 
 @pytest.mark.parametrize("fault", HOLDS, ids=str)
-def test_what_standing_survives_holds_and_recovers(fault: dict[str, float]) -> None:
+def test_other_faults_hold_and_recover(fault: dict[str, float]) -> None:
     machine = at(State.RUN)
     machine.update(replace(WELL, **fault))
     assert machine.state is State.HOLD
@@ -130,7 +130,7 @@ def test_what_standing_survives_holds_and_recovers(fault: dict[str, float]) -> N
 
 ALMOST = [
     {"state_age_s": 0.05},
-    {"picture_age_s": 0.19},
+    {"image_age_s": 0.19},
     {"planner_silence_s": 0.13},
     {"misses": 5},
     {"tilt": 0.9},
@@ -139,7 +139,7 @@ ALMOST = [
 
 
 @pytest.mark.parametrize("fault", ALMOST, ids=str)
-def test_less_is_run_through(fault: dict[str, float]) -> None:
+def test_values_within_the_limits_do_not_hold(fault: dict[str, float]) -> None:
     machine = at(State.RUN)
     feed(machine, replace(WELL, **fault), 2.0)
     assert machine.state is State.RUN
@@ -156,41 +156,41 @@ def test_a_fault_that_comes_and_goes_does_not_flicker() -> None:
     assert machine.state is State.HOLD
 
 
-def test_an_operators_hold_ends_only_with_the_operator() -> None:
+def test_a_requested_hold_ends_only_on_request() -> None:
     machine = at(State.RUN)
-    machine.update(WELL, Request.HOLD)
+    machine.update(WELL, OperatorRequest.HOLD)
     now = feed(machine, WELL, 5.0)
     assert machine.state is State.HOLD
-    machine.update(replace(WELL, time_ns=now), Request.RUN)
+    machine.update(replace(WELL, time_ns=now), OperatorRequest.RUN)
     feed(machine, WELL, 1.1, now)
     assert machine.state is State.RUN
 
 
-def test_standing_up_may_begin_low_but_not_end_there() -> None:
+def test_a_low_robot_may_stand_up_but_not_be_armed() -> None:
     machine = at(State.STAND)
     low = replace(WELL, height=0.3)
     now = feed(machine, low, 4.0)
     assert machine.state is State.STAND
-    (refused,) = machine.update(replace(low, time_ns=now), Request.ARM)
+    (refused,) = machine.update(replace(low, time_ns=now), OperatorRequest.ARM)
     assert "0.30 m" in refused
 
 
-def test_whatever_comes_damp_is_latched_and_run_is_never_entered_unasked() -> None:
+def test_damp_is_latched_and_run_needs_a_request_for_random_facts() -> None:
     rng = np.random.default_rng(0)
     for _ in range(300):
-        machine, now, asked, damped = Supervisor(Limits(stand_s=0.1)), 0, False, False
+        machine, now, requested, damped = Supervisor(Limits(stand_s=0.1)), 0, False, False
         for _ in range(100):
             now += TICK_NS
             facts = Facts(
                 now,
                 state_age_s=float(rng.choice([0.0, 0.15, 0.25], p=[0.9, 0.07, 0.03])),
-                picture_age_s=float(rng.choice([0.0, 0.3], p=[0.9, 0.1])),
+                image_age_s=float(rng.choice([0.0, 0.3], p=[0.9, 0.1])),
                 misses=int(rng.choice([0, 7], p=[0.9, 0.1])),
                 tilt=float(rng.choice([0.0, 1.2], p=[0.99, 0.01])),
             )
-            request = rng.choice([None, *Request], p=[0.7, 0.1, 0.1, 0.06, 0.03, 0.01])
+            request = rng.choice([None, *OperatorRequest], p=[0.7, 0.1, 0.1, 0.06, 0.03, 0.01])
             machine.update(facts, request)
-            asked |= request is Request.RUN
+            requested |= request is OperatorRequest.RUN
             assert not (damped and machine.state is not State.DAMP)
             damped = machine.state is State.DAMP
-            assert asked or machine.state is not State.RUN
+            assert requested or machine.state is not State.RUN

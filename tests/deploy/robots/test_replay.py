@@ -19,14 +19,14 @@ from egovcp.log.mcap_reader import read_recording
 from egovcp.log.sink import Sink
 from egovcp.log.tick import RunInfo, Tick
 from egovcp.plan import Policy, PolicyStep
-from egovcp.rate import FixedRate, LockstepClock
+from egovcp.rate import LockstepClock
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.testing import random_episode
-from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
 from egovcp_deploy.robots import LockstepRobot
 from egovcp_deploy.robots.replay import RECORDING_ENDS, ReplayRobot, open_recordings, recorded_run
 from egovcp_deploy.robots.sim import SimRobot
-from egovcp_deploy.runner import Runner
+from egovcp_deploy.rollouts import LockstepRunner
 from tests.support.sinks import MemorySink
 
 TICKS = 12
@@ -68,7 +68,7 @@ def watched(artifact_dir: Path, askew: float = 0.0) -> Watched:
 
 def run(policy: Watched, robot: LockstepRobot, sink: Sink) -> None:
     clock = LockstepClock()
-    Runner(InlineDesk(Thinker(policy), clock), robot, FixedRate(25, clock)).run(sink)
+    LockstepRunner(InlinePlanner(PlannerRunner(policy), clock), robot, clock).run(sink)
 
 
 def play(policy: Watched, robot: ReplayRobot, episode: int = 0) -> list[Tick]:

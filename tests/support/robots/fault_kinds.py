@@ -13,9 +13,9 @@ import numpy as np
 
 from egovcp.plan import PolicyStep
 from egovcp.spec import ACTION_DIM
-from egovcp_deploy.live.link import Order, encode_reply
-from egovcp_deploy.pilot.desk import Reply, Report
-from egovcp_deploy.pilot.states import Request
+from egovcp_deploy.live.link import encode_plan
+from egovcp_deploy.pilot.planner import ObservationMessage, PlanMessage
+from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest
 from egovcp_deploy.robots.wire import DISCONNECTED
 
 from . import fault_messages as m
@@ -298,36 +298,38 @@ def _stateful_planner(make: Callable[[], Planner]) -> Begin:
 
 
 def _plan_of(value: float) -> Planner:
-    return lambda report: [encode_reply(_filled(report, np.full((1, 4, ACTION_DIM), value)))]
+    return lambda report: [encode_plan(_filled(report, np.full((1, 4, ACTION_DIM), value)))]
 
 
-def _filled(report: Report, plan: np.ndarray[Any, np.dtype[np.floating[Any]]]) -> Reply:
+def _filled(
+    report: ObservationMessage, plan: np.ndarray[Any, np.dtype[np.floating[Any]]]
+) -> PlanMessage:
     values = plan.astype(np.float32)
-    return Reply(report.tick, PolicyStep(values[:, 0], values, iterations=1), 1.0)
+    return PlanMessage(report.tick, PolicyStep(values[:, 0], values, iterations=1), 1.0)
 
 
 def _shaking() -> Planner:
     rng = np.random.default_rng(0)
     return lambda report: [
-        encode_reply(_filled(report, rng.choice([-1.0, 1.0], (1, 4, ACTION_DIM))))
+        encode_plan(_filled(report, rng.choice([-1.0, 1.0], (1, 4, ACTION_DIM))))
     ]
 
 
 def _late(ticks: int) -> Planner:
     waiting: list[list[bytes]] = []
 
-    def answer(report: Report) -> list[list[bytes]]:
-        waiting.append(encode_reply(constant_reply(report)))
+    def answer(report: ObservationMessage) -> list[list[bytes]]:
+        waiting.append(encode_plan(constant_reply(report)))
         return [waiting.pop(0)] if len(waiting) > ticks else []
 
     return answer
 
 
-def _shifted(report: Report) -> list[list[bytes]]:
-    return [encode_reply(Reply(report.tick + 1000, constant_reply(report).step, 1.0))]
+def _shifted(report: ObservationMessage) -> list[list[bytes]]:
+    return [encode_plan(PlanMessage(report.tick + 1000, constant_reply(report).step, 1.0))]
 
 
-def _order(order: Order) -> Begin:
+def _order(order: OperatorCommand) -> Begin:
     return lambda rig: rig.order(order)
 
 
@@ -353,9 +355,9 @@ _OTHERS: Final = (
     _other("planner: answers garbage", _H, _planner(lambda report: [m.garbage(1), [b"", b""]])),
     _other("planner: answers of other ticks", _H, _planner(_shifted)),
     _other("planner: flood of messages", _ANY, _flood_of_messages),
-    _other("operator: velocity NaN", _R, _order(Order(velocity=(np.nan,) * 3))),
-    _other("operator: velocity 1e9", _R, _order(Order(velocity=(1e9,) * 3))),
-    _other("operator: emergency stop", _D, _order(Order(Request.ESTOP))),
+    _other("operator: velocity NaN", _R, _order(OperatorCommand(velocity=(np.nan,) * 3))),
+    _other("operator: velocity 1e9", _R, _order(OperatorCommand(velocity=(1e9,) * 3))),
+    _other("operator: emergency stop", _D, _order(OperatorCommand(OperatorRequest.ESTOP))),
     _other("remote control: emergency stop", _D, _pressed("L1", "B")),
     _other(
         "remote control: sticks NaN",

@@ -10,6 +10,7 @@ import gc
 import multiprocessing
 import os
 import signal
+import tempfile
 import threading
 import time
 from collections import deque
@@ -29,14 +30,12 @@ from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.live import DAMPED, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM
-from egovcp_deploy.live.guard import Guard, spare_body
-from egovcp_deploy.live.hardware import CameraOptions, HardwareOptions
-from egovcp_deploy.live.link import Link, Order, decode_report, encode_order, encode_reply
-from egovcp_deploy.live.priority import RECEIVING, raised_priority
-from egovcp_deploy.live.process import ControlSetup, control_process
-from egovcp_deploy.live.run_folder import run_folder
-from egovcp_deploy.pilot.desk import Reply, Report
-from egovcp_deploy.pilot.states import Limits, Request, State
+from egovcp_deploy.live.control_process import RECEIVING, control_process, raised_priority
+from egovcp_deploy.live.hardware import CameraOptions, ControlSetup, HardwareOptions
+from egovcp_deploy.live.link import Link, decode_observation, encode_operator_command, encode_plan
+from egovcp_deploy.live.processes import DampingWatchdog, standby_body
+from egovcp_deploy.pilot.planner import ObservationMessage, PlanMessage
+from egovcp_deploy.pilot.states import Limits, OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.bridge import BridgeConfig
 from egovcp_deploy.robots.fake import FakeBridge, InjectedFaults, Ports
 from egovcp_deploy.robots.fake.command import StepPacer
@@ -46,8 +45,8 @@ from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
 from .stream_proxy import StreamFault, StreamProxy
 
 Array = NDArray[np.float64]
-Planner = Callable[[Report], list[list[bytes]]]
-"""Report -> the messages that are sent as an answer."""
+Planner = Callable[[ObservationMessage], list[list[bytes]]]
+"""ObservationMessage -> the messages that are sent as an answer."""
 
 LIMITS: Final = Limits(stand_s=0.1, recover_s=0.2)
 _START_S: Final = 60.0
@@ -59,7 +58,7 @@ _FORKSERVER: Final = multiprocessing.get_context("forkserver")
 _FORKSERVER.set_forkserver_preload(
     [
         __name__,
-        "egovcp_deploy.live.process",
+        "egovcp_deploy.live.control_process",
         "egovcp.robot.controllers",
         "egovcp.sim.live",
         "pytest",
@@ -112,16 +111,16 @@ class Observed:
         return float(np.abs(np.diff(np.stack(following), axis=0)).max())
 
 
-def constant_reply(report: Report, level: float = 0.3) -> Reply:
+def constant_reply(report: ObservationMessage, level: float = 0.3) -> PlanMessage:
     """A plan that reaches a little, with the pelvis at its neutral height."""
     plan = np.full((1, 4, ACTION_DIM), level, np.float32)
     plan[..., -1] = 0.0
-    return Reply(report.tick, PolicyStep(plan[:, 0], plan, iterations=1), 1.0)
+    return PlanMessage(report.tick, PolicyStep(plan[:, 0], plan, iterations=1), 1.0)
 
 
-def constant_plan(report: Report) -> list[list[bytes]]:
+def constant_plan(report: ObservationMessage) -> list[list[bytes]]:
     """Answer of a planner without faults."""
-    return [encode_reply(constant_reply(report))]
+    return [encode_plan(constant_reply(report))]
 
 
 def _run_control_process(setup: ControlSetup) -> None:
@@ -192,7 +191,7 @@ class FaultRig:
             while self._outbox:
                 link.send(self._outbox.popleft())
             for parts in link.receive(0.01):
-                report = decode_report(parts)
+                report = decode_observation(parts)
                 if report is None:
                     continue
                 self._mode = report.mode
@@ -241,13 +240,13 @@ class FaultRig:
         bridge = BridgeConfig(state_port=self.proxy.port, command_port=ports.command_port)
         camera = ZmqCameraConfig(port=ports.camera_port, vertical_fov=fov)
         hardware = HardwareOptions(bridge, replace(CameraOptions(), server=camera))
-        address = f"ipc://{stack.enter_context(run_folder())}/link"
+        address = f"ipc://{stack.enter_context(tempfile.TemporaryDirectory())}/link"
         with raised_priority(RECEIVING):
             link = Link(address, serve=True)
         stack.callback(link.close)
         self._outbox.clear()
-        spare = stack.enter_context(spare_body(bridge))
-        setup = ControlSetup(address, hardware, "stance", LIMITS, os.getpid())
+        spare = stack.enter_context(standby_body(bridge))
+        setup = ControlSetup(hardware, "stance", LIMITS, address, os.getpid())
         self._mode, self._ending = "", False
         self.process: BaseProcess = _FORKSERVER.Process(
             target=_run_control_process, args=(setup,), daemon=True
@@ -255,8 +254,8 @@ class FaultRig:
         with raised_priority(RECEIVING):  # inherited by the fork server
             self.process.start()
         stack.callback(self._end_process)
-        guard = Guard(self.process, spare, lambda: self._ending)
-        stack.callback(guard.join_if_acting)
+        guard = DampingWatchdog(self.process, spare, lambda: self._ending)
+        stack.callback(guard.join_if_ended)
         ending = threading.Event()
         planner = threading.Thread(target=self._plan, args=(link, ending), daemon=True)
         with raised_priority(RECEIVING):
@@ -264,16 +263,16 @@ class FaultRig:
         stack.callback(planner.join)
         stack.callback(ending.set)
         for request, target in (
-            (Request.STAND, State.STAND),
-            (Request.ARM, State.ARMED),
-            (Request.RUN, State.RUN),
+            (OperatorRequest.STAND, State.STAND),
+            (OperatorRequest.ARM, State.ARMED),
+            (OperatorRequest.RUN, State.RUN),
         ):
             self._reach(request, target)
             if target is State.ARMED:
                 self.in_robot(self._robot.release)
                 time.sleep(0.15)
 
-    def _reach(self, request: Request, target: State) -> None:
+    def _reach(self, request: OperatorRequest, target: State) -> None:
         deadline = time.monotonic() + _START_S
         next_request = 0.0
         while self._mode != target:
@@ -281,7 +280,7 @@ class FaultRig:
             if now > deadline or (self._mode == State.DAMP and target is not State.DAMP):
                 raise RuntimeError(f"{self._mode or 'no report'}: {self._observed.events[-3:]}")
             if self._mode and now > next_request:
-                self.order(Order(request))
+                self.order(OperatorCommand(request))
                 next_request = now + 0.04
             time.sleep(0.005)
 
@@ -292,9 +291,9 @@ class FaultRig:
             self.process.kill()
         self.process.join()
 
-    def order(self, order: Order) -> None:
+    def order(self, order: OperatorCommand) -> None:
         """Send an order of the operator."""
-        self._outbox.append(encode_order(order))
+        self._outbox.append(encode_operator_command(order))
 
     def clear_faults(self) -> None:
         """End every fault."""

@@ -22,10 +22,10 @@ from egovcp.sim.live import LiveRobot, Phase
 from egovcp.sim.policies import Oracle
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import CONTROLLER_HZ, PHYSICS_STEPS_PER_CONTROLLER_TICK
-from egovcp_deploy.live.control import ControlLoop, Wishes
-from egovcp_deploy.pilot.desk import InlineDesk, Thinker
+from egovcp_deploy.live.control import ControlLoop
 from egovcp_deploy.pilot.pilot import Pilot
-from egovcp_deploy.pilot.states import Request, State
+from egovcp_deploy.pilot.planner import InlinePlanner, PlannerRunner
+from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
 from egovcp_deploy.robots.base import LowState, MotorCommand
 from egovcp_deploy.robots.fake.bridge import MODE
 from egovcp_deploy.robots.plausibility import PlausibilityFilter
@@ -158,7 +158,7 @@ class HealthyRun:
         clock = LockstepClock()
         checked = _CheckedRobot(robot, clock, alarms)
         checked.step()
-        pilot = Pilot(InlineDesk(Thinker(_OraclePolicy(robot)), clock), state=State.ARMED)
+        pilot = Pilot(InlinePlanner(PlannerRunner(_OraclePolicy(robot)), clock), state=State.ARMED)
         controller = make_controller(self._situation.controller)
         loop = ControlLoop(checked, checked.camera, controller, pilot)
         limit = min(max_s, _STEERED_S if self._situation.steered else np.inf)
@@ -170,7 +170,7 @@ class HealthyRun:
             if tick == _SETTLE_TICKS and not self._situation.steered:
                 robot.begin()
             loop.tick(clock.now_ns(), self._wishes(tick))
-            events += pilot.events()
+            events += pilot.take_events()
             for _ in range(PHYSICS_STEPS_PER_CONTROLLER_TICK):
                 checked.step()
             tick += 1
@@ -179,16 +179,16 @@ class HealthyRun:
             e for e in events if any(f"-> {s}" in e for s in (State.HOLD, State.DAMP))
         ]
 
-    def _wishes(self, tick: int) -> Wishes:
+    def _wishes(self, tick: int) -> OperatorCommand:
         if tick == 0:
-            return Wishes(Request.RUN)
+            return OperatorCommand(OperatorRequest.RUN)
         if not self._situation.steered:
             vx, vy, turn = self._robot.operator_velocity.tolist()
-            return Wishes(velocity=(vx, vy, turn))
+            return OperatorCommand(velocity=(vx, vy, turn))
         if tick % _STEERING_TICKS == 0:
             self._velocity = self._rng.uniform((-0.2, -0.2, -0.5), (0.6, 0.2, 0.5)).tolist()
         if tick % _STEERING_TICKS == _STEERING_TICKS // 2:
             bearing = self._rng.uniform(0, 2 * np.pi)
             self._robot.push(_PUSH * np.array([np.cos(bearing), np.sin(bearing), 0.0]))
         vx, vy, turn = self._velocity if tick >= _STEERING_TICKS else (0.0, 0.0, 0.0)
-        return Wishes(velocity=(vx, vy, turn))
+        return OperatorCommand(velocity=(vx, vy, turn))

@@ -20,10 +20,10 @@ from egovcp.sim.live import EpisodeOutcome, LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import PHYSICS_DT
 from egovcp.terminal import echo
+from egovcp_deploy.options import held_out
 from egovcp_deploy.robots.fake.bridge import FakeBridge, Ports
 from egovcp_deploy.robots.fake.episodes import EpisodeSchedule, EpisodeSequencer
 from egovcp_deploy.robots.fake.faults import FAULT_COMMANDS, InjectedFaults
-from egovcp_deploy.scenarios import held_out
 
 PROG: Final = "egovcp-fake-g1"
 _STEP_NS: Final = round(PHYSICS_DT * NS_PER_S)

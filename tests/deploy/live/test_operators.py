@@ -1,4 +1,4 @@
-"""A gamepad through the kernel's joystick events, here out of a pipe with a name."""
+"""A gamepad whose joystick events come from a named pipe."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from pathlib import Path
 import pytest
 
 from egovcp.errors import EnvironmentFailure
-from egovcp_deploy.live.gamepad import Gamepad, GamepadButtons, GamepadOptions
-from egovcp_deploy.live.link import Order
-from egovcp_deploy.pilot.states import Request
-from egovcp_deploy.pilot.velocity import VelocityCommand
+from egovcp_deploy.live.control import VelocityCommand
+from egovcp_deploy.live.operators import Gamepad, GamepadButtons, GamepadOptions
+from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest
 from egovcp_deploy.robots.remote_control import FULL_STICK
 
 A, B, Y, L1, SELECT, START = 0, 1, 3, 4, 6, 7
@@ -38,13 +37,13 @@ class Pad:
         self._plug = os.open(path, os.O_RDWR)
         self.operator = Gamepad(GamepadOptions(str(path)))
 
-    def do(self, *events: bytes, wait: float = 0.0) -> list[Order]:
+    def do(self, *events: bytes, wait: float = 0.0) -> list[OperatorCommand]:
         os.write(self._plug, b"".join(events))
-        return self.orders(wait)
+        return self.commands(wait)
 
-    def orders(self, wait: float = 0.0) -> list[Order]:
+    def commands(self, wait: float = 0.0) -> list[OperatorCommand]:
         self.now += round(wait * S)
-        return self.operator.orders(self.now, "run")
+        return self.operator.commands(self.now, "run")
 
     def unplug(self) -> None:
         os.close(self._plug)
@@ -62,28 +61,35 @@ class Pad:
 @pytest.fixture
 def pad(tmp_path: Path) -> Iterator[Pad]:
     pad = Pad(tmp_path / "js0")
-    pad.orders()  # the first velocity
+    pad.commands()  # the first velocity
     yield pad
     pad.close()
 
 
 @pytest.mark.parametrize(
     ("number", "request_"),
-    [(Y, Request.STAND), (A, Request.ARM), (START, Request.RUN), (B, Request.HOLD)],
+    [
+        (Y, OperatorRequest.STAND),
+        (A, OperatorRequest.ARM),
+        (START, OperatorRequest.RUN),
+        (B, OperatorRequest.HOLD),
+    ],
 )
-def test_a_button_asks_once_when_it_goes_down(pad: Pad, number: int, request_: Request) -> None:
-    assert pad.do(button(number, True)) == [Order(request_)]
+def test_a_button_gives_one_request_when_it_goes_down(
+    pad: Pad, number: int, request_: OperatorRequest
+) -> None:
+    assert pad.do(button(number, True)) == [OperatorCommand(request_)]
     assert pad.do() == []
     assert pad.do(button(number, False)) == []
-    assert pad.do(button(number, True), button(number, False)) == [Order(request_)]
+    assert pad.do(button(number, True), button(number, False)) == [OperatorCommand(request_)]
 
 
-def test_two_buttons_together_damp(pad: Pad) -> None:
+def test_l1_and_b_together_are_the_emergency_stop(pad: Pad) -> None:
     assert pad.do(button(L1, True)) == []
-    assert pad.do(button(B, True)) == [Order(Request.ESTOP)]
+    assert pad.do(button(B, True)) == [OperatorCommand(OperatorRequest.ESTOP)]
 
 
-def test_two_others_damp_and_quit(pad: Pad) -> None:
+def test_l1_and_select_together_quit(pad: Pad) -> None:
     assert pad.do(button(L1, True), button(SELECT, True))[-1].quit
 
 
@@ -94,38 +100,38 @@ def test_sticks_are_velocities_forward_left_and_turning_left(pad: Pad) -> None:
     assert order.velocity == pytest.approx((-FULL_STICK[0], 0.0, FULL_STICK[2]))
 
 
-def test_what_the_driver_says_at_the_start_moves_nothing(pad: Pad) -> None:
+def test_initial_events_of_the_driver_are_ignored(pad: Pad) -> None:
     (order,) = pad.do(axis(LY, -32767, kind=0x82), button(START, True)[:6] + b"\x81\x07", wait=0.2)
     assert order.velocity == (0.0, 0.0, 0.0)
 
 
-def test_buttons_that_are_not_used_and_numbers_of_other_pads(tmp_path: Path, pad: Pad) -> None:
+def test_unused_buttons_are_ignored_and_numbers_can_be_configured(tmp_path: Path, pad: Pad) -> None:
     assert pad.do(button(15, True), axis(17, 32767)) == []
     other = Pad(tmp_path / "js1")
     other.operator = Gamepad(
         GamepadOptions(str(tmp_path / "js1"), GamepadButtons(start=9, select=8, Y=2))
     )
-    assert other.do(button(9, True))[0] == Order(Request.RUN)
+    assert other.do(button(9, True))[0] == OperatorCommand(OperatorRequest.RUN)
     other.close()
 
 
-def test_unplugged_the_walk_runs_out_and_plugged_in_again_it_is_heard(
+def test_after_unplugging_the_velocity_times_out_and_replugging_works(
     pad: Pad, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = VelocityCommand()
     (order,) = pad.do(axis(LY, -32767), wait=0.2)
     assert order.velocity is not None
-    command.wish(pad.now, order.velocity)
+    command.set_target(pad.now, order.velocity)
     pad.unplug()
-    assert pad.orders(0.2) == []
+    assert pad.commands(0.2) == []
     assert "is gone" in capsys.readouterr().err
     for _ in range(10):
-        assert pad.orders(0.2) == []
+        assert pad.commands(0.2) == []
         moving = command.at(pad.now, allowed=True)
     assert not moving.any()
     pad.plug_in()
-    pad.orders(1.5)
-    assert pad.do(button(B, True))[0] == Order(Request.HOLD)
+    pad.commands(1.5)
+    assert pad.do(button(B, True))[0] == OperatorCommand(OperatorRequest.HOLD)
 
 
 @pytest.mark.parametrize("make", [lambda path: None, lambda path: path.mkdir()])

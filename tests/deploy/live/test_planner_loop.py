@@ -1,7 +1,8 @@
-"""The planner's loop without processes: what it orders when something in it fails."""
+"""The planner's loop without processes: commands after a failure."""
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -12,10 +13,10 @@ from egovcp.log.tick import Tick
 from egovcp.plan import PolicyStep
 from egovcp.rate import LockstepClock
 from egovcp.spec import ACTION_DIM, STATE_DIM
-from egovcp_deploy.live.link import Order, decode_order, encode_report
-from egovcp_deploy.live.planner import LiveSummary, PlannerLoop
-from egovcp_deploy.pilot.desk import Report, Thinker
-from egovcp_deploy.pilot.states import Request, State
+from egovcp_deploy.live.link import decode_operator_command, encode_observation
+from egovcp_deploy.live.planner_loop import LiveSummary, PlannerLoop
+from egovcp_deploy.pilot.planner import ObservationMessage, PlannerRunner
+from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
 from tests.support.sinks import MemorySink
 
 TICK_NS = 40_000_000
@@ -41,24 +42,24 @@ class Still:
     def advance(self, sent: object) -> None: ...
 
 
-class Control:
+class ControlStub:
     """The control process at the other end of the link: a report every tick, RUN until HOLD."""
 
     def __init__(self, clock: LockstepClock, mode: State, ticks: int) -> None:
         self._clock, self.mode, self._ticks = clock, mode, ticks
         self._tick = 0
-        self.orders: list[Order] = []
+        self.commands: list[OperatorCommand] = []
 
     def alive(self) -> bool:
         return self._tick < self._ticks
 
     def send(self, parts: Sequence[bytes]) -> bool:
-        order = decode_order(parts) if len(parts) == 1 else None
-        if order is not None:
-            self.orders.append(order)
-            if order.request is Request.HOLD and self.mode is State.RUN:
+        command = decode_operator_command(parts) if len(parts) == 1 else None
+        if command is not None:
+            self.commands.append(command)
+            if command.request is OperatorRequest.HOLD and self.mode is State.RUN:
                 self.mode = State.HOLD
-            if order.request is Request.ESTOP:
+            if command.request is OperatorRequest.ESTOP:
                 self.mode = State.DAMP
         return True
 
@@ -67,21 +68,23 @@ class Control:
         depth, state = np.zeros((48, 64), np.uint16), np.zeros(STATE_DIM, np.float32)
         sent = np.zeros(ACTION_DIM)
         now = self._clock.now_ns()
-        yield encode_report(Report(self._tick, now, depth, state, sent, self._tick == 0, self.mode))
+        yield encode_observation(
+            ObservationMessage(self._tick, now, depth, state, sent, self._tick == 0, self.mode)
+        )
         self._tick += 1
 
     @property
-    def asked(self) -> list[Request]:
-        return [order.request for order in self.orders if order.request is not None]
+    def requests(self) -> list[OperatorRequest]:
+        return [command.request for command in self.commands if command.request is not None]
 
 
-class Person:
+class ScriptedOperator:
     """An operator whose answers are decided by the test."""
 
-    def __init__(self, answer: Callable[[str], list[Order]] = lambda mode: []) -> None:
+    def __init__(self, answer: Callable[[str], list[OperatorCommand]] = lambda mode: []) -> None:
         self._answer = answer
 
-    def orders(self, now_ns: int, mode: str) -> list[Order]:
+    def commands(self, now_ns: int, mode: str) -> list[OperatorCommand]:
         return self._answer(mode)
 
 
@@ -95,95 +98,98 @@ class Broken(MemorySink):
 
 
 @pytest.fixture
-def told() -> list[str]:
+def warnings() -> list[str]:
     return []
 
 
 @pytest.fixture
-def fly(told: list[str]) -> Callable[..., tuple[Control, PlannerLoop, MemorySink]]:
-    """A loop whose planner fails in tick 5, before a control process that lives 200 ticks."""
+def make_loop(warnings: list[str]) -> Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]]:
+    """A loop whose planner fails in tick 5, with a control process of 200 ticks."""
 
     def make(
         fails_at: int = 5,
-        operator: Person | None = None,
+        operator: ScriptedOperator | None = None,
         sink: MemorySink | None = None,
         mode: State = State.RUN,
         stands: bool = True,
-    ) -> tuple[Control, PlannerLoop, MemorySink]:
+    ) -> tuple[ControlStub, PlannerLoop, MemorySink]:
         clock = LockstepClock(time_ns=10**12)
-        control, log = Control(clock, mode, 200), sink or MemorySink()
+        control, log = ControlStub(clock, mode, 200), sink or MemorySink()
         loop = PlannerLoop(
-            Thinker(Still(fails_at)),
+            PlannerRunner(Still(fails_at)),
             control,  # type: ignore[arg-type]
-            operator or Person(),
+            operator or ScriptedOperator(),
             log,
             clock,
             control.alive,
             stands=stands,
-            tell=told.append,
+            warn=warnings.append,
         )
         return control, loop, log
 
     return make
 
 
-def test_a_planner_that_raises_holds_the_robot_and_goes_on_listening_and_logging(
-    fly: Callable[..., tuple[Control, PlannerLoop, MemorySink]], told: list[str]
+def test_a_planner_that_raises_holds_the_robot_and_the_log_continues(
+    make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]], warnings: list[str]
 ) -> None:
-    control, loop, log = fly()
+    control, loop, log = make_loop()
     summary = loop.run()
     assert isinstance(summary.failure, RuntimeError)
-    assert control.asked == [Request.HOLD]
-    assert not control.alive()  # it was never told to end
+    assert control.requests == [OperatorRequest.HOLD]
+    assert not control.alive()  # it was never sent a quit command
     assert not loop.quitting
     assert summary.held == 194  # ticks 6 to 199
     assert [tick.index for tick in log.ticks] == list(range(200))
     assert log.ticks[-1].events[-1] == "end of the run: the control process is gone"
     assert "the planner failed: RuntimeError: out of ideas" in log.ticks[5].events
-    assert len(told) == 1
-    assert told[0].startswith("the planner failed: RuntimeError: out of ideas; the robot is held")
+    assert len(warnings) == 1
+    assert warnings[0].startswith(
+        "the planner failed: RuntimeError: out of ideas; the robot is held"
+    )
 
 
-def test_the_operator_ends_it_afterwards(
-    fly: Callable[..., tuple[Control, PlannerLoop, MemorySink]],
+def test_the_operator_ends_the_run_after_a_failure(
+    make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]],
 ) -> None:
     held = [0]
 
-    def answer(mode: str) -> list[Order]:
+    def answer(mode: str) -> list[OperatorCommand]:
         held[0] += mode == State.HOLD
-        return [Order(quit=True)] if held[0] == 20 else []
+        return [OperatorCommand(quit=True)] if held[0] == 20 else []
 
-    control, loop, log = fly(operator=Person(answer))
+    control, loop, log = make_loop(operator=ScriptedOperator(answer))
     loop.run()
     assert loop.quitting
-    assert control.orders[-1].quit
+    assert control.commands[-1].quit
     assert control.alive()
     assert log.ticks[-1].events[-1] == "end of the run: by the operator"
 
 
-def test_ctrl_c_twice_damps_afterwards(
-    fly: Callable[..., tuple[Control, PlannerLoop, MemorySink]],
+def test_ctrl_c_twice_damps_after_a_failure(
+    make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]],
 ) -> None:
-    def answer(mode: str) -> list[Order]:
-        loop.interrupts.count += mode == State.HOLD and loop.interrupts.count < 2
+    def answer(mode: str) -> list[OperatorCommand]:
+        if mode == State.HOLD and len(loop.interrupts) < 2:
+            loop.interrupts.append(signal.SIGINT)
         return []
 
-    control, loop, _ = fly(operator=Person(answer))
+    control, loop, _ = make_loop(operator=ScriptedOperator(answer))
     summary = loop.run()
-    assert Request.ESTOP in control.asked
+    assert OperatorRequest.ESTOP in control.requests
     assert summary.damped
     assert loop.quitting
 
 
 @pytest.mark.parametrize("what", ["operator", "log", "screen"])
-def test_whatever_else_fails_holds_too(
-    what: str, fly: Callable[..., tuple[Control, PlannerLoop, MemorySink]]
+def test_failure_of_operator_log_or_display_holds_the_robot(
+    what: str, make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]]
 ) -> None:
-    asked = [0]
+    calls = [0]
 
-    def answer(mode: str) -> list[Order]:
-        asked[0] += 1
-        if asked[0] > 3:
+    def answer(mode: str) -> list[OperatorCommand]:
+        calls[0] += 1
+        if calls[0] > 3:
             raise OSError("the terminal is gone")
         return []
 
@@ -191,22 +197,22 @@ def test_whatever_else_fails_holds_too(
         if tick.index > 3 and what == "screen":
             raise BrokenPipeError
 
-    operator = Person(answer) if what == "operator" else None
+    operator = ScriptedOperator(answer) if what == "operator" else None
     sink = Broken() if what == "log" else None
-    control, loop, _ = fly(fails_at=1000, operator=operator, sink=sink)
+    control, loop, _ = make_loop(fails_at=1000, operator=operator, sink=sink)
     summary = loop.run(show)
     assert summary.failure is not None
-    assert control.asked == [Request.HOLD]
+    assert control.requests == [OperatorRequest.HOLD]
     assert summary.held > 180
     assert not loop.quitting
 
 
 @pytest.mark.parametrize("mode", [State.INIT, State.RUN])
-def test_it_ends_by_itself_where_nothing_stands_or_the_robot_is_simulated(
-    mode: State, fly: Callable[..., tuple[Control, PlannerLoop, MemorySink]]
+def test_a_failure_ends_the_run_if_the_robot_lies_or_is_simulated(
+    mode: State, make_loop: Callable[..., tuple[ControlStub, PlannerLoop, MemorySink]]
 ) -> None:
-    control, loop, _ = fly(mode=mode, stands=mode is State.INIT)
+    control, loop, _ = make_loop(mode=mode, stands=mode is State.INIT)
     summary: LiveSummary = loop.run()
     assert loop.quitting
-    assert control.orders[-1].quit
+    assert control.commands[-1].quit
     assert summary.held == (0 if mode is State.INIT else pytest.approx(50, abs=3))

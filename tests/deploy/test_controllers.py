@@ -1,7 +1,8 @@
-"""The search finds the best action of its grid, fairly."""
+"""The search for the best constant action."""
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,8 +13,8 @@ import pytest
 from egovcp.errors import DataError
 from egovcp.sim.scenario import EPISODE_TASKS, Scenario
 from egovcp.spec import ACTION_DIM
-from egovcp_deploy.constant_search import Action, grid, load_constants, search_constant
-from egovcp_deploy.scenarios import held_out
+from egovcp_deploy.controllers import Action, grid, load_constants, search_constant
+from egovcp_deploy.options import held_out
 from egovcp_deploy.scores import EpisodeScore
 
 
@@ -26,9 +27,9 @@ class Landscape:
 
     def __call__(
         self, actions: Sequence[Action], scenarios: Sequence[Scenario]
-    ) -> list[EpisodeScore]:
-        self.played += zip(actions, scenarios, strict=True)
-        return [self._score(*pair) for pair in zip(actions, scenarios, strict=True)]
+    ) -> list[list[EpisodeScore]]:
+        self.played += itertools.product(actions, scenarios)
+        return [[self._score(action, scenario) for scenario in scenarios] for action in actions]
 
     def _score(self, action: Action, scenario: Scenario) -> EpisodeScore:
         luck = np.random.default_rng(scenario.episode).normal(0, self.noise)
@@ -38,7 +39,7 @@ class Landscape:
 
 @pytest.mark.parametrize("task", EPISODE_TASKS)
 @pytest.mark.parametrize("which", [0, 1, -1])
-def test_the_best_of_the_grid_wins_also_under_luck_that_all_share(task: str, which: int) -> None:
+def test_the_best_action_wins_under_noise_shared_by_all(task: str, which: int) -> None:
     best = grid(task)[which]
     land = Landscape(best, noise=5.0)
     found = search_constant(task, 0, land)
@@ -46,7 +47,7 @@ def test_the_best_of_the_grid_wins_also_under_luck_that_all_share(task: str, whi
     assert found.episodes == sum(action == best for action, _ in land.played)
 
 
-def test_all_candidates_of_a_round_play_the_same_scenarios_and_none_of_the_evaluation() -> None:
+def test_candidates_play_the_same_scenarios_and_none_of_the_evaluation() -> None:
     land = Landscape(grid("ball")[3], noise=1.0)
     search_constant("ball", 4, land)
     by_action: dict[Action, list[Scenario]] = {}
@@ -69,7 +70,7 @@ def test_the_grid_is_symmetric_inside_the_box_and_holds_the_neutral_pose(task: s
     assert (actions == 0).all(axis=1).sum() == 1
 
 
-def test_winners_are_read_back(tmp_path: Path) -> None:
+def test_constant_json_is_read_back(tmp_path: Path) -> None:
     entry = {"action": [0.1] * ACTION_DIM, "reward_mean": 0.2, "success_rate": 0.3, "episodes": 4}
     path = tmp_path / "constant.json"
     path.write_text(json.dumps({"ball": entry}))
@@ -80,7 +81,7 @@ def test_winners_are_read_back(tmp_path: Path) -> None:
     "content",
     [None, "not json", "[1]", '{"ball": 3}', '{"ball": {"action": [1, 2]}}', '{"ball": {"a": 0}}'],
 )
-def test_a_file_that_is_no_result_is_refused(tmp_path: Path, content: str | None) -> None:
+def test_a_file_of_another_format_is_refused(tmp_path: Path, content: str | None) -> None:
     path = tmp_path / "constant.json"
     if content is not None:
         path.write_text(content)

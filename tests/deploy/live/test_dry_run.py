@@ -1,4 +1,4 @@
-"""What `--dry_run` says of a robot: one line per check, and what to do."""
+"""`--dry_run` with a robot: one line per check, with what to do."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp_deploy.deploy import main
-from egovcp_deploy.live.preflight import arrivals, image_age, joint_offsets, posture
+from egovcp_deploy.dry_run import arrivals, image_age, joint_offsets, posture
 from egovcp_deploy.robots.fake import FakeBridge, Ports
 from egovcp_deploy.robots.g1_variants import describe_variant
 from egovcp_deploy.robots.subscriber import ArrivalStats
@@ -91,7 +91,7 @@ def test_a_good_connection_in_figures() -> None:
     )
 
 
-def test_the_age_of_images_is_measured_where_the_camera_tells() -> None:
+def test_the_age_of_images_is_checked_if_the_camera_reports_it() -> None:
     assert image_age([], 80.0).startswith("not measured")
     assert image_age([30.0, 40.0, 50.0], 80.0).startswith("40 ms when they arrive")
     with pytest.raises(EnvironmentFailure, match="expected at most 80"):
@@ -121,9 +121,9 @@ def look(
 
     The limits of the connection are those of a busy machine.
     """
-    limits = {"STATE_HZ": 5.0, "IMAGE_HZ": 1.0, "MOST_LOST": 0.95, "LISTEN_S": 1.5}
+    limits = {"STATE_HZ": 5.0, "IMAGE_HZ": 1.0, "MAX_LOST": 0.95, "LISTEN_S": 1.5}
     for name, value in limits.items():
-        monkeypatch.setattr(f"egovcp_deploy.live.preflight.{name}", value)
+        monkeypatch.setattr(f"egovcp_deploy.dry_run.{name}", value)
     monkeypatch.setattr("egovcp_deploy.robots.command_conflict.GAP_S", 2.0)
 
     def look(change: Callable[[FakeBridge], object], detailed: bool = True) -> Any:
@@ -142,7 +142,7 @@ def look(
                     f"--robot.bridge.command_port={fake.ports.command_port}",
                     f"--robot.camera.server.port={fake.ports.camera_port}",
                     *("--robot.limits.state_hold_s=5", "--robot.limits.state_damp_s=10"),
-                    *("--robot.limits.picture_hold_s=5", "--env.delay.image_age=[0.02,1.0]"),
+                    *("--robot.limits.image_hold_s=5", "--env.delay.image_age=[0.02,1.0]"),
                     *("--planner.samples=16", "--planner.elites=4"),
                 ]
             )
@@ -155,9 +155,9 @@ def look(
     return look
 
 
-def test_a_robot_that_is_well_is_go_in_every_line(look: Look) -> None:
+def test_a_healthy_robot_is_go_in_every_line(look: Look) -> None:
     def settle(fake: FakeBridge) -> None:
-        """Its limp joints come to rest; moving ones are damped by torques that nobody commands."""
+        """Its limp joints come to rest; the damping torques of moving ones are not commanded."""
         for _ in range(400):
             fake.step()
 

@@ -1,7 +1,7 @@
-"""egovcp-deploy before the fake robot, on the wall clock: processes are killed and interrupted.
+"""`egovcp-deploy` on the wall clock: processes are killed and interrupted.
 
-How soon things happen is for `tests/deploy/test_faults.py` and `test_control.py`, whose time does
-not depend on the machine; here it is whether they happen at all.
+Reaction times are tested in `tests/deploy/test_faults.py` and `test_control.py`, whose time does
+not depend on the machine; here only whether the reactions occur.
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -35,17 +36,17 @@ signal.signal(signal.SIGHUP, signal.SIG_DFL)  # also under nohup
 sys.exit(main(sys.argv[1:]))
 """
 #: The planner raises once it has driven for a while.
-_STUMBLE = """
-from egovcp_deploy.pilot import desk
-think = desk.Thinker.think
+_FAILING = """
+from egovcp_deploy.pilot import planner
+plan = planner.PlannerRunner.plan
 running = 0
-def stumble(self, reports, remaining=None):
+def failing(self, observations, remaining=None):
     global running
-    running += reports[-1].mode == "run"
+    running += observations[-1].mode == "run"
     if running > 5:
         raise ZeroDivisionError("a mistake")
-    return think(self, reports, remaining)
-desk.Thinker.think = stumble
+    return plan(self, observations, remaining)
+planner.PlannerRunner.plan = failing
 """
 
 
@@ -59,7 +60,7 @@ class Stand:
 
     @property
     def holds(self) -> bool:
-        """Whether its motors are told to hold something."""
+        """Whether its motors have stiffness."""
         return bool(self.fake.robot.robot.model.actuator_biasprm[:, 1].any())
 
     @property
@@ -167,7 +168,7 @@ def hang_up(program: subprocess.Popen[str]) -> None:
 
 
 @pytest.mark.parametrize("end", [kill, hang_up])
-def test_killing_the_planner_leaves_a_robot_that_stands_until_it_is_told_to_end(
+def test_killing_the_planner_leaves_the_robot_standing_until_sigterm(
     drive: Callable[..., Stand], end: Callable[[subprocess.Popen[str]], None]
 ) -> None:
     stand = drive()
@@ -191,10 +192,10 @@ def test_killing_the_planner_leaves_a_robot_that_stands_until_it_is_told_to_end(
     assert State.RUN in [tick.mode for tick in recording.ticks]
 
 
-def test_an_exception_in_the_planner_leaves_a_robot_that_stands_until_the_second_interrupt(
+def test_a_planner_exception_leaves_the_robot_standing_until_the_second_interrupt(
     drive: Callable[..., Stand],
 ) -> None:
-    stand = drive(before=_STUMBLE)
+    stand = drive(before=_FAILING)
     assert eventually(lambda: stand.modes()[-1:] == [State.HOLD])
     ticks = len(stand.modes())
     stand.program.send_signal(signal.SIGINT)
@@ -236,7 +237,7 @@ def test_a_robot_that_goes_silent_is_damped_and_the_run_is_a_safety_stop(
     assert "no new proprioception" in words
 
 
-def test_no_robot_there_is_said_at_once(artifact_dir: Path, tmp_path: Path) -> None:
+def test_a_missing_robot_is_reported_at_once(artifact_dir: Path, tmp_path: Path) -> None:
     result = subprocess.run(
         [
             *(sys.executable, "-m", "egovcp_deploy.deploy", "--robot.type=unitree_g1"),
@@ -251,3 +252,71 @@ def test_no_robot_there_is_said_at_once(artifact_dir: Path, tmp_path: Path) -> N
     assert "egovcp-fake-g1" in result.stderr
     assert "Traceback" not in result.stderr
     assert list((tmp_path / "run").iterdir()) == []  # the same command can be repeated
+
+
+type Start = Callable[..., subprocess.Popen[str]]
+
+
+@pytest.fixture
+def start(artifact_dir: Path, tmp_path: Path, short: list[str]) -> Iterator[Start]:
+    """Starts a run of a tiny planner that writes into ``tmp_path / "run"``."""
+    programs = list[subprocess.Popen[str]]()
+
+    def start(*flags: str) -> subprocess.Popen[str]:
+        command = [
+            *(sys.executable, "-m", "egovcp_deploy.deploy", "--realtime=true"),
+            *(f"--policy.path={artifact_dir}", f"--output_dir={tmp_path / 'run'}"),
+            *("--log.rrd=false", *short, *QUICK, *flags),
+        ]
+        environment = os.environ | {"OMP_NUM_THREADS": "1"}
+        program = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
+        programs.append(program)
+        return program
+
+    yield start
+    for program in programs:
+        if program.poll() is None:
+            program.kill()
+        program.wait()
+
+
+def listening(processes: Iterable[psutil.Process]) -> list[Any]:
+    """Where they listen for connections from outside."""
+    return [
+        connection.laddr
+        for process in processes
+        for connection in process.net_connections(kind="inet")
+        if connection.status == psutil.CONN_LISTEN
+    ]
+
+
+def test_a_simulated_episode_is_played_and_recorded(start: Start, tmp_path: Path) -> None:
+    program = start(*PATIENT, "--operator.duration=8")
+    words = program.communicate(timeout=200)[1]
+    assert program.returncode == 0, words
+    recording = read_recording(tmp_path / "run" / "rollout-0.mcap")
+    assert recording.complete
+    assert State.RUN in {tick.mode for tick in recording.ticks}
+    (outcome,) = json.loads((tmp_path / "run" / "task.json").read_text())
+    assert outcome["ticks"] == 15
+
+
+def test_a_killed_run_leaves_no_process_and_listens_on_the_loopback_only(
+    start: Start, tmp_path: Path
+) -> None:
+    program = start()
+
+    def begun() -> bool:
+        try:
+            return len(read_recording(tmp_path / "run" / "rollout-0.mcap").ticks) > 3
+        except DataError:
+            return False
+
+    assert eventually(begun)
+    children = psutil.Process(program.pid).children(recursive=True)
+    assert {address.ip for address in listening([psutil.Process(program.pid), *children])} == {
+        "127.0.0.1"
+    }
+    program.kill()
+    assert len(children) >= 3  # simulator, control, log
+    assert not psutil.wait_procs(children, timeout=60)[1]

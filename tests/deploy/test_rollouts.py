@@ -1,26 +1,25 @@
-"""The loop lines up observation, action and outcome, and keeps what really happened."""
+"""The lock-step loop aligns observation, action and outcome, and logs what was sent."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from egovcp.log.tick import CameraView
 from egovcp.plan import PolicyStep
-from egovcp.rate import FixedRate, LockstepClock
+from egovcp.rate import LockstepClock
 from egovcp.spec import ACTION_BOX, ACTION_DIM, STATE_DIM, STATE_SLICES
-from egovcp_deploy.pilot.desk import InlineDesk, Thinker
 from egovcp_deploy.pilot.pilot import REJECTED
+from egovcp_deploy.pilot.planner import LOGGED_CANDIDATES, InlinePlanner, PlannerRunner
 from egovcp_deploy.robots import ActionResult, RobotObservation
-from egovcp_deploy.runner import LOGGED_CANDIDATES, Runner
+from egovcp_deploy.rollouts import LockstepRunner
 from tests.support.sinks import MemorySink
 
 
 class PlainPolicy:
-    """Plans what it is told to; remembers what it saw and what it heard was sent."""
+    """Plans the given actions; records its observations and the sent actions."""
 
     def __init__(self, actions: list[float]) -> None:
         self.actions = actions
@@ -67,7 +66,7 @@ class FakePolicy(PlainPolicy):
 
 
 class FakeRobot:
-    """Its picture counts its ticks; it halves every action, to tell sent from planned."""
+    """Its image counts the ticks; it halves every action, so that sent and planned ones differ."""
 
     controller_id = "fake"
     camera = CameraView()
@@ -104,15 +103,13 @@ class FakeRobot:
         pass
 
 
-def runner(
-    policy: PlainPolicy, robot: FakeRobot, imagine: int = 16, max_ticks: int | None = None
-) -> Runner:
+def runner(policy: PlainPolicy, robot: FakeRobot, imagine: int = 16) -> LockstepRunner:
     clock = LockstepClock(time_ns=123)
-    desk = InlineDesk(Thinker(policy, imagine), clock)
-    return Runner(desk, robot, FixedRate(25, clock), max_ticks)
+    planner = InlinePlanner(PlannerRunner(policy, imagine), clock)
+    return LockstepRunner(planner, robot, clock)
 
 
-def test_a_tick_holds_the_observation_the_action_on_it_and_what_followed() -> None:
+def test_a_tick_holds_observation_action_and_outcome() -> None:
     policy, robot, memory = FakePolicy([0.1, 0.2, 0.3, 0.2, 0.1]), FakeRobot(), MemorySink()
     summary = runner(policy, robot, imagine=3).run(memory)
     assert [tick.index for tick in memory.ticks] == [0, 1, 2, 3, 4]
@@ -131,7 +128,7 @@ def test_a_tick_holds_the_observation_the_action_on_it_and_what_followed() -> No
     assert len(summary.plan_ms) == 5
 
 
-def test_the_recurrence_advances_with_what_was_really_sent() -> None:
+def test_the_recurrence_advances_with_the_sent_action() -> None:
     policy, memory = FakePolicy([0.3] * 5), MemorySink()
     runner(policy, FakeRobot()).run(memory)
     assert len(policy.sent) == 4  # the last action has no observation after it
@@ -148,15 +145,7 @@ def test_actions_pass_the_safety_filter_before_the_robot() -> None:
     assert summary.rejected == 1
 
 
-def test_a_robot_without_a_time_limit_is_stopped_by_the_runners() -> None:
-    memory = MemorySink()
-    robot = FakeRobot(limit=10**9)
-    summary = runner(FakePolicy([0.0] * 9), robot, max_ticks=7).run(memory)
-    assert summary.steps == robot.count == len(memory.ticks) == 7
-    assert not summary.over
-
-
-def test_every_rollout_starts_afresh() -> None:
+def test_every_rollout_starts_from_the_initial_state() -> None:
     policy, robot = FakePolicy([0.5] * 5), FakeRobot()
     loop = runner(policy, robot)
     actions = []
@@ -170,7 +159,7 @@ def test_every_rollout_starts_afresh() -> None:
     assert policy.resets == 2
 
 
-def test_of_a_policy_that_cannot_imagine_nothing_is_decoded() -> None:
+def test_without_a_world_model_nothing_is_decoded() -> None:
     memory = MemorySink()
     runner(PlainPolicy([0.1] * 5), FakeRobot(), imagine=3).run(memory)
     assert len(memory.ticks) == 5
@@ -190,17 +179,3 @@ def test_the_best_candidates_are_logged_as_hand_paths() -> None:
     expected = np.reshape(ACTION_BOX.neutral[:6], (2, 3))
     np.testing.assert_allclose(candidates.hands_b[0, 0], expected)
     assert memory.ticks[0].depth_imagined is None
-
-
-@pytest.mark.parametrize("late_ms", [0, 50])
-def test_overruns_are_counted(late_ms: int) -> None:
-    clock = LockstepClock()
-
-    class Slow(FakeRobot):
-        def act(self, action: NDArray[np.float64]) -> ActionResult:
-            clock.advance(late_ms * 1_000_000)
-            return super().act(action)
-
-    desk = InlineDesk(Thinker(FakePolicy([0.0] * 5)), clock)
-    loop = Runner(desk, Slow(), FixedRate(25, clock))
-    assert loop.run(MemorySink()).overruns == (5 if late_ms else 0)

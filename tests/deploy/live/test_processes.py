@@ -1,4 +1,4 @@
-"""However a control process is brought to its end, somebody damps the robot."""
+"""However a control process ends, the robot is damped."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from egovcp_deploy.live.ending import end
+from egovcp_deploy.live.processes import stop_control
 
 
 class Control:
@@ -33,12 +33,12 @@ class Control:
 
 @pytest.mark.parametrize("quitting", [True, False])
 @pytest.mark.parametrize("hears", ["order", "signal", "kill"])
-def test_a_process_is_asked_before_it_is_killed_and_then_the_guard_acts(
+def test_a_process_gets_sigterm_before_sigkill_after_which_the_watchdog_damps(
     hears: str, quitting: bool
 ) -> None:
     planner = SimpleNamespace(quitting=quitting)
     control = Control(hears, planner)
-    end(control, planner)
+    stop_control(control, planner)
     assert not control.is_alive()
     assert ("kill" in control.tried) == (hears == "kill")
     assert control.guarded_when_killed == (hears == "kill")

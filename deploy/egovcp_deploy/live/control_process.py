@@ -1,0 +1,181 @@
+"""The control process: runs the 50 Hz loop on the robot and outlives the planner.
+
+It owns the connection to the robot. If the planner's process ends or hangs, the robot is held.
+However this process itself ends, its last commands damp the motors.
+"""
+
+from __future__ import annotations
+
+import gc
+import os
+import signal
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
+from typing import Final
+
+from egovcp.errors import EgovcpError
+from egovcp.rate import FixedRate, MonotonicClock
+from egovcp.robot.controllers import make_controller
+from egovcp.spec import CONTROLLER_HZ
+from egovcp.terminal import echo, one_line
+from egovcp.workers import stop_on_signal
+from egovcp_deploy.live.control import ControlLoop, damping_command
+from egovcp_deploy.live.hardware import ControlSetup, Hardware, open_hardware
+from egovcp_deploy.live.link import Link, RemotePlanner
+from egovcp_deploy.live.operators import ButtonCommands
+from egovcp_deploy.pilot.pilot import Pilot
+from egovcp_deploy.pilot.states import OperatorCommand, OperatorRequest, State
+from egovcp_deploy.robots.base import LowLevelRobot
+from egovcp_deploy.robots.remote_control import RemoteControl
+
+#: Real-time priorities of threads that receive, and of the loop. The kernel's own threads have 50.
+RECEIVING: Final = 10
+CONTROL: Final = 20
+_NICE: Final = -10
+_ORPHAN_TICKS: Final = 100  # the process of a damped robot without a planner ends after 2 s
+_DAMPING_COMMANDS: Final = 10  # at the end of the process
+_DAMPING_PERIOD_NS: Final = 5_000_000
+_SWITCH_S: Final = 0.001  # longest wait of the loop for a receiving thread
+
+
+def control_process(setup: ControlSetup) -> None:
+    """Main function of the process; returns on a quit command, on SIGTERM, or if not needed."""
+    os.setsid()  # no SIGHUP, SIGTSTP or SIGQUIT from the terminal to the process that balances
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the planner's process
+    with stop_on_signal(signals=(signal.SIGTERM,), interrupt=False) as stopping:
+        sys.setswitchinterval(_SWITCH_S)
+        # Before there are threads: one that holds the interpreter's lock must not be preempted.
+        raise_priority(RECEIVING)
+        try:
+            hardware = open_hardware(setup.hardware)
+        except EgovcpError as error:
+            # The line above may be an unfinished progress bar.
+            echo("\n" + one_line(f"egovcp-deploy: error: {error}"), error=True)
+            sys.exit(error.exit_code)
+        with closing(hardware), closing(Link(setup.address, serve=False)) as link:
+            try:
+                control = ControlProcess(setup, hardware, link)
+                raise_priority(CONTROL)
+                gc.freeze()  # imported objects are not searched for garbage again
+                control.run(stopping)
+            finally:
+                damp_motors(hardware.body)
+
+
+class ControlProcess:
+    """The control loop with its inputs: operator commands, remote control, parent process."""
+
+    def __init__(self, setup: ControlSetup, hardware: Hardware, link: Link) -> None:
+        self._parent = setup.parent
+        self._body = body = hardware.body
+        self._planner = RemotePlanner(link)
+        self._loop = ControlLoop(
+            body,
+            hardware.eye,
+            make_controller(setup.controller),
+            Pilot(self._planner, setup.limits),
+            refusal=lambda: body.refusal,
+            fault=lambda: body.fault,
+            skipped=lambda: body.rejected,
+            link=hardware.link,
+        )
+        self._remote = RemoteOperator()
+        self._orphaned = 0
+
+    def run(self, stopping: Sequence[int]) -> None:
+        """Run until a quit command, or until ``stopping`` is not empty."""
+        rate = FixedRate(CONTROLLER_HZ, MonotonicClock())
+        rate.start()
+        while not stopping and self._orphaned < _ORPHAN_TICKS:
+            now = rate.clock.now_ns()
+            commands = self._planner.take_commands()
+            if any(command.quit for command in commands):
+                return
+            commands += self._remote.commands(self._body)
+            self._loop.tick(now, merged(commands))
+            self._check_parent()
+            rate.wait()
+
+    def _check_parent(self) -> None:
+        if os.getppid() == self._parent:
+            return
+        idle = self._loop.state in (State.INIT, State.DAMP)
+        if self._planner.alive and not idle:
+            with suppress(OSError):  # the terminal may be closed
+                echo(
+                    "egovcp-deploy: the planner's process has ended; the robot is held until it is "
+                    f"damped: by kill {os.getpid()}, or by L1 + B on its remote control",
+                    error=True,
+                )
+        self._planner.alive = False
+        self._orphaned += idle
+
+
+def merged(commands: Sequence[OperatorCommand]) -> OperatorCommand:
+    """The commands of one tick as one: an emergency stop if there is any, else the last values."""
+    request, velocity = None, None
+    for command in commands:
+        velocity = command.velocity or velocity
+        if request is not OperatorRequest.ESTOP:
+            request = command.request or request
+    return OperatorCommand(request, velocity)
+
+
+class RemoteOperator:
+    """The robot's own remote control: its buttons, and its sticks when they are not at rest."""
+
+    def __init__(self) -> None:
+        self._buttons = ButtonCommands()
+
+    def commands(self, body: LowLevelRobot) -> list[OperatorCommand]:
+        """Inputs since the last call."""
+        reading = body.read()
+        remote = None if reading is None else RemoteControl.parse(reading.remote)
+        if remote is None:
+            return []
+        vx, vy, yaw_rate = remote.velocity.tolist()
+        moving = any((vx, vy, yaw_rate))
+        commands = [OperatorCommand(velocity=(vx, vy, yaw_rate))] if moving else []
+        return commands + self._buttons.update(remote.pressed)
+
+
+def damp_motors(body: LowLevelRobot) -> None:
+    """Send several damping commands, 5 ms apart."""
+    clock = MonotonicClock()
+    for _ in range(_DAMPING_COMMANDS):
+        reading = body.read()
+        position, mode = (None, 0) if reading is None else (reading.joint_position, reading.mode)
+        body.write(damping_command(position, mode))
+        clock.sleep_until(clock.now_ns() + _DAMPING_PERIOD_NS)
+
+
+def raise_priority(level: int) -> bool:
+    """Give real-time priority ``level`` (1 to 99) to the calling thread and the threads that it
+    starts from now on; returns whether it was granted.
+
+    SCHED_FIFO needs root, CAP_SYS_NICE, or an ``rtprio`` limit in /etc/security/limits.conf. Where
+    it is refused, the nice value is lowered; with autogrouping (the default of most distributions)
+    that only counts among the threads of a session.
+    """
+    thread = threading.get_native_id()
+    try:
+        os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(level))
+    except (AttributeError, OSError):  # the former: not Linux
+        with suppress(OSError):
+            os.setpriority(os.PRIO_PROCESS, thread, _NICE)
+        return False
+    return True
+
+
+@contextmanager
+def raised_priority(level: int) -> Iterator[None]:
+    """Threads started in this context inherit real-time priority ``level``, if it is granted; the
+    calling thread gets its own priority back."""
+    with ExitStack() as stack:
+        with suppress(AttributeError, OSError):
+            policy, parameter = os.sched_getscheduler(0), os.sched_getparam(0)
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(level))
+            stack.callback(os.sched_setscheduler, 0, policy, parameter)
+        yield

@@ -1,0 +1,190 @@
+"""Child processes of a run on the wall clock: the control process with its watchdog, and the
+simulated robot. All of them have ended when their context is left."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import tempfile
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+from egovcp.errors import EnvironmentFailure
+from egovcp.log.async_sink import warn_on_stderr
+from egovcp.parent_death import die_with_parent
+from egovcp.workers import inherited_by_workers
+from egovcp_deploy.config import DeployConfig
+from egovcp_deploy.live.control_process import control_process, damp_motors
+from egovcp_deploy.live.hardware import CameraOptions, ControlSetup, HardwareOptions
+from egovcp_deploy.live.link import Link
+from egovcp_deploy.robots.base import LowLevelRobot
+from egovcp_deploy.robots.bridge import BridgeConfig, BridgeRobot
+from egovcp_deploy.robots.zmq_camera import ZmqCameraConfig
+
+if TYPE_CHECKING:
+    from egovcp_deploy.live.planner_loop import PlannerLoop
+    from egovcp_deploy.robots.fake.command import FakeG1Config
+
+_END_S: Final = 5.0  # for a process to end by itself
+_WATCHDOG_ROUNDS: Final = 20  # of damping commands, 50 ms each
+_SIMULATOR_START_S: Final = 60.0
+_ENDLESS_S: Final = 1e9
+
+
+@contextmanager
+def child_process(target: Callable[..., None], *args: Any, name: str) -> Iterator[BaseProcess]:
+    """A spawned process that ignores Ctrl-C; terminated, then killed, when the context is left."""
+    process = multiprocessing.get_context("spawn").Process(target=target, args=args, name=name)
+    with inherited_by_workers():
+        process.start()
+    try:
+        yield process
+    finally:
+        for end in (process.terminate, process.kill):
+            if process.is_alive():
+                end()
+                process.join(_END_S)
+
+
+# --- the control process ---------------------------------------------------------------------
+class RunningControl(NamedTuple):
+    """The control process of one run."""
+
+    process: BaseProcess
+    link: Link
+    watchdog: DampingWatchdog
+
+    def check_alive(self) -> None:
+        """Raise `EnvironmentFailure` if the process has ended."""
+        if not self.process.is_alive():
+            raise EnvironmentFailure(
+                f"the control process ended with code {self.process.exitcode}, see its message "
+                "above; egovcp-deploy --dry_run=true checks robot and camera"
+            )
+
+
+@contextmanager
+def running_control(setup: ControlSetup) -> Iterator[RunningControl]:
+    """Start the control process, its link and its watchdog; raises `EnvironmentFailure` if the
+    robot does not answer."""
+    with tempfile.TemporaryDirectory(prefix="egovcp-run-") as folder:
+        address = f"ipc://{folder}/link"
+        setup = replace(setup, address=address, parent=os.getpid())
+        with (
+            closing(Link(address, serve=True)) as link,
+            standby_body(setup.hardware.bridge) as body,
+            child_process(control_process, setup, name="egovcp-control") as process,
+        ):
+            watchdog = DampingWatchdog(process, body)
+            try:
+                yield RunningControl(process, link, watchdog)
+            finally:
+                watchdog.join_if_ended()
+
+
+def stop_control(process: BaseProcess, planner: PlannerLoop) -> None:
+    """End the control process: wait for it if it has a quit command, then SIGTERM, on which it
+    damps the motors too, then SIGKILL, after which the watchdog must damp them."""
+    if planner.quitting:
+        process.join(_END_S)
+    if process.is_alive():
+        planner.quitting = True
+        process.terminate()
+        process.join(_END_S)
+    if process.is_alive():
+        planner.quitting = False
+        process.kill()
+        process.join()
+
+
+@contextmanager
+def standby_body(config: BridgeConfig) -> Iterator[BridgeRobot]:
+    """A second connection to the robot that only sends: damping needs the robot's mode and no
+    further readings, so they are not decoded. Prints the robot's warning, if any, once."""
+    with closing(BridgeRobot(config)) as body:
+        body.connect()
+        if body.warning:
+            warn_on_stderr(f"egovcp-deploy: warning: {body.warning}")
+        body.stop_receiving()
+        yield body
+
+
+class DampingWatchdog:
+    """A thread that damps the robot over ``body``, a connection that nothing else uses, if the
+    control process ends although ``expected()`` is false."""
+
+    def __init__(
+        self,
+        process: BaseProcess,
+        body: LowLevelRobot,
+        expected: Callable[[], bool] = lambda: False,
+    ) -> None:
+        self._process, self._body, self.expected = process, body, expected
+        self.acted = False  # whether the robot had to be damped from here
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+        self._thread.start()
+
+    def _watch(self) -> None:
+        wait([self._process.sentinel])
+        if not self.expected():
+            self.acted = True
+            for _ in range(_WATCHDOG_ROUNDS):
+                damp_motors(self._body)
+
+    def join_if_ended(self) -> None:
+        """If the process has ended, wait until the robot is damped, where that is necessary."""
+        if not self._process.is_alive():
+            self._thread.join()
+
+
+# --- the simulated robot ---------------------------------------------------------------------
+@contextmanager
+def simulated_robot(config: DeployConfig, outcomes: Path) -> Iterator[HardwareOptions]:
+    """The simulator on the wall clock behind the wire of a robot, on free ports of the loopback;
+    ``outcomes`` is the file for the result of the episode.
+
+    Raises:
+        EnvironmentFailure: the simulator is not installed, or does not start.
+    """
+    from egovcp_deploy.robots.fake.bridge import Ports
+    from egovcp_deploy.robots.fake.command import FakeG1Config
+
+    fake = FakeG1Config(
+        task=config.task,
+        seed=config.seed,
+        pause=_ENDLESS_S,  # one episode
+        ports=Ports(command_port=0, state_port=0, camera_port=0),
+        json=str(outcomes),
+        env=config.env,
+    )
+    ours, theirs = multiprocessing.get_context("spawn").Pipe(duplex=False)
+    with child_process(_simulate, fake, theirs, os.getpid(), name="egovcp-simulator"):
+        theirs.close()
+        command, state, camera = _received_ports(ours)
+        eye = ZmqCameraConfig(port=camera, vertical_fov=config.env.camera.vertical_fov)
+        bridge = BridgeConfig(state_port=state, command_port=command)
+        yield HardwareOptions(bridge, CameraOptions(server=eye))
+
+
+def _simulate(fake: FakeG1Config, pipe: Connection, parent: int) -> None:
+    """Runs in the simulator's process."""
+    from egovcp_deploy.robots.fake.command import run
+
+    die_with_parent(parent)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is handled by the planner's process
+    run(fake, lambda ports: pipe.send((ports.command_port, ports.state_port, ports.camera_port)))
+
+
+def _received_ports(pipe: Connection) -> tuple[int, int, int]:
+    with suppress(EOFError):
+        if pipe.poll(_SIMULATOR_START_S):
+            command, state, camera = pipe.recv()
+            return command, state, camera
+    raise EnvironmentFailure("the simulator did not start, see its message above")

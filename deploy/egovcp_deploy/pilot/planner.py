@@ -1,0 +1,267 @@
+"""The planner as the pilot uses it: observations go in, plans come out later.
+
+    client.submit(o_t)  ...  client.poll() -> plans, each made from one observation
+
+`PlannerRunner` filters every observation in order and plans from the newest. `InlinePlanner` runs
+it in lock-step with simulated time; `live.link.RemotePlanner` reaches it in another process.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.log.tick import Candidates, MotorReadings, ValueMap
+from egovcp.plan import PlannerConfig, Policy, PolicyStep, blank_observation
+from egovcp.rate import Clock
+from egovcp.spec import ACTION_BOX, ACTION_DIM, ACTION_HANDS
+from egovcp_deploy.policy import ImaginingPolicy, RolloutPolicy, value_maps
+
+SKIPPED: Final = "observation skipped: its state is not finite, or impossible"
+BACKLOG: Final = 8  # observations that wait for a busy planner; older ones are dropped
+LOGGED_CANDIDATES: Final = 32  # best first; more would clutter the log
+BUDGET_S: Final = 0.034  # from an observation to its plan; the rest of the tick transports it
+POOR_TO_HALVE: Final = 3  # late or incomplete plans; two good plans compensate for one
+GOOD_TO_DOUBLE: Final = 50  # consecutive good plans, 2 s
+_COMPENSATION: Final = 0.5
+_MIN_SAMPLES: Final = 64
+_MIN_ELITES: Final = 4  # the mean of two follows Q's errors too closely (docs/planner.md)
+
+
+@dataclass(frozen=True)
+class ObservationMessage:
+    """One observation o_t for the planner."""
+
+    tick: int  # t, planner ticks; increases without gaps
+    time_ns: int  # when o_t was assembled, monotonic
+    depth: NDArray[np.uint16]  # (48, 64) mm, 0 invalid
+    state: NDArray[np.float32]  # (74,) proprioception; its command is the one sent before
+    sent: NDArray[np.float64]  # (7,) a_{t-1} as it was sent
+    first: bool = False  # whether the recurrence starts here: from zeros, with a_{t-1} neutral
+    mode: str = ""  # `State` of the robot's state machine
+    events: tuple[str, ...] = ()  # log lines since the last observation
+    motors: MotorReadings | None = None  # of the newest reading, for the log
+    link: Mapping[str, float] = field(default_factory=dict)  # `Tick.link`, for the log
+
+
+@dataclass(frozen=True)
+class PlanMessage:
+    """The plan made from the observation of ``tick``."""
+
+    tick: int
+    step: PolicyStep  # for one robot
+    plan_ms: float  # time to filter and plan
+    events: tuple[str, ...] = ()  # log lines of the planner
+    reconstructed: NDArray[np.float32] | None = None
+    """(48, 64) m: o_t decoded by the world model, for the log."""
+    imagined: NDArray[np.float32] | None = None  # (K, 48, 64) m: predictions 1..K ticks ahead
+    value_maps: tuple[ValueMap, ...] = ()
+
+    @property
+    def actions(self) -> NDArray[np.float64]:
+        """(N, 7) the plan; of a policy that does not plan, its one action."""
+        return np.asarray(self.step.plan[0] if self.step.plan.size else self.step.action, float)
+
+
+class PlannerClient(Protocol):
+    """Takes observations and returns plans. No call blocks."""
+
+    def submit(self, observation: ObservationMessage) -> None:
+        """Send o_t to the planner."""
+        ...
+
+    def poll(self, now_ns: int) -> list[PlanMessage]:
+        """Plans that have arrived by ``now_ns``, oldest first."""
+        ...
+
+    @property
+    def alive(self) -> bool:
+        """False once the planner is known to have ended."""
+        ...
+
+
+class AdaptiveBudget:
+    """Halves the samples of a planner that lacks time, and doubles them again, up to those of the
+    configuration ``full``, when it does not.
+
+    A plan cut short by its deadline has too few iterations; fewer samples in all iterations are
+    better than many samples in one (`docs/log.md`).
+    """
+
+    def __init__(self, full: PlannerConfig) -> None:
+        self._full = full
+        self.config = full  # configuration of the next plan
+        self._poor, self._good = 0.0, 0
+
+    def record(self, late: bool, iterations: int) -> bool:
+        """Count one plan with its iterations; true if `config` has changed."""
+        poor = late or iterations < self.config.iterations
+        self._poor = self._poor + 1 if poor else max(0.0, self._poor - _COMPENSATION)
+        self._good = 0 if poor else self._good + 1
+        if self._poor >= POOR_TO_HALVE:
+            return self._scale(self.config.samples // 2)
+        if self._good >= GOOD_TO_DOUBLE:
+            return self._scale(self.config.samples * 2)
+        return False
+
+    def _scale(self, samples: int) -> bool:
+        self._poor, self._good = 0.0, 0
+        full = self._full
+        samples = min(max(samples, _MIN_SAMPLES), full.samples)
+        elites = min(max(full.elites * samples // full.samples, _MIN_ELITES), full.elites)
+        changed = samples != self.config.samples
+        self.config = replace(full, samples=samples, elites=elites)
+        return changed
+
+
+class PlannerRunner:
+    """Filters every observation and plans from the newest, for one robot. For the log it decodes
+    the predictions of ``imagine`` ticks; 0 decodes nothing."""
+
+    def __init__(self, policy: RolloutPolicy, imagine: int = 0) -> None:
+        self._policy = policy
+        self._budget = AdaptiveBudget(policy.config) if isinstance(policy, Policy) else None
+        self._imagine = imagine
+        self._imagining = policy if imagine and isinstance(policy, ImaginingPolicy) else None
+        self._next_tick: int | None = None
+
+    def plan(
+        self,
+        observations: Sequence[ObservationMessage],
+        remaining: Callable[[], float] | None = None,
+    ) -> PlanMessage:
+        """Filter ``observations`` in order and plan from the last. A gap between their ticks
+        restarts the recurrence. Nothing is decoded: see `decode`.
+
+        Args:
+            observations: at least one.
+            remaining: seconds until the plan is due; None: no deadline.
+        """
+        begin = time.perf_counter()
+        events = list[str]()
+        *older, last = observations
+        for observation in older:
+            events += self._advance(observation)
+            self._policy.observe(observation.depth[None], observation.state[None])
+            events += self._skipped()
+        events += self._advance(last)
+        step = self._policy.act(last.depth[None], last.state[None], remaining)
+        events += self._skipped()
+        plan_ms = (time.perf_counter() - begin) * 1e3
+        return PlanMessage(last.tick, step, plan_ms, events=tuple(events))
+
+    def adapt(self, plan: PlanMessage, late: bool) -> bool:
+        """Adapt the number of samples to whether ``plan`` was late; true if it has changed."""
+        if self._budget is None or not self._budget.record(late, plan.step.iterations):
+            return False
+        assert isinstance(self._policy, Policy)
+        self._policy.config = self._budget.config
+        return True
+
+    @property
+    def samples(self) -> int:
+        """Present number of candidates per iteration; 0 of a policy that does not plan."""
+        return 0 if self._budget is None else self._budget.config.samples
+
+    def warm_up(self) -> None:
+        """Plan and decode on a blank observation: the first calls compile and allocate."""
+        depth, state = blank_observation(1)
+        blank = ObservationMessage(0, 0, depth[0], state[0], np.zeros(ACTION_DIM), first=True)
+        for _ in range(2):
+            self.decode(self.plan([blank]))
+        self._next_tick = None
+
+    def decode(self, plan: PlanMessage) -> PlanMessage:
+        """``plan`` with images for the log; call it before the next `plan`."""
+        if self._imagining is None:
+            return plan
+        maps: tuple[ValueMap, ...] = ()
+        if isinstance(policy := self._policy, Policy):
+            maps = value_maps(policy.model, policy.carry, plan.step.action[0])
+        return replace(
+            plan,
+            reconstructed=self._imagining.reconstruct()[0],
+            imagined=self._imagining.imagine(plan.step.plan, self._imagine)[0],
+            value_maps=maps,
+        )
+
+    def _advance(self, observation: ObservationMessage) -> list[str]:
+        """Advance the recurrence to ``observation``, or restart it."""
+        expected = observation.tick if self._next_tick is None else self._next_tick
+        lost = observation.tick - expected
+        self._next_tick = observation.tick + 1
+        if observation.first or lost:
+            self._policy.reset()
+        if not observation.first:
+            self._policy.advance(observation.sent[None])
+        return [f"planner lost {lost} observations: recurrence restarted"] if lost else []
+
+    def _skipped(self) -> list[str]:
+        policy = self._policy
+        return [SKIPPED] if isinstance(policy, Policy) and policy.skipped.any() else []
+
+
+class InlinePlanner:
+    """A `PlannerClient` in lock-step with simulated time. ``delay_ns`` is the simulated planning
+    time by tick; observations wait while the planner is busy."""
+
+    alive = True  # exceptions are raised in this process
+
+    def __init__(
+        self, runner: PlannerRunner, clock: Clock, delay_ns: Callable[[int], int] = lambda tick: 0
+    ) -> None:
+        self._runner = runner
+        self._clock = clock
+        self._delay_ns = delay_ns
+        self._waiting: deque[ObservationMessage] = deque(maxlen=BACKLOG)
+        self._ready: tuple[int, PlanMessage] | None = None
+
+    def submit(self, observation: ObservationMessage) -> None:
+        """Send o_t; an idle planner begins at once."""
+        self._waiting.append(observation)
+        self._begin(self._clock.now_ns())
+
+    def poll(self, now_ns: int) -> list[PlanMessage]:
+        """Plans that are due by ``now_ns``."""
+        plans = []
+        while self._ready is not None and self._ready[0] <= now_ns:
+            ready_ns, plan = self._ready
+            plans.append(plan)
+            self._ready = None
+            self._begin(ready_ns)
+        return plans
+
+    def _begin(self, now_ns: int) -> None:
+        if self._ready is None and self._waiting:
+            plan = self._runner.decode(self._runner.plan(list(self._waiting)))
+            self._waiting.clear()
+            self._ready = (now_ns + self._delay_ns(plan.tick), plan)
+
+
+def planner_fields(plan: PlanMessage | None) -> dict[str, Any]:
+    """The fields of `Tick` that come from the planner; unknown ones are left out."""
+    if plan is None:
+        return {}
+    step = plan.step
+    return {
+        "depth_reconstructed": plan.reconstructed,
+        "depth_imagined": plan.imagined,
+        "value_maps": plan.value_maps,
+        "plan": step.plan[0] if step.plan.size else None,
+        "candidates": _candidates(step) if step.candidates.size else None,
+        "value": float(step.value[0]) if step.value.size else None,
+        "termination": float(step.termination[0]) if step.termination.size else None,
+    }
+
+
+def _candidates(step: PolicyStep) -> Candidates:
+    """The best candidates as hand paths, m, heading frame."""
+    actions = step.candidates[0, :LOGGED_CANDIDATES]  # (n, N, 7)
+    hands = ACTION_BOX.to_metric(actions)[..., ACTION_HANDS].reshape(*actions.shape[:2], 2, 3)
+    return Candidates(hands, step.candidate_values[0, :LOGGED_CANDIDATES])
