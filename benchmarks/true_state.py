@@ -22,7 +22,7 @@ from egovcp.robot.geometry import rotation_matrix
 from egovcp.sim.env import PrivilegedState, VectorEnv
 from egovcp.sim.scenario import Scenario
 from egovcp.sim.scene import PARTS
-from egovcp_collect.dataset.again import changed_versions, scenario_of, simulated_again
+from egovcp_collect.dataset.audit import changed_versions, resimulate, scenario_of
 
 type Array = NDArray[np.float32]
 #: Column -> (N, width) rows of episodes, one after the other.
@@ -40,7 +40,7 @@ _RECORDED: Final = {
 
 
 class Watch:
-    """Notes the truth of every robot before each tick (`egovcp_collect.simulation.Watch`)."""
+    """Notes the truth of every robot before each tick (a `StepCallback` of the collection)."""
 
     def __init__(self) -> None:
         self._rows: dict[Scenario, list[dict[str, NDArray[np.float64]]]] = {}
@@ -142,7 +142,7 @@ def _simulate(reader: DatasetReader, chosen: Sequence[int], paths: Mapping[int, 
     """Keep each of the episodes."""
     watch, different = Watch(), []
     with tqdm(total=len(chosen), unit="ep", desc="simulate again", delay=1) as bar:
-        for index, episode in simulated_again(reader, chosen, watch, pictures=False):
+        for index, episode in resimulate(reader, chosen, watch, render_depth=False):
             truth = watch.take(scenario_of(reader, index))
             if _agrees(episode, reader.read_episode_columns(index, tuple(_RECORDED.values()))):
                 rows = {"state": episode.state, "action": episode.action}

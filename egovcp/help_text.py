@@ -133,7 +133,7 @@ def _groups(config_class: Any, config: Any, name: str) -> Iterator[_Group]:
     Args:
         config: an instance that has the defaults; None: those of the class.
     """
-    kinds, documents = option_types(config_class), dict(_documents(config_class))
+    kinds, documents = option_types(config_class), dict(field_docs(config_class))
     prefix = f"{name}." if name else ""
     options, nested = list[_Option](), list[tuple[Any, Any, str]]()
     if not name:
@@ -154,7 +154,7 @@ def _groups(config_class: Any, config: Any, name: str) -> Iterator[_Group]:
         yield from _groups(*arguments)
 
 
-def _documents(config_class: type) -> Iterator[tuple[str, str]]:
+def field_docs(config_class: type) -> Iterator[tuple[str, str]]:
     """(option, the string literal below it) of a dataclass and its bases."""
     for base in reversed(config_class.__mro__):
         if not dataclasses.is_dataclass(base):

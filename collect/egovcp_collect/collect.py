@@ -1,39 +1,50 @@
-"""`egovcp-collect`: simulation to LeRobot dataset."""
+"""`egovcp-collect`: simulate episodes and write them as a LeRobot dataset."""
 
 from __future__ import annotations
 
 import shlex
+import shutil
 import sys
+import time
 from collections.abc import Sequence
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from pathlib import Path
+from typing import Any, Final
 
-import draccus
+from tqdm import tqdm
 
+from egovcp import spec
 from egovcp.cli import run_command
-from egovcp.data import Provenance
+from egovcp.data import tiff
 from egovcp.data.committer import Committer, open_committer
 from egovcp.data.source import local_root
+from egovcp.errors import EnvironmentFailure
 from egovcp.packages import require_packages
-from egovcp.robot.controllers import make_controller
+from egovcp.sim.config import EnvConfig
 from egovcp.sim.env import resolve_config
 from egovcp.sim.scenario import Scenario
 from egovcp.terminal import echo
 from egovcp.workers import stop_on_signal
-from egovcp_collect.backend import Backend
-from egovcp_collect.config import SHAPING, CollectConfig
-from egovcp_collect.crew import Crew
-from egovcp_collect.progress import Progress
-from egovcp_collect.resume import require_same
-from egovcp_collect.room import require_room
-from egovcp_collect.versions import installed_versions
+from egovcp_collect.config import CollectConfig
+from egovcp_collect.provenance import make_provenance, require_compatible
+from egovcp_collect.worker_pool import WorkerPool
+from egovcp_collect.workers import Backend, LocalBackend
 
 PROG: Final = "egovcp-collect"
 _EPILOG: Final = (
-    "Every finished episode is safe on the disk at once. Whatever ends the command, the same "
-    "command with --resume goes on from there; with more --episodes it extends a dataset."
+    "Every finished episode is stored on the disk at once. After an interruption the same command "
+    "with --resume continues; with more --episodes it extends the dataset."
 )
+STAGED_FRAME_BYTES: Final = (
+    len(tiff.header(spec.DEPTH_ROWS, spec.DEPTH_COLS))
+    + 2 * spec.DEPTH_ROWS * spec.DEPTH_COLS
+    + 4 * (spec.STATE_DIM + spec.ACTION_DIM + 1)
+)
+"""Bytes of a frame in a staged episode, which is not compressed."""
+MIN_COMPRESSED_SHARE: Final = 0.2
+"""Lower bound of the compressed size of a frame as a share of `STAGED_FRAME_BYTES`."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -46,16 +57,16 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def collect(config: CollectConfig, command: str = "") -> None:
-    """Simulate what is missing, commit it shard by shard, and print a summary.
+    """Simulate the missing episodes, commit them shard by shard, and print a summary.
 
-    Whatever ends it early, every finished episode is sealed, and those that follow each other from
-    the first are in the dataset.
+    If it ends early, every finished episode is staged on the disk, and the longest sequence of
+    them without a gap is in the dataset.
 
     Raises:
-        UsageError: an option makes no sense, or something is there already.
-        DataError: what is there is damaged, or the simulation diverged.
-        EnvironmentFailure: another process writes the dataset; there is not enough room for it;
-            workers cannot be kept alive.
+        UsageError: an option is invalid, or the destination exists.
+        DataError: the existing data are damaged, or the simulation diverged.
+        EnvironmentFailure: another process writes the dataset, there is too little disk space, or
+            workers die repeatedly.
         OSError: the disk is full.
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
@@ -63,100 +74,105 @@ def collect(config: CollectConfig, command: str = "") -> None:
     if config.backend == "ray":
         require_packages("egovcp-collect", "--backend=ray", "ray")
     config = replace(config, env=resolve_config(config.env))
-    provenance = _provenance(config, command)
-    agree = partial(require_same, provenance) if config.resume else None
+    provenance = make_provenance(config, command)
+    check_existing = partial(require_compatible, provenance) if config.resume else None
     root = local_root(config.dataset)
-    with open_committer(root, provenance, config.shard_episodes, agree) as committer:
-        missing = _missing(config, committer)
-        require_room(committer.root.parent, missing, config.env, config.shard_episodes)
-        already = committer.committed + committer.staged
-        with Progress(config.episodes, already, lambda: _disk_bytes(committer)) as progress:
+    with open_committer(root, provenance, config.shard_episodes, check_existing) as committer:
+        missing = _missing_scenarios(config, committer)
+        require_disk_space(committer.root.parent, missing, config.env, config.shard_episodes)
+        began = time.monotonic()
+        with tqdm(
+            total=config.episodes,
+            initial=committer.committed + committer.staged,
+            unit="ep",
+            smoothing=0.1,
+            mininterval=0.5 if sys.stderr.isatty() else 10,
+        ) as bar:
             try:
-                _collect(config, missing, committer, progress)
+                steps = _simulate(config, missing, committer, bar)
             except BaseException as error:
                 _commit_after(error, committer)
                 raise
             committer.commit()
-        echo(_summary(committer, progress))
+        rate = steps / (time.monotonic() - began)
+        waiting = f", {committer.staged} more staged for --resume" if committer.staged else ""
+        echo(
+            f"{committer.committed} episodes, {committer.frames} steps, {rate:.0f} steps/s{waiting}"
+        )
         if committer.committed < config.episodes:
             raise KeyboardInterrupt
 
 
 def _commit_after(error: BaseException, committer: Committer) -> None:
-    """Commit what is sealed; should that fail, too, the user still hears of ``error``."""
+    """Commit the staged episodes; a second error becomes a note of the first."""
     try:
         committer.commit()
-    except Exception as second:  # noqa: BLE001 - whatever it is, it came after, and from, the first
-        words = f"what is sealed could not be committed, --resume will do it: {second}"
-        error.add_note(words)
-        echo(f"{PROG}: warning: {words}", error=True)
+    except Exception as second:  # noqa: BLE001 - it must not hide the first error
+        text = f"staged episodes could not be committed, --resume will do it: {second}"
+        error.add_note(text)
+        echo(f"{PROG}: warning: {text}", error=True)
 
 
-def _missing(config: CollectConfig, committer: Committer) -> list[Scenario]:
-    """The episodes that are neither committed nor sealed."""
+def _missing_scenarios(config: CollectConfig, committer: Committer) -> list[Scenario]:
+    """The episodes that are neither committed nor staged."""
     numbers = set(committer.missing(config.episodes))
     through = replace(config, episodes=max(numbers, default=0) + 1)
     return [scenario for scenario in through.scenarios() if scenario.episode in numbers]
 
 
-def _collect(
-    config: CollectConfig, scenarios: Sequence[Scenario], committer: Committer, progress: Progress
+def min_bytes(scenarios: Sequence[Scenario], env: EnvConfig, shard_episodes: int) -> int:
+    """Lower bound of the bytes that the episodes take, with one shard of them uncompressed."""
+    ticks = [env.episode(scenario.task).ticks for scenario in scenarios]
+    uncompressed = sum(ticks[:shard_episodes])
+    share = MIN_COMPRESSED_SHARE
+    return round(STAGED_FRAME_BYTES * (share * sum(ticks) + (1 - share) * uncompressed))
+
+
+def require_disk_space(
+    folder: Path, scenarios: Sequence[Scenario], env: EnvConfig, shard_episodes: int
 ) -> None:
-    """Until every episode is sealed, or a signal asks to stop."""
+    """Raise `EnvironmentFailure` if the file system of ``folder`` has less than `min_bytes`."""
+    needed = min_bytes(scenarios, env, shard_episodes)
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise EnvironmentFailure(
+            f"{len(scenarios)} episodes need at least {needed} bytes below {folder}, where "
+            f"{free} bytes are free; free disk space, reduce --episodes, or choose another "
+            "--dataset.root"
+        )
+
+
+def _simulate(
+    config: CollectConfig, scenarios: Sequence[Scenario], committer: Committer, bar: Any
+) -> int:
+    """Planner ticks until every episode is staged, or until a stop signal."""
     if not scenarios:
-        return
-    backend = _backend(config, committer)
-    workers = config.num_workers or backend.cores
-    with (
-        stop_on_signal() as stopped,
-        Crew(backend, workers, scenarios, config.num_envs, config.worker_timeout) as crew,
-    ):
-        while not crew.over and not stopped:
-            for report in crew.poll():
-                for sealed in report.sealed:
-                    sealed.verify()
-                    committer.staging.put(sealed)
-                for brief in report.done:
-                    committer.mark_staged(brief.number)
-                progress.add(report)
-            progress.show()
+        return 0
+    if config.backend == "ray":
+        from egovcp_collect.ray_workers import RayBackend
+
+        backend: Backend = RayBackend(config)
+    else:
+        backend = LocalBackend(config, committer.staging.folder)
+    count = config.num_workers or backend.cores
+    pool = WorkerPool(backend, count, scenarios, config.num_envs, config.worker_timeout)
+    steps, began = 0, time.monotonic()
+    with stop_on_signal() as stopped, closing(pool):
+        while not pool.done and not stopped:
+            for report in pool.poll():
+                for episode in report.staged:
+                    episode.verify()
+                    committer.staging.put(episode)
+                for number in report.finished:
+                    committer.mark_staged(number)
+                steps += report.steps
+                bar.update(len(report.finished))
+            rate = steps / (time.monotonic() - began)
+            bar.set_postfix_str(f"{rate:.0f} steps/s", refresh=False)
+            bar.update(0)
             if committer.next_shard_is_complete:
                 committer.commit()
-
-
-def _backend(config: CollectConfig, committer: Committer) -> Backend:
-    if config.backend == "ray":
-        from egovcp_collect.cluster import RayBackend
-
-        return RayBackend(config)
-    from egovcp_collect.local import LocalBackend
-
-    return LocalBackend(config, committer.staging.folder)
-
-
-def _disk_bytes(committer: Committer) -> int:
-    files = committer.root.glob("data/*/*.parquet")
-    return committer.staging.size() + sum(file.stat().st_size for file in files)
-
-
-def _summary(committer: Committer, progress: Progress) -> str:
-    """The last line of the command."""
-    waiting = f", {committer.staged} more sealed for --resume" if committer.staged else ""
-    return (
-        f"{committer.committed} episodes, {committer.frames} steps, {progress.rate:.0f} steps/s"
-        f"{waiting}"
-    )
-
-
-def _provenance(config: CollectConfig, command: str) -> Provenance:
-    settings = draccus.encode(config)
-    return Provenance(
-        controller_id=make_controller(config.env.controller).id,
-        seed=config.seed,
-        command=command,
-        versions=installed_versions(),
-        config={name: settings[name] for name in SHAPING},
-    )
+    return steps
 
 
 if __name__ == "__main__":

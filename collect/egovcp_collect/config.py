@@ -1,4 +1,4 @@
-"""Options of `egovcp-collect`, and which episodes they ask for."""
+"""Options of `egovcp-collect`, and the scenarios that they select."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_ETA, ACTION_RATE_LIMIT, TASKS
 
 ALL_TASKS: Final = "all"
-#: Options that an episode depends on; the others only say how the work is done.
-SHAPING: Final = ("task", "mix", "seed", "eta", "step_ticks", "boundary", "env")
+#: Options that determine the content of an episode; the others only schedule the work.
+EPISODE_OPTIONS: Final = ("task", "mix", "seed", "eta", "step_ticks", "boundary", "env")
 
 
 @dataclass(frozen=True)
 class MixConfig:
-    """Share of each task under --task=all, in any unit."""
+    """Relative weight of each task under --task=all."""
 
     ball: float = bounded(1.0, least=0)
     """Weight of ball episodes."""
@@ -36,41 +36,41 @@ class CollectConfig:
     """Simulate episodes under the random walk of the paper; write them as a LeRobot dataset."""
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """Where the dataset goes; without a root, into LeRobot's local folder under its id."""
+    """The new dataset; without a root it goes to LeRobot's local folder under its id."""
     task: str = "ball"
-    """Task to collect: ball, wall, arch, or all of them in turn."""
+    """Task to collect: ball, wall, arch, or all of them interleaved."""
     mix: MixConfig = field(default_factory=MixConfig)
-    """Shares of the tasks under --task=all."""
+    """Weights of the tasks under --task=all."""
     episodes: int = bounded(200, least=1, most=10**6)
-    """Number of episodes, those that --resume finds included."""
+    """Number of episodes, including those that --resume finds."""
     resume: bool = False
-    """Go on with the collection that is there, if any; with more episodes, extend the dataset."""
+    """Continue an existing collection, if any; with more episodes, extend the dataset."""
     shard_episodes: int = bounded(SHARD_EPISODES, least=1, most=65_536)
     """Episodes per data file; the dataset grows by one such shard at a time."""
     seed: int = bounded(0, least=0)
-    """Episode i is a function of (seed, i) alone, whatever the number of workers."""
+    """Episode i depends on (seed, i) only, not on the number of workers."""
     backend: Literal["local", "ray"] = "local"
     """Where the workers run: as processes of this machine, or on a Ray cluster (RAY_ADDRESS; needs
     egovcp-collect[ray])."""
     num_workers: int = bounded(0, least=0, most=65_536)
-    """Processes that simulate; 0: one per processor core, of the cluster under --backend=ray."""
+    """Simulation processes; 0: one per processor core, of the cluster under --backend=ray."""
     worker_timeout: float = bounded(120.0, least=1)
-    """A worker that reports nothing for so long is replaced, s."""
+    """Replace a worker that sends no report for this long, s."""
     num_envs: int = bounded(16, least=1, most=65_536)
-    """Robots that each process simulates side by side."""
+    """Robots that each process simulates in parallel."""
     eta: float = bounded(ACTION_ETA, above=0, most=2)
-    """Largest step of the random walk, action box units; what exceeds the rate limit of 0.32 per
+    """Largest step of the random walk, action box units; a step above the rate limit of 0.32 per
     planner tick (40 ms) is sent as a ramp."""
     step_ticks: tuple[int, int] = bounded((1, 1), least=1, most=100_000)
-    """Shortest and longest time from one step of the walk to the next, planner ticks; (1, 1) is
-    the paper's walk."""
+    """Shortest and longest interval between steps of the walk, planner ticks; (1, 1) is the
+    paper's walk."""
     boundary: Literal["reflect", "clip"] = "reflect"
-    """What keeps the walk inside the action box; clipping piles it up on the walls."""
+    """How the walk stays inside the action box; clipping accumulates actions on its faces."""
     env: EnvConfig = field(default_factory=EnvConfig)
     """Scenes, sensors, delays and randomisation."""
 
     def check(self) -> None:
-        """Raise `UsageError` for values that make no sense."""
+        """Raise `UsageError` for invalid values and combinations."""
         check_bounds(self, "--")
         if self.backend == "local":  # a cluster has other cores and other memory
             require_cores("--num_workers", self.num_workers)
@@ -80,36 +80,37 @@ class CollectConfig:
         choices = (*TASKS, ALL_TASKS)
         if self.task not in choices:
             raise UsageError(f"unknown task --task={self.task}{suggest(self.task, choices)}")
-        least, most = self.step_ticks
-        if least > most:
+        shortest, longest = self.step_ticks
+        if shortest > longest:
             raise UsageError(
-                f"--step_ticks={[least, most]}: expected 1 <= shortest <= longest, planner ticks"
+                f"--step_ticks={[shortest, longest]}: expected 1 <= shortest <= longest, planner "
+                "ticks"
             )
-        reached = min(2.0, least * ACTION_RATE_LIMIT)
-        if not 0 < self.eta <= reached:
+        reachable = min(2.0, shortest * ACTION_RATE_LIMIT)
+        if self.eta > reachable:
             raise UsageError(
-                f"--eta={self.eta}: expected more than 0 and at most {reached:g}: within "
-                f"--step_ticks={[least, most]} no more is sent, at the rate limit of "
-                f"{ACTION_RATE_LIMIT} per tick that collection and deployment share"
+                f"--eta={self.eta}: expected more than 0 and at most {reachable:g}, which is what "
+                f"the rate limit of {ACTION_RATE_LIMIT} per tick allows within "
+                f"--step_ticks={[shortest, longest]}"
             )
-        if min(self._weights()) < 0 or sum(self._weights()) <= 0:
-            raise UsageError(f"{self.mix}: expected weights of at least 0, and one above it")
+        if not any(self._weights()):
+            raise UsageError(f"{self.mix}: expected at least one of the weights above 0")
         if self.dataset.revision:
             raise UsageError("--dataset.revision has no meaning for a new dataset; drop it")
 
     def scenarios(self) -> tuple[Scenario, ...]:
-        """The episodes in order. Tasks interleave so that every prefix holds their shares."""
+        """The episodes in order. Tasks interleave so that every prefix has the shares of `mix`."""
         if self.task != ALL_TASKS:
             return tuple(Scenario(self.task, self.seed, i) for i in range(self.episodes))
         weights = self._weights()
         counts = [0] * len(TASKS)
-        chosen = []
+        scenarios = []
         for i in range(self.episodes):
             due = [w * (i + 1) / sum(weights) - n for w, n in zip(weights, counts, strict=True)]
             k = max(range(len(TASKS)), key=due.__getitem__)
             counts[k] += 1
-            chosen.append(Scenario(TASKS[k], self.seed, i))
-        return tuple(chosen)
+            scenarios.append(Scenario(TASKS[k], self.seed, i))
+        return tuple(scenarios)
 
     def _weights(self) -> tuple[float, ...]:
         return tuple(getattr(self.mix, task) for task in TASKS)

@@ -1,118 +1,155 @@
-"""Robots that simulate one episode after the other; the same in every kind of worker."""
+"""Simulates and records episodes; the same in every kind of worker."""
 
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from collections import Counter, defaultdict, deque
+from collections.abc import Callable, Iterable
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.data import Episode
-from egovcp.sim.env import Observation, VectorEnv
+from egovcp.sim.env import Observation, StepResult, VectorEnv
+from egovcp.sim.instance import EnvInstance
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
-from egovcp.spec import TASKS
+from egovcp.sim.scene import HANDS
 from egovcp_collect.config import CollectConfig
-from egovcp_collect.record import Record
 
-#: Looks at the robots; the second argument (B,) says whose episode is not over.
-type Watch = Callable[[VectorEnv, NDArray[np.bool_]], None]
+#: Called with the environment and (B,) whether the episode of each row is running.
+type StepCallback = Callable[[VectorEnv, NDArray[np.bool_]], None]
 
 
-@dataclass
-class Progress:
-    """What a while of simulation brought."""
-
-    steps: int = 0
-    """Planner ticks, all robots together."""
-    episodes: list[tuple[int, Episode]] = field(default_factory=list)
-    """Number and content of each episode that ended."""
+type SimulationResult = tuple[int, list[tuple[int, Episode]]]
+"""Planner ticks, summed over the robots; number and content of each finished episode."""
 
 
 class Simulation:
-    """Up to ``config.num_envs`` robots; one whose episode is over begins the next at once.
+    """Up to ``config.num_envs`` robots in parallel; a finished one starts the next episode.
 
-    An episode does not depend on its neighbours: it does not matter which robot plays it, or when.
+    An episode depends on its scenario only, not on its row or on the other rows.
 
     Args:
-        config: what shapes the episodes.
-        watch: shown the robots before each tick, as the row that the tick makes finds them.
-        pictures: false: depth stays empty, which is quicker; all else is the same.
+        config: the options in `EPISODE_OPTIONS`, and ``num_envs``.
+        on_step: called before each planner tick, with the state that the next row records.
+        render_depth: False leaves depth empty, which is faster; nothing else changes.
     """
 
     def __init__(
-        self, config: CollectConfig, watch: Watch | None = None, pictures: bool = True
+        self, config: CollectConfig, on_step: StepCallback | None = None, render_depth: bool = True
     ) -> None:
         self._config = config
-        self._watch = watch
-        self._pictures = pictures
+        self._on_step = on_step
+        self._render_depth = render_depth
         self._waiting: deque[Scenario] = deque()
         self._policy = RandomWalk(config.eta, config.boundary, config.step_ticks)
         self._env: VectorEnv | None = None
         self._observation: Observation
-        self._record: Record
+        self._records: list[EpisodeRecord]
 
     def add(self, scenarios: Iterable[Scenario]) -> None:
-        """Play these, too."""
+        """Append scenarios to the queue."""
         self._waiting.extend(scenarios)
 
     @property
     def idle(self) -> bool:
-        """Whether every episode is over and none waits."""
+        """Whether no episode is running or waiting."""
         return not self._waiting and (self._env is None or bool(self._env.done.all()))
 
-    def advance(self, seconds: float) -> Progress:
-        """Simulate for about this long, or until nothing is left to do."""
+    def run(self, seconds: float) -> SimulationResult:
+        """Simulate for about this long, or until idle."""
         end = time.monotonic() + seconds
-        progress = Progress()
+        steps, episodes = 0, list[tuple[int, Episode]]()
         while not self.idle and time.monotonic() < end:
-            self._tick(progress)
-        return progress
+            env = self._start_waiting()
+            running = ~env.done
+            steps += int(running.sum())
+            if self._on_step is not None:
+                self._on_step(env, running)
+            result = env.step(self._policy.act(env))
+            for row in np.flatnonzero(running).tolist():
+                instance, record = env.instances[row], self._records[row]
+                record.add(self._observation, result, row, instance)
+                if instance.done:
+                    episodes.append((instance.scenario.episode, record.episode(instance)))
+                    self._records[row] = EpisodeRecord()
+            self._observation = result.observation
+        return steps, episodes
 
-    def _tick(self, progress: Progress) -> None:
-        env = self._filled()
-        live = ~env.done
-        if self._watch is not None:
-            self._watch(env, live)
-        result = env.step(self._policy.act(env))
-        self._record.add(self._observation, result, live)
-        self._observation = result.observation
-        progress.steps += int(live.sum())
-        for row in np.flatnonzero(live):
-            instance = env.instances[row]
-            self._record.touch(row, instance)
-            if instance.done:
-                episode = self._record.episode(row, instance)
-                progress.episodes.append((instance.scenario.episode, episode))
+    def _start_waiting(self) -> VectorEnv:
+        """The environment, after waiting episodes were started in its finished rows."""
+        config, env = self._config, self._env
+        if env is None:
+            scenarios = self._take(config.num_envs)
+            self._records = [EpisodeRecord() for _ in scenarios]
+            env = VectorEnv(config.env, len(scenarios), render_depth=self._render_depth)
+            self._env = env
+            self._observation = env.reset(scenarios)
+            self._policy.reset(env, scenarios)
+        elif self._waiting and env.done.any():
+            rows = np.flatnonzero(env.done)[: len(self._waiting)].tolist()
+            scenarios = self._take(len(rows))
+            self._observation = env.reset_rows(rows, scenarios)
+            self._policy.reset_rows(rows, scenarios)
+        return env
 
-    def _filled(self) -> VectorEnv:
-        """The environment, every robot busy as long as episodes wait."""
-        if self._env is None:
-            return self._begin()
-        if self._waiting:
-            rows = np.flatnonzero(self._env.done)[: len(self._waiting)]
-            if len(rows):
-                self._refill(self._env, rows.tolist())
-        return self._env
+    def _take(self, count: int) -> list[Scenario]:
+        return [self._waiting.popleft() for _ in range(min(count, len(self._waiting)))]
 
-    def _begin(self) -> VectorEnv:
-        config = self._config
-        first = self._next(min(config.num_envs, len(self._waiting)))
-        limits = [config.env.episode(task).ticks for task in TASKS]
-        self._record = Record(len(first), max(limits))
-        self._env = VectorEnv(config.env, len(first), render_depth=self._pictures)
-        self._observation = self._env.reset(first)
-        self._policy.reset(self._env, first)
-        return self._env
 
-    def _refill(self, env: VectorEnv, rows: Sequence[int]) -> None:
-        scenarios = self._next(len(rows))
-        self._observation = env.reset_rows(rows, scenarios)
-        self._policy.reset_rows(rows, scenarios)
-        self._record.restart(np.asarray(rows, dtype=np.intp))
+class EpisodeRecord:
+    """The rows of one episode: (o[t], a[t], r[t], flags)."""
 
-    def _next(self, count: int) -> list[Scenario]:
-        return [self._waiting.popleft() for _ in range(count)]
+    def __init__(self) -> None:
+        self._rows: dict[str, list[Any]] = defaultdict(list)
+        self._term_sums: dict[str, float] = defaultdict(float)
+        self._term_ticks: Counter[str] = Counter()
+        self._hand_contacts = self._other_contacts = 0
+
+    def add(self, before: Observation, result: StepResult, row: int, instance: EnvInstance) -> None:
+        """Append row ``row`` of the environment: the observation before a step, and its result."""
+        values = {
+            "depth": before.depth[row].copy(),
+            "state": before.state[row].copy(),
+            "action": result.sent_action[row].astype(np.float32),
+            "reward": np.float32(result.reward[row]),
+            "done": result.terminated[row] | result.truncated[row],
+            "success": result.success[row],
+            "truncated": result.truncated[row],
+        }
+        for name, value in values.items():
+            self._rows[name].append(value)
+        for name in instance.task.terms:
+            term = float(result.reward_terms[name][row])
+            self._term_sums[name] += term
+            self._term_ticks[name] += term != 0
+        touched = instance.task.forces > 0
+        hands = touched[list(HANDS)]
+        self._hand_contacts += int(hands.any())
+        self._other_contacts += int(touched.sum() > hands.sum())
+
+    def episode(self, instance: EnvInstance) -> Episode:
+        """The finished episode."""
+        return Episode(
+            **{name: np.stack(values) for name, values in self._rows.items()},
+            task=instance.scenario.task,
+            time_limit=instance.task.ticks_limit,
+            metadata={
+                "seed": instance.scenario.seed,
+                "episode": instance.scenario.episode,
+                "event_tick": instance.task.event_tick,
+                "action_delay": instance.action_delay,
+                "image_age": instance.image_age,
+                "camera_pitch": instance.camera_pitch,
+                "physics": asdict(instance.physics),
+                "scene": instance.task.parameters,
+                "reward_terms": {
+                    name: {"sum": self._term_sums[name], "ticks": self._term_ticks[name]}
+                    for name in instance.task.terms
+                },
+                "contact_ticks": {"hands": self._hand_contacts, "other": self._other_contacts},
+            },
+        )

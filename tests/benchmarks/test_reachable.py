@@ -70,7 +70,7 @@ def test_truth_is_that_of_the_recorded_row(columns: Columns, reader: DatasetRead
 def test_what_was_simulated_is_kept(
     columns: Columns, reader: DatasetReader, kept: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("true_state.simulated_again", None)
+    monkeypatch.setattr("true_state.resimulate", None)
     again = true_states(reader, range(len(reader)), kept)
     assert all(np.array_equal(again[name], column) for name, column in columns.items())
 

@@ -12,7 +12,7 @@ from egovcp.data.committer import Committer
 from egovcp.errors import DataError
 from egovcp_collect.collect import main
 from egovcp_collect.config import CollectConfig, MixConfig
-from egovcp_collect.crew import Crew
+from egovcp_collect.worker_pool import WorkerPool
 
 _SHORT = ["--env.ball_episode.ticks=6", "--env.ball_episode.event_ticks=[0,1]"]
 
@@ -124,20 +124,20 @@ def test_a_place_that_cannot_be_written_is_refused(
 def test_an_error_is_not_hidden_by_the_commit_that_follows_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The simulation fails, and then the disk, when what was sealed is to be committed."""
+    """The simulation fails, then the commit of the staged episodes."""
 
-    def fail(self: Crew) -> None:
-        raise DataError("the robot has left the earth")
+    def fail(self: WorkerPool) -> None:
+        raise DataError("the simulation failed")
 
     def full(self: Committer) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(Crew, "poll", fail)
+    monkeypatch.setattr(WorkerPool, "poll", fail)
     monkeypatch.setattr(Committer, "commit", full)
     assert _collect(tmp_path / "new", "--episodes=1", "--num_workers=1") == 3
-    told = capsys.readouterr().err.strip().splitlines()
-    assert told[-1] == "egovcp-collect: error: the robot has left the earth"
-    (warning,) = [line for line in told if "warning" in line]
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert lines[-1] == "egovcp-collect: error: the simulation failed"
+    (warning,) = [line for line in lines if "warning" in line]
     assert "No space left" in warning
 
 

@@ -2,34 +2,31 @@
 
 from __future__ import annotations
 
-import ast
-import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import is_dataclass
-from functools import cache
-from itertools import pairwise
 from typing import Any, Final
 
 from egovcp import spec
 from egovcp.data import schema
+from egovcp.help_text import field_docs
 from egovcp.sim.config import EnvConfig
-from egovcp_collect.dataset.survey import TaskSurvey
+from egovcp_collect.dataset.statistics import TaskStatistics
 
 _FEATURES: Final = {
     spec.DEPTH_KEY: "planar depth (along the optical axis) of the head camera, mm; 0: not measured",
     spec.STATE_KEY: "proprioception and the last command, see below",
     spec.ACTION_KEY: "targets for hands and pelvis height, normalised, see below",
     spec.REWARD_KEY: "reward after the action",
-    spec.DONE_KEY: "the episode ended with this row, by a fall or by its time limit",
+    spec.DONE_KEY: "the episode ended with this row, by a fall or at its time limit",
     spec.SUCCESS_KEY: "the task is achieved after the action",
-    spec.TRUNCATED_KEY: "the episode ended with this row because its time was up",
+    spec.TRUNCATED_KEY: "the episode ended with this row at its time limit",
     "timestamp": "s since the start of the episode",
     "frame_index": "row within the episode",
     "episode_index": "episode within the dataset",
     "index": "row within the dataset",
     "task_index": "row of `meta/tasks.parquet`",
 }
-#: Part of the state -> what it is, unit, frame.
+#: Part of the state -> content, unit, frame.
 _STATE: Final = {
     "angular_velocity": ("angular velocity x, y, z", "rad/s", "pelvis IMU"),
     "projected_gravity": ("direction of gravity; upright is (0, 0, -1)", "unit", "pelvis IMU"),
@@ -53,18 +50,19 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str
 def feature_table() -> str:
     """Every column of the dataset."""
     rows = [
-        (f"`{key}`", _kind(feature), feature["shape"], _FEATURES[key])
+        (
+            f"`{key}`",
+            "image, uint16" if feature["dtype"] == "image" else feature["dtype"],
+            feature["shape"],
+            _FEATURES[key],
+        )
         for key, feature in schema.FEATURES.items()
     ]
     return markdown_table(("feature", "type", "shape", "content"), rows)
 
 
-def _kind(feature: Mapping[str, Any]) -> str:
-    return "image, uint16" if feature["dtype"] == "image" else str(feature["dtype"])
-
-
 def state_table() -> str:
-    """What each of the state's values is."""
+    """Content, unit and frame of each part of the state."""
     rows = [
         (f"{part.start}:{part.stop}", *_STATE[name]) for name, part in spec.STATE_SLICES.items()
     ]
@@ -72,7 +70,7 @@ def state_table() -> str:
 
 
 def action_table() -> str:
-    """What -1, 0 and 1 of each action are in metres."""
+    """Metres that correspond to -1, 0 and 1 of each action."""
     box = spec.ACTION_BOX
     rows = [
         (
@@ -86,78 +84,53 @@ def action_table() -> str:
 
 
 def settings_tables(config: Mapping[str, Any], tasks: Sequence[str]) -> tuple[str, str]:
-    """What was drawn per episode, and what was constant, of a recorded configuration."""
-    env = config.get("env", {})
+    """Parameters drawn per episode, and constant ones, of a recorded configuration."""
     drawn, constant = [], []
-    for name, value in _settings(env, tasks):
-        meaning = _meaning(name)
-        if _is_range(value):
+    for name, value, meaning in _settings(config.get("env", {}), tasks):
+        if isinstance(value, list) and len(value) == 2:  # a range
             low, high = value
             if low != high:
-                drawn.append((f"`env.{name}`", _plain(low), _plain(high), meaning))
+                drawn.append((f"`env.{name}`", _format(low), _format(high), meaning))
                 continue
             value = low
-        constant.append((f"`env.{name}`", _plain(value), meaning))
+        constant.append((f"`env.{name}`", _format(value), meaning))
     head = ("parameter", "from", "to", "meaning")
     return markdown_table(head, drawn), markdown_table(("parameter", "value", "meaning"), constant)
 
 
-def _settings(env: Mapping[str, Any], tasks: Sequence[str]) -> Iterator[tuple[str, Any]]:
-    """Dotted name and value of what concerns these tasks."""
+def _settings(env: Mapping[str, Any], tasks: Sequence[str]) -> Iterator[tuple[str, Any, str]]:
+    """Dotted name, value and documentation of the settings of these tasks.
+
+    A setting that this version does not have has no documentation.
+    """
     others = {task for task in spec.TASKS if task not in tasks}
-    for part, value in env.items():
-        if part.removesuffix("_episode") in others or part == "threads":
+    defaults, docs = EnvConfig(), dict(field_docs(EnvConfig))
+    for group, value in env.items():
+        if group.removesuffix("_episode") in others or group == "threads":
             continue
-        if isinstance(value, Mapping):
-            yield from ((f"{part}.{name}", setting) for name, setting in value.items())
-        else:
-            yield part, value
+        if not isinstance(value, Mapping):
+            yield group, value, docs.get(group, "")
+            continue
+        kind = type(getattr(defaults, group, None))
+        group_docs = dict(field_docs(kind)) if is_dataclass(kind) else {}
+        for name, setting in value.items():
+            yield f"{group}.{name}", setting, group_docs.get(name, "")
 
 
-def _is_range(value: object) -> bool:
-    return isinstance(value, list) and len(value) == 2
-
-
-def _plain(value: object) -> str:
+def _format(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.4g}"
-    return ", ".join(map(_plain, value)) if isinstance(value, list) else str(value)
+    return ", ".join(map(_format, value)) if isinstance(value, list) else str(value)
 
 
-def _meaning(name: str) -> str:
-    """The configuration's own words; empty for what this version does not know."""
-    owner: Any = EnvConfig()
-    *parts, last = name.split(".")
-    for part in parts:
-        owner = getattr(owner, part, None)
-    if not is_dataclass(owner):
-        return ""
-    kind: type = type(owner)
-    return field_docs(kind).get(last, "")
-
-
-@cache
-def field_docs(config_class: type) -> Mapping[str, str]:
-    """Field -> the docstring beneath it, on one line."""
-    body = ast.parse(inspect.getsource(config_class)).body[0]
-    assert isinstance(body, ast.ClassDef), "the source of a class is a class"
-    docs = {}
-    for statement, below in pairwise(body.body):
-        if isinstance(statement, ast.AnnAssign) and isinstance(statement.target, ast.Name):
-            text = below.value if isinstance(below, ast.Expr) else None
-            if isinstance(text, ast.Constant) and isinstance(text.value, str):
-                docs[statement.target.id] = " ".join(text.value.split())
-    return docs
-
-
-def coverage_table(tasks: Sequence[TaskSurvey]) -> str:
-    """One column of figures per task."""
-    facts = [_facts(task) for task in tasks]
-    rows = [(name, *(fact[name] for fact in facts)) for name in facts[0]]
+def coverage_table(tasks: Sequence[TaskStatistics]) -> str:
+    """Statistics, one column per task."""
+    columns = [_coverage_column(task) for task in tasks]
+    rows = [(name, *(column[name] for column in columns)) for name in columns[0]]
     return markdown_table(("", *(task.task for task in tasks)), rows)
 
 
-def _facts(task: TaskSurvey) -> dict[str, str]:
+def _coverage_column(task: TaskStatistics) -> dict[str, str]:
     r, d, length = task.returns, task.depth, task.length
     return {
         "episodes": f"{task.episodes}",
@@ -169,17 +142,17 @@ def _facts(task: TaskSurvey) -> dict[str, str]:
             f"{r.spread.mean:.3f}, {r.spread.std:.3f}" if r.spread else "none"
         ),
         "return, 5 % to 95 %": f"{r.spread.q05:.3f} to {r.spread.q95:.3f}" if r.spread else "none",
-        "rows with a reward ahead that stands out": f"{r.positive_share:.1%}",
-        "rows with a cost ahead that stands out": f"{r.negative_share:.1%}",
-        "cells of the hands' box that are filled": ", ".join(
+        "rows with a reward event ahead": f"{r.positive_share:.1%}",
+        "rows with a cost event ahead": f"{r.negative_share:.1%}",
+        "occupied cells of the hands' box": ", ".join(
             f"{hand} {share:.0%}" for hand, share in task.action.occupied.items()
         ),
         "depth pixels measured, nearer than 1 m": f"{d.valid_share:.0%}, {d.near_share:.1%}",
     }
 
 
-def event_table(tasks: Sequence[TaskSurvey]) -> str:
-    """How often each reward term acted."""
+def event_table(tasks: Sequence[TaskStatistics]) -> str:
+    """Rate of each reward term."""
     rows = [
         (task.task, f"`{name}`", f"{rate.per_1000_steps:.2f}", f"{rate.episode_share:.1%}")
         for task in tasks

@@ -1,4 +1,4 @@
-"""`egovcp-dataset check`: is every file and every frame of a dataset as it should be?"""
+"""`egovcp-dataset check`: find every problem in the files and frames of a dataset."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from egovcp.terminal import echo, one_line
 
 @dataclass(frozen=True)
 class CheckConfig:
-    """Read every file and every frame of a dataset, and name the file, episode and frame of
-    whatever is wrong. Ends with exit code 3 if anything is."""
+    """Read every file and every frame of a dataset, and print file, episode and frame of each
+    problem. Exits with code 3 if there is one."""
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
-    """The dataset: a folder, for which the network is never asked, or an id of the Hub."""
+    """The dataset: a folder, which is checked without network access, or an id of the Hub."""
     max_problems: int = bounded(20, least=1)
     """Stop after this many problems."""
     json: str = output_file()
@@ -36,52 +36,37 @@ class CheckConfig:
     "problem"}]}; empty: none."""
 
 
-CONFIG = CheckConfig
-
-
-def run(config: CheckConfig) -> None:
-    """Print every problem, and a summary.
-
-    Raises:
-        DataError: something is wrong.
-    """
+def run_check(config: CheckConfig) -> None:
+    """Print every problem, and a summary."""
     root = local_root(config.dataset)
-    if not (config.dataset.root and root.is_dir()):  # of a damaged one every problem is listed
+    if not (config.dataset.root and root.is_dir()):  # `locate` would stop at the first problem
         root = locate(config.dataset).root
-    with _progress() as progress:
-        found = list(islice(dataset_problems(root, progress), config.max_problems))
+    with progress_bar() as progress:
+        problems = list(islice(dataset_problems(root, progress), config.max_problems))
     episodes, frames = _size(root)
-    problems = [as_json(error, root) for error in found]
-    content = {"ok": not found, "episodes": episodes, "frames": frames, "problems": problems}
-    write_report(config.json, content)
-    for error in found:
-        echo(one_line(error))
+    result = {"ok": not problems, "episodes": episodes, "frames": frames}
+    write_report(config.json, {**result, "problems": [problem_as_json(p, root) for p in problems]})
+    for problem in problems:
+        echo(one_line(problem))
     if hidden := hidden_files(root / "data") + hidden_files(root / "meta"):
+        folders = shlex.join([str(root / "data"), str(root / "meta")])
         echo(
             f"ignored {hidden} hidden files and folders such as ._NAME of macOS, which LeRobot "
-            f"would read; remove them: find {_quoted(root / 'data')} {_quoted(root / 'meta')} "
-            "-name '.*' -prune -exec rm -r {} +"
+            f"would read; remove them: find {folders} -name '.*' -prune -exec rm -r {{}} +"
         )
-    if found:
-        raise DataError(_verdict(found, root, config.max_problems))
+    if problems:
+        more = " or more" if len(problems) == config.max_problems else ""
+        raise DataError(
+            f"{len(problems)}{more} problem(s) in {root}, the first: {problems[0]}; "
+            f"`egovcp-dataset repair {root} --output_dir=NEW` keeps the episodes that are sound"
+        )
     echo(f"{root}: {episodes} episodes, {frames} frames, nothing wrong")
 
 
-def _quoted(path: Path) -> str:
-    return shlex.quote(str(path))
-
-
-def _verdict(found: list[DataError], root: Path, limit: int) -> str:
-    number = f"{len(found)} or more" if len(found) == limit else f"{len(found)}"
-    return (
-        f"{number} problem(s) in {root}, the first: {found[0]}; `egovcp-dataset repair {root} "
-        "--output_dir=NEW` keeps the episodes that are sound"
-    )
-
-
 @contextmanager
-def _progress() -> Iterator[Callable[[int, int], None]]:
-    with tqdm(unit="ep", delay=1) as bar:
+def progress_bar(title: str = "") -> Iterator[Callable[[int, int], None]]:
+    """A progress bar, as a function of the episodes done and their total."""
+    with tqdm(desc=title or None, unit="ep", delay=1) as bar:
 
         def show(done: int, total: int) -> None:
             bar.total = total
@@ -91,7 +76,7 @@ def _progress() -> Iterator[Callable[[int, int], None]]:
 
 
 def _size(root: Path) -> tuple[int, int]:
-    """Episodes and frames, as far as they are known."""
+    """Episodes and frames according to ``info.json``; 0 where they are unknown."""
     try:
         info = metadata.load_info(root)
     except DataError:
@@ -101,8 +86,8 @@ def _size(root: Path) -> tuple[int, int]:
     return episodes, frames
 
 
-def as_json(error: DataError, root: Path) -> dict[str, Any]:
-    """A problem as the reports of `check` and `repair` have it."""
+def problem_as_json(error: DataError, root: Path) -> dict[str, Any]:
+    """A problem as in the reports of `check` and `repair`; the file is relative to ``root``."""
     file = Path(error.file)
     inside = bool(error.file) and file.is_relative_to(root)
     return {

@@ -1,12 +1,8 @@
-"""`egovcp-dataset SUBCOMMAND [ROOT] [--NAME=VALUE ...]`: work with a finished dataset.
+"""`egovcp-dataset SUBCOMMAND [ROOT] [--NAME=VALUE ...]`: inspect, check, repair and share datasets.
 
-A subcommand is a module with
-
-    CONFIG          frozen dataclass of its options; `dataset: DatasetConfig` comes first
-    run(config)     does the work, prints the result, raises an `EgovcpError` on failure
-    MORE            optional: the list option that takes the folders after the first
-
-and one line in `SUBCOMMANDS`. It is imported only when it is asked for.
+The subcommand NAME is the function ``run_NAME`` of a module, which is imported when it is called.
+It takes a frozen dataclass of options, whose first field is ``dataset: DatasetConfig``, prints the
+result, and raises an `EgovcpError` on failure.
 """
 
 from __future__ import annotations
@@ -15,7 +11,7 @@ import importlib
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from types import MappingProxyType
 from typing import Any, Final, get_type_hints
 
@@ -25,51 +21,24 @@ from egovcp.hub import is_local_path
 from egovcp.terminal import echo
 
 PROG: Final = "egovcp-dataset"
-
-
-@dataclass(frozen=True)
-class Subcommand:
-    """Where a subcommand lives, and what `egovcp-dataset --help` says of it."""
-
-    module: str
-    summary: str
-
-
-SUBCOMMANDS: Final[Mapping[str, Subcommand]] = MappingProxyType(
+#: Subcommand -> its module in this package, and its line in the help.
+SUBCOMMANDS: Final[Mapping[str, tuple[str, str]]] = MappingProxyType(
     {
-        "info": Subcommand(
-            "egovcp_collect.dataset.info", "what is in it: tasks, episodes, hours, provenance"
-        ),
-        "check": Subcommand(
-            "egovcp_collect.dataset.check", "read every file and frame; name whatever is wrong"
-        ),
-        "repair": Subcommand(
-            "egovcp_collect.dataset.repair", "write a sound copy of whatever can still be read"
-        ),
-        "merge": Subcommand(
-            "egovcp_collect.dataset.merge", "one dataset out of several of the same controller"
-        ),
-        "audit": Subcommand(
-            "egovcp_collect.dataset.audit",
-            "simulate episodes again: are they the same bit for bit?",
-        ),
-        "coverage": Subcommand(
-            "egovcp_collect.dataset.coverage", "is it worth training on? events, returns, actions"
-        ),
-        "card": Subcommand(
-            "egovcp_collect.dataset.card", "write its dataset card, README.md, with pictures"
-        ),
-        "viz": Subcommand(
-            "egovcp_collect.dataset.viz", "an episode in Rerun: depth, robot, actions, rewards"
-        ),
-        "push": Subcommand(
-            "egovcp_collect.dataset.push",
-            "publish it on the Hub: data, card and tags in one commit",
-        ),
-        "pull": Subcommand(
-            "egovcp_collect.dataset.pull", "download one commit of the Hub to a new folder, checked"
-        ),
+        "info": ("info", "print tasks, episodes, hours and provenance"),
+        "check": ("check", "read every file and frame; list all problems"),
+        "repair": ("rewrite", "write the readable episodes to a new dataset"),
+        "merge": ("rewrite", "join datasets of the same controller"),
+        "audit": ("audit", "simulate episodes again and compare them bit for bit"),
+        "coverage": ("coverage", "report events, returns, actions; assess it for training"),
+        "card": ("card", "write its dataset card, README.md, with plots"),
+        "viz": ("viz", "show an episode in Rerun: depth, robot, actions, rewards"),
+        "push": ("hub", "publish it on the Hub: data, card and tags in one commit"),
+        "pull": ("hub", "download one commit from the Hub to a new folder and check it"),
     }
+)
+_EPILOG: Final = (
+    "The dataset may be given without a flag: a folder, or an id of the Hub (user/name) where no "
+    "such folder exists."
 )
 
 
@@ -79,77 +48,61 @@ def main(argv: Sequence[str] | None = None) -> int:
     if not args or args[0] in ("-h", "--help"):
         echo(_help())
         return 0 if args else UsageError.exit_code
+    name = args[0]
     try:
-        name = _known(args[0])
-        module = importlib.import_module(SUBCOMMANDS[name].module)
-        flags = _flags(args[1:], module)
+        if name not in SUBCOMMANDS:
+            raise UsageError(f"unknown subcommand {name!r}{suggest(name, SUBCOMMANDS)}")
+        module = importlib.import_module(f"{__package__}.{SUBCOMMANDS[name][0]}")
+        run = getattr(module, f"run_{name}")
+        config_class = get_type_hints(run)["config"]
+        flags = _flags(args[1:], config_class)
     except UsageError as error:
         return report_error(PROG, error)
-    return run_command(module.CONFIG, module.run, flags, prog=f"{PROG} {name}", epilog=_EPILOG)
-
-
-_EPILOG = (
-    "The dataset may be given without a flag, before the options: a folder, or an id of the Hub "
-    "(user/name) where no such folder exists."
-)
+    return run_command(config_class, run, flags, prog=f"{PROG} {name}", epilog=_EPILOG)
 
 
 def _help() -> str:
     width = max(map(len, SUBCOMMANDS))
-    lines = [f"  {name:{width}}  {entry.summary}" for name, entry in SUBCOMMANDS.items()]
     return "\n".join(
         [
             f"usage: {PROG} SUBCOMMAND [ROOT] [--NAME=VALUE ...]",
             "",
-            "Look at, check, mend, join and share datasets in LeRobot's format.",
+            "Inspect, check, repair, join and share datasets in LeRobot's format.",
             "",
-            *lines,
+            *(f"  {name:{width}}  {summary}" for name, (_, summary) in SUBCOMMANDS.items()),
             "",
             "ROOT is the folder of a dataset, or its id on the Hub (user/name).",
-            f"`{PROG} SUBCOMMAND --help` explains the options of one.",
+            f"`{PROG} SUBCOMMAND --help` lists the options of a subcommand.",
         ]
     )
 
 
-def _known(name: str) -> str:
-    if name not in SUBCOMMANDS:
-        raise UsageError(f"unknown subcommand {name!r}{suggest(name, SUBCOMMANDS)}")
-    return name
-
-
-def _flags(args: Sequence[str], module: Any) -> list[str]:
-    """The arguments with those that have no flag turned into ``--dataset.root=`` or the like."""
-    switches = {"-h", "--help", "--debug", *_switches(module.CONFIG)}
+def _flags(args: Sequence[str], config_class: type[Any]) -> list[str]:
+    """Turn positional arguments into ``--dataset.*``, and further ones into ``--others``."""
+    hints = get_type_hints(config_class)
+    names = [option.name for option in fields(config_class)]
+    switches = {"-h", "--help", "--debug", *(f"--{n}" for n in names if hints[n] is bool)}
     flags: list[str] = []
     folders: list[str] = []
     for arg in args:
-        pending = bool(flags) and "=" not in flags[-1] and flags[-1] not in switches
+        needs_value = bool(flags) and "=" not in flags[-1] and flags[-1] not in switches
         if arg.startswith("-"):
             flags.append(arg)
-        elif pending:
+        elif needs_value:
             flags[-1] += f"={arg}"
         else:
             folders.append(arg)
-    more = getattr(module, "MORE", "")
-    if len(folders) > 1 and not more:
-        raise UsageError(
-            f"one dataset is expected, found {len(folders)}: {', '.join(folders)}; write the "
-            "value of an option as --name=value"
-        )
-    first = [_dataset_flag(folder) for folder in folders[:1]]
-    rest = [f"--{more}={json.dumps(folders[1:])}"] if folders[1:] else []
-    return [*first, *rest, *flags]
-
-
-def _switches(config_class: type[Any]) -> set[str]:
-    """Options that need no value, and so take no argument that follows them."""
-    hints = get_type_hints(config_class)
-    return {f"--{field.name}" for field in fields(config_class) if hints[field.name] is bool}
-
-
-def _dataset_flag(argument: str) -> str:
-    option = "root" if is_local_path(argument) else "repo_id"
-    return f"--dataset.{option}={argument}"
+    if len(folders) > 1:
+        if "others" not in names:
+            raise UsageError(
+                f"one dataset is expected, found {len(folders)}: {', '.join(folders)}; write the "
+                "value of an option as --name=value"
+            )
+        flags.insert(0, f"--others={json.dumps(folders[1:])}")
+    if folders:
+        option = "root" if is_local_path(folders[0]) else "repo_id"
+        flags.insert(0, f"--dataset.{option}={folders[0]}")
+    return flags
 
 
 if __name__ == "__main__":

@@ -1,9 +1,4 @@
-"""`egovcp-dataset viz`: an episode of a dataset in Rerun.
-
-The pelvis pose is not recorded, as no real robot measures it: the robot stands at the origin, at
-its commanded height, tilted as its IMU says. It therefore does not walk about, and depth is
-placed relative to it.
-"""
+"""`egovcp-dataset viz`: an episode of a dataset as a Rerun recording."""
 
 from __future__ import annotations
 
@@ -27,55 +22,43 @@ class VizConfig:
     """Show an episode in Rerun: depth, the robot's pose, hand targets, actions, rewards, state.
 
     The pelvis pose is not part of a dataset: the robot is drawn at the origin, at its commanded
-    height, tilted as its IMU says.
+    height, tilted as its IMU measured.
     """
 
     dataset: DatasetConfig = field(default_factory=DatasetConfig)
     """The dataset: a folder, or an id of the Hub."""
     episode: int = 0
-    """Which episode, counted from 0."""
+    """Index of the episode, counted from 0."""
     output: str = output_file()
-    """Recording to create; empty: NAME-episode-N.rrd in the present folder."""
+    """Recording to create; empty: NAME-episode-N.rrd in the current folder."""
     spawn: bool = False
-    """Open the recording in the Rerun viewer at once."""
+    """Open the recording in the Rerun viewer."""
 
 
-CONFIG = VizConfig
-
-
-def run(config: VizConfig) -> None:
-    """Write the recording, and open it if asked to.
-
-    Raises:
-        UsageError: there is no such episode.
-        DataError: the dataset is damaged.
-        EnvironmentFailure: Rerun is not installed, or the recording exists already.
-    """
+def run_viz(config: VizConfig) -> None:
+    """Write the recording."""
     require_packages("egovcp-collect", "the recording", "rerun")
     reader = DatasetReader.open(config.dataset)
     if not 0 <= config.episode < len(reader):
         raise UsageError(
             f"--episode={config.episode}: {reader.root} has episodes 0 to {len(reader) - 1}"
         )
-    name = f"{reader.root.name}-episode-{config.episode}.rrd"
+    name = reader.root.name
     if reader.source.commit:  # the folder of a downloaded dataset is named after its commit
-        name = f"{reader.source.repo_id.partition('/')[2]}-episode-{config.episode}.rrd"
-    output = Path(os.path.expanduser(config.output or name))
+        name = reader.source.repo_id.partition("/")[2]
+    output = Path(os.path.expanduser(config.output or f"{name}-episode-{config.episode}.rrd"))
     require_writable(output.parent)
     write_recording(reader, config.episode, output)
     echo(f"wrote {output}; {POSE}")
-    if config.spawn:
-        open_viewer(output)
+    if config.spawn:  # the viewer outlives this command; it accepts local connections only
+        command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(output)]
+        subprocess.Popen(command, start_new_session=True)
     else:
         echo(f"open it with: rerun {output}")
 
 
 def write_recording(reader: DatasetReader, index: int, output: Path, meshes: bool = True) -> None:
-    """Write episode ``index`` as the Rerun recording ``output``.
-
-    Raises:
-        EnvironmentFailure: ``output`` exists.
-    """
+    """Write episode ``index`` as the new Rerun recording ``output``."""
     from egovcp.log.rerun import RerunSink
 
     episode = reader.read(index)
@@ -86,9 +69,3 @@ def write_recording(reader: DatasetReader, index: int, output: Path, meshes: boo
         for tick in ticks_of(episode):
             sink.write(tick)
         sink.close()
-
-
-def open_viewer(recording: Path) -> None:
-    """Start the Rerun viewer on a file, as a process of its own that listens to nobody else."""
-    command = [sys.executable, "-m", "rerun", "--bind", "127.0.0.1", str(recording)]
-    subprocess.Popen(command, start_new_session=True)

@@ -1,4 +1,4 @@
-"""Episodes whose events, returns and outcomes are known, for what judges and shows datasets."""
+"""Episodes whose events, returns and outcomes are known."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""An episode is a function of what is recorded, or the audit says so."""
+"""`egovcp-dataset audit`: recorded episodes are reproduced, or reported."""
 
 import json
 import shutil
@@ -25,7 +25,7 @@ def copy(collected: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(collected, tmp_path / "copy"))
 
 
-def test_chosen_episodes_come_out_the_same(collected: Path, tmp_path: Path) -> None:
+def test_collected_episodes_are_reproduced(collected: Path, tmp_path: Path) -> None:
     report = tmp_path / "report.json"
     assert main(["audit", str(collected), "--count=2", f"--json={report}"]) == 0
     assert json.loads(report.read_text()) == {
@@ -36,7 +36,7 @@ def test_chosen_episodes_come_out_the_same(collected: Path, tmp_path: Path) -> N
     }
 
 
-def test_data_older_than_the_price_of_a_guard_come_out_the_same(tmp_path: Path) -> None:
+def test_data_without_a_recorded_guard_cost_are_reproduced(tmp_path: Path) -> None:
     root = tmp_path / "wall"
     episode = ["--env.wall_episode.ticks=5", "--env.wall_episode.event_ticks=[3,4]"]
     flags = [*episode, "--task=wall", "--env.wall.guard_cost=0", "--episodes=1", "--num_workers=1"]
@@ -45,7 +45,7 @@ def test_data_older_than_the_price_of_a_guard_come_out_the_same(tmp_path: Path) 
     assert main(["audit", str(root)]) == 0
 
 
-def test_an_episode_of_another_seed_is_told_with_the_versions(
+def test_a_different_episode_is_reported_with_the_versions(
     copy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     d.edit(d.COLLECTION, lambda c: c["episodes"][2]["metadata"].update(seed=4))(copy)
@@ -68,7 +68,7 @@ def test_an_episode_of_another_seed_is_told_with_the_versions(
         (lambda c: c.update(controller_id="other"), "controller other, but here it is"),
     ],
 )
-def test_what_cannot_be_repeated_is_told(
+def test_missing_information_is_reported(
     change: d.Callable[[dict], object], message: str, copy: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip

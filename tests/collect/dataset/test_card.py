@@ -1,4 +1,4 @@
-"""Dataset cards: readable by the Hub, complete, and out of the way of the data."""
+"""`egovcp-dataset card`: metadata, tables, plots."""
 
 import re
 from pathlib import Path
@@ -14,21 +14,22 @@ from egovcp.data import DatasetConfig, DatasetReader, Provenance, schema
 from egovcp.data.metadata import verify_hashes
 from egovcp.data.source import Source
 from egovcp.errors import UsageError
+from egovcp.help_text import field_docs
 from egovcp_collect.dataset import card
 from egovcp_collect.dataset.card import CardConfig, card_text
-from egovcp_collect.dataset.card_tables import field_docs, settings_tables
+from egovcp_collect.dataset.card_tables import settings_tables
 from egovcp_collect.dataset.cli import main
 
 from .conftest import write
 from .scenes import SETTINGS, three_balls, write_scenes
 
 HOUSE = Path(__file__).resolve().parents[3]
-PICTURE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
+IMAGE = re.compile(r"!\[[^]]*\]\(([^)]+)\)")
 
 
 @pytest.fixture(scope="module")
 def carded(tmp_path_factory: pytest.TempPathFactory) -> DatasetReader:
-    """Three balls with a card of their own."""
+    """Three ball episodes with a card."""
     reader = write_scenes(tmp_path_factory.mktemp("data") / "three", three_balls())
     assert main(["card", str(reader.root), "--repo_id=me/three"]) == 0
     return reader
@@ -39,7 +40,7 @@ def text(carded: DatasetReader) -> str:
     return (carded.root / "README.md").read_text()
 
 
-def test_the_hub_finds_what_it_looks_for(carded: DatasetReader) -> None:
+def test_front_matter_is_valid(carded: DatasetReader) -> None:
     data = DatasetCard.load(carded.root / "README.md").data
     assert data.license == "apache-2.0"
     assert data.task_categories == ["robotics"]
@@ -56,7 +57,7 @@ def test_the_schema_is_complete(text: str) -> None:
         assert f"| `{name}` |" in text
 
 
-def test_it_says_which_versions_read_the_files(text: str) -> None:
+def test_versions_that_read_the_files_are_named(text: str) -> None:
     metadata = schema.arrow_schema().metadata[b"huggingface"].decode()
     assert '"_type": "List"' in metadata  # which `datasets` knows since 4.0
     for words in (text, (HOUSE / "docs" / "data.md").read_text(encoding="utf-8")):
@@ -64,7 +65,7 @@ def test_it_says_which_versions_read_the_files(text: str) -> None:
         assert "LeRobot 0.6 or newer" in words
 
 
-def test_how_it_was_collected_is_told(text: str) -> None:
+def test_collection_is_described(text: str) -> None:
     assert SETTINGS.command in text
     assert "mujoco 3.11.0" in text
     assert "stance-1" in text
@@ -75,14 +76,14 @@ def test_how_it_was_collected_is_told(text: str) -> None:
     assert "a step every" not in text
 
 
-def test_a_walk_that_steps_less_often_is_told(tmp_path: Path) -> None:
+def test_a_walk_with_longer_steps_is_described(tmp_path: Path) -> None:
     known = Provenance("stance-1", seed=5, command="", config={"eta": 1.0, "step_ticks": [5, 9]})
     root = str(write(tmp_path / "data", [0], known))
     text = card_text(DatasetReader.open(DatasetConfig(root=root)), "me/steps")
     assert "a step every 5 to 9 ticks. It starts at the" in text
 
 
-def test_every_setting_of_a_task_is_in_one_of_the_tables_with_its_meaning() -> None:
+def test_every_setting_of_a_task_is_documented() -> None:
     env = SETTINGS.config["env"]
     for task in spec.TASKS:
         both = "\n".join(settings_tables(SETTINGS.config, [task]))
@@ -92,7 +93,7 @@ def test_every_setting_of_a_task_is_in_one_of_the_tables_with_its_meaning() -> N
             assert not line.endswith("|  |"), f"no meaning: {line}"
 
 
-def test_a_setting_of_another_version_is_kept_without_a_meaning() -> None:
+def test_a_setting_of_another_version_has_no_documentation() -> None:
     config = {"env": {"ball": {"spin_range": [0.0, 1.0]}, "moon": True}}
     drawn, constant = settings_tables(config, ["ball"])
     assert "| `env.ball.spin_range` | 0 | 1 |  |" in drawn
@@ -100,27 +101,27 @@ def test_a_setting_of_another_version_is_kept_without_a_meaning() -> None:
 
 
 def test_field_docs_read_fields_of_any_type() -> None:
-    docs = field_docs(CardConfig)
+    docs = dict(field_docs(CardConfig))
     assert set(docs) == set(CardConfig.__dataclass_fields__)
 
 
-def test_pictures_are_where_the_card_says(carded: DatasetReader, text: str) -> None:
-    found = PICTURE.findall(text)
+def test_plots_exist(carded: DatasetReader, text: str) -> None:
+    found = IMAGE.findall(text)
     assert len(found) == 4
     assert all((carded.root / path).is_file() for path in found)
 
 
-def test_what_is_pushed_is_what_the_command_wrote(carded: DatasetReader, text: str) -> None:
+def test_the_pushed_card_equals_the_written_one(carded: DatasetReader, text: str) -> None:
     assert card_text(carded, "me/three") == text
 
 
-def test_a_card_without_pictures_shows_none(sound: Path) -> None:
+def test_a_card_without_plots_shows_none(sound: Path) -> None:
     text = card_text(DatasetReader.open(DatasetConfig(root=str(sound))), "")
-    assert PICTURE.findall(text) == []
+    assert IMAGE.findall(text) == []
     assert 'LeRobotDataset("user/six")' in text
 
 
-def test_card_and_pictures_stay_out_of_the_data(carded: DatasetReader) -> None:
+def test_card_and_plots_do_not_change_the_data(carded: DatasetReader) -> None:
     verify_hashes(carded.root)
     DatasetReader.open(DatasetConfig(root=str(carded.root)))
     assert len(LeRobotDataset("me/three", root=carded.root)) == carded.num_frames
@@ -128,34 +129,34 @@ def test_card_and_pictures_stay_out_of_the_data(carded: DatasetReader) -> None:
     assert set(loaded.features) == set(schema.FEATURES)
 
 
-def test_a_card_can_lie_elsewhere(carded: DatasetReader, tmp_path: Path) -> None:
+def test_a_card_can_be_written_elsewhere(carded: DatasetReader, tmp_path: Path) -> None:
     before = {p: p.stat().st_mtime_ns for p in carded.root.rglob("*")}
     output = tmp_path / "cards" / "three.md"
     assert main(["card", str(carded.root), f"--output={output}", "--assets=assets/three"]) == 0
-    found = PICTURE.findall(output.read_text())
+    found = IMAGE.findall(output.read_text())
     assert len(found) == 4
     assert all((output.parent / path).is_file() for path in found)
     assert {p: p.stat().st_mtime_ns for p in carded.root.rglob("*")} == before
 
 
-def test_the_cache_of_the_hub_is_not_written_to(
+def test_the_hub_cache_is_not_changed(
     carded: DatasetReader, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     reader = DatasetReader(Source(carded.root, "me/three", commit="0" * 40))
     monkeypatch.setattr(card.DatasetReader, "open", lambda config: reader)
     with pytest.raises(UsageError, match="--output"):
-        card.run(CardConfig())
+        card.run_card(CardConfig())
 
 
-def test_the_template_of_the_repository_is_the_one_that_ships() -> None:
+def test_the_linked_template_equals_the_packaged_one() -> None:
     shipped = Path(egovcp_collect.dataset.__path__[0]) / "card_template.md"
     assert (HOUSE / "dataset_cards" / "template.md").read_text() == shipped.read_text()
 
 
 @pytest.mark.parametrize("task", spec.TASKS)
-def test_the_finished_cards_are_sound(task: str) -> None:
+def test_the_example_cards_are_valid(task: str) -> None:
     path = HOUSE / "dataset_cards" / f"{task}.md"
     assert DatasetCard.load(path).data.license == "apache-2.0"
-    found = PICTURE.findall(path.read_text())
+    found = IMAGE.findall(path.read_text())
     assert len(found) == 4
     assert all((path.parent / picture).is_file() for picture in found)

@@ -1,12 +1,24 @@
-"""The report of the check: all problems up to a limit, each with its place."""
+"""`egovcp-dataset check`: problems with their places, duplicates, hidden files."""
 
 import json
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from egovcp.data import DatasetWriter, Episode, Provenance
+from egovcp.data import (
+    DatasetConfig,
+    DatasetReader,
+    DatasetWriter,
+    Episode,
+    EpisodeStore,
+    Provenance,
+)
+from egovcp.data.committer import load_append_state, open_committer
 from egovcp_collect.dataset.cli import main
 
 from . import damage as d
@@ -29,7 +41,7 @@ def test_a_sound_dataset_passes(
     }
 
 
-def test_every_problem_is_told_up_to_the_limit(copy: Path, tmp_path: Path) -> None:
+def test_every_problem_is_listed_up_to_the_limit(copy: Path, tmp_path: Path) -> None:
     (copy / d.HASHES).unlink()
     d.column("next.reward", d.put(14, float("nan")))(copy)
     d.column("timestamp", d.put(15, 9.0))(copy)
@@ -48,7 +60,7 @@ def test_every_problem_is_told_up_to_the_limit(copy: Path, tmp_path: Path) -> No
     assert json.loads(report.read_text())["problems"] == problems[:2]
 
 
-def test_every_broken_part_of_meta_is_told(copy: Path, tmp_path: Path) -> None:
+def test_every_damaged_meta_file_is_listed(copy: Path, tmp_path: Path) -> None:
     (copy / d.HASHES).unlink()
     for name in (d.INFO, d.TASKS, d.STATS):
         d.cut(name, 0.5)(copy)
@@ -68,7 +80,7 @@ def test_a_snapshot_of_the_hubs_cache_may_link_to_its_blobs(copy: Path, tmp_path
     assert main(["check", str(snapshot)]) == 0
 
 
-def test_a_missing_folder_is_told_without_asking_the_hub(
+def test_a_missing_folder_is_reported_without_network_access(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["check", str(tmp_path / "none")]) == 3
@@ -88,7 +100,7 @@ def test_a_missing_folder_is_told_without_asking_the_hub(
     ],
 )
 @pytest.mark.parametrize("hashed", [True, False])
-def test_an_episode_that_is_there_twice_is_found(
+def test_a_duplicate_episode_is_found(
     second: Episode, file: str, words: str, hashed: bool, tmp_path: Path
 ) -> None:
     root, report = tmp_path / "twice", tmp_path / "report.json"
@@ -116,7 +128,7 @@ def test_recorded_rollouts_of_one_scenario_are_different_episodes(tmp_path: Path
 
 
 @pytest.mark.parametrize("source", [2, -1, True, "x", None])
-def test_an_episode_of_no_recorded_collection_is_found(
+def test_an_episode_of_an_unknown_source_is_found(
     source: object, sound: Path, tmp_path: Path
 ) -> None:
     other = write(tmp_path / "other", [6], Provenance("stance-1", 6, config={"eta": 0.1}))
@@ -132,3 +144,76 @@ def test_an_episode_of_no_recorded_collection_is_found(
     assert main(["repair", str(merged), f"--output_dir={new}"]) == 0
     assert main(["check", str(new), f"--json={report}"]) == 0
     assert json.loads(report.read_text())["episodes"] == 6
+
+
+_APPLE_DOUBLE = b"\0\5\x16\7\0\2\0\0Mac OS X        " + bytes(100)
+
+
+@pytest.fixture
+def from_mac(sound: Path, tmp_path: Path) -> Path:
+    """A copy of the sound dataset with the files that macOS adds on foreign disks."""
+    root = Path(shutil.copytree(sound, tmp_path / "copy"))
+    for path in [p for p in root.rglob("*") if p.is_file()]:
+        path.with_name(f"._{path.name}").write_bytes(_APPLE_DOUBLE)
+    for folder in (root, root / "data", root / "meta", root / "meta/episodes/chunk-000"):
+        (folder / ".DS_Store").write_bytes(bytes(6148))
+    (root / "data" / ".ipynb_checkpoints").mkdir()
+    (root / "data" / ".ipynb_checkpoints" / "file-000.parquet").write_bytes(b"x")
+    return root
+
+
+@pytest.mark.parametrize("hashed", [True, False])
+def test_check_names_files_of_macos_that_it_ignored(
+    from_mac: Path, hashed: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if not hashed:
+        (from_mac / "meta/sha256.json").unlink()
+    assert main(["check", str(from_mac)]) == 0
+    note = capsys.readouterr().out
+    assert "hidden files and folders such as ._NAME of macOS" in note
+    (command,) = re.findall(r"remove them: (find .*)", note)
+    subprocess.run(command, shell=True, check=True)
+    assert main(["check", str(from_mac)]) == 0
+    assert "hidden" not in capsys.readouterr().out
+
+
+def test_a_dataset_without_hidden_files_has_no_note(
+    sound: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", str(sound)]) == 0
+    assert "hidden" not in capsys.readouterr().out
+
+
+def _load(root: Path, new: Path) -> int:
+    return len(EpisodeStore.load([DatasetReader.open(DatasetConfig(root=str(root)))]).length)
+
+
+def _info(root: Path, new: Path) -> int:
+    assert main(["info", str(root), f"--json={new}"]) == 0
+    return int(json.loads(new.read_text())["episodes"])
+
+
+def _repair(root: Path, new: Path) -> int:
+    report = new.with_suffix(".json")
+    assert main(["repair", str(root), f"--output_dir={new}", f"--json={report}"]) == 0
+    assert json.loads(report.read_text())["dropped"] == []
+    return len(DatasetReader.open(DatasetConfig(root=str(new))))
+
+
+def _merge(root: Path, new: Path) -> int:
+    other = write(new.with_name("other"), [6])
+    assert main(["merge", str(root), str(other), f"--output_dir={new}"]) == 0
+    return len(DatasetReader.open(DatasetConfig(root=str(new)))) - 1
+
+
+def _resume(root: Path, new: Path) -> int:
+    assert load_append_state(root).next_number == 6
+    with open_committer(root, COLLECTED, 3, lambda provenance: None) as committer:
+        return committer.committed
+
+
+@pytest.mark.parametrize("read", [_load, _info, _repair, _merge, _resume])
+def test_every_reader_ignores_hidden_files(
+    read: Callable[[Path, Path], int], from_mac: Path, tmp_path: Path
+) -> None:
+    assert read(from_mac, tmp_path / "new") == 6

@@ -1,4 +1,4 @@
-"""Where the commands that write a new dataset may write it."""
+"""Output folders of the commands that write a new dataset."""
 
 import os
 from collections.abc import Callable
@@ -46,9 +46,7 @@ def _episodes(root: Path) -> int:
 
 @_WRITERS
 @pytest.mark.usefixtures("published")
-def test_a_link_stays_and_its_target_is_written(
-    command: Write, sound: Path, tmp_path: Path
-) -> None:
+def test_a_link_is_followed_and_kept(command: Write, sound: Path, tmp_path: Path) -> None:
     for name, is_there in (("empty", True), ("new", False)):
         link, real = tmp_path / f"link-{name}", tmp_path / name
         link.symlink_to(real)
@@ -62,9 +60,7 @@ def test_a_link_stays_and_its_target_is_written(
 
 @_WRITERS
 @pytest.mark.usefixtures("published")
-def test_a_folder_that_holds_something_stays_as_it_is(
-    command: Write, sound: Path, tmp_path: Path
-) -> None:
+def test_a_folder_with_content_is_refused(command: Write, sound: Path, tmp_path: Path) -> None:
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "notes.txt").write_text("mine")
     assert command(sound, tmp_path / "full") == 2

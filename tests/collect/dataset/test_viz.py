@@ -44,7 +44,7 @@ def column(store: Any, path: str, component: str) -> list[Any]:
     return [value for _, value in sorted(rows)]
 
 
-def test_everything_that_a_row_holds_has_its_entity(store: Any) -> None:
+def test_every_part_of_a_row_has_an_entity(store: Any) -> None:
     found = set(store.schema().entity_paths())
     expected = {paths.DEPTH, paths.CAMERA, paths.HAND_TARGETS, paths.SKELETON, paths.INFO}
     expected |= {f"{paths.ROBOT}/{link}" for link in LINK_NAMES}
@@ -54,7 +54,7 @@ def test_everything_that_a_row_holds_has_its_entity(store: Any) -> None:
     assert expected <= found
 
 
-def test_rows_are_recorded_as_they_are(store: Any, reader: DatasetReader) -> None:
+def test_rows_are_recorded_unchanged(store: Any, reader: DatasetReader) -> None:
     episode = reader.read(1)
     images = column(store, paths.DEPTH, "DepthImage:buffer")
     assert len(images) == len(episode)
@@ -79,7 +79,7 @@ def test_the_pelvis_stands_at_its_commanded_height(store: Any) -> None:
     np.testing.assert_allclose(translation, [0.0, 0.0, 0.7], atol=1e-6)
 
 
-def test_what_happened_is_told(reader: DatasetReader) -> None:
+def test_events_are_recorded(reader: DatasetReader) -> None:
     ticks = [*ticks_of(reader.read(1))]
     assert ticks[20].events == ("the ball is thrown",)
     assert ticks[40].events == ("reward -1.000", "a fall ends the episode")
@@ -89,7 +89,7 @@ def test_what_happened_is_told(reader: DatasetReader) -> None:
     assert ticks[2].time_ns == 2 * 40_000_000
 
 
-def test_the_camera_looks_as_it_did_in_the_episode() -> None:
+def test_the_camera_has_the_pose_of_the_episode() -> None:
     view = camera_view(SETTINGS.config, {"camera_pitch": 0.05})
     assert view.pitch == 0.05
     assert view.position == (0.058, 0.0, 0.42)
@@ -113,7 +113,7 @@ def test_the_command_names_the_file_after_dataset_and_episode(
 
 
 @pytest.mark.parametrize("episode", [-1, 3])
-def test_an_episode_that_is_not_there(
+def test_a_missing_episode_is_a_usage_error(
     reader: DatasetReader, episode: int, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["viz", str(reader.root), f"--episode={episode}"]) == 2

@@ -1,4 +1,4 @@
-"""What a collection may go on from."""
+"""Which existing collections --resume continues."""
 
 from __future__ import annotations
 
@@ -11,72 +11,72 @@ import pytest
 
 from egovcp.data import Provenance
 from egovcp.errors import UsageError
-from egovcp_collect.config import SHAPING, CollectConfig
-from egovcp_collect.resume import require_same
+from egovcp_collect.config import EPISODE_OPTIONS, CollectConfig
+from egovcp_collect.provenance import require_compatible
 
 
-def made(task: str = "ball") -> Provenance:
+def provenance(task: str = "ball") -> Provenance:
     settings: dict[str, Any] = draccus.encode(CollectConfig(task=task))
-    return Provenance("walk", seed=0, config={name: settings[name] for name in SHAPING})
+    return Provenance("walk", seed=0, config={name: settings[name] for name in EPISODE_OPTIONS})
 
 
-def test_an_option_newer_than_the_dataset_was_made_with_its_default() -> None:
-    now = made()
+def test_a_missing_option_counts_as_its_default() -> None:
+    now = provenance()
     older: dict[str, Any] = copy.deepcopy(dict(now.config))
     del older["env"]["ball"]["shape"], older["step_ticks"]
-    require_same(now, replace(now, config=older))
+    require_compatible(now, replace(now, config=older))
     other = copy.deepcopy(dict(now.config))
     other["env"]["ball"]["shape"] = "box"
     with pytest.raises(UsageError, match=r"--env\.ball\.shape was sphere, is box"):
-        require_same(replace(now, config=other), replace(now, config=older))
+        require_compatible(replace(now, config=other), replace(now, config=older))
 
 
-def test_a_controller_may_lie_elsewhere_if_it_is_the_same() -> None:
-    before, now = made(), copy.deepcopy(made())
+def test_controllers_are_compared_by_id() -> None:
+    before, now = provenance(), copy.deepcopy(provenance())
     now.config["env"]["controller"] = "/elsewhere/walk.safetensors"
-    require_same(now, before)
+    require_compatible(now, before)
     with pytest.raises(UsageError, match="low-level controller was walk, is stance"):
-        require_same(replace(now, controller_id="stance"), before)
+        require_compatible(replace(now, controller_id="stance"), before)
 
 
 @pytest.mark.parametrize("task", ["wall", "all"])
-def test_no_wall_of_before_gets_rows_in_which_a_guard_has_a_price(task: str) -> None:
-    now = made(task)
+def test_a_missing_guard_cost_counts_as_zero(task: str) -> None:
+    now = provenance(task)
     older: dict[str, Any] = copy.deepcopy(dict(now.config))
     del older["env"]["wall"]["guard_cost"]
     with pytest.raises(UsageError, match=r"--env\.wall\.guard_cost was 0\.0, is 0\.27"):
-        require_same(now, replace(now, config=older))
+        require_compatible(now, replace(now, config=older))
     free = copy.deepcopy(dict(now.config))
     free["env"]["wall"]["guard_cost"] = 0.0
-    require_same(replace(now, config=free), replace(now, config=older))
+    require_compatible(replace(now, config=free), replace(now, config=older))
 
 
-def test_a_ball_of_before_goes_on_though_walls_have_changed() -> None:
-    now = made("ball")
+def test_a_missing_guard_cost_does_not_matter_without_walls() -> None:
+    now = provenance("ball")
     older: dict[str, Any] = copy.deepcopy(dict(now.config))
     del older["env"]["wall"]["guard_cost"]
-    require_same(now, replace(now, config=older))
+    require_compatible(now, replace(now, config=older))
 
 
 def test_only_options_of_the_collected_task_are_listed() -> None:
-    before, other = made("ball"), copy.deepcopy(dict(made("ball").config))
+    before, other = provenance("ball"), copy.deepcopy(dict(provenance("ball").config))
     other["env"]["wall"]["push_speed_range"] = [0.1, 0.2]
     other["env"]["ball"]["shape"] = "box"
     with pytest.raises(UsageError) as caught:
-        require_same(replace(before, config=other), before)
+        require_compatible(replace(before, config=other), before)
     assert "--env.ball.shape was sphere, is box" in str(caught.value)
     assert "wall" not in str(caught.value)
 
 
 def test_options_of_another_task_are_listed_if_nothing_else_differs() -> None:
-    before, other = made("ball"), copy.deepcopy(dict(made("ball").config))
+    before, other = provenance("ball"), copy.deepcopy(dict(provenance("ball").config))
     other["env"]["wall"]["push_speed_range"] = [0.1, 0.2]
     with pytest.raises(UsageError, match=r"--env\.wall\.push_speed_range was"):
-        require_same(replace(before, config=other), before)
+        require_compatible(replace(before, config=other), before)
 
 
 def test_a_merged_or_converted_dataset_is_refused_without_listing_options() -> None:
-    before = replace(made(), seed=None, config={"sources": []})
+    before = replace(provenance(), seed=None, config={"sources": []})
     with pytest.raises(UsageError, match="was merged or converted") as caught:
-        require_same(made(), before)
+        require_compatible(provenance(), before)
     assert "--env" not in str(caught.value)

@@ -1,11 +1,11 @@
-"""The same episodes from a Ray cluster, a local one."""
+"""Collection on a local Ray cluster."""
 
 from pathlib import Path
 
 import pytest
 
-from egovcp_collect.cluster import RayWorker
 from egovcp_collect.collect import main
+from egovcp_collect.ray_workers import RayWorker
 
 ray = pytest.importorskip("ray")
 
@@ -27,21 +27,21 @@ def test_ray_gives_the_same_data(tmp_path: Path) -> None:
         assert (there / path.relative_to(here)).read_bytes() == path.read_bytes()
 
 
-def test_an_actor_that_cannot_be_ended_hides_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failure_to_end_an_actor_is_not_raised(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ray raises when its own connection is gone."""
 
     def refuse(actor: object) -> None:
         raise ray.exceptions.RaySystemError("the connection is gone")
 
     worker = object.__new__(RayWorker)
-    monkeypatch.setattr(worker, "_actor", None, raising=False)
+    worker._ray, worker._actor = ray, None
     monkeypatch.setattr(ray, "kill", refuse)
     worker.call = object()
     worker.kill()
     assert worker.call is None
 
 
-def test_a_cluster_that_is_not_there(
+def test_an_unreachable_cluster_is_an_environment_failure(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "nonsense://nowhere")

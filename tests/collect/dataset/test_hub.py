@@ -1,4 +1,4 @@
-"""From a folder to the Hub and back."""
+"""`egovcp-dataset push` and `pull`."""
 
 import hashlib
 import json
@@ -49,7 +49,7 @@ def hashes(folder: Path) -> dict[str, str]:
     }
 
 
-def test_there_and_back_again(
+def test_a_pulled_dataset_equals_the_pushed_one(
     hub: FakeHub, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (root / "assets").mkdir()
@@ -76,7 +76,7 @@ def test_there_and_back_again(
     assert "me/six" in (copy / "README.md").read_text()
 
 
-def test_pushing_again_changes_nothing_and_mends_the_tag(hub: FakeHub, root: Path) -> None:
+def test_pushing_again_completes_the_tag_only(hub: FakeHub, root: Path) -> None:
     hub.fail("tag", 503)
     assert push(root) == 5
     head = hub.store.refs(REPO).branches["main"]
@@ -144,7 +144,7 @@ def test_a_link_is_not_followed(
     assert "events.png is a link" in capsys.readouterr().err
 
 
-def test_a_pull_that_failed_goes_on_where_it_was(hub: FakeHub, root: Path, tmp_path: Path) -> None:
+def test_a_failed_pull_continues(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     assert push(root) == 0
     hub.heal()
     hub.fail("resolve", 503, after=4)
@@ -158,16 +158,14 @@ def test_a_pull_that_failed_goes_on_where_it_was(hub: FakeHub, root: Path, tmp_p
     assert hashes(tmp_path / "copy") == hashes(root)
 
 
-def test_a_pull_that_brought_nothing_leaves_nothing(
-    hub: FakeHub, root: Path, tmp_path: Path
-) -> None:
+def test_a_pull_without_any_file_leaves_no_folder(hub: FakeHub, root: Path, tmp_path: Path) -> None:
     assert push(root) == 0
     hub.fail("resolve", 403)
     assert pull(tmp_path / "copy") == 5
     assert not list(tmp_path.glob("*copy*"))
 
 
-def test_a_folder_is_not_overwritten_but_recognised(
+def test_a_folder_is_not_overwritten(
     hub: FakeHub, root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert push(root) == 0
@@ -221,7 +219,7 @@ def test_the_token_is_never_shown(
     assert TOKEN.encode() not in written
 
 
-def test_not_even_if_the_server_says_it(
+def test_a_token_repeated_by_the_server_is_not_shown(
     hub: FakeHub,
     root: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -244,7 +242,7 @@ def test_not_even_if_the_server_says_it(
         (["pull", "me/six"], "--output_dir is missing"),
     ],
 )
-def test_misuse_is_explained(
+def test_misuse_is_a_usage_error(
     args: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(args) == 2

@@ -1,0 +1,226 @@
+"""`egovcp-dataset merge` and `repair`: write a new dataset from the episodes of others."""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shlex
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from tqdm import tqdm
+
+from egovcp.checks.dataset import command_problems
+from egovcp.data import DatasetConfig, DatasetReader, DatasetWriter, Episode
+from egovcp.data.destination import require_new, resolve_root
+from egovcp.data.provenance import DuplicateFinder, ScenarioKeys
+from egovcp.data.source import Source, local_root, require_folder
+from egovcp.errors import DataError, UsageError
+from egovcp.outputs import output_file, write_report
+from egovcp.terminal import echo, one_line
+from egovcp_collect.dataset.check import problem_as_json
+from egovcp_collect.dataset.record_index import (
+    RecordIndex,
+    join_metadata,
+    join_provenance,
+    require_one_controller,
+)
+from egovcp_collect.dataset.recovery import RecoveredEpisode, recover_episodes
+
+
+@dataclass(frozen=True)
+class MergeConfig:
+    """Write the episodes of several datasets to one new dataset; the others are not changed.
+
+    They must have been collected with the same low-level controller. Each episode is compared with
+    the SHA-256 recorded at its collection, and keeps its metadata."""
+
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """The first dataset."""
+    others: list[str] = field(default_factory=list)
+    """Folders of the others; also those that follow the first without a flag."""
+    output_dir: str = ""
+    """Folder of the new dataset."""
+    duplicates: Literal["refuse", "drop"] = "refuse"
+    """Whether to refuse or drop an episode whose content equals that of an earlier one."""
+    json: str = output_file()
+    """File for the result: {"episodes", "frames", "dropped"}; empty: none."""
+
+
+@dataclass(frozen=True)
+class RepairConfig:
+    """Write every readable, valid and unaltered episode to a new dataset, and list the dropped
+    ones with reasons. The old dataset is not changed.
+
+    LeRobot's own tools (delete_episodes, split_dataset, merge_datasets) drop
+    meta/collection.json; --records restores it from the datasets that they were given."""
+
+    dataset: DatasetConfig = field(default_factory=DatasetConfig)
+    """The dataset to repair; a folder."""
+    output_dir: str = ""
+    """Folder of the new dataset."""
+    records: str = ""
+    """Datasets that the episodes were taken from, separated by commas; episodes are matched by
+    the SHA-256 of their content."""
+    json: str = output_file()
+    """File for the result: {"episodes", "frames", "dropped": [{"file", "episode", "frame",
+    "problem"}]}; empty: none."""
+
+
+def run_merge(config: MergeConfig) -> None:
+    """Write the new dataset and print what it holds."""
+    if not config.others:
+        raise UsageError("merge needs two datasets or more: egovcp-dataset merge A B ...")
+    datasets = (config.dataset, *(DatasetConfig(root=other) for other in config.others))
+    readers = [DatasetReader.open(dataset) for dataset in datasets]
+    output = _new_folder(config.output_dir, [reader.root for reader in readers])
+    require_one_controller({reader.root: reader.controller_id for reader in readers})
+    places, dropped = _distinct_episodes(readers, config.duplicates)
+    command = shlex.join(["egovcp-dataset", "merge", *(str(reader.root) for reader in readers)])
+    provenances = [reader.origin for reader in readers]
+    with DatasetWriter(output, join_provenance(provenances, command)) as writer:
+        for number, index in tqdm(places, unit="ep", delay=1):
+            episode = readers[number].read(index)
+            joined = join_metadata(episode.metadata, provenances, number)
+            writer.add(replace(episode, metadata=joined))
+        frames = writer.num_frames
+    result = {"episodes": len(places), "frames": frames, "dropped": dropped}
+    write_report(config.json, result)
+    echo(f"{output}: {len(places)} episodes, {frames} frames; {dropped} duplicates dropped")
+
+
+def _new_folder(output_dir: str, sources: Sequence[Path]) -> Path:
+    """The folder ``--output_dir``.
+
+    Raises:
+        UsageError: it is not given, exists and is not empty, or lies inside one of ``sources``.
+        EnvironmentFailure: it is a mount point.
+    """
+    if not output_dir:
+        raise UsageError("where does the new dataset go? give --output_dir=FOLDER")
+    folder = resolve_root(output_dir)
+    for source in sources:
+        if folder.is_relative_to(source.resolve()):
+            raise UsageError(f"--output_dir={output_dir} lies inside {source}; choose another")
+    require_new(folder)
+    return folder
+
+
+def _distinct_episodes(
+    readers: Sequence[DatasetReader], duplicates: str
+) -> tuple[list[tuple[int, int]], int]:
+    """(dataset, index) of the episodes to write, and how many duplicates are dropped.
+
+    Raises:
+        DataError: an episode equals an earlier one and ``duplicates`` is "refuse", or it has the
+            scenario of an earlier one but other content.
+    """
+    finder = DuplicateFinder[str]()
+    distinct, dropped = [], 0
+    for number, reader in enumerate(readers):
+        for index in range(len(reader)):
+            place, scenario = f"{reader.root}, episode {index}", reader.scenario(index)
+            digest = reader.digest(index) or reader.read(index).digest()
+            duplicate = finder.add(place, digest, scenario)
+            if duplicate is None:
+                distinct.append((number, index))
+            elif not duplicate.equal:
+                raise DataError(
+                    f"{place} is {scenario}, and so is {duplicate.place}, but their content "
+                    "differs: one was altered, or simulated on another machine; leave out one of "
+                    "the datasets"
+                )
+            elif duplicates == "refuse":
+                raise DataError(
+                    f"{place} equals {duplicate.place}; --duplicates=drop keeps the first"
+                )
+            else:
+                dropped += 1
+    return distinct, dropped
+
+
+def run_repair(config: RepairConfig) -> None:
+    """Write the new dataset and print the dropped episodes."""
+    root = local_root(config.dataset)
+    require_folder(root)
+    output = _new_folder(config.output_dir, [root])
+    originals = [
+        Path(os.path.expanduser(name)).absolute() for name in config.records.split(",") if name
+    ]
+    flags = [f"--records={','.join(map(str, originals))}"] if originals else []
+    command = shlex.join(["egovcp-dataset", "repair", str(root), *flags])
+    index = RecordIndex.build(root, originals, command)
+    dropped: list[DataError] = []
+    writer = DatasetWriter(output, index.provenance)
+    try:
+        for episode in tqdm(_sound_episodes(root, index, dropped), unit="ep", delay=1):
+            writer.add(episode)
+    except BaseException:
+        writer.discard()
+        raise
+    kept, frames = writer.num_episodes, writer.num_frames
+    writer.finalize() if kept else writer.discard()
+    for error in dropped:
+        echo(one_line(f"dropped: {error}"))
+    problems = [problem_as_json(error, root) for error in dropped]
+    write_report(config.json, {"episodes": kept, "frames": frames, "dropped": problems})
+    if not kept:
+        raise DataError(f"no episode of {root} can be kept; {len(dropped)} problem(s), see above")
+    echo(f"{output}: {kept} episodes, {frames} frames; {len(dropped)} problem(s) left behind")
+
+
+def _sound_episodes(root: Path, index: RecordIndex, dropped: list[DataError]) -> Iterator[Episode]:
+    """Each sound episode once; the errors of the others are appended to ``dropped``."""
+    seen: set[int | None] = set()
+    finder, scenarios = DuplicateFinder[int](), ScenarioKeys(index.provenance)
+    for found in recover_episodes(root):
+        if isinstance(found, DataError):
+            result: Episode | DataError = found
+            seen.add(found.episode)
+        else:
+            result = _validate(found, index, scenarios, finder)
+            seen.add(found.number)
+        if isinstance(result, DataError):
+            dropped.append(result)
+        else:
+            yield result
+    for number in sorted(set(range(index.recorded)) - seen):
+        dropped.append(DataError.at(_data_path(root, number), "cannot be read", number))
+
+
+def _validate(
+    found: RecoveredEpisode,
+    index: RecordIndex,
+    scenarios: ScenarioKeys,
+    finder: DuplicateFinder[int],
+) -> Episode | DataError:
+    """The episode with its record, or its first problem."""
+    digest = found.digest()
+    record = index.find(digest, found.number)
+    if record is None:
+        problem = (
+            "its content is in no record (meta/collection.json, --records): it was altered, or "
+            "comes from another dataset"
+        )
+        return DataError.at(found.file, problem, found.number)
+    episode = found.episode(record)
+    for frame, problem in itertools.chain(episode.problems(), command_problems(episode)):
+        return DataError.at(found.file, problem, found.number, frame)
+    try:
+        scenario = scenarios.key(episode.task, episode.metadata)
+    except DataError as error:
+        return DataError.at(found.file, error.problem, found.number)
+    duplicate = finder.add(found.number, digest, scenario)
+    if duplicate is not None:
+        return DataError.at(found.file, duplicate.problem(scenario), found.number)
+    return episode
+
+
+def _data_path(root: Path, number: int) -> Path:
+    """The file that should hold an episode, or the data folder if that is unknown."""
+    try:
+        return DatasetReader(Source(root, "")).data_path(number)
+    except (DataError, IndexError):
+        return root / "data"

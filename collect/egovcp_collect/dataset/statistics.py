@@ -1,0 +1,259 @@
+"""Statistics of a dataset per task: events, returns, actions, drawn parameters, depth.
+
+An *event row* is one whose reward differs from the task's median reward by more than
+`EVENT_REWARD`. Rewards are stored per row, their terms as sums per episode only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.data import DatasetReader, ReturnConfig
+from egovcp.spec import ACTION_BOX, ACTION_NAMES
+from egovcp_collect.dataset.task_data import (
+    DepthStatistics,
+    TaskRows,
+    TaskSample,
+    read_rows,
+    sample_episodes,
+)
+
+EVENT_REWARD: Final = 0.025  # a braced tick earns 0.03, a blocked ball or a passed arch 1
+#: Reward terms of the event of each task: of a success, and of a failure.
+GOOD_TERMS: Final = {"ball": ("block",), "wall": ("brace",), "arch": ("pass",)}
+BAD_TERMS: Final = {
+    "ball": ("hit", "fall"),
+    "wall": ("contact", "fall"),
+    "arch": ("head", "contact", "fall"),
+}
+HISTOGRAM_BINS: Final = 40
+"""Bins of an action's histogram, over [-1, 1]."""
+GRID_CELLS: Final = 8
+"""Cells per axis of the grid over the x, y and z of one hand."""
+_NOT_DRAWN: Final = ("seed", "episode", "reward_terms", "contact_ticks")  # in the metadata
+_HANDS: Final = {"left": slice(0, 3), "right": slice(3, 6)}
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """Extremes, quantiles, mean and standard deviation of a set of numbers."""
+
+    low: float
+    q05: float
+    median: float
+    q95: float
+    high: float
+    mean: float
+    std: float
+
+    @classmethod
+    def of(cls, values: NDArray[Any]) -> Self | None:
+        """The distribution of values of any shape; None if there are none."""
+        flat = np.asarray(values, np.float64).reshape(-1)
+        if not flat.size:
+            return None
+        low, q05, median, q95, high = np.quantile(flat, (0.0, 0.05, 0.5, 0.95, 1.0)).tolist()
+        return cls(low, q05, median, q95, high, float(flat.mean()), float(flat.std()))
+
+
+@dataclass(frozen=True)
+class EventRate:
+    """How often an event occurred."""
+
+    ticks: int
+    per_1000_steps: float  # ticks
+    episodes: int
+    episode_share: float  # of all episodes of the task
+
+
+@dataclass(frozen=True)
+class ReturnStatistics:
+    """Monte Carlo returns of the rows that have one."""
+
+    gamma: float
+    steps: int  # horizon K, planner ticks
+    valid_share: float  # rows whose return the time limit does not cut short
+    spread: Distribution | None
+    positive_share: float  # valid rows with an event row above the median within the horizon
+    negative_share: float  # valid rows with an event row below the median within the horizon
+
+
+@dataclass(frozen=True)
+class ActionStatistics:
+    """Which part of the action box N actions fill, and how evenly."""
+
+    histogram: dict[str, list[int]]  # action name -> rows per bin
+    uniformity: dict[str, float]
+    """Action name -> overlap of its histogram p over n bins with the even one, sum of
+    min(p_i, 1 / n): 1 is even, 1 / n is a single bin."""
+    occupied: dict[str, float]  # hand -> share of the grid cells that hold an action
+    workspace_m: dict[str, tuple[float, float]]
+    """Action name -> lowest and highest target, m, pelvis heading frame (height: above
+    ground)."""
+
+    @classmethod
+    def of(cls, action: NDArray[np.floating]) -> Self:
+        """The statistics of actions (N, 7) in box units."""
+        counts = {
+            name: np.histogram(action[:, i], HISTOGRAM_BINS, (-1.0, 1.0))[0]
+            for i, name in enumerate(ACTION_NAMES)
+        }
+        metric = ACTION_BOX.to_metric(action)
+        ranges = zip(metric.min(axis=0).tolist(), metric.max(axis=0).tolist(), strict=True)
+        return cls(
+            histogram={name: count.tolist() for name, count in counts.items()},
+            uniformity={
+                name: float(np.minimum(count / count.sum(), 1.0 / len(count)).sum())
+                for name, count in counts.items()
+            },
+            occupied={hand: _occupied(action[:, axes]) for hand, axes in _HANDS.items()},
+            workspace_m=dict(zip(ACTION_NAMES, ranges, strict=True)),
+        )
+
+
+def _occupied(points: NDArray[np.floating]) -> float:
+    """Share of the cells of a grid over [-1, 1]^3 that hold at least one of (N, 3) points."""
+    counts, _ = np.histogramdd(points, GRID_CELLS, [(-1.0, 1.0)] * 3)
+    return float((counts > 0).mean())
+
+
+@dataclass(frozen=True)
+class TaskStatistics:
+    """Statistics of the episodes of one task. Shares are of its episodes if not said otherwise."""
+
+    task: str
+    episodes: int
+    steps: int
+    step_share: float  # of the dataset's steps
+    length: Distribution | None  # ticks per episode
+    success_share: float
+    fall_share: float
+    event_episodes: int  # in which a term of `GOOD_TERMS` or `BAD_TERMS` was not zero
+    good_episodes: int
+    bad_episodes: int
+    events: dict[str, EventRate]
+    """Rate of each reward term, and of ``touch.hands`` and ``touch.other``, ticks of contact with
+    the task's object, where they were recorded."""
+    reward: Distribution | None
+    returns: ReturnStatistics
+    action: ActionStatistics
+    scene: dict[str, Distribution]
+    """Drawn parameter -> distribution over the episodes."""
+    depth: DepthStatistics  # of the sampled episodes
+
+
+@dataclass(frozen=True)
+class DatasetStatistics:
+    """Statistics of a dataset, and the data that its plots show; all by task."""
+
+    tasks: tuple[TaskStatistics, ...]
+    rows: tuple[TaskRows, ...]
+    samples: tuple[TaskSample, ...]
+
+
+def compute_statistics(reader: DatasetReader, returns: ReturnConfig) -> DatasetStatistics:
+    """Read the columns of a dataset, and sampled episodes.
+
+    Raises:
+        DataError: a file is damaged.
+    """
+    rows = read_rows(reader, returns)
+    samples = [sample_episodes(reader, task) for task in rows]
+    steps = reader.num_frames
+    tasks = [_task_statistics(r, s, returns, steps) for r, s in zip(rows, samples, strict=True)]
+    return DatasetStatistics(tuple(tasks), tuple(rows), tuple(samples))
+
+
+def _task_statistics(
+    rows: TaskRows, sample: TaskSample, returns: ReturnConfig, steps: int
+) -> TaskStatistics:
+    ticks = [_event_ticks(metadata) for metadata in rows.metadata]
+    good, bad = (
+        np.array([any(t.get(name) for name in terms[rows.task]) for t in ticks])
+        for terms in (GOOD_TERMS, BAD_TERMS)
+    )
+    names = dict.fromkeys(name for episode in ticks for name in episode)
+    return TaskStatistics(
+        task=rows.task,
+        episodes=len(rows.length),
+        steps=len(rows.reward),
+        step_share=len(rows.reward) / steps,
+        length=Distribution.of(rows.length),
+        success_share=float(rows.success.mean()),
+        fall_share=float(rows.fallen.mean()),
+        event_episodes=int((good | bad).sum()),
+        good_episodes=int(good.sum()),
+        bad_episodes=int(bad.sum()),
+        events={name: _rate([t.get(name, 0) for t in ticks], len(rows.reward)) for name in names},
+        reward=Distribution.of(rows.reward),
+        returns=_return_statistics(rows, returns),
+        action=ActionStatistics.of(rows.action),
+        scene=drawn_parameters(rows.metadata),
+        depth=sample.depth,
+    )
+
+
+def _event_ticks(metadata: Mapping[str, Any]) -> dict[str, int]:
+    """Ticks of an episode in which each reward term was not zero, and with each contact."""
+    terms = metadata.get("reward_terms", {})
+    contacts = metadata.get("contact_ticks", {})
+    return {name: int(term["ticks"]) for name, term in terms.items()} | {
+        f"touch.{part}": int(ticks) for part, ticks in contacts.items()
+    }
+
+
+def _rate(ticks: Sequence[int], steps: int) -> EventRate:
+    episodes = sum(t > 0 for t in ticks)
+    return EventRate(sum(ticks), 1000.0 * sum(ticks) / steps, episodes, episodes / len(ticks))
+
+
+def _return_statistics(rows: TaskRows, config: ReturnConfig) -> ReturnStatistics:
+    valid = rows.mc_valid
+    good, bad = events_ahead(rows, config.steps)
+    return ReturnStatistics(
+        gamma=config.gamma,
+        steps=config.steps,
+        valid_share=float(valid.mean()),
+        spread=Distribution.of(rows.mc_return[valid]),
+        positive_share=float(good[valid].mean()) if valid.any() else 0.0,
+        negative_share=float(bad[valid].mean()) if valid.any() else 0.0,
+    )
+
+
+def events_ahead(rows: TaskRows, steps: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(N,) and (N,): whether an event row above, or below, the median reward is among the next
+    ``steps`` rows of the episode, including the row itself."""
+    deviation = rows.reward - np.median(rows.reward)
+    end = np.repeat(rows.start + rows.length, rows.length)
+    here = np.arange(len(deviation))
+
+    def ahead(event: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        before = np.concatenate([[0], event.cumsum()])
+        return np.asarray(before[np.minimum(here + steps, end)] > before[here])
+
+    return ahead(deviation > EVENT_REWARD), ahead(deviation < -EVENT_REWARD)
+
+
+def drawn_parameters(metadata: Sequence[Mapping[str, Any]]) -> dict[str, Distribution]:
+    """Dotted name of each scene and randomisation parameter -> distribution over the episodes."""
+    values: dict[str, list[float]] = {}
+    for episode in metadata:
+        for name, value in _parameters(episode):
+            values.setdefault(name, []).append(value)
+    drawn = {name: Distribution.of(np.array(found)) for name, found in values.items()}
+    return {name: distribution for name, distribution in drawn.items() if distribution is not None}
+
+
+def _parameters(metadata: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, float]]:
+    for name, value in metadata.items():
+        if name in _NOT_DRAWN:
+            continue
+        if isinstance(value, Mapping):
+            yield from _parameters(value, f"{prefix}{name}.")
+        elif isinstance(value, int | float):
+            yield f"{prefix}{name}", float(value)

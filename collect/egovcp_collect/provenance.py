@@ -1,0 +1,111 @@
+"""Provenance of a collection: what is recorded, its migration, and the comparison for --resume."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import platform
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+import draccus
+
+from egovcp.data import Provenance
+from egovcp.errors import UsageError
+from egovcp.robot.controllers import make_controller
+from egovcp.spec import TASKS
+from egovcp_collect.config import ALL_TASKS, EPISODE_OPTIONS, CollectConfig
+
+_PACKAGES: Final = ("egovcp", "mujoco", "mjlab", "numpy", "lerobot")
+#: Task -> value that an option had before it existed, where that is not its default today.
+_IMPLICIT_SETTINGS: Final[Mapping[str, Any]] = {"wall": {"env": {"wall": {"guard_cost": 0.0}}}}
+_SHOWN_DIFFERENCES: Final = 5
+
+
+def make_provenance(config: CollectConfig, command: str) -> Provenance:
+    """What ``meta/collection.json`` records of a collection."""
+    settings = draccus.encode(config)
+    return Provenance(
+        controller_id=make_controller(config.env.controller).id,
+        seed=config.seed,
+        command=command,
+        versions=installed_versions(),
+        config={name: settings[name] for name in EPISODE_OPTIONS},
+    )
+
+
+def installed_versions() -> dict[str, str]:
+    """Installed version of each package that determines the data, and of Python."""
+    packages = {name: importlib.metadata.version(name) for name in _PACKAGES}
+    return {"python": platform.python_version(), **packages}
+
+
+def migrate_config(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """Recorded `EPISODE_OPTIONS`, with options that are newer than the record filled in."""
+    defaults = draccus.encode(CollectConfig())
+    config = {name: defaults[name] for name in EPISODE_OPTIONS}
+    for task, settings in _IMPLICIT_SETTINGS.items():
+        if recorded.get("task") in (task, ALL_TASKS):
+            config = _merge(config, settings)
+    return _merge(config, recorded)
+
+
+def _merge(base: Mapping[str, Any], update: Mapping[str, Any]) -> dict[str, Any]:
+    merged = {**base, **update}
+    for name, value in update.items():
+        if isinstance(value, Mapping) and isinstance(base.get(name), Mapping):
+            merged[name] = _merge(base[name], value)
+    return merged
+
+
+def require_compatible(now: Provenance, before: Provenance) -> None:
+    """Raise `UsageError` unless both collections give the same episode i, for every i."""
+    if before.seed is None:  # `egovcp-collect` always records one
+        raise UsageError(
+            "--resume continues a dataset that egovcp-collect began, and this one was merged or "
+            "converted; collect into another --dataset.root, then join both with "
+            "`egovcp-dataset merge`"
+        )
+    settings = {
+        "--seed": (before.seed, now.seed),
+        "low-level controller": (before.controller_id, now.controller_id),
+        **dict(_flat_pairs("--", migrate_config(before.config), now.config)),
+        **dict(_flat_pairs("version of ", before.versions, now.versions)),
+    }
+    changed = {
+        name: f"{name} was {old}, is {new}"
+        for name, (old, new) in settings.items()
+        # controllers are compared by id: a file of another name may hold the same one
+        if name != "--env.controller" and old != new
+    }
+    unused = _unused_prefixes(before, now)
+    used = [text for name, text in changed.items() if not name.startswith(unused)]
+    shown = used or list(changed.values())
+    if shown:
+        omitted = len(shown) - _SHOWN_DIFFERENCES
+        more = f", and {omitted} more" if omitted > 0 else ""
+        raise UsageError(
+            "--resume would add episodes of other settings: "
+            f"{'; '.join(shown[:_SHOWN_DIFFERENCES])}{more}; use the settings of the dataset, or "
+            "another --dataset.root"
+        )
+
+
+def _unused_prefixes(*collections: Provenance) -> tuple[str, ...]:
+    """Prefixes of the options of tasks that none of the collections has."""
+    tasks = {collection.config.get("task") for collection in collections}
+    if ALL_TASKS in tasks:
+        return ()
+    unused = [task for task in TASKS if task not in tasks]
+    return ("--mix.", *(f"--env.{task}{end}" for task in unused for end in (".", "_episode.")))
+
+
+def _flat_pairs(
+    prefix: str, before: Mapping[str, Any], now: Mapping[str, Any]
+) -> Iterator[tuple[str, tuple[Any, Any]]]:
+    """Dotted name, and old and new value, of each leaf of nested settings."""
+    for name in {**before, **now}:
+        old, new = before.get(name), now.get(name)
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            yield from _flat_pairs(f"{prefix}{name}.", old, new)
+        else:
+            yield f"{prefix}{name}", (old, new)

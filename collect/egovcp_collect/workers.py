@@ -1,0 +1,220 @@
+"""The interface of simulation workers, and workers that are processes of this machine."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import traceback
+from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Final, Protocol
+
+from egovcp.data import Episode
+from egovcp.data.staging import EncodedEpisode, StagedEpisode, StagingDir, encode
+from egovcp.errors import DataError
+from egovcp.hardware import available_cores
+from egovcp.sim.scenario import Scenario
+from egovcp.workers import inherited_by_workers
+from egovcp_collect.config import CollectConfig
+from egovcp_collect.simulation import Simulation
+
+_REPORT_S: Final = 0.25
+_MAX_PENDING: Final = 32  # episodes in memory that wait for the disk
+
+
+@dataclass(frozen=True)
+class WorkerReport:
+    """What a worker did since its last report."""
+
+    steps: int
+    """Planner ticks."""
+    finished: tuple[int, ...] = ()
+    """Numbers of the episodes that it finished."""
+    staged: tuple[StagedEpisode, ...] = ()
+    """Those that it could not stage on the disk itself."""
+    error: Exception | None = None
+    """The error that ended the worker; this is its last report."""
+
+
+class Worker(Protocol):
+    """A process that simulates episodes."""
+
+    def assign(self, scenarios: Sequence[Scenario]) -> None:
+        """Append episodes to its queue."""
+        ...
+
+    def poll(self) -> list[WorkerReport]:
+        """Reports since the last call; does not block."""
+        ...
+
+    @property
+    def alive(self) -> bool:
+        """Whether more reports can follow."""
+        ...
+
+    def kill(self) -> None:
+        """End it immediately; returns when it has ended."""
+        ...
+
+
+class Backend(Protocol):
+    """Starts workers."""
+
+    def start(self) -> Worker:
+        """Start a worker."""
+        ...
+
+    @property
+    def cores(self) -> int:
+        """Processor cores that workers can use."""
+        ...
+
+    def wait(self, seconds: float) -> None:
+        """Block until a worker has reported or died, at most this long."""
+        ...
+
+    def close(self) -> None:
+        """Free the resources of the backend itself."""
+        ...
+
+
+def encode_episode(number: int, episode: Episode) -> EncodedEpisode:
+    """Validate and encode an episode.
+
+    Raises:
+        DataError: it is invalid; the error's ``episode`` is ``number``.
+    """
+    try:
+        return encode(episode, f"episode {number}")
+    except DataError as error:
+        error.episode = number
+        raise
+
+
+def picklable(error: Exception) -> Exception:
+    """The error, or a `RuntimeError` with its message if it cannot be pickled."""
+    try:
+        pickle.loads(pickle.dumps(error))  # noqa: S301 - bytes made in this expression
+    except Exception:  # noqa: BLE001 - an exception class may raise anything here
+        return RuntimeError("".join(traceback.format_exception_only(error)).strip())
+    return error
+
+
+class LocalWorker(Worker):
+    """A process that stages its episodes on the disk itself; reports come through a pipe."""
+
+    def __init__(self, config: CollectConfig, staging: Path) -> None:
+        context = multiprocessing.get_context("spawn")
+        self.pipe, remote = context.Pipe()
+        self.process = context.Process(
+            target=_run_worker, args=(remote, config, staging, os.getpid()), daemon=True
+        )
+        with inherited_by_workers():
+            self.process.start()
+        remote.close()
+
+    def assign(self, scenarios: Sequence[Scenario]) -> None:
+        try:
+            self.pipe.send(list(scenarios))
+        except OSError:  # the process is dying; the pool assigns the episodes again
+            self.process.join(timeout=1)
+
+    def poll(self) -> list[WorkerReport]:
+        reports: list[WorkerReport] = []
+        try:
+            while self.pipe.poll():
+                reports.append(self.pipe.recv())
+        except (EOFError, OSError, pickle.UnpicklingError):
+            self.process.join(timeout=1)
+        return reports
+
+    @property
+    def alive(self) -> bool:
+        return self.process.is_alive()
+
+    def kill(self) -> None:
+        self.process.kill()
+        self.process.join()
+        self.pipe.close()
+
+
+class LocalBackend(Backend):
+    """Starts processes that stage episodes in the folder ``staging``."""
+
+    def __init__(self, config: CollectConfig, staging: Path) -> None:
+        self._config = config
+        self._staging = staging
+        self._workers: list[LocalWorker] = []
+
+    @property
+    def cores(self) -> int:
+        return available_cores()
+
+    def start(self) -> LocalWorker:
+        worker = LocalWorker(self._config, self._staging)
+        self._workers = [*self._running(), worker]
+        return worker
+
+    def wait(self, seconds: float) -> None:
+        wait([x for w in self._running() for x in (w.pipe, w.process.sentinel)], timeout=seconds)
+
+    def close(self) -> None:
+        pass  # the pool ends the processes
+
+    def _running(self) -> list[LocalWorker]:
+        return [worker for worker in self._workers if not worker.pipe.closed]
+
+
+def _run_worker(pipe: Connection, config: CollectConfig, staging: Path, parent: int) -> None:
+    """Body of the process; it ends with the pipe or with the parent."""
+    try:
+        simulation, stager = Simulation(config), _Stager(StagingDir(staging))
+        while os.getppid() == parent:
+            while pipe.poll(None if simulation.idle else 0):  # an idle worker blocks here
+                simulation.add(pipe.recv())
+            steps, episodes = simulation.run(_REPORT_S)
+            for number, episode in episodes:
+                stager.submit(number, episode)
+            pipe.send(WorkerReport(steps, stager.finished(wait=simulation.idle)))
+    except (EOFError, BrokenPipeError):
+        return
+    except Exception as error:  # noqa: BLE001 - every error is reported to the collection
+        error.add_note(traceback.format_exc())
+        pipe.send(WorkerReport(0, error=picklable(error)))
+
+
+class _Stager:
+    """Stages episodes on a thread, so that the simulation does not wait for the disk."""
+
+    def __init__(self, staging: StagingDir) -> None:
+        self._staging = staging
+        self._thread = ThreadPoolExecutor(1)
+        self._pending: deque[Future[int]] = deque()
+
+    def submit(self, number: int, episode: Episode) -> None:
+        """Queue an episode."""
+        self._pending.append(self._thread.submit(self._stage, number, episode))
+
+    def _stage(self, number: int, episode: Episode) -> int:
+        self._staging.put(StagedEpisode.of(number, encode_episode(number, episode)))
+        return number
+
+    def finished(self, wait: bool) -> tuple[int, ...]:
+        """Numbers of the episodes staged since the last call.
+
+        Blocks for all queued ones if ``wait``, else until at most `_MAX_PENDING` are queued.
+
+        Raises:
+            DataError: an episode is invalid.
+            OSError: the disk is full.
+        """
+        finished = []
+        pending = self._pending
+        while pending and (wait or len(pending) > _MAX_PENDING or pending[0].done()):
+            finished.append(pending.popleft().result())
+        return tuple(finished)

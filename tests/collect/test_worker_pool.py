@@ -1,0 +1,214 @@
+"""Workers that die, hang and fail: the pool finishes every episode."""
+
+import copy
+import time
+from collections.abc import Callable, Sequence
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from egovcp.errors import DataError, EnvironmentFailure
+from egovcp.sim.scenario import Scenario
+from egovcp.testing import random_episode
+from egovcp_collect.worker_pool import MAX_ATTEMPTS, WorkerPool
+from egovcp_collect.workers import WorkerReport, encode_episode, picklable
+
+_NUM_ENVS = 2
+
+type Behaviour = Callable[["_Worker", int], WorkerReport | None]
+
+
+class _Worker:
+    """Finishes one episode per poll; ``behaviour`` may do something else instead."""
+
+    def __init__(self, behaviour: Behaviour) -> None:
+        self._behaviour = behaviour
+        self._todo: list[int] = []
+        self.alive = True
+        self.hung = False
+        self.killed = False
+
+    def assign(self, scenarios: Sequence[Scenario]) -> None:
+        self._todo += [scenario.episode for scenario in scenarios]
+
+    def poll(self) -> list[WorkerReport]:
+        if not self._todo or not self.alive or self.hung:
+            return []
+        report = self._behaviour(self, self._todo[0])
+        if report is not None:
+            return [report]
+        if not self.alive or self.hung:
+            return []
+        return [WorkerReport(10, (self._todo.pop(0),))]
+
+    def kill(self) -> None:
+        self.alive, self.killed = False, True
+
+
+class _Backend:
+    cores = 2
+
+    def __init__(self, behaviour: Behaviour) -> None:
+        self._behaviour = behaviour
+        self.workers: list[_Worker] = []
+
+    def start(self) -> _Worker:
+        self.workers.append(_Worker(self._behaviour))
+        return self.workers[-1]
+
+    def wait(self, seconds: float) -> None:
+        time.sleep(0.001)
+
+    def close(self) -> None:
+        pass
+
+
+def _run(
+    behaviour: Behaviour, episodes: int = 20, workers: int = 2
+) -> tuple[list[int], WorkerPool, _Backend]:
+    """Numbers of the finished episodes in order, the pool, and its backend."""
+    backend = _Backend(behaviour)
+    scenarios = [Scenario("ball", 0, i) for i in range(episodes)]
+    numbers: list[int] = []
+    with closing(WorkerPool(backend, workers, scenarios, _NUM_ENVS, timeout=0.05)) as pool:
+        while not pool.done:
+            for report in pool.poll():
+                numbers += report.finished
+    return numbers, pool, backend
+
+
+def _once(what: Callable[[_Worker], WorkerReport | None], at: int) -> Behaviour:
+    """Do it the first time that episode ``at`` is simulated."""
+    done = []
+
+    def behaviour(worker: _Worker, number: int) -> WorkerReport | None:
+        if number != at or done:
+            return None
+        done.append(number)
+        return what(worker)
+
+    return behaviour
+
+
+def _die(worker: _Worker) -> None:
+    worker.alive = False
+
+
+def _hang(worker: _Worker) -> None:
+    worker.hung = True
+
+
+def _normal(worker: _Worker, number: int) -> None:
+    return None
+
+
+@pytest.mark.parametrize("episodes", [1, 2, 3, 7, 20])
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_every_episode_is_finished_once(episodes: int, workers: int) -> None:
+    numbers, pool, backend = _run(_normal, episodes, workers)
+    assert sorted(numbers) == list(range(episodes))
+    assert pool.replaced == 0
+    assert len(backend.workers) <= workers
+    assert all(worker.killed for worker in backend.workers)
+
+
+@pytest.mark.parametrize("fault", [_die, _hang])
+@pytest.mark.parametrize("at", [0, 7, 19])
+def test_a_lost_worker_is_replaced_and_its_episodes_are_repeated(
+    fault: Callable[[_Worker], None], at: int
+) -> None:
+    numbers, pool, backend = _run(_once(fault, at))
+    assert sorted(numbers) == list(range(20))
+    assert pool.replaced == 1
+    assert len(backend.workers) == 3
+
+
+def test_an_episode_that_kills_every_worker_raises() -> None:
+    def behaviour(worker: _Worker, number: int) -> None:
+        worker.alive = number != 7
+
+    with pytest.raises(
+        EnvironmentFailure, match=rf"was killed .*{MAX_ATTEMPTS} times.* episodes 7 to"
+    ):
+        _run(behaviour)
+
+
+def test_an_episode_that_always_hangs_raises() -> None:
+    def behaviour(worker: _Worker, number: int) -> None:
+        worker.hung = number == 7
+
+    with pytest.raises(EnvironmentFailure, match="sent no report for"):
+        _run(behaviour)
+
+
+def test_an_invalid_episode_is_repeated_once() -> None:
+    broken = DataError("episode 7, frame 3: state is not finite")
+    numbers, pool, _ = _run(_once(lambda worker: WorkerReport(0, error=broken), 7))
+    assert sorted(numbers) == list(range(20))
+    assert pool.replaced == 1
+
+
+def test_an_episode_that_stays_invalid_raises() -> None:
+    broken = DataError("episode 7, frame 3: state is not finite")
+
+    def behaviour(worker: _Worker, number: int) -> WorkerReport | None:
+        return WorkerReport(0, error=broken) if number == 7 else None
+
+    with pytest.raises(DataError, match="episode 7, frame 3"):
+        _run(behaviour)
+
+
+def _invalid(number: int) -> DataError:
+    error = DataError(f"episode {number}, frame 3: state is not finite")
+    error.episode = number
+    return error
+
+
+def test_invalid_episodes_of_one_worker_are_counted_separately() -> None:
+    """Two episodes of one worker are invalid once each."""
+    failed: list[int] = []
+
+    def behaviour(worker: _Worker, number: int) -> WorkerReport | None:
+        if number not in (6, 7) or number in failed:
+            return None
+        failed.append(number)
+        return WorkerReport(0, error=_invalid(number))
+
+    numbers, pool, _ = _run(behaviour, workers=1)
+    assert sorted(numbers) == list(range(20))
+    assert pool.replaced == 2
+
+
+def test_invalid_episodes_and_lost_workers_are_counted_separately() -> None:
+    """An episode is invalid once after its worker died once."""
+    faults: list[str] = []
+
+    def behaviour(worker: _Worker, number: int) -> WorkerReport | None:
+        if number != 7 or len(faults) == 2:
+            return None
+        faults.append("death" if not faults else "invalid")
+        if len(faults) == 2:
+            return WorkerReport(0, error=_invalid(7))
+        worker.alive = False
+        return None
+
+    numbers, pool, _ = _run(behaviour)
+    assert sorted(numbers) == list(range(20))
+    assert pool.replaced == 2
+
+
+def test_the_number_of_an_invalid_episode_is_pickled_with_the_error() -> None:
+    episode = random_episode(7)
+    episode.state[3, 0] = np.nan
+    with pytest.raises(DataError, match="episode 7, frame 3") as caught:
+        encode_episode(7, episode)
+    arrived = copy.copy(picklable(caught.value))  # copies as pickle does
+    assert isinstance(arrived, DataError)
+    assert (arrived.episode, str(arrived)) == (7, str(caught.value))
+
+
+@pytest.mark.parametrize("failure", [OSError(28, "No space left on device"), RuntimeError("bug")])
+def test_other_errors_are_raised_at_once(failure: Exception) -> None:
+    with pytest.raises(type(failure)):
+        _run(_once(lambda worker: WorkerReport(0, error=failure), 7))
