@@ -113,7 +113,7 @@ def _refused(
         (["--policy.push_to_hub"], "--policy.repo_id='': expected user/name"),
         (["--policy.push_to_hub", "--policy.repo_id=policy"], "'policy': expected user/name"),
         (["--policy.push_to_hub", "--policy.repo_id=me/../x"], "expected user/name"),
-        (["--policy.repo_id=me/policy"], "give --policy.push_to_hub"),
+        (["--policy.repo_id=me/policy"], "without --policy.push_to_hub"),
     ],
 )
 def test_a_bad_id_is_refused_before_training(

@@ -65,7 +65,7 @@ class LoadingConfig:
     """Files of each task that are fetched before the first step where the data comes from the Hub:
     the episodes in them give the scale of the returns, and are evaluated on."""
     network: RetryPolicy = field(default_factory=RetryPolicy)
-    """How long the Hub is asked for a file before the run ends; its checkpoints remain."""
+    """Retries of downloads from the Hub."""
 
 
 @dataclass(frozen=True)
@@ -88,8 +88,8 @@ class PolicyConfig(WorldModelConfig):
             )
         if self.repo_id and not self.push_to_hub:
             raise UsageError(
-                f"--policy.repo_id={self.repo_id} says where to publish the policy; give "
-                "--policy.push_to_hub to do so, or leave it empty"
+                f"--policy.repo_id={self.repo_id} names a repository without "
+                "--policy.push_to_hub; give that, or leave --policy.repo_id empty"
             )
 
     def world_model(self) -> WorldModelConfig:
@@ -173,7 +173,7 @@ class TrainConfig:
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""
     mixed_precision: str = "auto"
-    """Precision of matrix products: no, bf16, or auto (as accelerate launch was told, else bf16 if
+    """Precision of matrix products: no, bf16, or auto (as set by accelerate launch, else bf16 if
     the device computes in it, as GPUs since Ampere and CPUs with AVX512-BF16 or AMX do)."""
     tensorboard: bool = True
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""

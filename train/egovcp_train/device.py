@@ -39,7 +39,7 @@ def choose_device(name: str) -> torch.device:
 def choose_bf16(name: str, device: torch.device) -> bool:
     """Whether matrix products are in bfloat16, for a value of ``--mixed_precision``.
 
-    auto: as ``accelerate launch`` was told, else if the device computes in it; emulated bfloat16
+    auto: as set by ``accelerate launch``, else if the device computes in it; emulated bfloat16
     is slower than float32.
 
     Raises:

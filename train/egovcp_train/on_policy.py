@@ -24,7 +24,7 @@ type Log = dict[str, list[float]]
 
 
 @dataclass(frozen=True)
-class PpoOptions:
+class RslRlPpoConfig:
     """Proximal policy optimisation; the names are rsl-rl's."""
 
     num_steps_per_env: int = bounded(24, least=1, most=100_000)
@@ -48,7 +48,7 @@ class PpoOptions:
 
 
 def rsl_rl_config(
-    ppo: PpoOptions,
+    ppo: RslRlPpoConfig,
     actor: Mapping[str, Any],
     critic: Mapping[str, Any],
     obs_groups: Mapping[str, list[str]],

@@ -14,13 +14,13 @@ from egovcp_train.lowlevel.env import LowLevelEnv, mirrored
 from egovcp_train.lowlevel.learner import LowLevelLearner, SymmetricStart
 from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
 from egovcp_train.lowlevel.train import main
-from egovcp_train.on_policy import PpoOptions
+from egovcp_train.on_policy import RslRlPpoConfig
 
 
 def _learner(critic_warmup: int, **network: object) -> LowLevelLearner:
     env = LowLevelEnv(8, LowLevelTask(), WalkConfig(), SensorConfig())
     return LowLevelLearner(
-        env, NetworkConfig(**network), PpoOptions(), CurriculumConfig(start=0.5), critic_warmup
+        env, NetworkConfig(**network), RslRlPpoConfig(), CurriculumConfig(start=0.5), critic_warmup
     )
 
 
@@ -49,7 +49,7 @@ def test_the_warm_up_trains_the_critic_and_keeps_the_noise():
     scalars = [learner.iterate() for _ in range(2)]
     assert all(s["ppo/symmetric_error"] < 0.1 for s in scalars)
     assert scalars[-1]["ppo/action_std"] == pytest.approx(NetworkConfig().initial_std)
-    assert scalars[-1]["ppo/learning_rate"] == PpoOptions().learning_rate
+    assert scalars[-1]["ppo/learning_rate"] == RslRlPpoConfig().learning_rate
 
 
 def test_the_actor_becomes_symmetric():

@@ -21,7 +21,7 @@ from egovcp_train.lowlevel.config import (
 from egovcp_train.lowlevel.env import LowLevelEnv
 from egovcp_train.lowlevel.learner import LowLevelLearner, next_difficulty, walk_policy
 from egovcp_train.lowlevel.train import main
-from egovcp_train.on_policy import PpoOptions
+from egovcp_train.on_policy import RslRlPpoConfig
 
 SMALL = ["--robots=8", "--threads=1", "--ppo.num_steps_per_env=8", "--save_freq=2"]
 LAST = Path("checkpoints/last/pretrained_model/walk.safetensors")
@@ -87,7 +87,7 @@ def _learner(**curriculum: float) -> LowLevelLearner:
     return LowLevelLearner(
         env,
         NetworkConfig(actor=(16,), critic=(16,)),
-        PpoOptions(num_steps_per_env=4),
+        RslRlPpoConfig(num_steps_per_env=4),
         CurriculumConfig(**curriculum),
     )
 
@@ -120,7 +120,7 @@ def test_ppo_learns_what_a_term_rewards():
     learner = LowLevelLearner(
         env,
         NetworkConfig(actor=(16,), critic=(16,)),
-        PpoOptions(entropy_coef=0.0, desired_kl=0.05),
+        RslRlPpoConfig(entropy_coef=0.0, desired_kl=0.05),
         CurriculumConfig(),
     )
     torch.manual_seed(0)

@@ -1,1 +1,1 @@
-"""What a world model knows of whole episodes that it was not trained on."""
+"""Measurements of a world model on held-out episodes."""

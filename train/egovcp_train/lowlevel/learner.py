@@ -17,14 +17,14 @@ from egovcp_train import on_policy
 from egovcp_train.lowlevel.config import CurriculumConfig, NetworkConfig
 from egovcp_train.lowlevel.env import LowLevelEnv, mirrored
 from egovcp_train.lowlevel.sensing import PRIVILEGED_DIM
-from egovcp_train.on_policy import Log, OnPolicyLearner, PpoOptions
+from egovcp_train.on_policy import Log, OnPolicyLearner, RslRlPpoConfig
 
 _FRAMES: Final = 10_000_000  # weight of an initial network's normalisation, observations
 _BATCH: Final = 1024
 _LEARNING_RATE: Final = 5e-4
 
 
-def rsl_rl_config(network: NetworkConfig, ppo: PpoOptions) -> dict[str, Any]:
+def rsl_rl_config(network: NetworkConfig, ppo: RslRlPpoConfig) -> dict[str, Any]:
     """rsl-rl's configuration of actor, critic and PPO."""
     shared = {"class_name": "MLPModel", "activation": network.activation, "obs_normalization": True}
     return on_policy.rsl_rl_config(
@@ -82,7 +82,7 @@ class LowLevelLearner(OnPolicyLearner):
         self,
         env: LowLevelEnv,
         network: NetworkConfig,
-        ppo: PpoOptions,
+        ppo: RslRlPpoConfig,
         curriculum: CurriculumConfig,
         critic_warmup: int = 0,
     ) -> None:

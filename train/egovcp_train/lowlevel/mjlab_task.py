@@ -50,7 +50,7 @@ from egovcp_train.lowlevel.mjlab_terms import (
     TaskLogicTermCfg,
     logic_term,
 )
-from egovcp_train.on_policy import PpoOptions, shrink_output
+from egovcp_train.on_policy import RslRlPpoConfig, shrink_output
 
 TASK_ID: Final = "Egovcp-LowLevel-Unitree-G1"
 
@@ -155,9 +155,9 @@ class SymmetricPpoCfg(RslRlPpoAlgorithmCfg):
     rnd_cfg: dict[str, Any] | None = None
 
 
-def rl_cfg(network: NetworkConfig | None = None, ppo: PpoOptions | None = None) -> Any:
+def rl_cfg(network: NetworkConfig | None = None, ppo: RslRlPpoConfig | None = None) -> Any:
     """PPO as on the CPU."""
-    shared = rsl_rl_config(network or NetworkConfig(), ppo or PpoOptions())
+    shared = rsl_rl_config(network or NetworkConfig(), ppo or RslRlPpoConfig())
     algorithm = shared["algorithm"]
     algorithm["symmetry_cfg"]["data_augmentation_func"] = "egovcp_train.lowlevel.env:mirrored"
     return RslRlOnPolicyRunnerCfg(

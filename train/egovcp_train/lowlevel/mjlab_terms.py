@@ -26,7 +26,7 @@ from egovcp_train.lowlevel.config import CurriculumConfig, DisturbanceConfig, Lo
 from egovcp_train.lowlevel.env import TaskLogic
 from egovcp_train.lowlevel.learner import next_difficulty
 from egovcp_train.lowlevel.physics import HEAD, Snapshot
-from egovcp_train.on_policy import PpoOptions
+from egovcp_train.on_policy import RslRlPpoConfig
 
 ROBOT: Final = "robot"  # name in the scene
 LOGIC: Final = "loop"  # name of the command term
@@ -46,7 +46,7 @@ class TaskLogicTermCfg(CommandTermCfg):
     walk: WalkConfig = field(default_factory=WalkConfig)
     sensors: SensorConfig = field(default_factory=SensorConfig)
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
-    ticks_per_iteration: int = PpoOptions.num_steps_per_env
+    ticks_per_iteration: int = RslRlPpoConfig.num_steps_per_env
 
     def build(self, env: ManagerBasedRlEnv) -> TaskLogicTerm:
         return TaskLogicTerm(self, env)

@@ -209,7 +209,7 @@ def _feet(model: mujoco.MjModel) -> list[int]:
 def _randomised(
     base: mujoco.MjModel, config: DisturbanceConfig, rng: np.random.Generator
 ) -> mujoco.MjModel:
-    """A copy of ``base`` with random physical parameters; each joint has gains of its own."""
+    """A copy of ``base`` with random physical parameters; the gains differ by joint."""
     model = mujoco.MjModel.__copy__(base)
     model.geom_friction[_feet(model), 0] = rng.uniform(*config.friction)
     scale = rng.uniform(*config.mass_scale)

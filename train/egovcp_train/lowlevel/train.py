@@ -30,7 +30,7 @@ from egovcp_train.checkpoint import (
     resumed_options,
 )
 from egovcp_train.lowlevel.config import CurriculumConfig, LowLevelTask, NetworkConfig
-from egovcp_train.on_policy import PpoOptions, run_iterations
+from egovcp_train.on_policy import RslRlPpoConfig, run_iterations
 
 PROG = "egovcp-train-lowlevel"
 POLICY_FILE = "walk.safetensors"
@@ -61,7 +61,7 @@ class LowLevelTrainConfig:
     """Noise of proprioception."""
     network: NetworkConfig = field(default_factory=NetworkConfig)
     """Policy and critic."""
-    ppo: PpoOptions = field(default_factory=PpoOptions)
+    ppo: RslRlPpoConfig = field(default_factory=RslRlPpoConfig)
     """Proximal policy optimisation."""
     curriculum: CurriculumConfig = field(default_factory=CurriculumConfig)
     """When the task becomes harder."""
@@ -102,7 +102,7 @@ def train(config: LowLevelTrainConfig) -> None:
     Raises:
         UsageError: the network of --init has another size.
         ArtifactError: the file of --init cannot be used.
-        KeyboardInterrupt: it was asked to stop before the end; the checkpoint is written.
+        KeyboardInterrupt: a signal ended it early; the checkpoint is written.
     """
     require_memory_for_robots("--robots", config.robots)
     output = prepare_output(config.output_dir, config.resume)

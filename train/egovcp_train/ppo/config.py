@@ -10,7 +10,7 @@ from egovcp.errors import UsageError, suggest
 from egovcp.reactive import ReactiveConfig
 from egovcp.sim.config import EnvConfig
 from egovcp.spec import GAMMA, TASKS
-from egovcp_train.on_policy import PpoOptions
+from egovcp_train.on_policy import RslRlPpoConfig
 
 HELD_OUT: Final = 1_000_000_000  # seeds from here on are those of egovcp-eval
 ALL: Final = "all"
@@ -35,8 +35,8 @@ class PpoTrainConfig:
     """Policy and critic."""
     initial_std: float = bounded(0.4, above=0)
     """Standard deviation of the actions at the start, box units."""
-    ppo: PpoOptions = field(
-        default_factory=lambda: PpoOptions(
+    ppo: RslRlPpoConfig = field(
+        default_factory=lambda: RslRlPpoConfig(
             num_steps_per_env=50, desired_kl=0.01, gamma=GAMMA, entropy_coef=0.002
         )
     )
