@@ -36,6 +36,9 @@ REMOVED_OPTIONS: Final[Mapping[str, str]] = {
         "windows are drawn uniformly: leave it out; --sampling.tasks weights whole tasks"
     ),
     "datasets.return_steps": "all datasets have one horizon of returns: use --returns.steps",
+    # egovcp-experiment
+    "train.task_flags": "all tasks share one recipe: use --train.flags",
+    "play.task_flags": "all tasks share one recipe: use --play.flags",
     # egovcp-eval-model
     "return_steps": "Q is compared with the returns that it was trained on: leave it out",
 }

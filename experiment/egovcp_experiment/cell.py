@@ -1,133 +1,146 @@
-"""A cell: one run of a command, and what it takes from the cells before it."""
+"""Cells: single runs of a command with its flags, and the commands that cells run.
+
+Commands are named, not imported: applications do not depend on each other.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
+from egovcp.data.schema import COLLECTION_PATH, HASHES_PATH
 from egovcp.errors import UsageError
+from egovcp.files import sha256
+from egovcp.manifest import MANIFEST, SEAL, read_manifest
+from egovcp.reactive import ReactiveNetwork
+
+#: Artifact of egovcp-train, relative to the folder of the run.
+ARTIFACT: Final = "checkpoints/last/pretrained_model"
+#: Policy of egovcp-train-ppo, relative to a checkpoint.
+PPO_POLICY: Final = "pretrained_model/ppo.safetensors"
+#: Result file of a study of this package.
+RESULT: Final = "result.json"
 
 type Flags = Mapping[str, Any]
-"""Name of a flag, without the dashes -> its value: text, number, truth, list or mapping of these,
-with an `Output`, a `Found` or a `Given` anywhere in it."""
+"""Name of a flag without dashes -> text, number, bool, list or mapping; references at any depth."""
+
+type Record = Mapping[str, Any]
+"""The stored result of a cell."""
 
 
 @dataclass(frozen=True)
-class Output:
-    """A file or folder that another cell makes."""
+class CellOutput:
+    """Reference to a file or folder that another cell writes."""
 
     cell: str
     """Name of that cell."""
     path: str = ""
-    """Below its folder; empty: the folder itself."""
+    """Relative to its folder; empty: the folder itself."""
 
 
 @dataclass(frozen=True)
-class Found:
-    """A figure of another cell's result."""
+class CellFigure:
+    """Reference to a value in another cell's figures."""
 
     cell: str
     """Name of that cell."""
     keys: tuple[str, ...]
-    """Where in its figures."""
+    """Path in the nested figures."""
 
 
 @dataclass(frozen=True)
-class Given:
-    """A file or folder that was there before, or something on the Hub."""
+class ExternalPath:
+    """Reference to a file or folder that no cell writes, or to a Hub repository."""
 
     path: str
     """As the user wrote it."""
 
 
-type Reference = Output | Found | Given
+type Reference = CellOutput | CellFigure | ExternalPath
 
 
 @dataclass(frozen=True)
-class Tool:
-    """A command that cells run: ``MODULE.main(argv)``."""
+class CellCommand:
+    """A command that cells run, as ``MODULE.main(argv)``."""
 
     module: str
-    """Where its `main` is."""
+    """Module with `main`."""
     output: str
-    """The flag that names the folder it writes."""
+    """Flag for the output folder."""
     figures: Callable[[Path], dict[str, Any]]
-    """What is kept of a finished run, from its folder."""
+    """Reads the figures to store from the output folder."""
     digest: Callable[[Path], str]
-    """SHA-256 of what other cells take from the folder."""
-    continued: Callable[[Path], Flags | None] = lambda folder: None
-    """Flags that go on with what an interrupted run left in its folder; None: start anew."""
+    """SHA-256 of the outputs that other cells read."""
+    resume_flags: Callable[[Path], Flags | None] = lambda folder: None
+    """Flags that resume an interrupted run in the folder; None: start again."""
     prog: str = ""
     """Name of the command in reports; empty: ``python -m MODULE``."""
     packages: tuple[str, ...] = ()
-    """Modules of optional packages that it imports."""
-    learns: bool = False
-    """Whether it trains networks, which a GPU is for."""
-    alone: bool = False
-    """Whether it measures time, so that nothing may run beside it."""
+    """Optional modules that it imports."""
+    uses_gpu: bool = False
+    """Whether it trains networks and needs a GPU on a cluster."""
+    exclusive: bool = False
+    """Whether it measures time, so that no other cell may run at the same time."""
+
+    @property
+    def shell_name(self) -> str:
+        """The command as typed in a shell."""
+        return self.prog or f"python -m {self.module}"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One run of a tool."""
+    """One run of a command."""
 
     name: str
-    """Unique in an output folder; cells of one name and other settings are refused."""
-    tool: Tool
-    """What is run."""
+    """Unique in an output folder."""
+    command: CellCommand
     flags: Flags = field(default_factory=dict)
-    """Its flags."""
     extra: tuple[str, ...] = ()
-    """Further flags as they are written, ``--name=value``."""
+    """Further flags as the user wrote them, ``--name=value``."""
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Names of the cells that must be complete before, each once."""
-        found = (r.cell for r in references(self.flags) if not isinstance(r, Given))
+        """Names of the cells whose results it reads."""
+        found = (r.cell for r in references(self.flags) if not isinstance(r, ExternalPath))
         return tuple(dict.fromkeys(found))
 
 
 def references(value: Any) -> Iterator[Reference]:
-    """Every reference in a value, at any depth."""
-    if isinstance(value, Output | Found | Given):
+    """All references in a value, at any depth."""
+    if isinstance(value, CellOutput | CellFigure | ExternalPath):
         yield value
-    elif isinstance(value, Mapping):
-        for part in value.values():
-            yield from references(part)
-    elif isinstance(value, list | tuple):
-        for part in value:
+    elif isinstance(value, Mapping | list | tuple):
+        for part in value.values() if isinstance(value, Mapping) else value:
             yield from references(part)
 
 
-def filled(value: Any, fill: Callable[[Reference], Any]) -> Any:
-    """The value with ``fill(reference)`` in the place of each reference."""
-    if isinstance(value, Output | Found | Given):
-        return fill(value)
+def resolve(value: Any, reference_value: Callable[[Reference], Any]) -> Any:
+    """The value with each reference replaced by ``reference_value(reference)``."""
+    if isinstance(value, CellOutput | CellFigure | ExternalPath):
+        return reference_value(value)
     if isinstance(value, Mapping):
-        return {name: filled(part, fill) for name, part in value.items()}
+        return {name: resolve(part, reference_value) for name, part in value.items()}
     if isinstance(value, list | tuple):
-        return [filled(part, fill) for part in value]
+        return [resolve(part, reference_value) for part in value]
     return value
 
 
-def written(flags: Flags) -> list[str]:
+def to_argv(flags: Flags) -> list[str]:
     """``--name=value`` of flags without references."""
-    return [f"--{name}={text(value)}" for name, value in flags.items()]
-
-
-def text(value: Any) -> str:
-    """A flag's value as it is written."""
-    return value if isinstance(value, str) else json.dumps(value)
+    return [f"--{k}={v if isinstance(v, str) else json.dumps(v)}" for k, v in flags.items()]
 
 
 def in_order(cells: Sequence[Cell]) -> tuple[Cell, ...]:
-    """The cells, each once, where every one must come after those it needs.
+    """The cells without duplicates.
 
     Raises:
-        UsageError: two differ under one name, or one needs what does not come before it.
+        UsageError: two different cells share a name, or a cell comes before one that it needs.
     """
     known: dict[str, Cell] = {}
     for cell in cells:
@@ -137,3 +150,120 @@ def in_order(cells: Sequence[Cell]) -> tuple[Cell, ...]:
             if name not in known:
                 raise UsageError(f"cell {cell.name} needs {name}, which does not come before it")
     return tuple(known.values())
+
+
+def read_json(path: Path) -> Any:
+    """The content of a JSON file."""
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def external_digest(path: str) -> str:
+    """SHA-256 of an artifact, dataset or file; of a Hub repository only of its name."""
+    folder = Path(os.path.expanduser(path))
+    if (folder / MANIFEST).is_file():
+        return _artifact_digest(folder)
+    if (folder / HASHES_PATH).is_file():
+        return sha256(folder / HASHES_PATH)
+    if folder.is_file():
+        return sha256(folder)
+    return hashlib.sha256(path.encode()).hexdigest()
+
+
+def _artifact_digest(folder: Path) -> str:
+    return str(read_manifest(folder)[SEAL])
+
+
+def _collect_figures(folder: Path) -> dict[str, Any]:
+    info = read_json(folder / "meta" / "info.json")
+    collection = read_json(folder / COLLECTION_PATH)
+    return {
+        "episodes": info["total_episodes"],
+        "steps": info["total_frames"],
+        "controller_id": collection.get("controller_id", ""),
+    }
+
+
+def _train_figures(folder: Path) -> dict[str, Any]:
+    manifest = read_manifest(folder / ARTIFACT)
+    return {"step": manifest["step"], "tasks": manifest["heldout_tasks"]}
+
+
+def _ppo_figures(folder: Path) -> dict[str, Any]:
+    policy = ReactiveNetwork.load(folder / "checkpoints" / "last" / PPO_POLICY)
+    return {name: policy.provenance[name] for name in ("steps", "episodes")}
+
+
+def _ppo_digest(folder: Path) -> str:
+    """Of the policies of all checkpoints."""
+    checkpoints = sorted(p for p in (folder / "checkpoints").iterdir() if p.name.isdigit())
+    lines = [f"{p.name} {sha256(p / PPO_POLICY)}" for p in checkpoints]
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()
+
+
+def _eval_figures(folder: Path) -> dict[str, Any]:
+    """Task -> controller -> figures; ``played`` has a column per episode quantity."""
+    run = read_json(folder / "eval_run.json")["episodes"]
+    return {
+        task: {name: {**row, "played": _columns(run[task][name])} for name, row in rows.items()}
+        for task, rows in read_json(folder / "eval.json").items()
+    }
+
+
+def _columns(episodes: list[Mapping[str, Any]]) -> dict[str, Any]:
+    names = ("episode", "steps", "reward", "success")
+    columns: dict[str, Any] = {name: [episode[name] for episode in episodes] for name in names}
+    if "parts" in episodes[0]:
+        parts = episodes[0]["parts"]
+        columns["parts"] = {part: [e["parts"][part] for e in episodes] for part in parts}
+    return columns
+
+
+def _resume_from_checkpoint(folder: Path) -> Flags | None:
+    return {"resume": True} if (folder / "checkpoints" / "last").exists() else None
+
+
+COLLECT: Final = CellCommand(
+    module="egovcp_collect.collect",
+    output="dataset.root",
+    figures=_collect_figures,
+    digest=lambda folder: sha256(folder / HASHES_PATH),
+    resume_flags=lambda folder: {"resume": True} if folder.exists() else None,
+    prog="egovcp-collect",
+)
+TRAIN: Final = CellCommand(
+    module="egovcp_train.train",
+    output="output_dir",
+    figures=_train_figures,
+    digest=lambda folder: _artifact_digest(folder / ARTIFACT),
+    resume_flags=_resume_from_checkpoint,
+    prog="egovcp-train",
+    uses_gpu=True,
+)
+TRAIN_PPO: Final = CellCommand(
+    module="egovcp_train.ppo.train",
+    output="output_dir",
+    figures=_ppo_figures,
+    digest=_ppo_digest,
+    resume_flags=_resume_from_checkpoint,
+    prog="egovcp-train-ppo",
+    packages=("rsl_rl", "tensordict"),
+    uses_gpu=True,
+)
+PLAY: Final = CellCommand(
+    module="egovcp_deploy.evaluate",
+    output="output_dir",
+    figures=_eval_figures,
+    digest=lambda folder: sha256(folder / "eval_run.json"),
+    prog="egovcp-eval",
+)
+
+
+def study(name: str, exclusive: bool = False) -> CellCommand:
+    """The study ``egovcp_experiment.studies.NAME``."""
+    return CellCommand(
+        module=f"egovcp_experiment.studies.{name}",
+        output="output_dir",
+        figures=lambda folder: dict(read_json(folder / RESULT)),
+        digest=lambda folder: sha256(folder / RESULT),
+        exclusive=exclusive,
+    )

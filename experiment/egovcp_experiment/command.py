@@ -1,10 +1,10 @@
-"""`egovcp-experiment NAME --output_dir=... [--NAME=VALUE ...]`: one of the paper's experiments."""
+"""`egovcp-experiment NAME --output_dir=... [--NAME=VALUE ...]`: run one of the experiments."""
 
 from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -20,15 +20,13 @@ from egovcp.hub import is_local_path
 from egovcp.packages import require_packages
 from egovcp.terminal import echo
 from egovcp_experiment.cell import Cell, in_order
-from egovcp_experiment.cluster import RayRunner
-from egovcp_experiment.config import ExperimentConfig
+from egovcp_experiment.config import SCALES, ExperimentConfig
 from egovcp_experiment.experiments import EXPERIMENTS
-from egovcp_experiment.local import LocalRunner
-from egovcp_experiment.report.publish import publish
-from egovcp_experiment.runner import Runner
-from egovcp_experiment.scales import SCALES
-from egovcp_experiment.schedule import Schedule
-from egovcp_experiment.store import Store
+from egovcp_experiment.local_runner import LocalRunner
+from egovcp_experiment.ray_runner import RayRunner
+from egovcp_experiment.report import publish
+from egovcp_experiment.scheduler import CellScheduler
+from egovcp_experiment.store import CellStore
 
 PROG: Final = "egovcp-experiment"
 _EPILOG: Final = (
@@ -53,10 +51,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def scale_of(argv: Sequence[str]) -> Mapping[str, Any]:
-    """What stands where no flag says otherwise: the configuration of the scale.
+    """Defaults of all options: the configuration of the scale in ``argv``.
 
     Raises:
-        UsageError: a config file, which says everything itself, would hide it.
+        UsageError: the scale is unknown, or a config file would override it.
     """
     given = dict(a.removeprefix("--").split("=", 1) for a in argv if "=" in a)
     if "config_path" in given:
@@ -70,10 +68,10 @@ def scale_of(argv: Sequence[str]) -> Mapping[str, Any]:
 
 
 def execute(config: ExperimentConfig, name: str, command: str) -> None:
-    """Run what is missing, and write the report of what is there, also when it was stopped.
+    """Run the missing cells and write the report, also after an interruption.
 
     Raises:
-        UsageError: an option makes no sense, or results of other settings are there.
+        UsageError: an option is invalid, or results of other settings are stored.
         EnvironmentFailure: a package is missing, cells failed, or the folder cannot be used.
         KeyboardInterrupt: after SIGINT or SIGTERM.
     """
@@ -81,34 +79,30 @@ def execute(config: ExperimentConfig, name: str, command: str) -> None:
     require_given(config)
     experiment = EXPERIMENTS[name]
     cells = in_order(experiment.cells(config))
-    store = Store(Path(config.output_dir))
-    say = echo
-    with store.locked(), closing(_runner(config, say)) as runner:
-        schedule = Schedule(cells, store, config.jobs, say, runner)
+    store = CellStore(Path(config.output_dir))
+    with store.locked(), closing(_runner(config)) as runner:
+        scheduler = CellScheduler(cells, store, config.jobs, echo, runner)
+        records = scheduler.records
         if config.backend == "local":
-            missing_cells = [cell for cell in cells if cell.name not in schedule.records]
-            _require_packages(missing_cells)
-        echo(f"{PROG} {name}: {len(cells)} cells, {len(schedule.records)} complete")
+            _require_packages([cell for cell in cells if cell.name not in records])
+        echo(f"{PROG} {name}: {len(cells)} cells, {len(records)} complete")
         try:
-            schedule.run()
+            scheduler.run()
         finally:
-            records = {
-                c.name: schedule.records[c.name] for c in cells if c.name in schedule.records
-            }
+            complete = {c.name: records[c.name] for c in cells if c.name in records}
             missing = [cell.name for cell in cells if cell.name not in records]
-            report = experiment.report(config, records)
+            report = experiment.report(config, complete)
             encoded = draccus.encode(config)
-            publish(store.folder, name, report, records, missing, encoded, command)
+            publish(store.folder, name, report, complete, missing, encoded, command)
     for line in report.shows:
         echo(f"- {line}")
     echo(f"report: {store.folder / name}.html, .md, .json")
 
 
 def require_given(config: ExperimentConfig) -> None:
-    """Refuse datasets and policies that the user named and that cannot be used.
+    """Refuse unusable `data.roots` and `train.policies` before any cell runs.
 
-    Otherwise the first cell that needs one would fail, hours later perhaps. Policies on the Hub
-    are left to their cells.
+    Policies on the Hub are checked by their cells.
 
     Raises:
         UsageError: a folder is not named.
@@ -128,7 +122,7 @@ def require_given(config: ExperimentConfig) -> None:
 
 @contextmanager
 def _naming(option: str) -> Iterator[None]:
-    """Put the option before the message of an error."""
+    """Prefix errors with the option."""
     try:
         yield
     except EgovcpError as error:
@@ -136,28 +130,22 @@ def _naming(option: str) -> Iterator[None]:
 
 
 def _require_packages(cells: Sequence[Cell]) -> None:
-    """Refuse cells whose commands would end for a missing package, hours later perhaps."""
-    for tool in dict.fromkeys(cell.tool for cell in cells):
-        require_packages("egovcp-experiment", tool.prog or tool.module, *tool.packages)
+    """Raise `EnvironmentFailure` if a command lacks an optional package."""
+    for command in dict.fromkeys(cell.command for cell in cells):
+        require_packages("egovcp-experiment", command.shell_name, *command.packages)
 
 
-def _runner(config: ExperimentConfig, say: Callable[[str], None]) -> Runner:
-    return RayRunner(config.ray, say) if config.backend == "ray" else LocalRunner(config.jobs)
+def _runner(config: ExperimentConfig) -> RayRunner | LocalRunner:
+    return RayRunner(config.ray, echo) if config.backend == "ray" else LocalRunner(config.jobs)
 
 
 def _help() -> str:
     width = max(map(len, EXPERIMENTS))
-    lines = [f"  {name:{width}}  {entry.summary}" for name, entry in EXPERIMENTS.items()]
-    return "\n".join(
-        [
-            f"usage: {PROG} NAME --output_dir=... [--scale=smoke|small|paper] [--NAME=VALUE ...]",
-            "",
-            "Run one of the paper's experiments, cell by cell, and write its report.",
-            "",
-            *lines,
-            "",
-            f"`{PROG} NAME --help` explains the options.",
-        ]
+    listed = "\n".join(f"  {name:{width}}  {e.SUMMARY}" for name, e in EXPERIMENTS.items())
+    return (
+        f"usage: {PROG} NAME --output_dir=... [--scale=smoke|small|paper] [--NAME=VALUE ...]\n\n"
+        f"Run one of the paper's experiments, cell by cell, and write its report.\n\n{listed}\n\n"
+        f"`{PROG} NAME --help` explains the options."
     )
 
 

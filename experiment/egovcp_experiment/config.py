@@ -1,9 +1,10 @@
-"""The options of `egovcp-experiment`: what a scale stands for, and what flags may change."""
+"""Options of `egovcp-experiment`, and the complete configurations that `--scale` selects."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Final, Literal
 
 from egovcp.bounds import bounded, check_bounds, require_cores
 from egovcp.errors import UsageError, suggest
@@ -14,59 +15,56 @@ Scale = Literal["smoke", "small", "paper"]
 
 @dataclass(frozen=True)
 class EpisodesConfig:
-    """A number of episodes for each task."""
+    """Number of episodes per task."""
 
     ball: int = bounded(1334, least=1, most=1_000_000)
-    """Of the ball task, 150 ticks each where no flag says otherwise."""
+    """Episodes of the ball task, by default of 150 ticks each."""
     wall: int = bounded(1334, least=1, most=1_000_000)
-    """Of the wall task, likewise."""
+    """Episodes of the wall task, by default of 150 ticks each."""
     arch: int = bounded(870, least=1, most=1_000_000)
-    """Of the arch task, 230 ticks each."""
+    """Episodes of the arch task, by default of 230 ticks each."""
 
 
 @dataclass(frozen=True)
 class DataConfig:
-    """The random data that models are trained on."""
+    """Random data that models are trained on."""
 
     episodes: EpisodesConfig = field(default_factory=EpisodesConfig)
     """Episodes to collect."""
     seed: int = bounded(0, least=0)
     """Seed of the collection."""
     parts: tuple[float, ...] = bounded((0.125, 0.25, 0.5, 1.0), above=0)
-    """Shares of the episodes that models are trained on in sample-efficiency, ascending; above 1,
-    more are collected for it."""
+    """Shares of the episodes that sample-efficiency trains on, ascending; above 1, more episodes
+    are collected for it."""
     roots: dict[str, str] = field(default_factory=dict)
-    """Datasets that are there already, '{ball: data/ball}'; they are not collected again."""
+    """Existing datasets per task, '{ball: data/ball}', instead of collecting."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-collect, '[--num_envs=8]'."""
 
 
 @dataclass(frozen=True)
 class TrainingConfig:
-    """How models are trained."""
+    """Training of the world models."""
 
     preset: Literal["default", "paper", "debug"] = "default"
-    """Starting point of all options of egovcp-train."""
+    """Preset of egovcp-train."""
     steps: int = bounded(20_000, least=1)
     """Gradient steps of a model."""
     max_minutes: float = bounded(0.0, least=0)
     """Wall-clock limit of a training, minutes; 0: none."""
     compared_steps: int = bounded(20_000, least=1)
-    """Gradient steps, without a limit of time, where choices of training are compared."""
+    """Gradient steps, without a time limit, of models that table1 and ablations compare."""
     seeds: tuple[int, ...] = bounded((0,), least=0)
-    """Every model is trained once with each of these."""
+    """Training seeds; every model is trained once with each."""
     policies: dict[str, str] = field(default_factory=dict)
-    """Artifacts that are there already, '{ball: RUN/checkpoints/last/pretrained_model}', in the
-    place of the default model of that task (all: of the multi-task model) under every seed."""
+    """Existing policies per task (all: the multi-task model) instead of training the default model,
+    '{ball: RUN/checkpoints/last/pretrained_model}'; used for every seed."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-train."""
-    task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """Flags after those for the models of one task (all: of the multi-task model), '{wall:
-    [--batch_size=32]}'."""
 
     @property
     def budget(self) -> str:
-        """For how long a model is trained, in words."""
+        """Length of a training in words."""
         if self.max_minutes:
             return f"{self.max_minutes:g} minutes"
         return f"{self.steps} gradient steps"
@@ -74,55 +72,51 @@ class TrainingConfig:
 
 @dataclass(frozen=True)
 class PlayConfig:
-    """The closed-loop episodes."""
+    """Closed-loop episodes."""
 
     episodes: int = bounded(100, least=1, most=1_000_000)
-    """Scenarios of each task; all variants play the same."""
+    """Scenarios of each task; all variants play the same ones."""
     seed: int = bounded(0, least=0)
-    """Which held-out scenarios."""
+    """Seed of the held-out scenarios."""
     branches: int = bounded(12, least=2, most=10_000)
-    """Random walks from each step of a plan, whose mean return is what the step is worth."""
+    """Random walks from each step of a plan, whose mean return is the target of Q in variance."""
     budget_ms: float = bounded(40.0, above=0)
-    """Time for a plan, where searches are compared on equal time, ms."""
+    """Time per plan for the searches that planners compares, ms."""
     flags: tuple[str, ...] = ()
-    """Further flags of egovcp-eval; studies that play take those of the planner, too."""
-    task_flags: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    """Flags after those where the model of one task plays (all: the multi-task model), '{ball:
-    [--planner.action_parameterization=target]}'."""
+    """Further flags of egovcp-eval; studies in simulation use those of the planner."""
 
 
 @dataclass(frozen=True)
-class PpoConfig:
-    """The model-free baseline, in ppo and sample-efficiency."""
+class PpoBaselineConfig:
+    """The model-free baseline of ppo and sample-efficiency."""
 
     steps: int = bounded(200_000, least=0)
     """Transitions of a training, rounded to whole updates between policies; 0: no PPO in
     sample-efficiency."""
     policies: int = bounded(4, least=1, most=10_000)
-    """Policies along a training that are played, equally far apart; the last is that of its
-    end."""
+    """Policies that are evaluated, at equal distances along a training, the last at its end."""
     robots: int = bounded(32, least=1, most=65_536)
-    """Robots simulated side by side."""
+    """Robots simulated in parallel."""
     ticks: int = bounded(50, least=1, most=100_000)
-    """Ticks of each robot from one update to the next."""
+    """Ticks of each robot between two updates."""
     flags: tuple[str, ...] = ()
     """Further flags of egovcp-train-ppo, '[--ppo.entropy_coef=0.01]'."""
 
     @property
     def updates(self) -> int:
-        """Updates from one policy to the next."""
+        """Updates between two policies."""
         return max(1, round(self.steps / (self.policies * self.robots * self.ticks)))
 
     @property
     def transitions(self) -> tuple[int, ...]:
-        """What each of the policies has seen."""
+        """Transitions seen by each of the policies."""
         if not self.steps:
             return ()
         each = self.updates * self.robots * self.ticks
         return tuple(each * (k + 1) for k in range(self.policies))
 
     def check(self) -> None:
-        """Raise `UsageError` for values that make no sense."""
+        """Raise `UsageError` for flags that would change which policies are saved."""
         own = ("steps", "robots", "ppo.num_steps_per_env", "save_freq", "max_minutes")
         for flag in self.flags:
             if flag.removeprefix("--").split("=", 1)[0] in own:
@@ -134,68 +128,63 @@ class PpoConfig:
 
 @dataclass(frozen=True)
 class RayConfig:
-    """What a cell is given on a Ray cluster."""
+    """Resources of a cell on a Ray cluster."""
 
     cpus: float = bounded(1.0, above=0)
-    """Processor cores that are set aside for it. Commands see all cores of their node none the
-    less: tell `egovcp-collect --num_workers` and `egovcp-train --threads` with
-    '--data.flags=[--num_workers=8]', '--train.flags=[--threads=8]'."""
+    """CPU cores reserved per cell. Ray does not limit commands to them: set their processes and
+    threads with '--data.flags=[--num_workers=8]', '--train.flags=[--threads=8]'."""
     gpus: float = bounded(0.0, least=0)
-    """GPUs that are set aside for a training; other cells get none."""
+    """GPUs reserved per training; other cells use none."""
 
 
 @dataclass(frozen=True)
 class ExperimentConfig:
     """Run one of the paper's experiments, cell by cell, and write its report.
 
-    A cell that is complete is never run again: the same command goes on where it was stopped, and
-    experiments with the same output folder share datasets and models. --scale says what all other
-    options are, unless they are given.
+    Complete cells are not run again: the same command continues where it was stopped, and
+    experiments with the same output folder share datasets and models. --scale sets the defaults of
+    all other options.
     """
 
     output_dir: str = ""
-    """Folder of cells and reports; may hold those of other experiments of the same options."""
+    """Folder of cells and reports; experiments with the same options can share it."""
     scale: Scale = "small"
-    """smoke: minutes, the figures mean nothing; small: hours on two cores; paper: the paper's."""
+    """smoke: minutes, figures without meaning; small: hours on two cores; paper: the paper's."""
     backend: Literal["local", "ray"] = "local"
-    """Where cells run: processes of this machine; or the Ray cluster of RAY_ADDRESS, all of whose
-    nodes must have --output_dir under the same path."""
+    """Where cells run: local: on this machine; ray: on the Ray cluster of RAY_ADDRESS, whose nodes
+    must all have --output_dir under the same path."""
     jobs: int = bounded(1, least=1, most=1024)
-    """Cells that run side by side; here each on its share of the processor cores."""
+    """Cells that run at the same time; on this machine each on its share of the CPU cores."""
     ray: RayConfig = field(default_factory=RayConfig)
-    """Each cell's share of a Ray cluster."""
+    """Resources of a cell on a Ray cluster."""
     tasks: tuple[str, ...] = TASKS
     """Tasks to learn and play."""
     only: tuple[str, ...] = ()
     """Names of the variants to run; empty: all."""
     most: int = bounded(0, least=0)
-    """Of all, only so many variants; 0: no limit."""
+    """Run only the first variants, at most this many; 0: all."""
     scenes: tuple[str, ...] = ()
-    """Flags of both collection and play, as of `egovcp-collect --env.*`:
-    '[--env.controller=stance]'."""
+    """Scene flags of both collection and evaluation, '[--env.controller=stance]'."""
     data: DataConfig = field(default_factory=DataConfig)
     """Data."""
     train: TrainingConfig = field(default_factory=TrainingConfig)
     """Training."""
-    ppo: PpoConfig = field(default_factory=PpoConfig)
+    ppo: PpoBaselineConfig = field(default_factory=PpoBaselineConfig)
     """The model-free baseline."""
     play: PlayConfig = field(default_factory=PlayConfig)
     """Closed loop."""
 
     def check(self) -> None:
-        """Raise `UsageError` for values that make no sense."""
+        """Raise `UsageError` for invalid values."""
         if not self.output_dir:
             raise UsageError("--output_dir is missing; name the folder of cells and reports")
         check_bounds(self, "--")
         if self.backend == "local":
             require_cores("--jobs", self.jobs)
-        models = (*TASKS, "all")
         for option, given, known in (
             ("tasks", self.tasks, TASKS),
             ("data.roots", self.data.roots, TASKS),
-            ("train.policies", self.train.policies, models),
-            ("train.task_flags", self.train.task_flags, models),
-            ("play.task_flags", self.play.task_flags, models),
+            ("train.policies", self.train.policies, (*TASKS, "all")),
         ):
             for task in given:
                 if task not in known:
@@ -216,13 +205,104 @@ class ExperimentConfig:
         self.ppo.check()
 
     def chosen[T](self, variants: dict[str, T]) -> dict[str, T]:
-        """Those of the variants that `only` names, or the first `most`.
+        """The variants that `only` names, or the first `most`.
 
         Raises:
-            UsageError: one of the names is unknown.
+            UsageError: a name is unknown.
         """
         for name in self.only:
             if name not in variants:
                 raise UsageError(f"unknown variant --only={name}{suggest(name, variants)}")
         names = self.only or tuple(variants)[: self.most or None]
         return {name: variants[name] for name in variants if name in names}
+
+
+def smoke() -> ExperimentConfig:
+    """Every command of an experiment once, in minutes; the figures mean nothing."""
+    return ExperimentConfig(
+        scale="smoke",
+        most=3,
+        scenes=(  # episodes of 1 to 2 s with the cheap controller
+            "--env.controller=stance",
+            "--env.ball_episode.ticks=30",
+            "--env.ball_episode.event_ticks=[2,4]",
+            "--env.wall_episode.ticks=30",
+            "--env.wall_episode.event_ticks=[2,4]",
+            "--env.arch_episode.ticks=50",
+            "--env.arch_episode.event_ticks=[2,4]",
+        ),
+        data=DataConfig(EpisodesConfig(ball=24, wall=24, arch=24), parts=(0.5, 1.0)),
+        train=TrainingConfig(
+            preset="debug",
+            steps=4,
+            compared_steps=4,
+            flags=(
+                "--batch_size=4",
+                "--sampling.length=9",
+                "--returns.steps=6",
+                "--planner.samples=32",
+                "--planner.elites=8",
+                "--tensorboard=false",
+                "--device=cpu",
+                "--threads=1",
+            ),
+        ),
+        ppo=PpoBaselineConfig(
+            steps=64,
+            policies=2,
+            robots=4,
+            ticks=8,
+            flags=("--ppo.num_mini_batches=2", "--tensorboard=false", "--threads=1"),
+        ),
+        play=PlayConfig(
+            episodes=4, branches=2, budget_ms=5.0, flags=("--num_workers=1", "--num_envs=4")
+        ),
+    )
+
+
+def small() -> ExperimentConfig:
+    """Hours on two cores: at most 500 000 random steps per task, ten minutes of training per model,
+    100 paired episodes."""
+    return ExperimentConfig(
+        scale="small",
+        scenes=("--env.controller=stance",),
+        data=DataConfig(
+            EpisodesConfig(ball=5400, wall=4000, arch=870),
+            flags=(  # hands hold each target for a while; throws come early in an episode
+                "--eta=1",
+                "--step_ticks=[5,15]",
+                "--env.ball_episode.ticks=46",
+                "--env.ball_episode.event_ticks=[4,10]",
+            ),
+        ),
+        train=TrainingConfig(
+            max_minutes=10.0,
+            compared_steps=1000,
+            flags=("--eval_freq=0", "--tensorboard=false"),
+        ),
+        # Options were tuned on the scenarios of seeds 0, 1 and 3. 12 ms are 64 candidates on one
+        # core without AVX-512.
+        play=PlayConfig(seed=2, branches=6, budget_ms=12.0),
+    )
+
+
+def paper() -> ExperimentConfig:
+    """The paper's scale, for a GPU: 500 000 random steps per task, three training seeds."""
+    return ExperimentConfig(
+        scale="paper",
+        data=DataConfig(
+            EpisodesConfig(ball=3334, wall=3334, arch=2174), parts=(0.1, 0.2, 0.5, 1.0, 2.0)
+        ),
+        train=TrainingConfig(
+            steps=100_000, compared_steps=100_000, seeds=(0, 1, 2), flags=("--eval_freq=0",)
+        ),
+        ppo=PpoBaselineConfig(steps=5_000_000, policies=10),
+        play=PlayConfig(episodes=300),
+    )
+
+
+SCALES: Final[Mapping[Scale, Callable[[], ExperimentConfig]]] = {
+    "smoke": smoke,
+    "small": small,
+    "paper": paper,
+}

@@ -1,8 +1,8 @@
-"""The output folder: a result for every finished cell, which is never made twice.
+"""The output folder of experiments, with one result per complete cell.
 
-cells/NAME.json   the result: settings, figures, minutes, command, hashes
-work/NAME/        what the command wrote
-logs/NAME.log     what it printed
+cells/NAME.json   result: settings, figures, minutes, command, hashes
+work/NAME/        output of the command
+logs/NAME.log     standard output and error of the command
 """
 
 from __future__ import annotations
@@ -13,41 +13,42 @@ import shlex
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
 from egovcp.data.destination import writer_lock
 from egovcp.errors import EnvironmentFailure, UsageError
 from egovcp.files import write_json
-from egovcp_experiment.cell import Cell, Found, Given, Output, Reference, filled, written
-from egovcp_experiment.tools import given_digest, read_json
-
-type Record = Mapping[str, Any]
-"""The result of a cell."""
+from egovcp_experiment.cell import (
+    Cell,
+    CellFigure,
+    CellOutput,
+    ExternalPath,
+    Record,
+    Reference,
+    external_digest,
+    read_json,
+    resolve,
+    to_argv,
+)
+from egovcp_experiment.local_runner import versions
 
 _CELLS: Final = "cells"
-_PACKAGES: Final = ("egovcp", "torch", "numpy", "mujoco")
 
 
-def versions() -> dict[str, str]:
-    """What decides about figures beside the flags: package -> version."""
-    return {name: version(name) for name in _PACKAGES}
-
-
-class Store:
-    """The results of cells in one folder."""
+class CellStore:
+    """Results of cells in one folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
 
     @contextmanager
     def locked(self) -> Iterator[None]:
-        """Create the folder, and keep others from working in it.
+        """Create the folder and lock it against other experiments.
 
         Raises:
-            UsageError: it holds something else.
-            EnvironmentFailure: another process works in it, or it cannot be made.
+            UsageError: the folder has other content.
+            EnvironmentFailure: another process uses it, or it cannot be created.
         """
         folder = self.folder
         if folder.exists() and not folder.is_dir():
@@ -63,22 +64,18 @@ class Store:
         with writer_lock(folder, folder / _CELLS):
             yield
 
-    def work(self, cell: Cell) -> Path:
-        """The folder of a cell's command."""
-        return self.folder / "work" / cell.name
-
     def log(self, cell: Cell) -> Path:
-        """What the command of a cell printed."""
+        """The log file of a cell."""
         return self.folder / "logs" / f"{cell.name}.log"
 
-    def kept(self, cell: Cell, known: Mapping[str, Record]) -> Record | None:
-        """The result of a cell, if it is there.
+    def load(self, cell: Cell, known: Mapping[str, Record]) -> Record | None:
+        """The result of a cell, or None.
 
         Args:
             known: results of the cells that it needs.
 
         Raises:
-            UsageError: it was made with other settings.
+            UsageError: the stored result has other settings.
         """
         path = self._path(cell)
         if not path.exists():
@@ -93,19 +90,19 @@ class Store:
         return record
 
     def settings(self, cell: Cell, known: Mapping[str, Record]) -> dict[str, Any]:
-        """All that the figures of a cell depend on; folders count by what is in them."""
+        """All that the figures of a cell depend on; folders are identified by their hashes."""
 
         def identity(reference: Reference) -> Any:
-            if isinstance(reference, Output):
-                made = known[reference.cell]["sha256"]
-                return {"cell": reference.cell, "path": reference.path, "sha256": made}
-            if isinstance(reference, Given):
-                return {"sha256": given_digest(reference.path)}
+            if isinstance(reference, CellOutput):
+                digest = known[reference.cell]["sha256"]
+                return {"cell": reference.cell, "path": reference.path, "sha256": digest}
+            if isinstance(reference, ExternalPath):
+                return {"sha256": external_digest(reference.path)}
             return _figure(known, reference)
 
         settings = {
-            "module": cell.tool.module,
-            "flags": filled(cell.flags, identity),
+            "module": cell.command.module,
+            "flags": resolve(cell.flags, identity),
             "extra": list(cell.extra),
             "versions": versions(),
         }
@@ -113,45 +110,39 @@ class Store:
         return through_json
 
     def prepare(self, cell: Cell, known: Mapping[str, Record]) -> list[str]:
-        """The arguments of a cell's command; what an attempt left is continued or removed."""
+        """Arguments of a cell's command; an interrupted run is resumed, or else removed."""
 
-        def place(reference: Reference) -> Any:
-            if isinstance(reference, Output):
-                return str(self.folder / "work" / reference.cell / reference.path)
-            if isinstance(reference, Given):
+        def location(reference: Reference) -> Any:
+            if isinstance(reference, CellOutput):
+                return str(self._work(reference.cell) / reference.path)
+            if isinstance(reference, ExternalPath):
                 return reference.path
             return _figure(known, reference)
 
-        work = self.work(cell)
-        more = cell.tool.continued(work)
-        if more is None:
+        work = self._work(cell.name)
+        resume_flags = cell.command.resume_flags(work)
+        if resume_flags is None:
             shutil.rmtree(work, ignore_errors=True)
-        work.parent.mkdir(parents=True, exist_ok=True)
-        self.log(cell).parent.mkdir(parents=True, exist_ok=True)
-        flags = {cell.tool.output: str(work)} | dict(filled(cell.flags, place)) | dict(more or {})
-        return [*written(flags), *cell.extra]
+        for folder in (work.parent, self.log(cell).parent):
+            folder.mkdir(parents=True, exist_ok=True)
+        flags = {cell.command.output: str(work), **resolve(cell.flags, location)}
+        return [*to_argv({**flags, **(resume_flags or {})}), *cell.extra]
 
-    def keep(
-        self,
-        cell: Cell,
-        known: Mapping[str, Record],
-        argv: list[str],
-        minutes: float,
-        surroundings: Mapping[str, Any],
+    def save(
+        self, cell: Cell, known: Mapping[str, Record], argv: list[str], facts: Mapping[str, Any]
     ) -> Record:
-        """Write the result of a cell whose command has ended well."""
+        """Write the result of a cell whose command has succeeded, with ``facts`` of the run."""
         settings = self.settings(cell, known)
-        work = self.work(cell)
-        prog = [cell.tool.prog] if cell.tool.prog else ["python", "-m", cell.tool.module]
+        work = self._work(cell.name)
+        text = json.dumps(settings, sort_keys=True)
         record = {
             "cell": cell.name,
             "settings": settings,
-            "settings_sha256": _hash(settings),
-            "sha256": cell.tool.digest(work),
-            "command": shlex.join([*prog, *argv]),
-            "minutes": minutes,
-            **surroundings,
-            "figures": cell.tool.figures(work),
+            "settings_sha256": hashlib.sha256(text.encode()).hexdigest(),
+            "sha256": cell.command.digest(work),
+            "command": f"{cell.command.shell_name} {shlex.join(argv)}",
+            **facts,
+            "figures": cell.command.figures(work),
         }
         write_json(self._path(cell), record)
         return record
@@ -159,16 +150,15 @@ class Store:
     def _path(self, cell: Cell) -> Path:
         return self.folder / _CELLS / f"{cell.name}.json"
 
+    def _work(self, name: str) -> Path:
+        return self.folder / "work" / name
 
-def _figure(known: Mapping[str, Record], wanted: Found) -> Any:
-    value: Any = known[wanted.cell]["figures"]
-    for key in wanted.keys:
+
+def _figure(known: Mapping[str, Record], reference: CellFigure) -> Any:
+    value: Any = known[reference.cell]["figures"]
+    for key in reference.keys:
         value = value[key]
     return value
-
-
-def _hash(settings: Any) -> str:
-    return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()
 
 
 def _difference(before: Any, now: Any, place: str = "") -> str:

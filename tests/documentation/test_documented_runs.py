@@ -45,7 +45,7 @@ _ELSEWHERE = {
     "--backend=ray": "tests/collect/test_cluster.py",
     "--robot.type=unitree_g1": "tests/deploy/robots/test_fake_command.py",
     "--realtime": "tests/deploy/live/test_drive.py",
-    "--controllers=planner,ppo": "tests/experiment/test_ppo.py",
+    "--controllers=planner,ppo": "tests/experiment/experiments/test_ppo.py",
     "egovcp-dataset audit": "tests/collect/dataset/test_audit.py",
 }
 #: Repository on the fake Hub -> folder.

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from egovcp.files import sha256
-from egovcp_experiment.cell import Cell, Tool
-from egovcp_experiment.tools import read_json
+from egovcp_experiment.cell import Cell, CellCommand, read_json
 
 _COMMAND = """
 import json, sys, time
@@ -45,23 +43,6 @@ type MakeCell = Callable[..., Cell]
 
 
 @pytest.fixture
-def trained() -> Callable[[str, float], Mapping[str, Any]]:
-    """Makes the record of a training on a task, whose Q explains so much of the returns."""
-
-    def make(task: str, r2: float) -> Mapping[str, Any]:
-        errors = {str(k): {"model_mm": 1.0, "repeat_mm": 4.0} for k in (4, 8)}
-        found = {
-            "depth": dict.fromkeys(("moving", "near", "valid"), errors),
-            "state": {"joint_position": {"4": {"model": 2.0, "repeat": 3.0}}},
-            "termination": {"5": {"auc": None}},
-            "value": {"r2": r2, "slope": 1.0},
-        }
-        return {"figures": {"tasks": {task: found}}}
-
-    return make
-
-
-@pytest.fixture
 def diary(tmp_path: Path) -> Path:
     """Every run of the command adds a line: its cell, and how it was resumed."""
     return tmp_path / "diary.txt"
@@ -72,12 +53,12 @@ def cell(tmp_path: Path, diary: Path, monkeypatch: pytest.MonkeyPatch) -> MakeCe
     """Makes cells that add numbers; keyword arguments are flags."""
     (tmp_path / "quick_command.py").write_text(_COMMAND)
     monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
-    tool = Tool(
+    tool = CellCommand(
         module="quick_command",
         output="output_dir",
         figures=lambda folder: dict(read_json(folder / "result.json")),
         digest=lambda folder: sha256(folder / "result.json"),
-        continued=lambda folder: {"resume": True} if (folder / "checkpoint").exists() else None,
+        resume_flags=lambda folder: {"resume": True} if (folder / "checkpoint").exists() else None,
     )
 
     def make(name: str, **flags: object) -> Cell:

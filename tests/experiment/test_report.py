@@ -1,4 +1,4 @@
-"""Reports: the same in three forms, and the page needs nothing else."""
+"""Reports have the same content in three forms; the page is self-contained."""
 
 from __future__ import annotations
 
@@ -7,9 +7,7 @@ import re
 from pathlib import Path
 from typing import Any
 
-from egovcp_experiment.report.document import Report, Table
-from egovcp_experiment.report.publish import publish
-from egovcp_experiment.report.svg import drawn
+from egovcp_experiment.report import ExperimentReport, Table, draw, publish
 
 RECORD: dict[str, Any] = {
     "command": "egovcp-train --steps=3",
@@ -25,10 +23,10 @@ RECORD: dict[str, Any] = {
 }
 
 
-def _report() -> Report:
-    plot = drawn("curve", "a curve & more", lambda figure: figure.subplots().plot([1, 2]))
+def _report() -> ExperimentReport:
+    plot = draw("curve", "a curve & more", lambda figure: figure.subplots().plot([1, 2]))
     table = Table("rows", ("name", "value"), (("a|b", "`x<1`"),))
-    return Report("Title <1>", ("ours is **worse**",), ("text", table, plot), {"x": 1.5})
+    return ExperimentReport("Title <1>", ("ours is **worse**",), ("text", table, plot), {"x": 1.5})
 
 
 def _publish(folder: Path, scale: str = "small", missing: tuple[str, ...] = ()) -> None:
@@ -36,7 +34,7 @@ def _publish(folder: Path, scale: str = "small", missing: tuple[str, ...] = ()) 
     publish(folder, "test", _report(), {"cell": RECORD}, missing, {"scale": scale}, command)
 
 
-def test_three_forms_say_the_same(tmp_path: Path) -> None:
+def test_three_forms_have_the_same_content(tmp_path: Path) -> None:
     _publish(tmp_path)
     content = json.loads((tmp_path / "test.json").read_text())
     text = (tmp_path / "test.md").read_text()
@@ -65,7 +63,7 @@ def test_drawings_are_reproducible() -> None:
     assert _report().parts[2] == _report().parts[2]
 
 
-def test_smoke_and_missing_cells_are_said_first(tmp_path: Path) -> None:
+def test_smoke_and_missing_cells_come_first(tmp_path: Path) -> None:
     _publish(tmp_path, "smoke", ("other",))
     shows = json.loads((tmp_path / "test.json").read_text())["shows"]
     assert "mean nothing" in shows[0]

@@ -1,5 +1,5 @@
-"""Scenes that no model was trained on: other things, other sizes, noise and delay, and several
-tasks in one episode (figure 4a)."""
+"""Scenes that no model was trained on: other objects, sizes, noise and delay, and several tasks in
+one episode (figure 4a)."""
 
 from __future__ import annotations
 
@@ -10,28 +10,22 @@ from typing import Any, Final
 from egovcp.robot.controllers import WALK, make_controller
 from egovcp.sim.config import STANDING_PUSHES, STEPPING_PUSHES
 from egovcp.sim.scenario import SEQUENCE
+from egovcp_experiment import results
 from egovcp_experiment.cell import Cell, Flags
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.experiment import Experiment
 from egovcp_experiment.grid import ALL, Grid, Variant
-from egovcp_experiment.outcomes import Outcome, outcome
-from egovcp_experiment.report.document import (
-    Plot,
-    Report,
-    Table,
-    percent,
-    percent_range,
-    points_range,
-)
-from egovcp_experiment.report.svg import drawn
-from egovcp_experiment.store import Record
+from egovcp_experiment.report import ExperimentReport, Part, Table, percent
 
-#: What the conditions of a task are compared with: the first of them.
+SUMMARY: Final = (
+    "unseen boxes, sizes, speeds, walls and arches; noise and delay; several tasks in one episode "
+    "(fig. 4a)"
+)
+#: The first condition of a task, which the others are compared with.
 TRAINED: Final = "as_trained"
 _REFERENCES: Final = ("hold", "oracle")
 
 #: Conditions of every task. Training has noise of 0.001 to 0.004 z^2, up to 1 % holes, actions
-#: that take effect 0 to 2 ticks of 20 ms late, and pictures 20 to 80 ms old.
+#: delayed by 0 to 2 ticks of 20 ms, and images 20 to 80 ms old.
 _SENSING: Final[dict[str, Flags]] = {
     "noise_x4": {"env.camera.noise_per_z2": [0.008, 0.016]},
     "holes_10": {"env.camera.hole_probability": [0.1, 0.1]},
@@ -67,7 +61,7 @@ _OWN: Final[dict[str, dict[str, Flags]]] = {
         "faster": {"env.arch.speed_range": [0.55, 0.65]},
     },
 }
-#: Conditions of a sequence, which no model is trained on: the first is made of scenes that one is.
+#: Conditions of a sequence of tasks; the first has only scenes of training.
 _SEQUENCES: Final[dict[str, Flags]] = {
     "arch_then_ball": {"env.sequence.parts": ["arch", "ball"]},
     "arch_then_box": {"env.sequence.parts": ["arch", "ball"], "env.ball.shape": "box"},
@@ -79,16 +73,16 @@ _SEQUENCES: Final[dict[str, Flags]] = {
 
 
 @dataclass(frozen=True)
-class _Played:
-    """The outcomes in one condition."""
+class _Condition:
+    """Scores in one condition."""
 
-    planner: Outcome
-    references: dict[str, Outcome]
+    planner: results.EvalScores
+    references: dict[str, results.EvalScores]
 
 
 def conditions(config: ExperimentConfig, task: str) -> dict[str, Flags]:
-    """Condition -> the flags of scenes in which it differs from training, the first not at all; of
-    a sequence those whose parts are all among the tasks."""
+    """Condition -> changed flags of scenes, none for the first; of a sequence those whose parts are
+    all among the tasks."""
     if task == SEQUENCE:
         return {
             name: flags
@@ -97,20 +91,20 @@ def conditions(config: ExperimentConfig, task: str) -> dict[str, Flags]:
         }
     own = {TRAINED: {}, **_OWN[task]}
     if task == "wall":
-        low, high = _pushes(config)
+        low, high = _push_speeds(config)
         own["harder"] = {"env.wall.push_speed_range": [high, high + (high - low) / 2]}
     return {**own, **_SENSING}
 
 
-def _pushes(config: ExperimentConfig) -> tuple[float, float]:
-    """What the controller of the scenes is pushed with, m/s."""
+def _push_speeds(config: ExperimentConfig) -> tuple[float, float]:
+    """Range of push speeds for the low-level controller, m/s."""
     scenes = dict(flag.removeprefix("--").split("=", 1) for flag in config.scenes)
     walks = make_controller(scenes.get("env.controller", WALK)).walks
     return STEPPING_PUSHES if walks else STANDING_PUSHES
 
 
 def _chosen(config: ExperimentConfig) -> dict[str, dict[str, Flags]]:
-    """Task -> its conditions that are asked for and the first, unless none is."""
+    """Task -> its chosen conditions; with --only, also the first one of each task that has any."""
     every = {task: conditions(config, task) for task in (*config.tasks, SEQUENCE)}
     if not config.only:
         return {task: config.chosen(row) for task, row in every.items() if row}
@@ -122,142 +116,97 @@ def _chosen(config: ExperimentConfig) -> dict[str, dict[str, Flags]]:
     }
 
 
-def _plays(config: ExperimentConfig, grid: Grid) -> dict[tuple[str, str], tuple[list[str], str]]:
-    """(task, condition) -> names of the planner's cells, one for each seed, and the references'."""
-    found = {}
-    for task, row in _chosen(config).items():
-        for name, flags in row.items():
-            variant = Variant(f"in_{name}", play=flags)
-            model = ALL if task == SEQUENCE else task
-            planner = [grid.play(task, seed, variant, model).name for seed in config.train.seeds]
-            others = grid.references(task, f"references-{task}-{name}", flags, _REFERENCES)
-            found[task, name] = (planner, others.name)
-    return found
+def _plays(grid: Grid) -> dict[str, dict[str, tuple[list[str], str]]]:
+    """Task -> condition -> names of the planner's cells, one per seed, and of the references'."""
+    return {
+        task: {
+            name: (
+                grid.plays(
+                    task,
+                    Variant(f"in_{name}", play=flags),
+                    ALL if task == SEQUENCE else task,
+                ),
+                grid.references(task, f"references-{task}-{name}", flags, _REFERENCES).name,
+            )
+            for name, flags in row.items()
+        }
+        for task, row in _chosen(grid.config).items()
+    }
 
 
-def _cells(config: ExperimentConfig) -> list[Cell]:
+def cells(config: ExperimentConfig) -> list[Cell]:
     grid = Grid(config)
-    _plays(config, grid)
+    _plays(grid)
     return grid.cells
 
 
-def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
+def report(config: ExperimentConfig, records: results.Records) -> ExperimentReport:
+    plays = _plays(Grid(config))
     shows: list[str] = []
-    parts: list[str | Table | Plot] = [
+    parts: list[Part] = [
         "The model knows scenes `as_trained` only. All conditions draw the same scenarios, so that "
-        "differences are paired. `hold` and `oracle` (scripted, sees the truth, same delays) say "
-        "what a condition asks for: where the oracle fails, too, it may be out of reach."
+        "differences are paired. `hold` and `oracle` (scripted, with the simulator's state and the "
+        "same delays) show how hard a condition is: where the oracle fails, too, it may be "
+        "infeasible."
     ]
-    if SEQUENCE in _chosen(config):
+    if SEQUENCE in plays:
         parts.append(
-            "A sequence is several tasks in one episode, and won if each of them is. It is played "
-            "by the model of all tasks, which is told neither what comes nor when. Each part draws "
-            "what its task draws alone; what a fall keeps from beginning is lost."
+            "A sequence is several tasks in one episode; it succeeds if each of them does. It is "
+            "played by the model of all tasks, whose input names neither tasks nor times. Each "
+            "part draws what its task draws alone; parts after a fall are failures."
         )
     figures: dict[str, Any] = {}
-    plays = _plays(config, Grid(config))
-    for task, row in _chosen(config).items():
+    for task, row in plays.items():
         found = {}
-        for name in row:
-            planner, others = plays[task, name]
-            played = outcome(records, planner, task)
-            if played is not None:
-                known = {r: outcome(records, [others], task, r) for r in _REFERENCES}
-                references = {r: o for r, o in known.items() if o is not None}
-                found[name] = _Played(played, references)
-        if next(iter(row)) in found:
-            parts += [_table(task, found, row), _plot(task, found)]
-            shows += _shows(task, found)
+        for name, (played, references) in row.items():
+            planner = results.eval_scores(records, played, task)
+            if planner is not None:
+                known = results.controller_scores(records, references, task, _REFERENCES)
+                found[name] = _Condition(planner, known)
+        base = next(iter(row))
+        if base in found:
+            planner_scores = {name: each.planner for name, each in found.items()}
+            parts.append(_table(task, found, _chosen(config)[task]))
+            parts.append(results.comparison_plot(f"conditions-{task}", task, planner_scores, base))
+            shows += _conclusions(task, found)
         figures[task] = {
-            name: {
-                "planner": played.planner.figures(),
-                **{r: o.figures() for r, o in played.references.items()},
-            }
-            for name, played in found.items()
+            name: results.figures_of({"planner": each.planner, **each.references})
+            for name, each in found.items()
         }
     title = "Generalisation: scenes that no model was trained on"
-    return Report(title, tuple(shows), tuple(parts), figures)
+    return ExperimentReport(title, tuple(shows), tuple(parts), figures)
 
 
-def _table(task: str, found: Mapping[str, _Played], flags: Mapping[str, Flags]) -> Table:
-    base = next(iter(flags))
-    trained = found[base].planner
-    kinds = list(dict.fromkeys(part for p in found.values() for part in p.planner.parts))
-    rows = []
-    for name, played in found.items():
-        gain, interval = played.planner.success_gain(trained)
-        beside = ("", "") if name == base else (f"{100 * gain:+.1f}", points_range(interval))
-        shares = played.planner.part_rates
-        rows.append(
-            (
-                name,
-                percent(played.planner.success_rate),
-                percent_range(played.planner.success_interval),
-                *beside,
-                *(percent(shares.get(kind)) for kind in kinds),
-                *(_rate(played.references.get(r)) for r in _REFERENCES),
-                " ".join(f"`{k}={v}`" for k, v in flags[name].items()),
-            )
-        )
-    won = (f"planner's {kind}" for kind in kinds)
-    beside = (f"- {base} (points)", "95 %")
-    head = ("condition", "planner", "95 %", *beside, *won, *_REFERENCES, "scene")
-    return Table(f"{task}: success", head, tuple(rows))
+def _table(task: str, found: Mapping[str, _Condition], flags: Mapping[str, Flags]) -> Table:
+    planner = {name: each.planner for name, each in found.items()}
+    kinds = list(dict.fromkeys(part for each in planner.values() for part in each.parts))
+    columns = []
+    for name, each in found.items():
+        rates = each.planner.part_rates
+        rates |= {r: scores.success_rate for r, scores in each.references.items()}
+        scene = " ".join(f"`{k}={v}`" for k, v in flags[name].items())
+        columns.append((*(percent(rates.get(r)) for r in (*kinds, *_REFERENCES)), scene))
+    head = (*(f"planner's {kind}" for kind in kinds), *_REFERENCES, "scene")
+    return results.comparison(task, planner, next(iter(flags))).with_columns(head, columns)
 
 
-def _rate(played: Outcome | None) -> str:
-    return percent(None if played is None else played.success_rate)
-
-
-def _plot(task: str, found: Mapping[str, _Played]) -> Plot:
-    def paint(figure: Any) -> None:
-        axes = figure.subplots()
-        at = list(range(len(found)))
-        planner = [100 * p.planner.success_rate for p in found.values()]
-        ranges = [p.planner.success_interval for p in found.values()]
-        axes.bar(at, planner, color="C0", width=0.6, label="planner")
-        for x, (low, high) in zip(at, ranges, strict=True):
-            axes.plot([x, x], [100 * low, 100 * high], color="0.2", linewidth=1)
-        for reference, mark in zip(_REFERENCES, ("_", "x"), strict=True):
-            known = [
-                (x, p.references.get(reference)) for x, p in zip(at, found.values(), strict=True)
-            ]
-            xs = [x for x, o in known if o is not None]
-            ys = [100 * o.success_rate for _, o in known if o is not None]
-            axes.plot(xs, ys, mark, color="C3", markersize=8, label=reference)
-        axes.set_xticks(at, list(found), rotation=30, ha="right")
-        axes.set(ylabel="success, %", ylim=(0, 103))
-        axes.legend(fontsize=7, loc="lower right")
-
-    return drawn(f"conditions-{task}", f"{task}: success with 95 % intervals", paint, (8.0, 3.4))
-
-
-def _shows(task: str, found: Mapping[str, _Played]) -> list[str]:
+def _conclusions(task: str, found: Mapping[str, _Condition]) -> list[str]:
     (base, first), *others = found.items()
-    trained = first.planner
     worse, same = [], []
-    for name, played in others:
-        gain, (_, high) = played.planner.success_gain(trained)
-        if high < 0:
-            worse.append(f"`{name}` {100 * gain:+.0f}")
+    for name, each in others:
+        gain = each.planner.gain(first.planner)
+        if gain.success_interval[1] < 0:
+            worse.append(f"`{name}` {100 * gain.success:+.0f}")
         else:
             same.append(f"`{name}`")
     scenes = "scenes as trained" if base == TRAINED else f"episodes of `{base}`"
-    lines = [f"{task}: {percent(trained.success_rate)} of {scenes}"]
-    for name, played in found.items():
-        shares = (f"{kind} {percent(r)}" for kind, r in played.planner.part_rates.items())
-        if played.planner.parts:
-            lines.append(f"{task}: parts won in `{name}`: {', '.join(shares)}")
+    lines = [f"{task}: {percent(first.planner.success_rate)} of {scenes}"]
+    for name, each in found.items():
+        rates = ", ".join(f"{kind} {percent(r)}" for kind, r in each.planner.part_rates.items())
+        if rates:
+            lines.append(f"{task}: parts won in `{name}`: {rates}")
     if worse:
         lines.append(f"{task}: worse by more than chance, points: {', '.join(worse)}")
     if same:
         lines.append(f"{task}: no loss beyond chance (95 %) in {', '.join(same)}")
     return lines
-
-
-EXPERIMENT: Final = Experiment(
-    "unseen boxes, sizes, speeds, walls and arches; noise and delay; several tasks in one episode "
-    "(fig. 4a)",
-    _cells,
-    _report,
-)

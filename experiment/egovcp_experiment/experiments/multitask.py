@@ -1,149 +1,106 @@
-"""One model on the data of all tasks against one for each task (figure 6)."""
+"""One model on the data of all tasks against one model per task (figure 6)."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from egovcp.manifest import MANIFEST, read_manifest
+from egovcp_experiment import results
 from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.experiment import Experiment
 from egovcp_experiment.grid import ALL, REFERENCES, Grid, Variant
-from egovcp_experiment.outcomes import Outcome, outcome
-from egovcp_experiment.report.comparison import comparison
-from egovcp_experiment.report.document import Plot, Report, Table, number
-from egovcp_experiment.report.svg import drawn
-from egovcp_experiment.store import Record
-from egovcp_experiment.tools import study
+from egovcp_experiment.report import (
+    ExperimentReport,
+    Part,
+    Plot,
+    draw,
+    number,
+    points_range,
+)
 
-SINGLE: Final = "single"
-MIXED: Final = "mixed"
-_LATENTS: Final = "latents"
-_LATENT_EPISODES: Final = 16  # of each task; states are thinned out anyway
+SUMMARY: Final = "one model on mixed data against one per task; t-SNE of h and z (fig. 6)"
+_LATENT_EPISODES: Final = 16  # per task
 
 
-def _plays(config: ExperimentConfig, grid: Grid) -> dict[str, dict[str, list[str]]]:
-    """Task -> `SINGLE` or `MIXED` -> names of its cells, one for each seed."""
+def _plays(grid: Grid, task: str) -> dict[str, list[str]]:
+    """``single`` and ``mixed`` -> names of their cells, one per seed."""
     return {
-        task: {
-            SINGLE: [grid.play(task, s, Variant(SINGLE)).name for s in config.train.seeds],
-            MIXED: [grid.play(task, s, Variant(MIXED), ALL).name for s in config.train.seeds],
-        }
-        for task in config.tasks
+        "single": grid.plays(task, Variant("single")),
+        "mixed": grid.plays(task, Variant("mixed"), ALL),
     }
 
 
-def _latents(config: ExperimentConfig, grid: Grid) -> str:
-    flags = {
-        **grid.planner(ALL),
-        "policy.path": grid.model(ALL, config.train.seeds[0]),
-        "tasks": list(config.tasks),
-        "episodes": min(config.play.episodes, _LATENT_EPISODES),
-        "seed": config.play.seed,
-    }
-    return grid.add(Cell(_LATENTS, study("latents"), flags, config.scenes)).name
-
-
-def _cells(config: ExperimentConfig) -> list[Cell]:
+def cells(config: ExperimentConfig) -> list[Cell]:
     grid = Grid(config)
-    _plays(config, grid)
+    for task in config.tasks:
+        _plays(grid, task)
     for task in config.tasks:
         grid.references(task)
-    _latents(config, grid)
+    episodes = min(config.play.episodes, _LATENT_EPISODES)
+    grid.sim_study("latents", ALL, {"tasks": list(config.tasks), "episodes": episodes})
     return grid.cells
 
 
-def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
+def report(config: ExperimentConfig, records: results.Records) -> ExperimentReport:
+    grid = Grid(config)
     shows: list[str] = []
-    parts: list[str | Table | Plot] = [f"{_lengths(config)}{_planners(config)}"]
+    tables: list[Part] = []
     figures: dict[str, Any] = {}
     levels: dict[str, dict[str, float]] = {}
-    for task, cells in _plays(config, Grid(config)).items():
-        found = {k: o for k, v in cells.items() if (o := outcome(records, v, task)) is not None}
-        others = {
-            r: o
-            for r in REFERENCES
-            if (o := outcome(records, [f"references-{task}"], task, r)) is not None
-        }
-        figures[task] = {name: o.figures() for name, o in {**found, **others}.items()}
-        if found:
-            parts.append(comparison(task, {**found, **others}, SINGLE))
-        if len(found) == 2:
-            shows.append(_line(task, found))
-        if "oracle" in others and "random" in others:
-            levels[task] = {name: _level(o, others) for name, o in found.items()}
+    for task in config.tasks:
+        scores = results.all_scores(records, _plays(grid, task), task)
+        references = results.controller_scores(records, f"references-{task}", task, REFERENCES)
+        figures[task] = results.figures_of({**scores, **references})
+        if scores:
+            tables.append(results.comparison(task, {**scores, **references}, "single"))
+        if len(scores) == 2:
+            shows.append(_conclusion(task, scores))
+        if {"oracle", "random"} <= references.keys():
+            levels[task] = {name: _level(each, references) for name, each in scores.items()}
             figures[task]["normalised"] = levels[task]
-    if levels:
-        parts.insert(1, _levels_plot(levels))
-    if _LATENTS in records:
-        latents = records[_LATENTS]["figures"]
-        parts += [_maps(latents), _neighbours(latents)]
+    parts: list[Part] = [
+        _introduction(config),
+        *([_levels_plot(levels)] if levels else []),
+        *tables,
+    ]
+    if "latents" in records:
+        latents = records["latents"]["figures"]
+        parts.append(_maps(latents))
         shows.append(_separation(latents))
-        figures[_LATENTS] = {
+        figures["latents"] = {
             k: {n: latents[k][n] for n in ("same_task", "chance", "tick_r2")} for k in ("h", "z")
         }
     title = "Multi-task: one model on mixed data against one for each task"
-    return Report(title, tuple(shows), tuple(parts), figures)
+    return ExperimentReport(title, tuple(shows), tuple(parts), figures)
 
 
-def _lengths(config: ExperimentConfig) -> str:
-    """For how long the models were trained, those that were given included."""
-    given = {who: p for who, p in config.train.policies.items() if who in _models(config)}
-    if not given:
-        return (
-            f"Every model was trained for {config.train.budget}: the one on mixed data learns "
-            f"{len(config.tasks)} tasks in the time that a single-task model has for one, and is "
-            "told nothing of which task it is."
-        )
-    named = "; ".join(f"{_models(config)[who]}, {_steps(path)}" for who, path in given.items())
-    rest = len(given) < len(_models(config))
-    others = f" Every other model was trained for {config.train.budget}." if rest else ""
+def _introduction(config: ExperimentConfig) -> str:
+    given = [task for task in (*config.tasks, ALL) if task in config.train.policies]
+    existing = f" except those given for {', '.join(given)} (`--train.policies`)" if given else ""
     return (
-        f"Models that were there before (`--train.policies`): {named}.{others} The one on mixed "
-        "data is told nothing of which task it is."
+        f"Every model{existing} was trained for {config.train.budget}: the one on mixed data "
+        f"learns {len(config.tasks)} tasks in the time that a single-task model has for one. Its "
+        "input does not name the task."
     )
 
 
-def _steps(policy: str) -> str:
-    folder = Path(os.path.expanduser(policy))
-    if not (folder / MANIFEST).is_file():
-        return f"`{policy}`"  # on the Hub, or gone since
-    return f"{read_manifest(folder).get('step', '?')} gradient steps"
+def _level(scores: results.EvalScores, references: Mapping[str, results.EvalScores]) -> float:
+    """Reward per step on a scale from the random walk (0) to the oracle (1)."""
+    low, high = references["random"].reward_per_step, references["oracle"].reward_per_step
+    return (scores.reward_per_step - low) / (high - low) if high != low else float("nan")
 
 
-def _models(config: ExperimentConfig) -> dict[str, str]:
-    """Task, or `ALL` -> what its model is called."""
-    return {**{task: f"of {task} alone" for task in config.tasks}, ALL: "on mixed data"}
-
-
-def _planners(config: ExperimentConfig) -> str:
-    """In what the models' planners differ; empty if they do not."""
-    own = config.play.task_flags
-    return "".join(
-        f" The model {words} is played with `{' '.join(own[model])}`."
-        for model, words in _models(config).items()
-        if own.get(model)
-    )
-
-
-def _level(played: Outcome, others: Mapping[str, Outcome]) -> float:
-    """Reward per step, 0 where the random walk is and 1 where the oracle is."""
-    low, high = others["random"].reward_per_step, others["oracle"].reward_per_step
-    return (played.reward_per_step - low) / (high - low) if high != low else float("nan")
-
-
-def _line(task: str, found: Mapping[str, Outcome]) -> str:
-    single, mixed = found[SINGLE], found[MIXED]
-    gain, (low, high) = mixed.success_gain(single)
-    verdict = "better" if low > 0 else "worse" if high < 0 else "no different beyond chance"
+def _conclusion(task: str, scores: Mapping[str, results.EvalScores]) -> str:
+    single, mixed = scores["single"], scores["mixed"]
+    gain = mixed.gain(single)
+    low, high = gain.success_interval
+    word = "better" if low > 0 else "worse" if high < 0 else "no different beyond chance"
     return (
         f"{task}: mixed {mixed.success_rate:.1%}, single {single.success_rate:.1%} success; mixed "
-        f"is {verdict} ({100 * gain:+.1f} points, 95 % {100 * low:+.1f} to {100 * high:+.1f})"
+        f"is {word} ({100 * gain.success:+.1f} points, 95 % "
+        f"{points_range(gain.success_interval)})"
     )
 
 
@@ -151,7 +108,7 @@ def _levels_plot(levels: Mapping[str, Mapping[str, float]]) -> Plot:
     def paint(figure: Any) -> None:
         axes = figure.subplots()
         at = np.arange(len(levels))
-        for k, name in enumerate((SINGLE, MIXED)):
+        for k, name in enumerate(("single", "mixed")):
             heights = [row.get(name, float("nan")) for row in levels.values()]
             axes.bar(at + 0.35 * (k - 0.5), heights, 0.33, label=name)
         axes.axhline(1, color="0.6", linewidth=0.8, linestyle=":")
@@ -160,59 +117,34 @@ def _levels_plot(levels: Mapping[str, Mapping[str, float]]) -> Plot:
         axes.set_ylabel("reward, 0 random, 1 oracle")
         axes.legend(fontsize=8)
 
-    return drawn("normalised", "Reward per step: 0 a random walk, 1 the oracle", paint, (5.0, 3.0))
+    return draw("normalised", "Reward per step: 0 a random walk, 1 the oracle", paint, (5.0, 3.0))
 
 
 def _maps(latents: Mapping[str, Any]) -> Plot:
     task, tick = np.array(latents["task"]), np.array(latents["tick"])
 
     def paint(figure: Any) -> None:
-        for k, name in enumerate(("h", "z")):
+        for (by_task, by_tick), name in zip(figure.subplots(2, 2), ("h", "z"), strict=True):
             points = np.array(latents[name]["map"])
-            by_task, by_time = (
-                figure.add_subplot(2, 2, 2 * k + 1),
-                figure.add_subplot(2, 2, 2 * k + 2),
-            )
-            for i, words in enumerate(latents["tasks"]):
-                own = task == i
-                by_task.scatter(*points[own].T, s=4, label=words, linewidths=0)
-            shades = by_time.scatter(*points.T, s=4, c=tick, cmap="viridis", linewidths=0)
+            for i, label in enumerate(latents["tasks"]):
+                by_task.scatter(*points[task == i].T, s=4, label=label, linewidths=0)
+            shades = by_tick.scatter(*points.T, s=4, c=tick, cmap="viridis", linewidths=0)
             by_task.set_ylabel(name)
-            by_task.set_title("by task", fontsize=8)
-            by_time.set_title("by tick", fontsize=8)
             by_task.legend(fontsize=7, markerscale=3)
-            figure.colorbar(shades, ax=by_time)
-            for axes in (by_task, by_time):
+            figure.colorbar(shades, ax=by_tick)
+            for axes, title in ((by_task, "by task"), (by_tick, "by tick")):
+                axes.set_title(title, fontsize=8)
                 axes.set(xticks=[], yticks=[])
 
     caption = "t-SNE of h (above) and z (below) of the mixed model in closed loop"
-    return drawn("latents", caption, paint, (8.0, 6.5))
-
-
-def _neighbours(latents: Mapping[str, Any]) -> Table:
-    rows = tuple(
-        (
-            name,
-            f"{latents[name]['same_task']:.3f}",
-            f"{latents[name]['chance']:.3f}",
-            number(latents[name]["tick_r2"]),
-        )
-        for name in ("h", "z")
-    )
-    head = ("state", "neighbours of the same task", "by chance", "R2 of the tick from neighbours")
-    return Table("Ten nearest states of other episodes, in the whole space", head, rows)
+    return draw("latents", caption, paint, (8.0, 6.5))
 
 
 def _separation(latents: Mapping[str, Any]) -> str:
     h, z = latents["h"], latents["z"]
     return (
         f"the nearest states of other episodes are of the same task in {h['same_task']:.1%} (h) "
-        f"and {z['same_task']:.1%} (z) of cases, by chance in {h['chance']:.1%}; they tell "
+        f"and {z['same_task']:.1%} (z) of cases, by chance in {h['chance']:.1%}; they explain "
         f"{number(h['tick_r2'], '.2f')} (h) and {number(z['tick_r2'], '.2f')} (z) of the variance "
         "of time within a task"
     )
-
-
-EXPERIMENT: Final = Experiment(
-    "one model on mixed data against one for each task; t-SNE of h and z (fig. 6)", _cells, _report
-)

@@ -1,4 +1,4 @@
-"""Does averaging Q along a plan help because its errors average out (section III-D)?"""
+"""Whether errors of Q along a plan average out and predict the best horizon (section III-D)."""
 
 from __future__ import annotations
 
@@ -6,60 +6,50 @@ import math
 from collections.abc import Mapping
 from typing import Any, Final
 
+import numpy as np
+
+from egovcp_experiment import results
 from egovcp_experiment.cell import Cell
 from egovcp_experiment.config import ExperimentConfig
-from egovcp_experiment.experiment import Experiment
 from egovcp_experiment.grid import Grid, Variant
-from egovcp_experiment.outcomes import Outcome, outcome
-from egovcp_experiment.report.comparison import comparison
-from egovcp_experiment.report.document import Plot, Report, Table
-from egovcp_experiment.report.svg import drawn
-from egovcp_experiment.store import Record
+from egovcp_experiment.report import ExperimentReport, Part, Plot, Table, draw, signed_range
 from egovcp_experiment.studies.residuals import STEPS
-from egovcp_experiment.tools import study
 
+SUMMARY: Final = (
+    "do the errors of Q along a plan average out, and predict the best horizon (section III-D)?"
+)
 _HORIZONS: Final = tuple(range(1, STEPS + 1))
 _WALK: Final = ("--eta", "--step_ticks", "--boundary")  # flags of egovcp-collect
 _PLANS: Final = {"planner": "plans that the planner chose", "random": "random plans"}
 
 
-def _residuals(config: ExperimentConfig, grid: Grid, task: str) -> str:
-    flags = {
-        **grid.planner(task),
-        "policy.path": grid.model(task, config.train.seeds[0]),
-        "task": task,
-        "episodes": config.play.episodes,
-        "branches": config.play.branches,
-        "seed": config.play.seed,
-    }
-    walk = tuple(flag for flag in config.data.flags if flag.partition("=")[0] in _WALK)
-    more = (*config.scenes, *walk)
-    return grid.add(Cell(f"residuals-{task}", study("residuals"), flags, more)).name
+def _residuals(grid: Grid, task: str) -> str:
+    """Name of the cell of the study."""
+    config = grid.config
+    flags = {"task": task, "episodes": config.play.episodes, "branches": config.play.branches}
+    walk = [flag for flag in config.data.flags if flag.partition("=")[0] in _WALK]
+    return grid.sim_study("residuals", task, flags, walk)
 
 
-def _plays(config: ExperimentConfig, grid: Grid, task: str) -> dict[int, list[str]]:
-    """Horizon -> names of its cells, one for each seed."""
+def _plays(grid: Grid, task: str) -> dict[int, list[str]]:
+    """Horizon -> names of its cells, one per seed."""
     return {
-        n: [
-            grid.play(task, s, Variant(f"horizon_{n}", play={"planner.horizon": n})).name
-            for s in config.train.seeds
-        ]
-        for n in _HORIZONS
+        n: grid.plays(task, Variant(f"horizon_{n}", play={"planner.horizon": n})) for n in _HORIZONS
     }
 
 
-def _cells(config: ExperimentConfig) -> list[Cell]:
+def cells(config: ExperimentConfig) -> list[Cell]:
     grid = Grid(config)
     for task in config.tasks:
-        _residuals(config, grid, task)
-        _plays(config, grid, task)
+        _residuals(grid, task)
+        _plays(grid, task)
     return grid.cells
 
 
-def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
+def report(config: ExperimentConfig, records: results.Records) -> ExperimentReport:
     grid = Grid(config)
     shows: list[str] = []
-    parts: list[str | Table | Plot] = [
+    parts: list[Part] = [
         "Residuals are Q along an imagined plan minus the mean return of random walks that the "
         "simulator takes from the same step of the same plan; the variance of that mean is taken "
         "off. Bounds use the largest correlation between two steps and the least and largest "
@@ -68,42 +58,38 @@ def _report(config: ExperimentConfig, records: Mapping[str, Record]) -> Report:
     ]
     figures: dict[str, Any] = {}
     for task in config.tasks:
-        played = {
-            n: o
-            for n, cells in _plays(config, grid, task).items()
-            if (o := outcome(records, cells, task)) is not None
-        }
-        figures[task] = {"horizons": {str(n): o.figures() for n, o in played.items()}}
-        name = _residuals(config, grid, task)
-        if name in records:
-            plans = records[name]["figures"]["plans"]
+        scores = results.all_scores(records, _plays(grid, task), task)
+        figures[task] = {"horizons": results.figures_of(scores)}
+        record = records.get(_residuals(grid, task))
+        if record is not None:
+            plans = record["figures"]["plans"]
             figures[task]["residuals"] = plans
             known = {kind: row for kind, row in plans.items() if "horizons" in row}
             parts += [_table(task, kind, row) for kind, row in known.items()]
-            if known and played:
-                parts.append(_plot(task, known, played))
-            shows += _shows(task, known, played)
-        if played:
-            rows = {f"N = {n}": o for n, o in played.items()}
-            parts.append(comparison(f"{task}: closed loop", rows, "N = 4"))
+            if known and scores:
+                parts.append(_plot(task, known, scores))
+            shows += _conclusions(task, known, scores)
+        if scores:
+            rows = {f"N = {n}": each for n, each in scores.items()}
+            parts.append(results.comparison(f"{task}: closed loop", rows, "N = 4"))
     title = "Variance: do the errors of Q along a plan average out?"
-    return Report(title, tuple(shows), tuple(parts), figures)
+    return ExperimentReport(title, tuple(shows), tuple(parts), figures)
 
 
 def _table(task: str, kind: str, row: Mapping[str, Any]) -> Table:
     rows = tuple(
         (
             str(at["n"]),
-            f"{row['sigma'][at['n'] - 1]:.4f}",
-            f"{row['bias'][at['n'] - 1]:+.4f}",
-            f"{row['bias_of_cutting'][at['n'] - 1]:+.4f}",
+            f"{row['sigma'][k]:.4f}",
+            f"{row['bias'][k]:+.4f}",
+            f"{row['bias_of_cutting'][k]:+.4f}",
             f"{at['variance']:.5f}",
             f"{at['v_lb']:.5f}",
             f"{at['v_ub']:.5f}",
             f"{at['bias']:+.4f}",
             f"{at['error']:.5f}",
         )
-        for at in row["horizons"]
+        for k, at in enumerate(row["horizons"])
     )
     head = (
         *("N", "sigma of step N-1", "its bias", "cutting", "Var of J_N's error"),
@@ -113,8 +99,8 @@ def _table(task: str, kind: str, row: Mapping[str, Any]) -> Table:
     return Table(title, head, rows)
 
 
-def _shows(
-    task: str, plans: Mapping[str, Mapping[str, Any]], played: Mapping[int, Outcome]
+def _conclusions(
+    task: str, plans: Mapping[str, Mapping[str, Any]], scores: Mapping[int, results.EvalScores]
 ) -> list[str]:
     lines = []
     for kind, row in plans.items():
@@ -125,26 +111,24 @@ def _shows(
             f"{row['rho_next']:.2f} (largest {row['rho_max']:.2f}); averaging over N = 4 leaves "
             f"{share:.0%} of the variance of N = 1, where independent errors would leave 25 %"
         )
-    if plans and len(played) == len(_HORIZONS):
+    if plans and len(scores) == len(_HORIZONS):
         row = plans.get("planner") or next(iter(plans.values()))
         predicted = min(row["horizons"], key=lambda at: at["error"])["n"]
-        best = max(played, key=lambda n: played[n].reward_per_step)
-        gain, (low, high) = played[best].reward_gain(played[predicted])
+        best = max(scores, key=lambda n: scores[n].reward_per_step)
+        gain = scores[best].gain(scores[predicted])
+        word = gain.word("not as predicted", same="no more than chance, so no contradiction")
+        word = "as predicted" if best == predicted else word
         lines.append(
             f"{task}: the mean square error is least at N = {predicted}; reward in closed loop is "
-            f"best at N = {best}, by {gain:+.5f} a step (95 % {low:+.5f} to {high:+.5f}) beside "
-            f"N = {predicted}: " + _verdict(best == predicted, low)
+            f"best at N = {best}, by {gain.reward:+.5f} a step (95 % "
+            f"{signed_range(gain.reward_interval)}) compared with N = {predicted}: {word}"
         )
     return lines
 
 
-def _verdict(same: bool, low: float) -> str:
-    if same:
-        return "as predicted"
-    return "not as predicted" if low > 0 else "no more than chance, so no contradiction"
-
-
-def _plot(task: str, plans: Mapping[str, Mapping[str, Any]], played: Mapping[int, Outcome]) -> Plot:
+def _plot(
+    task: str, plans: Mapping[str, Mapping[str, Any]], scores: Mapping[int, results.EvalScores]
+) -> Plot:
     def paint(figure: Any) -> None:
         left, right = figure.subplots(1, 2)
         for k, (kind, row) in enumerate(plans.items()):
@@ -156,27 +140,14 @@ def _plot(task: str, plans: Mapping[str, Mapping[str, Any]], played: Mapping[int
             left.plot(at, [found[0] / n for n in at], ":", color=f"C{k}")
         left.set(xlabel="N", ylabel="variance of J_N's error")
         left.legend(fontsize=8)
-        right.plot(list(played), [o.reward_per_step for o in played.values()], "o-", color="C2")
-        ranges = [o.reward_interval for o in played.values()]
-        right.fill_between(
-            list(played),
-            [r[0] for r in ranges],
-            [r[1] for r in ranges],
-            color="C2",
-            alpha=0.15,
-            linewidth=0,
-        )
+        rewards = [each.reward_per_step for each in scores.values()]
+        right.plot(list(scores), rewards, "o-", color="C2")
+        ranges = np.array([each.reward_interval for each in scores.values()]).T
+        right.fill_between(list(scores), *ranges, color="C2", alpha=0.15, linewidth=0)
         right.set(xlabel="N", ylabel="reward per step, closed loop")
 
     caption = (
-        f"{task}: measured variance between its bounds (shaded) and beside that of independent "
+        f"{task}: measured variance between its bounds (shaded), variance of independent "
         "errors (dotted), and reward against N"
     )
-    return drawn(f"bounds-{task}", caption, paint)
-
-
-EXPERIMENT: Final = Experiment(
-    "do the errors of Q along a plan average out, and predict the best horizon (section III-D)?",
-    _cells,
-    _report,
-)
+    return draw(f"bounds-{task}", caption, paint)

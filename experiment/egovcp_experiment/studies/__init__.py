@@ -1,1 +1,1 @@
-"""Cells that compute with the library alone; each is a command, ``python -m``, of its own."""
+"""Studies of a trained policy: cells of this package, each also ``python -m MODULE``."""

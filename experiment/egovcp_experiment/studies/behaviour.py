@@ -1,202 +1,165 @@
-"""Does a policy act for a reason? What it does where nothing happens, and afterwards.
+"""Behaviour of a policy with and without events.
 
-ball   empty scenes: how far the hands leave the neutral pose, beside scenes with a throw
-wall   undisturbed scenes: does anything touch the wall? After a push: are the hands back?
-arch   how high the pelvis stands while no arch is near
+ball   distance of the hands from their start in empty scenes, and before and after a throw
+wall   contact in undisturbed scenes; whether the hands return after a push
+arch   height of the pelvis near an arch and far from it
 """
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.artifact import Artifact
-from egovcp.cli import run_command
-from egovcp.errors import UsageError
 from egovcp.intervals import bootstrap, wilson
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import StepResult, resolve_config
-from egovcp.sim.scenario import Scenario
+from egovcp.sim.env import resolve_config
 from egovcp.spec import PLANNER_HZ, TASKS
-from egovcp_experiment.studies.study import finish
-from egovcp_experiment.studies.watching import Moment, WatchConfig, Watcher, watch
+from egovcp_experiment.studies import study
 
-PROG: Final = "python -m egovcp_experiment.studies.behaviour"
-AT_REST_MPS: Final = (
-    0.10  # a pelvis slower than this has recovered, if it stays so for half a second
-)
+#: A robot has recovered when its pelvis is slower than this for half a second.
+AT_REST_MPS: Final = 0.10
 _REST_TICKS: Final = PLANNER_HZ // 2
-NEAR_NEUTRAL_M: Final = 0.10  # a hand so close to where it was at the start is back
+NEAR_NEUTRAL_M: Final = 0.10  # distance at which a hand is back at its start
 BACK_TICKS: Final = 2 * PLANNER_HZ
 STANDING_M: Final = 0.70
-_PASSED_M: Final = 0.9  # an arch so far behind has been passed, whatever its depth
+_PASSED_M: Final = 0.9  # distance behind the pelvis at which any arch has been passed
 
 type Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class BehaviourConfig(WatchConfig):
-    """What a policy does where nothing happens, and after something has."""
+class BehaviourConfig(study.SimStudyConfig):
+    """Measure the behaviour of a policy with and without events."""
 
 
 @dataclass
-class Track:
-    """What one robot did."""
+class BehaviourTrace:
+    """One episode, a value per tick."""
 
-    since: list[float]
+    since: list[float] = field(default_factory=list)
     """s since the event."""
-    hands: list[Array]
+    hands: list[Array] = field(default_factory=list)
     """(2, 3) palms in the pelvis frame, m."""
-    action: list[Array]
+    action: list[Array] = field(default_factory=list)
     """(7,) sent."""
-    pelvis: list[float]
+    pelvis: list[float] = field(default_factory=list)
     """m above ground."""
-    speed: list[float]
+    speed: list[float] = field(default_factory=list)
     """Horizontal, m/s."""
-    ahead: list[float]
-    """Object before the pelvis, m."""
+    ahead: list[float] = field(default_factory=list)
+    """x of the object in the pelvis frame, m."""
     touched: bool = False
-    """Whether anything has met the object."""
+    """Whether the robot has touched the object."""
     away: bool = False
-    """A push away from the wall."""
+    """Whether the push is away from the wall."""
     fallen: bool = False
 
+    @property
+    def hands_away(self) -> Array:
+        """(T,) distance of the further hand from its start, m."""
+        hands = np.stack(self.hands)
+        away: Array = np.linalg.norm(hands - hands[0], axis=-1).max(axis=-1)
+        return away
 
-class _Tracks(Watcher):
-    """Follows every robot."""
+    @property
+    def hands_back(self) -> bool | None:
+        """Whether both hands return within two seconds of recovery from the push; None if the robot
+        falls or the episode ends earlier."""
+        slow = (np.array(self.speed) < AT_REST_MPS) & (np.array(self.since) > 0)
+        rest = np.convolve(slow, np.ones(_REST_TICKS), "valid") >= _REST_TICKS
+        if self.fallen or not rest.any():
+            return None
+        start = int(rest.argmax())
+        window = self.hands_away[start : start + BACK_TICKS]
+        back = bool((window < NEAR_NEUTRAL_M).any())
+        return back if back or len(window) == BACK_TICKS else None
 
-    def __init__(self) -> None:
-        self.tracks: list[Track] = []
+    def far(self, near: float) -> NDArray[np.bool_]:
+        """(T,) whether the arch is further ahead than ``near``, m, or passed."""
+        ahead = np.array(self.ahead)
+        far: NDArray[np.bool_] = (ahead > near) | (ahead < -_PASSED_M)
+        return far
 
-    def begin(self, scenarios: Sequence[Scenario]) -> None:
-        self._group = [Track([], [], [], [], [], []) for _ in scenarios]
-        self.tracks += self._group
 
-    def before(self, moment: Moment) -> None:
-        truth = moment.env.privileged_state()
-        for row in np.flatnonzero(moment.live).tolist():
-            track = self._group[row]
-            track.since.append(float(truth.since_event[row]))
-            track.hands.append(truth.hands_b[row])
-            track.pelvis.append(float(truth.pelvis_w[row, 2]))
-            track.speed.append(float(np.hypot(*truth.pelvis_velocity_w[row, :2])))
-            track.ahead.append(float(truth.object_b[row, 0]))
-            track.away = abs(moment.env.parameters[row].get("push_bearing", 0.0)) > np.pi / 2
-
-    def after(self, moment: Moment, result: StepResult) -> None:
-        force = moment.env.privileged_state().contact_force
-        for row in np.flatnonzero(moment.live).tolist():
-            track = self._group[row]
-            track.action.append(result.sent_action[row].copy())
-            track.touched |= bool(force[row].any())
-            track.fallen = bool(result.terminated[row])
+type Traces = list[BehaviourTrace]
 
 
 def measure(config: BehaviourConfig) -> None:
-    """Play scenes with and without an event, and write what was done in them."""
-    if config.task not in TASKS:
-        raise UsageError(f"--task={config.task}: expected one of {', '.join(TASKS)}")
-    artifact = config.artifact()
-    eventful = _tracks(artifact, config.env, config)
-    empty = _tracks(artifact, config.empty(), config)
+    """Play scenes with and without an event, and write the figures."""
+    config.require_task(TASKS)
+    artifact = config.load()
+    eventful = _traces(artifact, config.env, config)
+    empty = _traces(artifact, config.empty_scenes(), config)
     found = {"ball": _ball, "wall": _wall, "arch": _arch}[config.task](config, eventful, empty)
-    finish(config, {"task": config.task, "episodes": config.episodes, **found})
+    config.write({"task": config.task, "episodes": config.episodes, **found})
 
 
-def _tracks(artifact: Artifact, env: EnvConfig, config: BehaviourConfig) -> list[Track]:
-    tracks = _Tracks()
-    watch(artifact, env, config, tracks)
-    return tracks.tracks
+def _traces(artifact: Artifact, env_config: EnvConfig, config: BehaviourConfig) -> Traces:
+    """One trace per episode."""
+    traces = [BehaviourTrace() for _ in range(config.episodes)]
+    for step in study.play_episodes(artifact, env_config, config):
+        state, force = step.state, step.env.privileged_state().contact_force
+        for row in step.live:
+            trace = traces[step.scenarios[row].episode]
+            trace.since.append(float(state.since_event[row]))
+            trace.hands.append(state.hands_b[row])
+            trace.action.append(step.result.sent_action[row].copy())
+            trace.pelvis.append(float(state.pelvis_w[row, 2]))
+            trace.speed.append(float(np.hypot(*state.pelvis_velocity_w[row, :2])))
+            trace.ahead.append(float(state.object_b[row, 0]))
+            trace.away = abs(step.env.parameters[row].get("push_bearing", 0.0)) > np.pi / 2
+            trace.touched |= bool(force[row].any())
+            trace.fallen = bool(step.result.terminated[row])
+    return traces
 
 
-def _ball(config: BehaviourConfig, eventful: list[Track], empty: list[Track]) -> dict[str, Any]:
-    after = [hands_away(t)[np.array(t.since) > 0] for t in eventful]
-    flights = [part for part in after if len(part)]
+def _ball(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str, Any]:
     return {
-        "empty_scene": _means([hands_away(t) for t in empty]),
-        "before_throw": _means([hands_away(t)[np.array(t.since) < 0] for t in eventful]),
-        "after_throw": _means(flights),
-        "empty_scene_effort": _means([effort(t) for t in empty]),
+        "empty_scene": _means([t.hands_away for t in empty]),
+        "before_throw": _means([t.hands_away[np.array(t.since) < 0] for t in eventful]),
+        "after_throw": _means([t.hands_away[np.array(t.since) > 0] for t in eventful]),
+        "empty_scene_effort": _means([np.square(np.stack(t.action)).mean(-1) for t in empty]),
     }
 
 
-def _wall(config: BehaviourConfig, eventful: list[Track], empty: list[Track]) -> dict[str, Any]:
-    untouched = [not track.touched for track in empty]
-    back = [b for t in eventful if not t.away and (b := hands_back(t)) is not None]
-    pushed = [track for track in eventful if not track.away]
+def _wall(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str, Any]:
+    pushed = [trace for trace in eventful if not trace.away]
+    back = [flag for trace in pushed if (flag := trace.hands_back) is not None]
     return {
-        "undisturbed_without_contact": _share(untouched),
+        "undisturbed_without_contact": _share([not trace.touched for trace in empty]),
         "braced_for_s": resolve_config(config.env).wall.disturbed_time,
         "hands_back": _share(back),
         "pushed": len(pushed),
         "recovered": len(back),
-        "empty_scene": _means([hands_away(t) for t in empty]),
+        "empty_scene": _means([t.hands_away for t in empty]),
     }
 
 
-def _arch(config: BehaviourConfig, eventful: list[Track], empty: list[Track]) -> dict[str, Any]:
+def _arch(config: BehaviourConfig, eventful: Traces, empty: Traces) -> dict[str, Any]:
     near = config.env.arch.near
-    heights = [np.array(t.pelvis)[_far(t, near)] for t in [*eventful, *empty]]
-    heights = [part for part in heights if len(part)]
-    under = [np.array(t.pelvis)[~_far(t, near)] for t in eventful]
+    heights = [np.array(t.pelvis)[t.far(near)] for t in [*eventful, *empty]]
     return {
         "pelvis_far": _means(heights),
         "standing_far": _means([(part > STANDING_M).astype(float) for part in heights]),
-        "pelvis_near": _means([part for part in under if len(part)]),
+        "pelvis_near": _means([np.array(t.pelvis)[~t.far(near)] for t in eventful]),
     }
-
-
-def _far(track: Track, near: float) -> NDArray[np.bool_]:
-    """Ticks in which the arch is further ahead than ``near``, or well behind."""
-    ahead = np.array(track.ahead)
-    far: NDArray[np.bool_] = (ahead > near) | (ahead < -_PASSED_M)
-    return far
-
-
-def hands_away(track: Track) -> Array:
-    """(T,) how far the further hand is from where it was at the start, m."""
-    hands = np.stack(track.hands)
-    away: Array = np.linalg.norm(hands - hands[0], axis=-1).max(axis=-1)
-    return away
-
-
-def effort(track: Track) -> Array:
-    """(T,) mean squared action: what the tasks charge for."""
-    squares: Array = np.square(np.stack(track.action)).mean(-1)
-    return squares
-
-
-def hands_back(track: Track) -> bool | None:
-    """Whether both hands are back within two seconds of recovery from the push; None: it fell, or
-    the episode ended before that could be seen."""
-    slow = (np.array(track.speed) < AT_REST_MPS) & (np.array(track.since) > 0)
-    rest = np.convolve(slow, np.ones(_REST_TICKS), "valid") >= _REST_TICKS
-    if track.fallen or not rest.any():
-        return None
-    start = int(rest.argmax())
-    window = hands_away(track)[start : start + BACK_TICKS]
-    back = bool((window < NEAR_NEUTRAL_M).any())
-    return back if back or len(window) == BACK_TICKS else None
 
 
 def _share(flags: Sequence[bool]) -> dict[str, Any]:
     if not flags:
         return {"share": None, "ci95": None, "episodes": 0}
-    count = sum(flags)
-    return {
-        "share": count / len(flags),
-        "ci95": list(wilson(count, len(flags))),
-        "episodes": len(flags),
-    }
+    share, interval = sum(flags) / len(flags), wilson(sum(flags), len(flags))
+    return {"share": share, "ci95": list(interval), "episodes": len(flags)}
 
 
 def _means(parts: Sequence[Array]) -> dict[str, Any]:
-    """Mean over episodes of their means, with its interval."""
+    """Mean over episodes of their means, with its interval; empty parts do not count."""
     means = np.array([part.mean() for part in parts if len(part)])
     if not len(means):
         return {"mean": None, "ci95": None, "episodes": 0}
@@ -205,12 +168,7 @@ def _means(parts: Sequence[Array]) -> dict[str, Any]:
 
 
 CONFIG = BehaviourConfig
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run_command(CONFIG, measure, argv, prog=PROG)
-
+main = study.make_main("behaviour", CONFIG, measure)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(None))

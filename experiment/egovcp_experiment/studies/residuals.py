@@ -1,14 +1,17 @@
-"""The errors of Q along plans, against what the plans were really worth (section III-D).
+"""Errors of Q along plans against simulated returns, and their variance (section III-D).
 
     e_k = Q^(h_k, z^_k, a_k) - Q(s_k, a_k),    k = 0 .. N-1
 
-Q^ is what the model says along a plan that it imagines. Q is what the data's random walk earns from
-there: the simulator is brought to the same state again, follows the plan up to a_k, and walks on at
-random, several times over. Where the data's walk rests between its steps, a_k may be anywhere in a
-rest: how long that goes on is drawn, too. The mean of these returns has an error of its own, whose
-variance is known and taken off; errors of different k come from different walks and do not mix.
+Q^ is the model's value along an imagined plan. Q is the mean return of the data's random walk from
+there: the simulator is reset to the same state, follows the plan up to a_k, and continues with
+several random walks. If the data's walk rests between its steps, the remaining rest is drawn, too.
+The sampling variance of the mean is subtracted; errors of different k use different walks.
 
-Two kinds of plans: the planner's own, which were chosen for their Q^, and random ones.
+    E[(J_N - J^_N)^2] = 1/N^2 sum_ij Cov[e_i, e_j] + bias^2
+    V_ub = (N + rho (N^2 - N)) / N^2 sigma_max^2
+    V_lb = max((N sigma_min^2 - rho (N^2 - N) sigma_max^2) / N^2, 0)
+
+There are two kinds of plans: the planner's own, which maximise Q^, and random ones.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -24,156 +27,128 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from egovcp.artifact import Artifact, returns_of
-from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.model import Carry, WorldModel
 from egovcp.plan.search import random_walk
 from egovcp.sim.config import EnvConfig
-from egovcp.sim.env import StepResult, VectorEnv
+from egovcp.sim.env import VectorEnv
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_DIM, ACTION_ETA
-from egovcp_experiment.studies.study import finish
-from egovcp_experiment.studies.watching import Moment, WatchConfig, Watcher, watch
-from egovcp_experiment.variance import Residuals, analysis
+from egovcp_experiment.studies import study
 
-PROG: Final = "python -m egovcp_experiment.studies.residuals"
 STEPS: Final = 6  # the longest horizon of table I
-#: Ticks from the event to the moment of a plan; episodes take them in turn.
+#: Ticks from the event to the plan; episodes take them in turn.
 _AFTER: Final = {"ball": (-5, 4, 8, 12, 16), "wall": (-5, 1, 4, 8), "arch": (-2, 20, 40, 60, 80)}
 
 type Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class ResidualsConfig(WatchConfig):
-    """Errors of Q along plans, one plan of each kind in every episode."""
+class ResidualsConfig(study.SimStudyConfig):
+    """Errors of Q along plans, one plan of each kind per episode."""
 
     branches: int = 12
-    """Random walks that the worth of a step is the mean of."""
+    """Random walks per step of a plan; their mean return is the target of Q."""
     eta: float = ACTION_ETA
-    """egovcp-collect's, of the data that Q was trained on; so are the next two."""
+    """Step size of the data's random walk, as in egovcp-collect."""
     step_ticks: tuple[int, int] = (1, 1)
-    """Shortest and longest time from one step of the walk to the next, planner ticks."""
+    """Shortest and longest time between two steps of the walk, planner ticks."""
     boundary: Literal["reflect", "clip"] = "reflect"
     """What keeps the walk inside the action box."""
 
-    def random_walk(self) -> RandomWalk:
-        """The data's."""
-        return RandomWalk(self.eta, self.boundary, self.step_ticks)
+    def check(self) -> None:
+        """Raise `UsageError` for invalid values."""
+        self.require_task(_AFTER)
+        if self.branches < 2:
+            raise UsageError(f"--branches={self.branches}: expected at least 2")
+        least, most = self.step_ticks
+        if not 1 <= least <= most or not 0 < self.eta <= 2:
+            raise UsageError(
+                f"--eta={self.eta} --step_ticks={[least, most]}: expected a step within the box, "
+                "at most 2, and 1 <= shortest <= longest; the data's card says how its walk stepped"
+            )
 
 
 @dataclass
-class _Point:
-    """The moment of a plan."""
+class _Start:
+    """Start of the plans in an episode."""
 
     scenario: Scenario
-    tick: int
     sent: list[Array]
-    """Actions up to here."""
+    """Actions before."""
     plans: dict[str, Array]
     """Kind -> (STEPS, 7)."""
     values: dict[str, Array]
-    """Kind -> (STEPS,) what the model says."""
+    """Kind -> (STEPS,) Q^ along the plan."""
 
 
-class _Points(Watcher):
-    """Keeps one moment of every episode."""
-
-    def __init__(self, task: str, artifact: Artifact, seed: int) -> None:
-        self._after, self._model = _AFTER[task], artifact.world_model
-        self._eta = artifact.planner.eta
-        self._generator = torch.Generator().manual_seed(seed)
-        self.points: list[_Point] = []
-
-    def begin(self, scenarios: Sequence[Scenario]) -> None:
-        self._scenarios = tuple(scenarios)
-        self._sent: list[list[Array]] = [[] for _ in scenarios]
-
-    def before(self, moment: Moment) -> None:
-        for row in np.flatnonzero(moment.live).tolist():
-            scenario = self._scenarios[row]
-            event = int(moment.env.parameters[row]["event_tick"])
-            due = max(0, event + self._after[scenario.episode % len(self._after)])
-            if int(moment.env.tick[row]) == due:
-                self.points.append(self._point(moment, row, scenario))
-
-    def after(self, moment: Moment, result: StepResult) -> None:
-        for row in np.flatnonzero(moment.live).tolist():
-            self._sent[row].append(result.sent_action[row].copy())
-
-    def _point(self, moment: Moment, row: int, scenario: Scenario) -> _Point:
-        start = self._sent[row][-1] if self._sent[row] else np.zeros(ACTION_DIM)
-        deltas = 2 * torch.rand(STEPS, ACTION_DIM, generator=self._generator) - 1
-        executed = torch.as_tensor(start, dtype=torch.float32)
-        plans = {
-            "planner": moment.step.plan[row].astype(np.float64),
-            "random": random_walk(executed, deltas, self._eta).double().numpy(),
-        }
-        carry = moment.policy.carry.row(row)
-        values = {kind: _values(self._model, carry, plan) for kind, plan in plans.items()}
-        tick = int(moment.env.tick[row])
-        return _Point(scenario, tick, list(self._sent[row]), plans, values)
+def _starts(artifact: Artifact, config: ResidualsConfig) -> list[_Start]:
+    """One start per episode."""
+    after, eta = _AFTER[config.task], artifact.planner.eta
+    generator = torch.Generator().manual_seed(config.seed)
+    longest = replace(artifact, planner=replace(artifact.planner, horizon=STEPS))
+    sent: dict[int, list[Array]] = {episode: [] for episode in range(config.episodes)}
+    starts = []
+    for step in study.play_episodes(longest, config.env, config):
+        for row in step.live:
+            scenario = step.scenarios[row]
+            past = sent[scenario.episode]
+            event = int(step.env.parameters[row]["event_tick"])
+            if int(step.tick[row]) == max(0, event + after[scenario.episode % len(after)]):
+                last = past[-1] if past else np.zeros(ACTION_DIM)
+                deltas = 2 * torch.rand(STEPS, ACTION_DIM, generator=generator) - 1
+                executed = torch.as_tensor(last, dtype=torch.float32)
+                plans = {
+                    "planner": step.plan.plan[row].astype(np.float64),
+                    "random": random_walk(executed, deltas, eta).double().numpy(),
+                }
+                carry = step.carry.row(row)
+                values = {k: _values(artifact.world_model, carry, p) for k, p in plans.items()}
+                starts.append(_Start(scenario, list(past), plans, values))
+            past.append(step.result.sent_action[row].copy())
+    return starts
 
 
 @torch.no_grad()
 def _values(model: WorldModel, carry: Carry, plan: Array) -> Array:
     """(STEPS,) Q^ along the plan."""
-    actions = torch.as_tensor(plan).to(carry.h)
     found = []
-    for action in actions:
+    for action in torch.as_tensor(plan).to(carry.h):
         found.append(float(model.value(carry, action[None])))
         carry = model.imagine(carry, action[None])
     return np.array(found)
 
 
 def measure(config: ResidualsConfig) -> None:
-    """Plan, branch, and write the errors."""
-    if config.task not in _AFTER:
-        raise UsageError(f"--task={config.task}: expected one of {', '.join(_AFTER)}")
-    if config.branches < 2:
-        raise UsageError(f"--branches={config.branches}: expected at least 2")
-    least, most = config.step_ticks
-    if not 1 <= least <= most or not 0 < config.eta <= 2:
-        raise UsageError(
-            f"--eta={config.eta} --step_ticks={[least, most]}: expected a step within the box, at "
-            "most 2, and 1 <= shortest <= longest; the data's card says how its walk stepped"
-        )
-    artifact = config.artifact()
-    points = _Points(config.task, artifact, config.seed)
-    longest = replace(artifact, planner=replace(artifact.planner, horizon=STEPS))
-    watch(longest, config.env, config, points)
-    returns = _returns(artifact)
-    found: dict[str, list[Residuals]] = {}
-    for number, point in enumerate(tqdm(points.points, unit="plan", desc="branch")):
-        for kind, plan in point.plans.items():
-            rng = np.random.default_rng([config.seed, number])
-            rngs = rng.spawn(STEPS * config.branches)
-            worth = _branches(config.env, point, plan, config.random_walk(), rngs, *returns)
-            found.setdefault(kind, []).append(Residuals(point.values[kind], *worth))
-    finish(
-        config,
-        {
-            "task": config.task,
-            "branches": config.branches,
-            "return_steps": returns[1],
-            "return_std": float(artifact.world_model.return_std),
-            "plans": {kind: analysis(rows) for kind, rows in found.items()},
-        },
-    )
-
-
-def _returns(artifact: Artifact) -> tuple[float, int]:
-    """Discount and ticks of the return that Q was trained on."""
+    """Plan, branch, and write the analysis."""
+    config.check()
+    artifact = config.load()
     if not artifact.manifest.get("train_config", {}).get("returns"):
         raise UsageError(f"{artifact.path} does not say which return it was trained on")
     returns = returns_of(artifact)
-    return returns.gamma, returns.steps
+    starts = _starts(artifact, config)
+    walk = RandomWalk(config.eta, config.boundary, config.step_ticks)
+    found: dict[str, list[Residuals]] = {}
+    for number, start in enumerate(tqdm(starts, unit="plan", desc="branch")):
+        for kind, plan in start.plans.items():
+            rngs = np.random.default_rng([config.seed, number]).spawn(STEPS * config.branches)
+            simulated = _branches(config.env, start, plan, walk, rngs, returns.gamma, returns.steps)
+            found.setdefault(kind, []).append(Residuals(start.values[kind], *simulated))
+    config.write(
+        {
+            "task": config.task,
+            "branches": config.branches,
+            "return_steps": returns.steps,
+            "return_std": float(artifact.world_model.return_std),
+            "plans": {kind: analysis(rows) for kind, rows in found.items()},
+        }
+    )
 
 
 def _branches(
     env_config: EnvConfig,
-    point: _Point,
+    start: _Start,
     plan: Array,
     walk: RandomWalk,
     rngs: Sequence[np.random.Generator],
@@ -184,10 +159,10 @@ def _branches(
     of the plan on; each of (STEPS * branches) ``rngs`` makes one branch."""
     rows = len(rngs)
     env = VectorEnv(env_config, rows, render_depth=False)
-    env.reset([point.scenario] * rows)
-    for action in point.sent:
+    env.reset([start.scenario] * rows)
+    for action in start.sent:
         env.step(np.tile(action, (rows, 1)))
-    own = np.repeat(np.arange(STEPS), rows // STEPS)  # the step of the plan that a row is about
+    own = np.repeat(np.arange(STEPS), rows // STEPS)  # the step of the plan that a row measures
     short, whole = np.zeros(rows), np.zeros(rows)
     walk.start_at(np.zeros((rows, ACTION_DIM)), rngs)
     age = 0
@@ -207,13 +182,86 @@ def _branches(
     return short.reshape(STEPS, -1), whole.reshape(STEPS, -1)
 
 
+class Residuals(NamedTuple):
+    """One plan of K steps."""
+
+    value: Array
+    """(K,) Q^ along the plan."""
+    short: Array
+    """(K, R) returns of random walks from each step on, with the horizon of training."""
+    whole: Array
+    """(K, R) the same to the end of the episode."""
+
+
+def analysis(plans: Sequence[Residuals]) -> dict[str, Any]:
+    """Variances, correlations, bounds and biases; needs at least three plans."""
+    if len(plans) < 3:
+        return {"plans": len(plans)}
+    errors = np.stack([p.value - p.short.mean(1) for p in plans])  # (P, K)
+    noise = np.stack([p.short.var(1, ddof=1) / p.short.shape[1] for p in plans]).mean(0)
+    covariance = _positive(np.cov(errors.T, ddof=1) - np.diag(noise))
+    rho = _correlation(covariance)
+    cut = np.stack([(p.short - p.whole).mean(1) for p in plans])
+    return {
+        "plans": len(plans),
+        "sigma": np.sqrt(np.diag(covariance)).tolist(),
+        "rho": rho.tolist(),
+        "rho_max": _largest(rho),
+        "rho_next": float(np.mean(np.diag(rho, 1))) if len(rho) > 1 else None,
+        "return_noise_variance": noise.tolist(),
+        "bias": errors.mean(0).tolist(),
+        "bias_of_cutting": cut.mean(0).tolist(),
+        "horizons": [_horizon(n, covariance, errors) for n in range(1, len(covariance) + 1)],
+    }
+
+
+def _positive(covariance: Array) -> Array:
+    """The nearest positive semidefinite matrix: subtracting noise may give negative variances."""
+    values, vectors = np.linalg.eigh(covariance)
+    fixed: Array = (vectors * np.maximum(values, 0.0)) @ vectors.T
+    return fixed
+
+
+def _correlation(covariance: Array) -> Array:
+    sigma = np.sqrt(np.diag(covariance))
+    scale = np.outer(sigma, sigma)
+    rho: Array = np.divide(covariance, scale, out=np.eye(len(sigma)), where=scale > 0)
+    return rho
+
+
+def _largest(rho: Array) -> float:
+    """The largest absolute correlation between two different steps."""
+    apart = np.abs(rho[~np.eye(len(rho), dtype=bool)])
+    return float(apart.max()) if len(apart) else 0.0
+
+
+def _horizon(n: int, covariance: Array, errors: Array) -> dict[str, float]:
+    """Variance, bounds, bias and mean square error of J_N."""
+    part = covariance[:n, :n]
+    sigma = np.sqrt(np.diag(part))
+    rho = _largest(_correlation(part))
+    low, high = bounds(n, float(sigma.min()), float(sigma.max()), rho)
+    variance = float(part.sum()) / n**2
+    bias = float(errors[:, :n].mean())
+    return {
+        "n": n,
+        "variance": variance,
+        "v_lb": low,
+        "v_ub": high,
+        "bias": bias,
+        "error": variance + bias**2,
+    }
+
+
+def bounds(n: int, sigma_min: float, sigma_max: float, rho: float) -> tuple[float, float]:
+    """V_lb and V_ub of the paper."""
+    pairs = n * n - n
+    low = (n * sigma_min**2 - rho * pairs * sigma_max**2) / n**2
+    return max(low, 0.0), (n + rho * pairs) / n**2 * sigma_max**2
+
+
 CONFIG = ResidualsConfig
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run_command(CONFIG, measure, argv, prog=PROG)
-
+main = study.make_main("residuals", CONFIG, measure)
 
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(main(None))

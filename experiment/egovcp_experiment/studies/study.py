@@ -1,19 +1,33 @@
-"""What the studies share: a policy to look at, and a folder for what was found."""
+"""Shared parts of the studies: options, result file, and closed-loop play."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import batched
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+
 from egovcp.artifact import Artifact
+from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.files import write_json
+from egovcp.model import Carry, WorldModel
+from egovcp.plan import PolicyStep
 from egovcp.policy_options import PlannerOptions, PolicyOptions, load_policy
-from egovcp_experiment.tools import RESULT
+from egovcp.robot.controllers import make_controller
+from egovcp.sim.config import EnvConfig, evaluation_config
+from egovcp.sim.env import Observation, PrivilegedState, StepResult, VectorEnv
+from egovcp.sim.scenario import Scenario
+from egovcp_experiment.cell import RESULT
 
-_AS_IT_IS: Final = PlannerOptions()
+_SEED: Final = 4_000_000_000  # added to seeds: no collection or evaluation has these scenarios
+_ENVS: Final = 8  # robots in parallel
 
 
 @dataclass(frozen=True)
@@ -23,23 +37,25 @@ class StudyConfig:
     output_dir: str = ""
     """New folder for the result."""
     policy: PolicyOptions = field(default_factory=PolicyOptions)
-    """The policy to look at."""
+    """Policy to study."""
+    planner: PlannerOptions = field(default_factory=PlannerOptions)
+    """Changes to the policy's planner."""
 
-    def load(self, planner: PlannerOptions = _AS_IT_IS) -> Artifact:
-        """The policy, its planner changed.
+    def load(self) -> Artifact:
+        """The policy with the changed planner.
 
         Raises:
-            UsageError: none is named, or the changes make no sense.
+            UsageError: none is named, or the changes are invalid.
             ArtifactError: it is missing or damaged.
         """
         self.policy.require()
-        return load_policy(self.policy, planner)
+        return load_policy(self.policy, self.planner)
 
-    def folder(self) -> Path:
-        """Make the folder.
+    def write(self, figures: Mapping[str, Any]) -> None:
+        """Write the result into the new folder.
 
         Raises:
-            UsageError: none is named, or it holds a result.
+            UsageError: no folder is named, or it holds a result.
         """
         if not self.output_dir:
             raise UsageError("--output_dir is missing; name a new folder")
@@ -47,9 +63,97 @@ class StudyConfig:
         if (folder / RESULT).exists():
             raise UsageError(f"{folder} holds a result already; name a new folder")
         folder.mkdir(parents=True, exist_ok=True)
-        return folder
+        write_json(folder / RESULT, figures)
 
 
-def finish(config: StudyConfig, figures: Mapping[str, Any]) -> None:
-    """Write what was found."""
-    write_json(config.folder() / RESULT, figures)
+@dataclass(frozen=True)
+class SimStudyConfig(StudyConfig):
+    """Options of the studies in simulation."""
+
+    task: str = "ball"
+    """Task to play."""
+    episodes: int = 16
+    """Number of scenarios."""
+    seed: int = 0
+    """Seed of the scenarios."""
+    env: EnvConfig = field(default_factory=evaluation_config)
+    """Scenes, sensors, delays and randomisation."""
+
+    def load(self) -> Artifact:
+        """The policy with the changed planner.
+
+        Raises:
+            UsageError: an option is invalid.
+            ArtifactError: the policy is missing, damaged, or of another low-level controller.
+        """
+        if self.episodes < 1:
+            raise UsageError(f"--episodes={self.episodes}: expected at least 1")
+        artifact = super().load()
+        artifact.require_controller(make_controller(self.env.controller).id)
+        return artifact
+
+    def require_task(self, known: Sequence[str] | Mapping[str, object]) -> None:
+        """Raise `UsageError` unless the task is one of ``known``."""
+        if self.task not in known:
+            raise UsageError(f"--task={self.task}: expected one of {', '.join(known)}")
+
+    def empty_scenes(self) -> EnvConfig:
+        """The scenes without events."""
+        name = f"{self.task}_episode"
+        empty = replace(self.env.episode(self.task), empty_probability=1.0)
+        return replace(self.env, **{name: empty})  # type: ignore[arg-type]
+
+
+def make_main[C: StudyConfig](
+    name: str, config: type[C], measure: Callable[[C], None]
+) -> Callable[[Sequence[str] | None], int]:
+    """The `main` of a study's module, which returns the exit code."""
+
+    def main(argv: Sequence[str] | None = None) -> int:
+        prog = f"python -m egovcp_experiment.studies.{name}"
+        return run_command(config, measure, argv, prog=prog)
+
+    return main
+
+
+@dataclass(frozen=True)
+class PlayedStep:
+    """A step of all robots, after its execution."""
+
+    scenarios: Sequence[Scenario]
+    """One per row."""
+    env: VectorEnv
+    """After the step."""
+    model: WorldModel
+    state: PrivilegedState
+    """Before the step."""
+    carry: Carry
+    """Before the step, with its observation."""
+    tick: NDArray[np.int64]
+    """(E,) before the step."""
+    live: list[int]
+    """Rows whose episode was not over."""
+    observation: Observation
+    plan: PolicyStep
+    result: StepResult
+
+
+def play_episodes(
+    artifact: Artifact, env_config: EnvConfig, config: SimStudyConfig
+) -> Iterator[PlayedStep]:
+    """Play the scenarios of ``config`` in the scenes of ``env_config``, in groups of `_ENVS`."""
+    scenarios = [Scenario(config.task, _SEED + config.seed, i) for i in range(config.episodes)]
+    with tqdm(total=len(scenarios), unit="ep", desc=f"play {config.task}") as bar:
+        for group in batched(scenarios, _ENVS):
+            env = VectorEnv(env_config, len(group))
+            policy = artifact.make_policy(len(group), config.seed)
+            observation = env.reset(group)
+            while not env.done.all():
+                plan = policy.act(observation.depth, observation.state)
+                live = [int(row) for row in np.flatnonzero(~env.done)]
+                before = (env.privileged_state(), policy.carry.map(torch.clone), np.array(env.tick))
+                result = env.step(plan.action)
+                policy.advance(result.sent_action)
+                yield PlayedStep(group, env, policy.model, *before, live, observation, plan, result)
+                observation = result.observation
+            bar.update(len(group))

@@ -1,4 +1,4 @@
-"""Behaviour is told from what hands and pelvis did."""
+"""Behaviour follows from the traces of hands and pelvis."""
 
 from __future__ import annotations
 
@@ -7,41 +7,41 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from egovcp_experiment.studies.behaviour import Track, hands_away, hands_back, main
-from egovcp_experiment.tools import read_json
+from egovcp_experiment.cell import read_json
+from egovcp_experiment.studies.behaviour import BehaviourTrace, main
 
 TICK = 0.04
 
 
-def track(reach: list[float], speed: list[float]) -> Track:
+def track(reach: list[float], speed: list[float]) -> BehaviourTrace:
     """Hands that reach forward by so much in each tick, m; the push comes at tick 1."""
     hands = [np.array([[0.3 + r, 0.2, 0.1], [0.3, -0.2, 0.1]]) for r in reach]
     since = [(t - 1) * TICK for t in range(len(reach))]
     zeros = [0.0] * len(reach)
-    return Track(since, hands, [np.zeros(7)] * len(reach), zeros, speed, zeros)
+    return BehaviourTrace(since, hands, [np.zeros(7)] * len(reach), zeros, speed, zeros)
 
 
 def test_the_further_hand_counts() -> None:
-    np.testing.assert_allclose(hands_away(track([0.0, 0.4], [0, 0])), [0.0, 0.4])
+    np.testing.assert_allclose(track([0.0, 0.4], [0, 0]).hands_away, [0.0, 0.4])
 
 
 def test_hands_that_return_after_recovery_are_back() -> None:
     pushed = [0.5] * 20
     still = [0.0] * 60
     reach = [0.0, *[0.4] * 40, *[0.05] * 39]
-    assert hands_back(track(reach, [*pushed, *still])) is True
+    assert track(reach, [*pushed, *still]).hands_back is True
 
 
-def test_hands_that_stay_up_are_not() -> None:
-    assert hands_back(track([0.0, *[0.4] * 99], [*[0.5] * 20, *[0.0] * 80])) is False
+def test_hands_that_stay_up_are_not_back() -> None:
+    assert track([0.0, *[0.4] * 99], [*[0.5] * 20, *[0.0] * 80]).hands_back is False
 
 
-def test_what_cannot_be_seen_is_not_judged() -> None:
+def test_episodes_without_recovery_are_not_judged() -> None:
     never_slow = track([0.0, *[0.4] * 79], [0.5] * 80)
     too_short = track([0.0, *[0.4] * 39], [*[0.5] * 10, *[0.0] * 30])
     fallen = track([0.0, *[0.4] * 99], [*[0.5] * 20, *[0.0] * 80])
     fallen.fallen = True
-    assert [hands_back(t) for t in (never_slow, too_short, fallen)] == [None, None, None]
+    assert [t.hands_back for t in (never_slow, too_short, fallen)] == [None, None, None]
 
 
 @pytest.mark.parametrize(
@@ -56,7 +56,7 @@ def test_every_task_is_measured(task: str, key: str, flags: list[str], tmp_path:
     assert 0 < found[key]["mean"] < 1
 
 
-def test_its_planner_can_be_changed(
+def test_planner_options_change_the_planner(
     flags: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     argv = ["--task=ball", *flags, "--planner.samples=3", "--planner.elites=2"]

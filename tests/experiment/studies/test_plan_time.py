@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from egovcp.plan import PlannerConfig
+from egovcp_experiment.cell import read_json
 from egovcp_experiment.studies import plan_time
-from egovcp_experiment.tools import read_json
 
 
 @pytest.mark.parametrize(
@@ -19,9 +19,11 @@ from egovcp_experiment.tools import read_json
         (10.0, 34.0, 1.0, 32),  # out of reach: the least there is
     ],
 )
-def test_the_line_through_two_times(few: float, many: float, budget: float, samples: int) -> None:
+def test_candidates_follow_from_two_times(
+    few: float, many: float, budget: float, samples: int
+) -> None:
     planner = PlannerConfig(samples=256, elites=4)
-    found = plan_time._afforded(planner, "cem", few, many, budget)
+    found = plan_time._affordable(planner, "cem", few, many, budget)
     assert found["samples"] == samples
     assert found["elites"] == 4  # the planner's number
     assert found["plan_ms"] == pytest.approx(2 + samples / 32)

@@ -6,12 +6,21 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from egovcp.sim.config import EnvConfig, EpisodeConfig
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
-from egovcp_experiment.studies.residuals import STEPS, _branches, _Point, main
-from egovcp_experiment.tools import read_json
+from egovcp_experiment.cell import read_json
+from egovcp_experiment.studies.residuals import (
+    STEPS,
+    Residuals,
+    _branches,
+    _Start,
+    analysis,
+    bounds,
+    main,
+)
 
 
 def _config(ticks: int) -> EnvConfig:
@@ -22,12 +31,12 @@ def _config(ticks: int) -> EnvConfig:
 def _branch(
     ticks: int, steps: int, plan: np.ndarray, walk: RandomWalk
 ) -> tuple[np.ndarray, np.ndarray]:
-    point = _Point(Scenario("ball", 0, 0), 2, [np.zeros(7)] * 2, {}, {})
+    point = _Start(Scenario("ball", 0, 0), [np.zeros(7)] * 2, {}, {})
     rngs = np.random.default_rng(0).spawn(2 * STEPS)
     return _branches(_config(ticks), point, plan, walk, rngs, 0.5, steps)
 
 
-def test_each_step_counts_from_its_own_action_on() -> None:
+def test_returns_start_at_the_action_of_each_step() -> None:
     """In an empty scene the reward is the cost of the pose, -0.01 mean(a^2), known in advance."""
     plan = np.repeat(np.linspace(0.1, 0.3, STEPS)[:, None], 7, axis=1)
     short, whole = _branch(2 + STEPS, 1, plan, RandomWalk())
@@ -36,13 +45,13 @@ def test_each_step_counts_from_its_own_action_on() -> None:
     assert (whole[:-1] < short[:-1]).all()
 
 
-def test_walks_part_after_the_plan() -> None:
+def test_walks_differ_after_the_plan() -> None:
     short, whole = _branch(20, 6, np.zeros((STEPS, 7)), RandomWalk())
     assert (short[:, 0] != short[:, 1]).all()
     assert (np.abs(whole) >= np.abs(short)).all()
 
 
-def test_a_walk_that_rests_stays_where_the_plan_has_led() -> None:
+def test_a_resting_walk_holds_the_last_action_of_the_plan() -> None:
     """A rest of 100 ticks is all but never over within the 6 ticks after the plan: what is counted
     is the cost of standing where the plan ended, -0.01 mean(a^2) in each tick."""
     plan = np.repeat(np.linspace(0.1, 0.3, STEPS)[:, None], 7, axis=1)
@@ -63,3 +72,44 @@ def test_the_study_measures_both_kinds_of_plans(flags: list[str], tmp_path: Path
     for row in found["plans"].values():
         assert row["plans"] == 3
         assert [at["n"] for at in row["horizons"]] == list(range(1, STEPS + 1))
+
+
+def plans(rho: float, noise: float, bias: float = 0.0, count: int = 4000) -> list[Residuals]:
+    """Errors of deviation 0.5 whose steps correlate by rho; returns of 4 walks with that noise."""
+    rng = np.random.default_rng(0)
+    steps, walks = 4, 4
+    common = rng.normal(size=(count, 1)) * rho**0.5
+    errors = 0.5 * (common + rng.normal(size=(count, steps)) * (1 - rho) ** 0.5) + bias
+    truth = rng.normal(size=(count, steps))
+    returns = truth[:, :, None] + noise * rng.normal(size=(count, steps, walks))
+    return [Residuals(truth[p] + errors[p], returns[p], returns[p] - 0.25) for p in range(count)]
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.6])
+def test_noise_of_the_returns_is_subtracted(rho: float) -> None:
+    found = analysis(plans(rho, noise=2.0, bias=0.1))
+    np.testing.assert_allclose(found["sigma"], 0.5, atol=0.06)
+    assert found["rho_next"] == pytest.approx(rho, abs=0.12)
+    np.testing.assert_allclose(found["bias"], 0.1, atol=0.06)
+    np.testing.assert_allclose(found["bias_of_cutting"], 0.25)
+
+
+@pytest.mark.parametrize("rho", [0.0, 0.3, 1.0])
+def test_the_variance_of_a_mean_lies_between_its_bounds(rho: float) -> None:
+    for at in analysis(plans(rho, noise=0.0))["horizons"]:
+        n = at["n"]
+        assert at["variance"] == pytest.approx(0.25 * (1 + (n - 1) * rho) / n, rel=0.1)
+        assert at["v_lb"] <= at["variance"] * 1.001
+        assert at["variance"] <= at["v_ub"] * 1.001
+        assert at["error"] == pytest.approx(at["variance"] + at["bias"] ** 2)
+
+
+def test_the_bounds_are_those_of_the_paper() -> None:
+    assert bounds(1, 0.3, 0.5, 0.9) == pytest.approx((0.09, 0.25))
+    assert bounds(4, 0.5, 0.5, 0.0) == pytest.approx((0.0625, 0.0625))
+    low, high = bounds(4, 0.5, 0.5, 0.5)
+    assert (low, high) == (0.0, pytest.approx((4 + 0.5 * 12) / 16 * 0.25))
+
+
+def test_two_plans_are_too_few() -> None:
+    assert analysis(plans(0.0, 1.0, count=2)) == {"plans": 2}

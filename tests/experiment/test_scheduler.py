@@ -1,4 +1,4 @@
-"""Cells run once, in order, side by side; what fails or is stopped goes on later."""
+"""Cells run once, in order and in parallel; failed and stopped cells continue later."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from egovcp.errors import EnvironmentFailure, UsageError
-from egovcp_experiment.cell import Cell, Found, Given, Output
-from egovcp_experiment.schedule import Schedule
-from egovcp_experiment.store import Store
+from egovcp_experiment.cell import Cell, CellFigure, CellOutput, ExternalPath
+from egovcp_experiment.scheduler import CellScheduler
+from egovcp_experiment.store import CellStore
 
 from .conftest import MakeCell
 
@@ -26,22 +26,22 @@ def run(
     folder: Path,
     jobs: int = 1,
     say: Callable[[str], None] = lambda line: None,
-) -> Schedule:
+) -> CellScheduler:
     """Run cells, or raise what running them raises."""
-    store = Store(folder)
+    store = CellStore(folder)
     with store.locked():
-        schedule = Schedule(cells, store, jobs, say)
+        schedule = CellScheduler(cells, store, jobs, say)
         schedule.run()
     return schedule
 
 
 def chain(cell: MakeCell) -> list[Cell]:
     """a, then b from a file of a, then c from a figure of b."""
-    b = cell("b", add=2, source=Output("a", "result.json"))
-    return [cell("a", add=1), b, cell("c", add=Found("b", ("total",)))]
+    b = cell("b", add=2, source=CellOutput("a", "result.json"))
+    return [cell("a", add=1), b, cell("c", add=CellFigure("b", ("total",)))]
 
 
-def test_cells_take_files_and_figures_of_those_before(cell: MakeCell, tmp_path: Path) -> None:
+def test_cells_read_files_and_figures_of_other_cells(cell: MakeCell, tmp_path: Path) -> None:
     records = run(chain(cell), tmp_path / "out").records
     assert [records[name]["figures"]["total"] for name in "abc"] == [1, 3, 3]
     assert records["b"]["settings"]["flags"]["source"]["sha256"] == records["a"]["sha256"]
@@ -67,7 +67,7 @@ def test_other_settings_are_refused_before_anything_runs(
 def test_other_content_of_a_given_file_is_refused(cell: MakeCell, tmp_path: Path) -> None:
     file = tmp_path / "given.json"
     file.write_text('{"total": 4}')
-    cells = [cell("a", source=Given(str(file)))]
+    cells = [cell("a", source=ExternalPath(str(file)))]
     assert run(cells, tmp_path / "out").records["a"]["figures"]["total"] == 4
     run(cells, tmp_path / "out")
     file.write_text('{"total": 5}')
@@ -75,7 +75,7 @@ def test_other_content_of_a_given_file_is_refused(cell: MakeCell, tmp_path: Path
         run(cells, tmp_path / "out")
 
 
-def test_a_failure_keeps_only_those_waiting_that_need_it(
+def test_a_failure_stops_only_the_cells_that_need_it(
     cell: MakeCell, tmp_path: Path, diary: Path
 ) -> None:
     broken, alone = cell("a", fail=3), cell("d", add=1)
@@ -86,24 +86,22 @@ def test_a_failure_keeps_only_those_waiting_that_need_it(
     assert diary.read_text().split() == ["a", "d", "a", "b", "c"]
 
 
-def test_independent_cells_run_side_by_side(cell: MakeCell, tmp_path: Path) -> None:
+def test_independent_cells_run_in_parallel(cell: MakeCell, tmp_path: Path) -> None:
     """Each of two waits until it is interrupted: both have begun only if they run together."""
     cells = [cell("a", wait=60), cell("b", wait=60)]
     with pytest.raises(KeyboardInterrupt):
         interrupted(cells, tmp_path / "out", jobs=2)
 
 
-def test_what_measures_time_runs_alone_and_after_what_can_share(
-    cell: MakeCell, tmp_path: Path
-) -> None:
+def test_exclusive_cells_run_alone_and_last(cell: MakeCell, tmp_path: Path) -> None:
     shared = cell("t", wait=0.3)
-    timing = replace(shared, tool=replace(shared.tool, alone=True))
+    timing = replace(shared, command=replace(shared.command, exclusive=True))
     other = replace(timing, name="u")
-    after = cell("c", add=Found("u", ("total",)))
-    said: list[str] = []
+    after = cell("c", add=CellFigure("u", ("total",)))
+    lines: list[str] = []
     cells = [timing, other, cell("a", wait=0.5), cell("b", wait=0.1), after]
-    run(cells, tmp_path / "out", jobs=3, say=said.append)
-    told = [line.partition(", ")[2] for line in said]
+    run(cells, tmp_path / "out", jobs=3, say=lines.append)
+    told = [line.partition(", ")[2] for line in lines]
     order = [f"{t.partition(':')[0]} {t.partition(': ')[2].split()[0]}" for t in told]
     assert order[:2] == ["a begins;", "b begins;"]
     assert sorted(order[2:4]) == ["a done", "b done"]
@@ -111,14 +109,12 @@ def test_what_measures_time_runs_alone_and_after_what_can_share(
     assert order[8:] == ["c begins;", "c done"]
 
 
-def test_an_interrupt_stops_cleanly_and_the_same_cells_go_on(
-    cell: MakeCell, tmp_path: Path, diary: Path
-) -> None:
+def test_an_interrupted_cell_is_resumed(cell: MakeCell, tmp_path: Path, diary: Path) -> None:
     out = tmp_path / "out"
-    said: list[str] = []
+    lines: list[str] = []
     with pytest.raises(KeyboardInterrupt):
-        interrupted([cell("a", wait=60)], out, say=said.append)
-    assert "a: stopped after" in said[-1]
+        interrupted([cell("a", wait=60)], out, say=lines.append)
+    assert "a: stopped after" in lines[-1]
     assert (out / "work" / "a" / "checkpoint").exists()
     assert not (out / "cells" / "a.json").exists()
     run([cell("a", wait=0.01)], out)
@@ -137,9 +133,7 @@ def interrupted(cells: Sequence[Cell], folder: Path, jobs: int = 1, **options: A
     run(cells, folder, jobs, **options)
 
 
-def test_what_an_attempt_left_without_a_checkpoint_is_removed(
-    cell: MakeCell, tmp_path: Path
-) -> None:
+def test_output_without_a_checkpoint_is_removed(cell: MakeCell, tmp_path: Path) -> None:
     rest = tmp_path / "out" / "work" / "a" / "torn"
     (tmp_path / "out" / "cells").mkdir(parents=True)
     rest.mkdir(parents=True)
@@ -147,20 +141,20 @@ def test_what_an_attempt_left_without_a_checkpoint_is_removed(
     assert not rest.exists()
 
 
-def test_two_commands_do_not_work_in_one_folder(tmp_path: Path) -> None:
+def test_the_folder_is_locked(tmp_path: Path) -> None:
     with (
-        Store(tmp_path / "out").locked(),
+        CellStore(tmp_path / "out").locked(),
         pytest.raises(EnvironmentFailure, match="is being written by process"),
-        Store(tmp_path / "out").locked(),
+        CellStore(tmp_path / "out").locked(),
     ):
         pass
 
 
-def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+def test_a_folder_with_other_content_is_refused(tmp_path: Path) -> None:
     (tmp_path / "thesis.txt").write_text("do not touch")
     with (
         pytest.raises(UsageError, match="something other than experiments"),
-        Store(tmp_path).locked(),
+        CellStore(tmp_path).locked(),
     ):
         pass
 

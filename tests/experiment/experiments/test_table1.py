@@ -1,4 +1,4 @@
-"""Table I: what its cells run, which of them share a model, and what is made of given numbers."""
+"""Table I: its cells, shared models, and verdicts."""
 
 from __future__ import annotations
 
@@ -9,15 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from egovcp_experiment.cell import Cell, Output
-from egovcp_experiment.claims import Claim, Verdict, by_chance, weigh
-from egovcp_experiment.config import ExperimentConfig, TrainingConfig
+from egovcp_experiment.cell import ARTIFACT, PLAY, TRAIN, Cell, CellOutput
+from egovcp_experiment.config import SCALES, ExperimentConfig, TrainingConfig
 from egovcp_experiment.experiments import EXPERIMENTS
-from egovcp_experiment.report.document import Report, Table
-from egovcp_experiment.scales import SCALES
-from egovcp_experiment.tools import ARTIFACT, PLAY, TRAIN
-
-type Trained = Callable[[str, float], Mapping[str, Any]]
+from egovcp_experiment.experiments.table1 import Claim, Verdict, count_verdicts, judge
+from egovcp_experiment.report import ExperimentReport, Table
+from egovcp_experiment.results import Gain
 
 TABLE1 = EXPERIMENTS["table1"]
 SEEDS = (0, 1)
@@ -37,23 +34,25 @@ def planned(name: str) -> tuple[object, object]:
     return flags["planner.objective"], flags["planner.horizon"]
 
 
-def test_rows_say_what_is_planned_by() -> None:
+def test_rows_set_objective_and_horizon() -> None:
     assert [planned(f"ours_n{n}") for n in range(1, 7)] == [("value", n) for n in range(1, 7)]
     assert planned("arwm") == ("value", 4)
     assert planned("rew_mpc") == ("reward", 4)
     assert planned("td_mpc_mc") == planned("td_mpc_td") == ("td", 4)
 
 
-def test_rows_of_one_training_share_its_model() -> None:
-    ours = Output("train-ball-reward-s1", ARTIFACT)
+def test_rows_share_models() -> None:
+    ours = CellOutput("train-ball-reward-s1", ARTIFACT)
     for name in (*(f"ours_n{n}" for n in range(1, 7)), "rew_mpc", "td_mpc_mc"):
         assert row(name, 1).flags["policy.path"] == ours
-    assert row("arwm", 1).flags["policy.path"] == Output("train-ball-reward_arwm-s1", ARTIFACT)
-    assert row("td_mpc_td", 1).flags["policy.path"] == Output("train-ball-reward_td-s1", ARTIFACT)
-    assert sum(cell.tool is TRAIN for cell in CELLS.values()) == 3 * len(SEEDS) * 2
+    assert row("arwm", 1).flags["policy.path"] == CellOutput("train-ball-reward_arwm-s1", ARTIFACT)
+    assert row("td_mpc_td", 1).flags["policy.path"] == CellOutput(
+        "train-ball-reward_td-s1", ARTIFACT
+    )
+    assert sum(cell.command is TRAIN for cell in CELLS.values()) == 3 * len(SEEDS) * 2
 
 
-def test_models_differ_in_their_own_flag_only() -> None:
+def test_models_differ_in_one_flag() -> None:
     joint, arwm, td = (
         CELLS[f"train-wall-{name}-s0"].flags for name in ("reward", "reward_arwm", "reward_td")
     )
@@ -64,14 +63,14 @@ def test_models_differ_in_their_own_flag_only() -> None:
 
 
 def test_all_rows_and_references_play_the_same_scenarios() -> None:
-    plays = [c for c in CELLS.values() if c.tool is PLAY and c.flags["task"] == "ball"]
+    plays = [c for c in CELLS.values() if c.command is PLAY and c.flags["task"] == "ball"]
     assert len(plays) == 10 * len(SEEDS) + 1
     assert {(c.flags["episodes"], c.flags["seed"]) for c in plays} == {(100, 0)}
 
 
 def test_a_smoke_run_has_each_of_the_models() -> None:
     cells = TABLE1.cells(replace(SCALES["smoke"](), tasks=("ball",)))
-    assert [c.name for c in cells if c.tool is TRAIN] == [
+    assert [c.name for c in cells if c.command is TRAIN] == [
         "train-ball-reward-s0",
         "train-ball-reward_arwm-s0",
         "train-ball-reward_td-s0",
@@ -79,7 +78,7 @@ def test_a_smoke_run_has_each_of_the_models() -> None:
 
 
 def record(task: str, reward: float, success: float, rng: np.random.Generator) -> Mapping[str, Any]:
-    """Ten ticks an episode, with a little luck in each."""
+    """Ten ticks an episode, with a little noise."""
     played = {
         "episode": list(range(COUNT)),
         "steps": [10] * COUNT,
@@ -94,7 +93,7 @@ def results(reward: Callable[[str, str, int], float]) -> dict[str, Mapping[str, 
     rng = np.random.default_rng(0)
     found = {}
     for name, cell in CELLS.items():
-        if cell.tool is PLAY and cell.flags["controllers"] == "planner":
+        if cell.command is PLAY and cell.flags["controllers"] == "planner":
             _, task, variant, seed = name.split("-")
             level = reward(task, variant, int(seed[1:]))
             found[name] = record(task, level, 0.5 + level, rng)
@@ -107,11 +106,11 @@ def as_in_the_paper(task: str, variant: str, seed: int) -> float:
     return 0.2 if variant in best else 0.1 if variant == "ours_n4" else 0.0
 
 
-def report(reward: Callable[[str, str, int], float]) -> Report:
+def report(reward: Callable[[str, str, int], float]) -> ExperimentReport:
     return TABLE1.report(CONFIG, results(reward))
 
 
-def words(found: Report) -> set[tuple[str, str, str, str]]:
+def words(found: ExperimentReport) -> set[tuple[str, str, str, str]]:
     return {(c["above"], c["below"], c["task"], c["verdict"]) for c in found.figures["claims"]}
 
 
@@ -133,25 +132,14 @@ def test_the_papers_ordering_is_recognised() -> None:
     assert any(line.startswith("ours, N=4 above ours, N=1: ball holds (") for line in found.shows)
 
 
-def test_the_opposite_is_contradicted_and_no_difference_is_undecided() -> None:
+def test_the_opposite_is_contradicted_and_equality_is_undecided() -> None:
     opposite = report(lambda *cell: -as_in_the_paper(*cell))
     assert {word for *_, word in words(opposite)} == {"contradicted"}
     same = report(lambda *cell: 0.0)
     assert {word for *_, word in words(same)} == {"undecided"}
 
 
-def test_the_reward_where_both_succeed_is_said_beside() -> None:
-    found = report(as_in_the_paper)
-    (claims,) = [p for p in found.parts if isinstance(p, Table) and p.title.startswith("Differ")]
-    (row,) = [row for row in claims.rows if row[:2] == ("ours, N=4 above ARWM", "ball")]
-    gain = row[claims.head.index("reward/step where both succeed (95 %)")]
-    assert float(gain.split()[0]) == pytest.approx(0.2, abs=0.01)
-    figures = next(c for c in found.figures["claims"] if c["below"] == "arwm")
-    low, high = figures["reward_gain_of_wins_ci95"]
-    assert low < figures["reward_gain_of_wins"] < high
-
-
-def test_what_one_training_alone_does_holds_on_average_only() -> None:
+def test_a_claim_that_fails_in_one_training_holds_on_average_only() -> None:
     found = report(lambda task, variant, seed: (0.3, -0.1)[seed] if variant == "ours_n4" else 0.0)
     assert ("ours_n4", "ours_n1", "ball", "holds on average only") in words(found)
     assert "in 1 of 2 trainings" in " ".join(found.shows)
@@ -167,21 +155,7 @@ def test_the_summary_marks_the_best_and_has_the_deviation_of_trainings() -> None
     assert [line[0] for line in summary.rows if line[1].startswith("**")] == ["ARWM"]
 
 
-def test_the_models_stand_beside_each_other_on_held_out_episodes(trained: Trained) -> None:
-    records = {f"train-ball-reward-s{seed}": trained("ball", 0.2 + 0.2 * seed) for seed in SEEDS}
-    records["train-ball-reward_td-s1"] = trained("ball", 0.1)
-    found = TABLE1.report(CONFIG, results(as_in_the_paper) | records)
-    (table,) = [p for p in found.parts if isinstance(p, Table) and "held-out" in p.title]
-    rows = {row[1]: dict(zip(table.head, row, strict=True)) for row in table.rows}
-    assert list(rows) == ["joint embedding", "Q by TD"]
-    assert rows["joint embedding"]["Q R2"] == "0.3 ± 0.1"
-    assert rows["joint embedding"]["moving, 8 (x)"] == "4 ± 0"
-    assert rows["Q by TD"]["Q R2"] == "0.1"
-    assert rows["Q by TD"]["AUC within 5"] == "-"
-    assert found.figures["models"]["ball"]["joint embedding"]["Q R2"] == pytest.approx([0.2, 0.4])
-
-
-def test_a_claim_is_weighed_by_the_trainings_that_both_have() -> None:
+def test_a_claim_uses_the_trainings_of_both_rows() -> None:
     rng = np.random.default_rng(0)
     records = {
         "a0": record("ball", 0.0, 0.5, rng),
@@ -189,17 +163,19 @@ def test_a_claim_is_weighed_by_the_trainings_that_both_have() -> None:
         "b0": record("ball", 0.0, 0.5, rng),
     }
     claim = Claim("a", "b", ("ball",))
-    verdict = weigh(claim, "ball", {0: "a0", 1: "a1"}, {0: "b0", 1: "b1"}, records)
+    rows = {"a": {0: "a0", 1: "a1"}, "b": {0: "b0", 1: "b1"}}
+    verdict = judge(claim, "ball", rows, records)
     assert verdict is not None
-    assert (verdict.seeds, verdict.word, verdict.success) == (1, "undecided", 0.0)
-    assert weigh(claim, "ball", {1: "a1"}, {1: "b1"}, records) is None
+    assert (verdict.seeds, verdict.word, verdict.gain.success) == (1, "undecided", 0.0)
+    assert judge(claim, "ball", {"a": {1: "a1"}, "b": {1: "b1"}}, records) is None
 
 
-def test_chance_is_said() -> None:
+def test_verdicts_are_counted() -> None:
     claim = Claim("a", "b", ("ball",))
-    up = Verdict(claim, "ball", 1.0, (0.5, 1.5), 0.0, (0.0, 0.0), None, agreeing=1, seeds=1)
-    even = replace(up, reward_interval=(-0.1, 0.1))
-    assert by_chance([up] * 3 + [even] * 17).startswith(
+    gain = Gain(1.0, (0.5, 1.5), 0.0, (0.0, 0.0))
+    up = Verdict(claim, "ball", gain, agreeing=1, seeds=1)
+    even = replace(up, gain=gain._replace(reward_interval=(-0.1, 0.1)))
+    assert count_verdicts([up] * 3 + [even] * 17).startswith(
         "of 20 claims, one for each task: 3 holds, 17 undecided (95 % intervals; were no two "
         "rows any different, about 0.5 would"
     )

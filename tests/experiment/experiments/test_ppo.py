@@ -1,4 +1,4 @@
-"""PPO's cells, what is kept of its trainings, and the verdicts on it."""
+"""PPO's cells, digests and conclusions."""
 
 from __future__ import annotations
 
@@ -10,11 +10,10 @@ from typing import Any
 import pytest
 
 from egovcp.errors import UsageError
-from egovcp_experiment.cell import Output
-from egovcp_experiment.config import ExperimentConfig, PpoConfig, TrainingConfig
+from egovcp_experiment.cell import PPO_POLICY, TRAIN_PPO, CellOutput
+from egovcp_experiment.config import ExperimentConfig, PpoBaselineConfig, TrainingConfig
 from egovcp_experiment.experiments import EXPERIMENTS
-from egovcp_experiment.store import Store
-from egovcp_experiment.tools import PPO_POLICY, TRAIN_PPO
+from egovcp_experiment.store import CellStore
 
 PPO = EXPERIMENTS["ppo"]
 CONFIG = ExperimentConfig(
@@ -22,14 +21,14 @@ CONFIG = ExperimentConfig(
     tasks=("ball",),
     scenes=("--env.controller=stance",),
     train=TrainingConfig(seeds=(3,)),
-    ppo=PpoConfig(steps=1000, policies=2, robots=10, ticks=5, flags=("--threads=1",)),
+    ppo=PpoBaselineConfig(steps=1000, policies=2, robots=10, ticks=5, flags=("--threads=1",)),
 )
 
 
-def test_policies_are_those_that_the_training_saves() -> None:
+def test_played_policies_are_saved_ones() -> None:
     cells = {cell.name: cell for cell in PPO.cells(CONFIG)}
     training = cells["ppo-ball-s3"]
-    argv = Store(Path("out")).prepare(training, {})
+    argv = CellStore(Path("out")).prepare(training, {})
     assert argv == [
         "--output_dir=out/work/ppo-ball-s3",
         "--task=ball",
@@ -43,7 +42,7 @@ def test_policies_are_those_that_the_training_saves() -> None:
     ]
     plays = [cells[f"play-ball-ppo_{seen}-s3"] for seen in (500, 1000)]
     assert [play.flags["ppo.path"] for play in plays] == [
-        Output("ppo-ball-s3", f"checkpoints/{iteration}/{PPO_POLICY}")
+        CellOutput("ppo-ball-s3", f"checkpoints/{iteration}/{PPO_POLICY}")
         for iteration in ("000010", "000020")
     ]
     planner = cells["play-ball-default-s3"]
@@ -54,31 +53,32 @@ def test_policies_are_those_that_the_training_saves() -> None:
 
 
 def test_transitions_are_whole_updates_equally_far_apart() -> None:
-    assert PpoConfig(steps=200_000).transitions == (49_600, 99_200, 148_800, 198_400)
-    assert PpoConfig(steps=1, policies=2).transitions == (1600, 3200)
-    assert PpoConfig(steps=0).transitions == ()
+    assert PpoBaselineConfig(steps=200_000).transitions == (49_600, 99_200, 148_800, 198_400)
+    assert PpoBaselineConfig(steps=1, policies=2).transitions == (1600, 3200)
+    assert PpoBaselineConfig(steps=0).transitions == ()
 
 
-def test_flags_that_would_move_the_policies_are_refused() -> None:
+def test_flags_that_change_which_policies_are_saved_are_refused() -> None:
     for flag in ("--steps=5", "--robots=2", "--save_freq=1"):
         ppo = replace(CONFIG.ppo, flags=(flag,))
         with pytest.raises(UsageError, match=flag):
             replace(CONFIG, ppo=ppo).check()
     with pytest.raises(UsageError, match=r"--ppo\.steps=0"):
-        PPO.cells(replace(CONFIG, ppo=PpoConfig(steps=0)))
+        PPO.cells(replace(CONFIG, ppo=PpoBaselineConfig(steps=0)))
 
 
-def test_sample_efficiency_shares_the_trainings_and_can_do_without() -> None:
+def test_sample_efficiency_shares_the_trainings() -> None:
     ours = {cell.name: cell for cell in PPO.cells(CONFIG)}
     curves = {cell.name: cell for cell in EXPERIMENTS["sample-efficiency"].cells(CONFIG)}
     shared = {"ppo-ball-s3", "play-ball-ppo_500-s3", "play-ball-ppo_1000-s3", "bounds-ball"}
     assert {name for name in curves if "ppo" in name or name in ours} >= shared
     assert all(curves[name] == ours[name] for name in shared)
-    without = EXPERIMENTS["sample-efficiency"].cells(replace(CONFIG, ppo=PpoConfig(steps=0)))
+    no_ppo = replace(CONFIG, ppo=PpoBaselineConfig(steps=0))
+    without = EXPERIMENTS["sample-efficiency"].cells(no_ppo)
     assert not [cell for cell in without if "ppo" in cell.name]
 
 
-def test_any_policy_along_the_way_decides_about_the_hash(tmp_path: Path) -> None:
+def test_every_saved_policy_changes_the_digest(tmp_path: Path) -> None:
     for iteration in ("000010", "000020"):
         file = tmp_path / "checkpoints" / iteration / PPO_POLICY
         file.parent.mkdir(parents=True)
@@ -100,7 +100,7 @@ def played(name: str, success: int, reward: float) -> Mapping[str, Any]:
     return {name: {"plan_ms_p50": 1.0, "played": columns}}
 
 
-def test_verdicts_come_from_the_numbers() -> None:
+def test_conclusions_follow_from_the_scores() -> None:
     records = {
         "collect-ball-1334": {"figures": {"episodes": 1334, "steps": 200_100}},
         "play-ball-default-s3": {"figures": {"ball": played("planner", 18, 1.0)}},
@@ -122,6 +122,8 @@ def test_verdicts_come_from_the_numbers() -> None:
         "worse (reward per step -0.08000, 95 % -0.08000 to -0.08000; success -40.0 points"
     )
     assert shows[1].startswith(
-        "ball: beside the neutral pose, PPO is better (reward per step +0.01000"
+        "ball: compared with the neutral pose, PPO is better (reward per step +0.01000"
     )
-    assert shows[2].startswith("ball: beside its first policy, PPO's last is no different beyond")
+    assert shows[2].startswith(
+        "ball: compared with its first policy, PPO's last is no different beyond"
+    )

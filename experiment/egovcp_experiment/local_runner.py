@@ -1,0 +1,143 @@
+"""Runs cells in processes of this machine.
+
+``python -m egovcp_experiment.local_runner MODULE [--flags]`` is the process of a cell: it calls
+``MODULE.main``. Its standard input is a pipe without data. When the other end closes, because the
+experiment stops or its process has died, the command is interrupted as by Ctrl-C: a training writes
+its checkpoint, a collection keeps its episodes, and no process is left behind.
+"""
+
+from __future__ import annotations
+
+import importlib
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+if TYPE_CHECKING:  # not imported in the processes of cells
+    from egovcp_experiment.cell import CellCommand
+
+INTERRUPTED: Final = 130  # exit code after Ctrl-C
+
+
+@dataclass(frozen=True)
+class CellExit:
+    """A command that has ended."""
+
+    code: int
+    """Its exit code."""
+    machine: Mapping[str, Any]
+    """Hardware that it ran on."""
+
+
+def versions() -> dict[str, str]:
+    """Versions of the packages that figures depend on."""
+    return {name: version(name) for name in ("egovcp", "torch", "numpy", "mujoco")}
+
+
+@cache
+def machine() -> dict[str, Any]:
+    """Hardware of this machine. Opens the GPU, so it is called after a command has ended."""
+    from egovcp.hardware import hardware
+
+    return {name: value for name, value in hardware().items() if name.startswith("hardware")}
+
+
+class LocalProcess:
+    """A command in a process, which is interrupted when this process ends."""
+
+    def __init__(
+        self, module: str, argv: Sequence[str], log: Path, folder: str | None = None
+    ) -> None:
+        with log.open("ab") as output:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "egovcp_experiment.local_runner", module, *argv],
+                stdin=subprocess.PIPE,
+                stdout=output,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,  # the scheduler handles Ctrl-C
+                env=os.environ | {"PYTHONUNBUFFERED": "1"},
+                cwd=folder,
+            )
+
+    @property
+    def pid(self) -> int:
+        """Process and process group."""
+        return self._process.pid
+
+    def ended(self) -> CellExit | None:
+        """How it ended, or None."""
+        code = self._process.poll()
+        if code is None:
+            return None
+        self.interrupt()  # closes the pipe
+        return CellExit(code, machine())
+
+    def wait(self, seconds: float) -> CellExit | None:
+        """`ended` after at most this time."""
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(seconds)
+        return self.ended()
+
+    def interrupt(self) -> None:
+        """Close its standard input, which interrupts it."""
+        assert self._process.stdin is not None
+        self._process.stdin.close()
+
+    def kill(self) -> None:
+        """Kill it and its children."""
+        with suppress(ProcessLookupError):
+            os.killpg(self.pid, signal.SIGKILL)
+        self._process.wait()
+
+
+class LocalRunner:
+    """Runs at most ``jobs`` commands at a time, each on its share of the CPU cores."""
+
+    def __init__(self, jobs: int = 1) -> None:
+        self._slots: list[LocalProcess | None] = [None] * jobs
+
+    def start(self, command: CellCommand, argv: Sequence[str], log: Path) -> LocalProcess:
+        """Run a command at once."""
+        slot = next(k for k, p in enumerate(self._slots) if p is None or p.ended() is not None)
+        process = self._slots[slot] = LocalProcess(command.module, argv, log)
+        jobs = len(self._slots)
+        if jobs > 1 and hasattr(os, "sched_setaffinity"):
+            cores = sorted(os.sched_getaffinity(0))
+            with suppress(OSError):  # it may have ended already
+                os.sched_setaffinity(process.pid, cores[slot::jobs] or cores)
+        return process
+
+    def close(self) -> None:
+        """There is nothing to release."""
+
+
+def _interrupt_at_end_of_input() -> None:
+    while os.read(0, 1):
+        pass
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+def main() -> int:
+    """Entry point of a cell's process; returns the exit code of the command."""
+    module, *argv = sys.argv[1:]
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})  # Ray's workers block it
+    threading.Thread(target=_interrupt_at_end_of_input, daemon=True).start()
+    sys.argv = [module, *argv]
+    try:
+        return int(importlib.import_module(module).main(argv))
+    except KeyboardInterrupt:
+        return INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

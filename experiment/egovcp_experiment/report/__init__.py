@@ -1,1 +1,0 @@
-"""Reports: what an experiment found, as JSON, Markdown and a page that needs nothing else."""

@@ -1,0 +1,336 @@
+"""Results of closed-loop and held-out evaluations: statistics, tables and plots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from egovcp.intervals import Interval, bootstrap, wilson
+from egovcp_experiment.cell import Record
+from egovcp_experiment.report import (
+    Plot,
+    Table,
+    draw,
+    number,
+    percent,
+    percent_range,
+    points_range,
+    signed_range,
+)
+
+type Array = NDArray[np.float64]
+type Records = Mapping[str, Record]
+
+_TRIALS: Final = 10  # as in the paper
+
+
+class Gain(NamedTuple):
+    """Paired differences of two `EvalScores`, with 95 % intervals over scenarios."""
+
+    reward: float
+    """Per step."""
+    reward_interval: Interval
+    success: float
+    success_interval: Interval
+
+    def word(self, better: str = "better", worse: str = "worse", same: str = "undecided") -> str:
+        """By the interval of the reward."""
+        low, high = self.reward_interval
+        return better if low > 0 else worse if high < 0 else same
+
+    def columns(self) -> tuple[str, ...]:
+        """Success, percentage points, and reward per step, each with its interval."""
+        return (
+            f"{100 * self.success:+.1f}",
+            points_range(self.success_interval),
+            f"{self.reward:+.5f}",
+            signed_range(self.reward_interval),
+        )
+
+    def __str__(self) -> str:
+        success, success_range, reward, reward_range = self.columns()
+        return (
+            f"reward per step {reward}, 95 % {reward_range}; success {success} points, "
+            f"{success_range}"
+        )
+
+
+@dataclass(frozen=True)
+class EvalScores:
+    """Scores of S training seeds on the same E scenarios."""
+
+    reward: Array
+    """(S, E) sum over the episode."""
+    steps: Array
+    """(S, E) planner ticks."""
+    success: Array
+    """(S, E) 0 or 1."""
+    plan_ms: tuple[float, ...] = ()
+    """(S,) median time per plan and robot, ms."""
+    parts: Mapping[str, Array] = field(default_factory=dict)
+    """(S, E) 0 or 1 for each part of a sequence of tasks."""
+
+    @property
+    def success_rate(self) -> float:
+        """Mean over seeds and scenarios."""
+        return float(self.success.mean())
+
+    @property
+    def part_rates(self) -> dict[str, float]:
+        """Success rate of each part of a sequence."""
+        return {name: float(each.mean()) for name, each in self.parts.items()}
+
+    @property
+    def success_interval(self) -> Interval:
+        """95 %: Wilson for one seed, bootstrap over scenarios for several."""
+        if len(self.success) == 1:
+            return wilson(int(self.success.sum()), self.success.size)
+        return bootstrap(lambda i: _mean(self.success, i), self.success.shape[1])
+
+    @property
+    def reward_per_step(self) -> float:
+        """Sum of all rewards over sum of all steps."""
+        return float(self.reward.sum() / self.steps.sum())
+
+    @property
+    def reward_interval(self) -> Interval:
+        """95 %, bootstrap over scenarios."""
+        return bootstrap(self._reward_per_step, self.reward.shape[1])
+
+    @property
+    def reward_of_seeds(self) -> Array:
+        """(S,) reward per step of each training."""
+        each: Array = self.reward.sum(1) / self.steps.sum(1)
+        return each
+
+    @property
+    def reward_spread(self) -> float | None:
+        """Standard deviation of the reward per step over seeds; None for one seed."""
+        return float(np.std(self.reward_of_seeds, ddof=1)) if len(self.reward) > 1 else None
+
+    @property
+    def reward_trial_spread(self) -> float | None:
+        """Standard deviation of the reward per step over trials; None for a single scenario. A
+        trial is a tenth of the scenarios with one seed."""
+        count = min(_TRIALS, self.reward.shape[1])
+        if count < 2:
+            return None
+        parts = np.array_split(np.arange(self.reward.shape[1]), count)
+        trials = [self.reward[:, p].sum(1) / self.steps[:, p].sum(1) for p in parts]
+        return float(np.std(trials, ddof=1))
+
+    def _reward_per_step(self, i: NDArray[np.int64]) -> Array:
+        return _mean(self.reward, i) / _mean(self.steps, i)
+
+    def gain(self, other: EvalScores) -> Gain:
+        """Differences to ``other`` on the same scenarios."""
+        success = self.success.mean(0) - other.success.mean(0)
+        return Gain(
+            self.reward_per_step - other.reward_per_step,
+            bootstrap(lambda i: self._reward_per_step(i) - other._reward_per_step(i), len(success)),
+            float(success.mean()),
+            bootstrap(lambda i: success[i].mean(1), len(success)),
+        )
+
+    def figures(self) -> dict[str, Any]:
+        """For programs."""
+        return {
+            "seeds": len(self.reward),
+            "episodes": self.reward.shape[1],
+            "success_rate": self.success_rate,
+            "success_ci95": list(self.success_interval),
+            "reward_mean": self.reward_per_step,
+            "reward_ci95": list(self.reward_interval),
+            "reward_sd_over_seeds": self.reward_spread,
+            "reward_sd_over_trials": self.reward_trial_spread,
+            "plan_ms_p50": list(self.plan_ms),
+            **({"parts": self.part_rates} if self.parts else {}),
+        }
+
+
+def _mean(values: Array, picks: NDArray[np.int64]) -> Array:
+    """(S, E) values -> (R,) means over seeds and the picked scenarios (R, E)."""
+    mean: Array = values.mean(0)[picks].mean(1)
+    return mean
+
+
+def eval_scores(
+    records: Records, cells: Iterable[str], task: str, controller: str = "planner"
+) -> EvalScores | None:
+    """Scores of a controller on a task from cells, one per seed; None if all are missing."""
+    rows = [records[name]["figures"][task][controller] for name in cells if name in records]
+    if not rows:
+        return None
+
+    def column(name: str) -> Array:
+        return np.array([row["played"][name] for row in rows], np.float64)
+
+    parts = {
+        part: np.array([row["played"]["parts"][part] for row in rows], np.float64)
+        for part in rows[0]["played"].get("parts", ())
+    }
+    times = tuple(float(row["plan_ms_p50"]) for row in rows)
+    return EvalScores(column("reward"), column("steps"), column("success"), times, parts)
+
+
+def all_scores[K](
+    records: Records, plays: Mapping[K, Sequence[str]], task: str, controller: str = "planner"
+) -> dict[K, EvalScores]:
+    """Scores of each variant that has results, from the names of its cells."""
+    found = {k: eval_scores(records, cells, task, controller) for k, cells in plays.items()}
+    return {k: scores for k, scores in found.items() if scores is not None}
+
+
+def controller_scores(
+    records: Records, cell: str, task: str, controllers: Iterable[str]
+) -> dict[str, EvalScores]:
+    """Scores of the controllers that one cell played."""
+    found = {name: eval_scores(records, [cell], task, name) for name in controllers}
+    return {name: scores for name, scores in found.items() if scores is not None}
+
+
+def figures_of(scores: Mapping[Any, EvalScores]) -> dict[str, Any]:
+    """Name -> figures."""
+    return {str(name): each.figures() for name, each in scores.items()}
+
+
+def comparison(title: str, scores: Mapping[str, EvalScores], reference: str) -> Table:
+    """Success and reward of each, and paired differences to ``reference``."""
+    head = ["", "success", "95 %", "reward/step", "95 %", "sd over seeds"]
+    base = scores.get(reference)
+    if base is not None:
+        head += [f"success - {reference} (points)", "95 %", f"reward - {reference}", "95 %"]
+    rows = []
+    for name, each in scores.items():
+        row = [
+            name,
+            percent(each.success_rate),
+            percent_range(each.success_interval),
+            f"{each.reward_per_step:+.5f}",
+            signed_range(each.reward_interval),
+            number(each.reward_spread, ".5f"),
+        ]
+        if base is not None:
+            row += [""] * 4 if each is base else each.gain(base).columns()
+        rows.append(tuple(row))
+    return Table(title, tuple(head), tuple(rows))
+
+
+def comparison_plot(
+    name: str, title: str, scores: Mapping[str, EvalScores], reference: str
+) -> Plot:
+    """Success and reward of each with their intervals."""
+
+    def paint(figure: Any) -> None:
+        rows = range(len(scores))
+        for axes, (label, curve) in zip(figure.subplots(1, 2), _QUANTITIES.items(), strict=True):
+            for row, each in zip(rows, scores.values(), strict=True):
+                middle, low, high = curve(each)
+                axes.plot([low, high], [row, row], color="C0", linewidth=1.5)
+                axes.plot([middle], [row], "o", color="C0", markersize=4)
+            axes.set_yticks(list(rows), list(scores))
+            axes.invert_yaxis()
+            axes.set_xlabel(label)
+            if reference in scores:
+                middle = curve(scores[reference])[0]
+                axes.axvline(middle, color="0.7", linewidth=0.8, zorder=0)
+
+    height = 0.9 + 0.25 * len(scores)
+    return draw(name, f"{title}, with 95 % intervals", paint, (8.0, height))
+
+
+def _success_percent(scores: EvalScores) -> tuple[float, float, float]:
+    low, high = scores.success_interval
+    return 100 * scores.success_rate, 100 * low, 100 * high
+
+
+#: Label of an axis -> value and interval.
+_QUANTITIES: Final[Mapping[str, Callable[[EvalScores], tuple[float, float, float]]]] = {
+    "success, %": _success_percent,
+    "reward per step": lambda scores: (scores.reward_per_step, *scores.reward_interval),
+}
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Scores of one learner along its transitions."""
+
+    label: str
+    points: Mapping[int, EvalScores]
+    """Transitions -> scores."""
+    colour: str
+    """Of Matplotlib."""
+    style: str = "o-"
+    """Of Matplotlib."""
+
+
+def learning_curves(name: str, caption: str, curves: Sequence[Curve]) -> Plot:
+    """Success and reward against transitions, with 95 % intervals."""
+
+    def paint(figure: Any) -> None:
+        from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
+
+        left, right = figure.subplots(1, 2)
+        for axes, (label, quantity) in zip((left, right), _QUANTITIES.items(), strict=True):
+            for curve in curves:
+                xs = list(curve.points)
+                middle, low, high = zip(*map(quantity, curve.points.values()), strict=True)
+                axes.plot(xs, middle, curve.style, color=curve.colour, label=curve.label)
+                if len(xs) == 1:  # an error bar instead of a band
+                    axes.plot(xs * 2, [low[0], high[0]], color=curve.colour, linewidth=1)
+                else:
+                    axes.fill_between(xs, low, high, color=curve.colour, alpha=0.15, linewidth=0)
+            axes.set_xscale("log")
+            axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))  # for less than a decade
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+            axes.xaxis.set_minor_formatter(NullFormatter())
+            axes.set(xlabel="transitions", ylabel=label)
+        left.legend(fontsize=8)
+
+    return draw(name, f"{caption}, 95 % intervals", paint)
+
+
+def _depth_gain(task: Mapping[str, Any], region: str, k: int) -> float | None:
+    return _gain(task["depth"][region][str(k)], "model_mm", "repeat_mm")
+
+
+def _gain(errors: Mapping[str, float | None], model: str, repeat: str) -> float | None:
+    """How many times smaller the model's error is than that of repeating the last row."""
+    ours, theirs = errors[model], errors[repeat]
+    return None if not ours or theirs is None else theirs / ours
+
+
+#: Column -> its value in egovcp-train's report of one task; None if the episodes do not have it.
+HELDOUT: Final[Mapping[str, Callable[[Mapping[str, Any]], float | None]]] = {
+    "moving, 4 ahead (x)": lambda task: _depth_gain(task, "moving", 4),
+    "moving, 8 (x)": lambda task: _depth_gain(task, "moving", 8),
+    "near, 8 (x)": lambda task: _depth_gain(task, "near", 8),
+    "all pixels, 8 (x)": lambda task: _depth_gain(task, "valid", 8),
+    "joints, 4 (x)": lambda task: _gain(task["state"]["joint_position"]["4"], "model", "repeat"),
+    "AUC within 5": lambda task: task["termination"]["5"]["auc"],
+    "Q R2": lambda task: task["value"]["r2"],
+    "Q slope": lambda task: task["value"]["slope"],
+    "z active": lambda task: task["latent"]["active"],
+    "KL (nats)": lambda task: task["latent"]["kl_nats"],
+}
+#: What `over_seeds` prints.
+OVER_SEEDS: Final = "several seeds: mean and half of the range"
+
+
+def heldout(records: Records, cells: Iterable[str], task: str) -> dict[str, list[float]]:
+    """Column -> its values in the trainings, one per seed; empty without results."""
+    runs = [records[cell]["figures"]["tasks"][task] for cell in cells if cell in records]
+    values = {name: [column(run) for run in runs] for name, column in HELDOUT.items() if runs}
+    return {name: [v for v in column if v is not None] for name, column in values.items()}
+
+
+def over_seeds(values: Sequence[float]) -> str:
+    """One value, or mean and half of the range of several."""
+    if not values:
+        return "-"
+    text = f"{sum(values) / len(values):.3g}"
+    return text if len(values) == 1 else f"{text} ± {(max(values) - min(values)) / 2:.2g}"

@@ -1,0 +1,184 @@
+"""Runs the cells that have no result yet, several at a time."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Final
+
+from egovcp.errors import EnvironmentFailure, UsageError
+from egovcp.workers import stop_on_signal
+from egovcp_experiment.cell import Cell, Record, in_order
+from egovcp_experiment.local_runner import INTERRUPTED, LocalProcess, LocalRunner
+from egovcp_experiment.ray_runner import RayRun, RayRunner
+from egovcp_experiment.store import CellStore
+
+_POLL_S: Final = 0.05
+
+
+@dataclass
+class _Running:
+    """A cell whose command runs."""
+
+    cell: Cell
+    argv: list[str]
+    run: LocalProcess | RayRun
+    start: float
+
+    @property
+    def minutes(self) -> float:
+        return (time.monotonic() - self.start) / 60.0
+
+
+class CellScheduler:
+    """Runs the cells of an experiment and stores their results.
+
+    Args:
+        cells: each after those it needs.
+        store: results.
+        jobs: cells that run at a time.
+        log: called with each line of progress.
+        runner: runs the commands; None: `LocalRunner`.
+
+    Raises:
+        UsageError: a stored result has other settings.
+    """
+
+    def __init__(
+        self,
+        cells: Sequence[Cell],
+        store: CellStore,
+        jobs: int = 1,
+        log: Callable[[str], None] = print,
+        runner: LocalRunner | RayRunner | None = None,
+    ) -> None:
+        if jobs < 1:
+            raise UsageError(f"--jobs={jobs}: expected at least 1")
+        self._cells = in_order(cells)
+        self._store, self._jobs, self._log = store, jobs, log
+        self._runner = runner or LocalRunner(jobs)
+        self.records: dict[str, Record] = {}
+        self.failed: dict[str, str] = {}
+        self._running: list[_Running] = []
+        self._stopping = False
+        for cell in self._cells:  # refuses other settings before anything runs
+            if self._has_inputs(cell):
+                self._load(cell)
+
+    def run(self) -> Mapping[str, Record]:
+        """Run what is missing; a failed cell stops only the cells that need it.
+
+        Raises:
+            UsageError: a stored result has other settings, found once its inputs are known.
+            EnvironmentFailure: cells failed; all cells that do not need them are complete.
+            KeyboardInterrupt: after SIGINT or SIGTERM, once the commands have ended.
+        """
+        with stop_on_signal() as stopped:
+            try:
+                while not stopped and (self._start_ready() or self._running):
+                    self._collect()
+                    time.sleep(_POLL_S)
+                if stopped:
+                    self._stop(stopped)
+            finally:
+                for running in self._running:
+                    running.run.kill()
+                self._running = []
+        if self.failed:
+            raise EnvironmentFailure(self._failure_message())
+        return self.records
+
+    def _has_inputs(self, cell: Cell) -> bool:
+        return all(name in self.records for name in cell.needs)
+
+    def _load(self, cell: Cell) -> bool:
+        record = self._store.load(cell, self.records)
+        if record is not None:
+            self.records[cell.name] = record
+        return record is not None
+
+    def _ready(self) -> list[Cell]:
+        """Cells that could start now, exclusive ones last: they wait for all others."""
+        done = {*self.records, *self.failed, *(running.cell.name for running in self._running)}
+        ready = [c for c in self._cells if c.name not in done and self._has_inputs(c)]
+        return sorted(ready, key=lambda cell: cell.command.exclusive)
+
+    def _start_ready(self) -> bool:
+        """Start cells while there is room; returns whether any are still ready."""
+        for cell in self._ready():
+            if not self._has_room(cell):
+                return True
+            if not self._load(cell):
+                argv = self._store.prepare(cell, self.records)
+                self._progress(cell, "begins")
+                run = self._runner.start(cell.command, argv, self._store.log(cell))
+                self._running.append(_Running(cell, argv, run, time.monotonic()))
+        return bool(self._ready())
+
+    def _has_room(self, cell: Cell) -> bool:
+        busy = [running.cell.command for running in self._running]
+        if cell.command.exclusive or any(command.exclusive for command in busy):
+            return not busy
+        return len(busy) < self._jobs
+
+    def _collect(self) -> None:
+        """Store the results of commands that have ended."""
+        for running in list(self._running):
+            cell = running.cell
+            try:
+                end = running.run.ended()
+            except EnvironmentFailure as error:
+                self._running.remove(running)
+                self._fail(running, str(error))
+                continue
+            if end is None:
+                continue
+            self._running.remove(running)
+            if end.code == INTERRUPTED and self._stopping:
+                self._progress(cell, f"stopped after {running.minutes:.1f} min")
+            elif end.code != 0:
+                message = _last_line(self._store.log(cell)) or f"exit code {end.code}"
+                self._fail(running, message)
+            else:
+                date = datetime.now(UTC).isoformat(timespec="seconds")
+                facts = {"minutes": running.minutes, "date": date, **end.machine}
+                record = self._store.save(cell, self.records, running.argv, facts)
+                self.records[cell.name] = record
+                self._progress(cell, f"done in {running.minutes:.1f} min")
+
+    def _fail(self, running: _Running, message: str) -> None:
+        self.failed[running.cell.name] = message
+        self._progress(running.cell, f"failed after {running.minutes:.1f} min: {message}")
+
+    def _progress(self, cell: Cell, event: str) -> None:
+        number = self._cells.index(cell) + 1
+        left = len(self._cells) - len(self.records)
+        self._log(f"cell {number} of {len(self._cells)}, {cell.name}: {event}; {left} to go")
+
+    def _stop(self, stopped: Sequence[int]) -> None:
+        """Interrupt all commands and wait for them, until a second signal."""
+        self._stopping = True
+        self._log(f"stopping {len(self._running)} processes; once more to kill them")
+        for running in self._running:
+            running.run.interrupt()
+        while self._running and len(stopped) < 2:
+            self._collect()
+            time.sleep(_POLL_S)
+        raise KeyboardInterrupt
+
+    def _failure_message(self) -> str:
+        name, message = next(iter(self.failed.items()))
+        log = self._store.log(next(c for c in self._cells if c.name == name))
+        more = f" (and {len(self.failed) - 1} more)" if len(self.failed) > 1 else ""
+        return (
+            f"cell {name}{more} failed: {message}; see {log}. All cells that do not need it are "
+            "complete; once the cause is fixed, the same command continues from here"
+        )
+
+
+def _last_line(log: Path) -> str:
+    lines = log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return lines[-1] if lines else ""
