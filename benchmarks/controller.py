@@ -1,8 +1,8 @@
 """Milliseconds per 20 ms step of the low-level controllers: one robot, and each of sixteen.
 
 `stance` and `walk` are whole steps, from a measurement to joint targets; `network` is the trained
-part of `walk` alone. One thread, measurements of robots that stand and are told to walk; what a
-step costs hardly depends on them.
+part of `walk` alone. One thread; the measurements are of standing robots with a walking command and
+have little influence on the time.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ROBOTS = (1, 16)
 
 
 def measurements(robots: int) -> np.ndarray:
-    """(robots, 74) nearly the standing pose, told to walk at 0.3 m/s."""
+    """(robots, 74) near the standing pose, with a command to walk at 0.3 m/s."""
     pose = standing_pose(ACTION_BOX.neutral[-1])
     pitch = 2 * np.arctan2(pose.quaternion[2], pose.quaternion[0])
     state = np.zeros((robots, STATE_DIM))
@@ -44,7 +44,7 @@ def measurements(robots: int) -> np.ndarray:
 
 
 def shipped_network() -> WalkPolicy:
-    """The network of the controller that the package ships."""
+    """The network of the shipped controller."""
     file = resources.files("egovcp.robot").joinpath("g1_walk.safetensors")
     with resources.as_file(file) as path:
         return WalkPolicy.load(path)
@@ -53,7 +53,7 @@ def shipped_network() -> WalkPolicy:
 def repeated(
     function: Callable[[np.ndarray], object], x: np.ndarray, times: int
 ) -> Callable[[], None]:
-    """``times`` calls in a row as one measurement: one alone is near the clock's noise."""
+    """``times`` calls as one measurement, as a single one is too short to time."""
 
     def run() -> None:
         for _ in range(times):

@@ -1,8 +1,8 @@
 """How far each joint's target passes the joint's range: what `egovcp.robot.kinematics` allows.
 
 Plays every task with both low-level controllers, once with random hands and once with the oracle
-(blocks, braces after pushes, walks under the arch). Robots that fall are left out: a controller
-that has lost its balance asks for anything.
+(blocks, braces after pushes, walks under the arch). Robots that fall are left out, as targets
+during a fall are arbitrary.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 class TargetRecorder:
-    """A controller that remembers the greatest excess of its targets, per robot."""
+    """A controller that records the greatest excess of its targets, per robot."""
 
     def __init__(self, controller: LowLevelController, robots: int) -> None:
         self._controller = controller
@@ -53,7 +53,7 @@ def excess(which: str, task: str, policy: EnvPolicy, robots: int, seed: int) -> 
     policy.reset(env, scenarios)
     while not env.done.all():
         env.step(policy.act(env))
-    stood = np.array([not lane.terminated for lane in env.instances])
+    stood = np.array([not instance.terminated for instance in env.instances])
     below = recorder.below[stood].max(axis=0, initial=-np.inf)
     above = recorder.above[stood].max(axis=0, initial=-np.inf)
     return below, above

@@ -1,31 +1,27 @@
-"""Training windows per second: other readers against the two streams.
+"""Training windows per second of the two streams and of LeRobot's dataset.
 
-The same dataset and windows of the same length, batch by batch, one process each with one thread:
+The same dataset and windows of the same length, batch by batch, with one thread:
 
-* ``lerobot``: `LeRobotDataset` with `delta_timestamps` for every feature that a window needs, items
-  at random places, collated by torch;
+* ``lerobot``: `LeRobotDataset` with `delta_timestamps` for every feature of a window, items at
+  random places, collated by torch;
 * ``ram``: `egovcp.data.InMemorySampler`, all episodes in memory;
-* ``bounded``: `egovcp.data.StreamingSampler`, episodes read from the disk through a shuffle window;
-* ``lance``, ``lance_jpeg`` (with --lance_python): stable-worldmodel's reader, see
-  `lance_windows.py`; ratios of ours to it are to the faster of its two ways.
+* ``bounded``: `egovcp.data.StreamingSampler`, episodes read from the disk through a shuffle window.
 
 The cases take turns; ratios are medians of the ratios of one turn. Processor time counts, so that
-other programs on the machine do not. The disk's pages are cached: this measures decoding.
+other programs do not matter. The disk's pages are cached: this measures decoding.
 
-Beside them, by wall clock, an epoch from a Hub on this machine with an empty cache against the same
-epoch from the disk (``hub_ratio``), and, with --growth, rate and memory of the bounded stream over
-datasets of many more episodes.
+``hub_ratio`` compares, by wall clock, an epoch streamed from a Hub on this machine with an empty
+cache with the same epoch from the disk.
 
     python benchmarks/loader.py --root data/wall
-    uv venv outputs/swm
-    uv pip install --python outputs/swm/bin/python stable-worldmodel opencv-python-headless imageio
-    python benchmarks/loader.py --lance_python outputs/swm/bin/python --growth 100 1000 10000
 """
 
 from __future__ import annotations
 
 import contextlib
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -33,17 +29,17 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from growth import growth
-from hub_stream import epoch_rates
-from lance_reader import CASES, LanceReader, lance_reader
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
 from report import parser, publish
 from torch.utils.data import default_collate
-from writer import make_episode
+from writer import PROVENANCE, make_episode
 from writer import writer as write
 
 from egovcp import spec
+from egovcp.cli import DatasetConfig
 from egovcp.data import (
+    DatasetReader,
+    DatasetWriter,
     EpisodeIndex,
     EpisodeStore,
     InMemorySampler,
@@ -52,8 +48,17 @@ from egovcp.data import (
     StreamingSampler,
     open_dataset,
 )
+from egovcp.hub import Content, Publication, RetryPolicy
+from egovcp.hub import publish as publish_dataset
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(ROOT))  # for tests.support
+
+from tests.support.hub import in_this_process  # noqa: E402
 
 BATCH = 16
+HUB_REPO = "me/bench"
+HUB_EPISODES_PER_FILE = 25
 
 
 def lerobot(root: Path, length: int) -> Iterator[object]:
@@ -68,7 +73,7 @@ def lerobot(root: Path, length: int) -> Iterator[object]:
         yield default_collate([dataset[row] for row in rows])
 
 
-def measured(batches: Iterator[object], seconds: float) -> float:
+def windows_per_second(batches: Iterator[object], seconds: float) -> float:
     """Windows per second of processor time, over at least so many seconds of it."""
     count, start = 0, time.process_time()
     while (passed := time.process_time() - start) < seconds:
@@ -78,13 +83,9 @@ def measured(batches: Iterator[object], seconds: float) -> float:
 
 
 def compare(
-    index: EpisodeIndex,
-    length: int,
-    rounds: int,
-    shuffle: ShuffleConfig,
-    lance: LanceReader | None,
+    index: EpisodeIndex, length: int, rounds: int, shuffle: ShuffleConfig
 ) -> dict[str, object]:
-    """The rates, and the ratios of ours to the others'."""
+    """Rates, and the ratios of both streams to LeRobot."""
     config = SamplerConfig(batch_size=BATCH, length=length)
     (reader,) = index.readers
     cases: dict[str, Callable[[], Iterator[object]]] = {
@@ -95,13 +96,10 @@ def compare(
     streams = {name: make() for name, make in cases.items()}
     for stream in streams.values():
         next(stream)
-    found = []
-    for _ in range(rounds):
-        row = {name: measured(stream, 1.0) for name, stream in streams.items()}
-        for name in CASES if lance else ():
-            assert lance is not None
-            row[name], row[f"{name}_wall"] = lance.measure(name, 1.0)
-        found.append(row)
+    found = [
+        {name: windows_per_second(stream, 1.0) for name, stream in streams.items()}
+        for _ in range(rounds)
+    ]
     figures: dict[str, object] = {
         "episodes": len(index),
         "frames": index.num_frames,
@@ -110,23 +108,62 @@ def compare(
         "shuffle_episodes": shuffle.episodes,
         "shuffle_reuse": shuffle.reuse,
     }
-    figures |= {f"{k}_windows_per_s": statistics.median(r[k] for r in found) for k in found[0]}
+    figures |= {f"{k}_windows_per_s": statistics.median(r[k] for r in found) for k in streams}
     for name in ("ram", "bounded"):
         figures[f"{name}_ratio"] = statistics.median(r[name] / r["lerobot"] for r in found)
-        if lance:
-            ratios = (r[name] / max(r[case] for case in CASES) for r in found)
-            figures[f"{name}_lance_ratio"] = statistics.median(ratios)
     return figures
 
 
 def from_hub(folder: Path, episodes: int, length: int, rounds: int) -> dict[str, object]:
-    """An epoch from the Hub against one from the disk."""
+    """Windows per second of an epoch from the Hub and from the disk, and their ratio.
+
+    Each epoch from the Hub begins with an empty cache, so that files are downloaded while they are
+    read. The first turn warms up and does not count.
+    """
     config, shuffle = SamplerConfig(batch_size=BATCH, length=length), ShuffleConfig(32)
-    rows = epoch_rates(folder, episodes, config, shuffle, rounds)
-    rates = {
-        f"{name}_epoch_windows_per_s": statistics.median(r[name] for r in rows) for name in rows[0]
+    root = folder / "local"
+    with DatasetWriter(root, PROVENANCE, HUB_EPISODES_PER_FILE) as writer:
+        for number in range(episodes):
+            writer.add(make_episode(number, 150))
+    files = [path for path in root.rglob("*") if path.is_file()]
+    contents = {path.relative_to(root).as_posix(): Content(path) for path in files}
+    with serving(folder / "hub") as endpoint:
+        with in_this_process(endpoint, folder / "home"):
+            publish_dataset(Publication(HUB_REPO, contents, "a benchmark"), RetryPolicy())
+        rows = []
+        for _ in range(rounds + 1):
+            disk = epoch(DatasetReader.open(DatasetConfig(root=str(root))), config, shuffle)
+            with tempfile.TemporaryDirectory() as home, in_this_process(endpoint, Path(home)):
+                reader = DatasetReader.on_demand(DatasetConfig(repo_id=HUB_REPO))
+                rows.append((disk, epoch(reader, config, shuffle)))
+    return {
+        "disk_epoch_windows_per_s": statistics.median(disk for disk, _ in rows[1:]),
+        "hub_epoch_windows_per_s": statistics.median(hub for _, hub in rows[1:]),
+        "hub_ratio": statistics.median(hub / disk for disk, hub in rows[1:]),
     }
-    return rates | {"hub_ratio": statistics.median(r["hub"] / r["disk"] for r in rows)}
+
+
+@contextlib.contextmanager
+def serving(folder: Path) -> Iterator[str]:
+    """Run a fake Hub in a process; gives its address."""
+    command = [sys.executable, "-m", "tests.support.hub", "--root", folder]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as hub:
+        assert hub.stdout is not None
+        try:
+            yield hub.stdout.readline().split("HF_ENDPOINT=")[1].split()[0]
+        finally:
+            hub.terminate()
+
+
+def epoch(reader: DatasetReader, config: SamplerConfig, shuffle: ShuffleConfig) -> float:
+    """Windows per second of wall clock of an epoch."""
+    index = EpisodeIndex.of([reader])
+    stream = StreamingSampler(index, config, shuffle=shuffle, checked=not reader.is_remote)
+    batches = int(index.num_frames * shuffle.reuse / config.length / config.batch_size)
+    start = time.perf_counter()
+    for _ in range(batches):
+        next(stream)
+    return batches * config.batch_size / (time.perf_counter() - start)
 
 
 def main() -> None:
@@ -137,34 +174,20 @@ def main() -> None:
     options.add_argument("--length", type=int, default=32, help="rows of a window")
     options.add_argument("--window", type=int, default=128, help="episodes in memory")
     options.add_argument("--reuse", type=float, default=1.0, help="uses of each row while there")
-    options.add_argument("--lance_python", type=Path, help="Python that has stable-worldmodel")
     options.add_argument("--hub_episodes", type=int, default=400, help="streamed; 0: none")
-    options.add_argument(
-        "--growth", type=int, nargs="*", default=[], help="numbers of episodes, multiples of 100"
-    )
     args = options.parse_args()
     torch.set_num_threads(1)
-    shuffle = ShuffleConfig(args.window, args.reuse)
     figures: dict[str, object] = {}
-    with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
+    with tempfile.TemporaryDirectory() as folder:
         home = Path(folder)
         root = args.root or home / "dataset"
         if args.root is None:
             write(root, [make_episode(i, 150) for i in range(args.episodes)])
-        index = EpisodeIndex.of([open_dataset(root)], "train")
-        if args.hub_episodes:  # first: by the clock, and with files that want memory, alone
+        if args.hub_episodes:  # first: measured by wall clock, without other files in memory
             figures |= from_hub(home / "remote", args.hub_episodes, args.length, args.rounds)
-        lance = None
-        if args.lance_python is None:
-            print("stable-worldmodel's reader is left out: no --lance_python")
-        else:
-            lance = stack.enter_context(
-                lance_reader(args.lance_python, index, home / "lance", args.length, BATCH)
-            )
-        figures |= compare(index, args.length, args.rounds, shuffle, lance)
-        if args.growth:
-            config = SamplerConfig(batch_size=BATCH, length=args.length)
-            figures |= growth(home / "growth", args.growth, config, shuffle, seconds=5.0)
+        index = EpisodeIndex.of([open_dataset(root)], "train")
+        shuffle = ShuffleConfig(args.window, args.reuse)
+        figures |= compare(index, args.length, args.rounds, shuffle)
         publish(figures, args.json)
 
 

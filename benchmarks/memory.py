@@ -1,7 +1,7 @@
 """Resident memory of a whole collection, and whether it grows with the number of episodes.
 
-Runs `egovcp-collect` as a user does, twice, and sums the resident memory of the service and all its
-workers ten times per second. Pages that several processes share count once for each.
+Runs `egovcp-collect` twice and sums the resident memory of all its processes ten times per second.
+Pages that several processes share count once for each.
 
     python benchmarks/memory.py --episodes 200 800
 """
@@ -18,7 +18,7 @@ from report import parser, publish
 
 
 def resident_mb(process: psutil.Process) -> float:
-    """Of a process and its descendants."""
+    """Resident memory of a process and its descendants."""
     total = 0
     for each in (process, *process.children(recursive=True)):
         try:
@@ -29,7 +29,7 @@ def resident_mb(process: psutil.Process) -> float:
 
 
 def peak_mb(task: str, episodes: int) -> float:
-    """The most that a collection of so many episodes holds."""
+    """Peak memory of a collection."""
     with tempfile.TemporaryDirectory() as folder:
         command = [sys.executable, "-m", "egovcp_collect.collect", f"--task={task}"]
         service = psutil.Popen(

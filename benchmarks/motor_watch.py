@@ -1,8 +1,8 @@
 """False alarms of the motor watch: simulated walking, standing, reaching and pushes.
 
 Robots of different mass, friction, gains and delay play the skills of `egovcp-eval-lowlevel` with
-sensor noise. Whatever the watch says of one that has not fallen is a false alarm. With --dropped,
-the left knee's motor gives no torque from 3 s on, and the time until it is noticed is measured.
+sensor noise. An alarm for a robot that has not fallen is a false alarm. With --dropped, the left
+knee's motor gives no torque from 3 s on, and the time to detection is measured.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _TICK_NS = 1_000_000_000 // CONTROLLER_HZ
 def play(
     controller_name: str, skill: Skill, robots: int, seed: int, dropped: bool
 ) -> tuple[float, list[str], list[float]]:
-    """Seconds of robots that stood, what the watch said of them, and s until it noticed."""
+    """Seconds of standing robots, their alarms, and the detection times, s."""
     rng = np.random.default_rng([seed, 1])
     config = DisturbanceConfig()
     physics = BatchPhysics(robots, "stock", config, 1, seed)
@@ -95,7 +95,7 @@ def main() -> None:
         default=["stand", "walk", "crouch", "push"],
         help="of egovcp-eval-lowlevel",
     )
-    p.add_argument("--dropped", action="store_true", help="let a knee drop out after a while")
+    p.add_argument("--dropped", action="store_true", help="the left knee gives no torque after 3 s")
     p.set_defaults(rounds=1)
     args = p.parse_args()
     total, alarms, noticed = 0.0, list[str](), list[float]()

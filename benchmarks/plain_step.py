@@ -1,4 +1,4 @@
-"""A gradient step as one would write it down in eager PyTorch, for `train_step.py` to compare with.
+"""A gradient step in plain eager PyTorch, which `train_step.py` compares with.
 
 The same mathematics as `egovcp.model` and `egovcp_train.loop`: the same weights, loss terms and
 random draws, optimiser and averaging. Every network is a plain module on concatenated inputs, the
@@ -80,7 +80,7 @@ class PlainModel(nn.Module):
         new: Tensor = self.gru(self.mix(torch.cat([z, action], -1)), h)
         return new
 
-    def picture(self, features: Tensor) -> Tensor:
+    def decode_image(self, features: Tensor) -> Tensor:
         """(N, features) -> nearness (N, 48, 64)."""
         maps = self.decoder_input(features)
         maps = maps.view(len(maps), -1, spec.DEPTH_ROWS // 8, spec.DEPTH_COLS // 8)
@@ -171,7 +171,7 @@ def depth_loss(
 ) -> Tensor:
     every = model.config.loss.decode_every
     chosen = slice(int(torch.randint(every, (), generator=generator)), None, every)
-    image = model.picture(features[:, chosen].flatten(0, 1))
+    image = model.decode_image(features[:, chosen].flatten(0, 1))
     error = 0.5 * (image - near[:, chosen].flatten(0, 1)) ** 2
     error = error * weight[:, chosen].flatten(0, 1)
     return mean_where(error.mean((-2, -1)), batch.valid[:, chosen].flatten())
@@ -252,11 +252,11 @@ def multistep_terms(
             rows.append(start + k)
             known.append(unbroken(batch, k)[:, start])
     features, at, valid = torch.cat(seen, 1), torch.cat(rows), torch.cat(known, 1)
-    image = model.picture(features.flatten(0, 1)).view(len(near), len(at), *near.shape[2:])
-    picture = (0.5 * weight[:, at] * (image - near[:, at]) ** 2).mean((-2, -1))
+    image = model.decode_image(features.flatten(0, 1)).view(len(near), len(at), *near.shape[2:])
+    depth = (0.5 * weight[:, at] * (image - near[:, at]) ** 2).mean((-2, -1))
     proprioception = (0.5 * (model.decode_state(features) - state[:, at]) ** 2).mean(-1)
     return [
-        loss.multistep_depth * mean_where(picture, valid),
+        loss.multistep_depth * mean_where(depth, valid),
         loss.multistep_state * mean_where(proprioception, valid),
     ]
 

@@ -1,13 +1,12 @@
 """Milliseconds per plan of every backend, against plain eager PyTorch of the same mathematics.
 
-The plain one writes equation 15 down: every candidate carries its own copy of the state, and
-every step runs every network, in float32. All have the same weights and random draws.
+The plain one follows equation 15: every candidate has a copy of the state, and every step runs
+every network, in float32. All have the same weights and random draws.
 
-`arithmetic_share` says which part of the rate of a plain matrix product of the same precision, in
-the same run, a backend reaches, counting only the arithmetic that a plan needs. `observe` is
-the filter's step; `command` is from an observation to the action, with the backend of `auto`.
-Where there is a GPU, `gpu_*` are plans on it, by CUDA graphs, up to the action in the processor's
-memory.
+`arithmetic_share` is a backend's rate, counting only the arithmetic that a plan needs, relative to
+a plain matrix product of the same precision in the same run. `observe` is the filter's step;
+`command` is from an observation to the action, with the backend of `auto`. Where there is a GPU,
+`gpu_*` are plans on it, by CUDA graphs, up to the action in the processor's memory.
 """
 
 from __future__ import annotations

@@ -1,10 +1,9 @@
-"""What a backend's arithmetic costs on recorded states, with a trained policy.
+"""Accuracy of the planner backends on recorded states, with a trained policy.
 
-From states that the model filters out of recorded episodes, every backend plans with the same draws
-as the step-by-step float32 reference. Two figures count: how far the first action moves, in the
-action's box of [-1, 1], and how much J is lost, as the reference sees it, in deviations of J among
-the candidates of a first round. Beside them the same of the reference itself with other random
-draws: what chance costs.
+Every backend plans from states of recorded episodes, with the draws of the step-by-step float32
+reference. Figures: the change of the first action, in the action box of [-1, 1], and the loss of J
+by the reference, in standard deviations of J among the candidates of a first iteration.
+`other_draws` are the same figures of the reference itself with other random draws.
 """
 
 from __future__ import annotations

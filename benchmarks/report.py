@@ -1,4 +1,4 @@
-"""What every benchmark prints: flat keys, the hardware beside them."""
+"""Options, timing and output of all benchmarks: flat keys and the hardware."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from egovcp.hardware import hardware
 def interleaved_times(
     cases: dict[str, Callable[[], object]], rounds: int
 ) -> dict[str, list[float]]:
-    """Seconds of each case, ascending; the cases take turns, so that drift hits all alike."""
+    """Seconds of each case, ascending; the cases take turns, so that drift affects all of them."""
     times: dict[str, list[float]] = {name: [] for name in cases}
     for case in cases.values():
         case()

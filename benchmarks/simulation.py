@@ -36,7 +36,7 @@ ENVS = 16
 
 
 def bare_rate(task: str, controller: str, cores: int, groups: int) -> tuple[float, float]:
-    """Planner ticks per second of all processes together, and the most that one holds, MB."""
+    """Planner ticks per second of all processes together, and the peak memory of one, MB."""
     start = time.perf_counter()
     with multiprocessing.get_context("spawn").Pool(cores) as pool:
         jobs = [(task, controller, worker, groups) for worker in range(cores)]
@@ -81,9 +81,9 @@ def collection_rate(task: str, controller: str, cores: int, episodes: int) -> fl
 
 
 def milliseconds_per_tick(task: str, controller: str, groups: int = 1) -> dict[str, float]:
-    """CPU time per planner tick and robot of one process over whole episodes: all of it, and
-    what the controller (and inside it the arms' inverse kinematics), physics, depth pictures
-    (rays and noise) and the rest cost."""
+    """CPU time per planner tick and robot of one process over whole episodes: in total, and of
+    the controller (and in it the arms' inverse kinematics), physics, depth images (rays and
+    noise) and the rest."""
     env, policy = VectorEnv(replace(EnvConfig(), controller=controller), ENVS), RandomWalk()
     env.reset([Scenario(task, 0, i) for i in range(ENVS)])  # builds the models
     with timed_parts(env) as spent:
@@ -139,7 +139,7 @@ def _timed(
 
 
 def resident_megabytes() -> float:
-    """The most that this process has held in memory."""
+    """Peak memory of this process."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024  # kB on Linux
 
 

@@ -1,4 +1,4 @@
-"""How hard the tasks are for a low-level controller: reference policies, and what they earn.
+"""Difficulty of the tasks for a low-level controller: success and reward of reference policies.
 
 Plays held-out scenarios of each task with `hold` (neutral pose), `constant` (the best fixed action,
 searched on other scenarios), `random` (the paper's random walk) and `oracle`, both bands of the
@@ -32,7 +32,7 @@ from egovcp_deploy.options import held_out
 from egovcp_deploy.scores import EpisodeScore, reward_interval, reward_per_step, success_rate
 
 PLAYERS = ("hold", "constant", "random", "oracle")
-PUSHED = ("hold", "oracle")  # who plays the wall at one speed after another
+PUSHED = ("hold", "oracle")  # for the wall at one push speed after another
 BANDS = {"default": (1.16, 1.24), "low": (1.08, 1.16)}
 MOST_AT_REST, LEAST_BY_ORACLE = 0.2, 0.9
 ENVS = 10
@@ -40,7 +40,7 @@ ENVS = 10
 
 @dataclass(frozen=True)
 class Result:
-    """What one player did on one task."""
+    """Scores of one player on one task."""
 
     success: float
     success_ci95: Interval

@@ -1,17 +1,16 @@
-"""What logging adds to a tick: in the loop, on a thread, and in a process of its own.
+"""Time that logging adds to a tick: in the loop, on a thread, and in a separate process.
 
-The loop plans (a small model: many short operations, so that whoever takes the interpreter lock
-is felt), then writes a tick with everything in it to an MCAP file and to Rerun.
+The loop plans with a small model, whose many short operations are sensitive to the interpreter
+lock, then writes a complete tick to an MCAP file and to Rerun.
 
     none          no log
     inline        the sinks are called by the loop
     thread        a queue and a thread
     process       `AsyncFanout`
-    stalled_disk  the same; the process that writes the MCAP file is stopped, as by a disk
-    dead_viewer   the same; Rerun goes to a viewer that has been killed
+    stalled_disk  the same; the process that writes the MCAP file is stopped
+    dead_viewer   the same; the Rerun viewer was killed
 
-``cpu`` figures are the time that the loop's thread itself computed while it wrote: what is left
-when other programs do not take its core in between.
+``cpu`` figures are the CPU time of the loop's thread while it writes.
 """
 
 from __future__ import annotations
@@ -42,10 +41,10 @@ from egovcp.spec import PLANNER_DT, PLANNER_HZ, STATE_DIM
 from egovcp.testing import toy_model
 
 _INFO = RunInfo("ball")
-_PAUSE_S = 0.2  # between two cases: what the one before has left behind is written meanwhile
+_PAUSE_S = 0.2  # between two cases, to write queued ticks
 
 
-class Nowhere:
+class NoLog:
     """No log."""
 
     def open(self, info: RunInfo) -> None: ...
@@ -56,7 +55,7 @@ class Nowhere:
 
 
 class Threaded:
-    """The plain alternative to a process."""
+    """A queue and a thread."""
 
     def __init__(self, sink: Sink) -> None:
         self._sink = sink
@@ -141,12 +140,12 @@ def _planning() -> Callable[[], object]:
     model = toy_model()
     config = PlannerConfig(samples=64, elites=16)
     carry, executed = model.initial(1), torch.zeros(1, 7)
-    judge = ReferenceEvaluator(model, config)
+    evaluator = ReferenceEvaluator(model, config)
 
     def plan() -> object:
         with torch.no_grad():
             generator = torch.Generator().manual_seed(0)
-            return make_plan(judge, optimiser_of(config), carry, executed, config, generator)
+            return make_plan(evaluator, optimiser_of(config), carry, executed, config, generator)
 
     return plan
 
@@ -154,18 +153,18 @@ def _planning() -> Callable[[], object]:
 def _tick() -> Tick:
     """A tick with everything that a run with a world model logs."""
     rng = np.random.default_rng(0)
-    film = np.linspace(0.5, 4.5, 48 * 64).reshape(48, 64) + rng.normal(0, 0.01, (17, 48, 64))
+    images = np.linspace(0.5, 4.5, 48 * 64).reshape(48, 64) + rng.normal(0, 0.01, (17, 48, 64))
     state = rng.normal(0, 0.1, STATE_DIM).astype(np.float32)
     state[3:6] = (0.0, 0.0, -1.0)
     return Tick(
         index=0,
         time_ns=0,
-        depth=(1000 * film[0]).astype(np.uint16),
+        depth=(1000 * images[0]).astype(np.uint16),
         state=state,
         action_planned=np.zeros(7, np.float32),
         action_sent=np.zeros(7, np.float32),
-        depth_reconstructed=film[0].astype(np.float32),
-        depth_imagined=film[1:].astype(np.float32),
+        depth_reconstructed=images[0].astype(np.float32),
+        depth_imagined=images[1:].astype(np.float32),
         plan=np.zeros((4, 7), np.float32),
         candidates=Candidates(rng.uniform(0, 0.5, (32, 4, 2, 3)), rng.normal(size=32)),
         value=1.0,
@@ -183,7 +182,7 @@ def _cases(stack: contextlib.ExitStack) -> dict[str, contextlib.AbstractContextM
         return McapSink(folder / f"{name}.mcap"), RerunSink(folder / f"{name}.rrd")
 
     return {
-        "none": _opened(Nowhere()),
+        "none": _opened(NoLog()),
         "inline": _opened(Fanout(pair("inline"))),
         "thread": _opened(Threaded(Fanout(pair("thread")))),
         "process": _opened(_fanout(*pair("process"))),

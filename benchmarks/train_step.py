@@ -1,8 +1,8 @@
 """Gradient steps per second, against a plain eager implementation and on data that is ready.
 
 * ``step``: `egovcp_train.loop.Learner.update`, forward to averaged weights, on one batch in memory,
-  in the precision that ``egovcp-train`` takes here by itself (``bf16`` says which), and in a
-  process that keeps freed memory, as it does;
+  in the default precision of ``egovcp-train`` on this machine (see ``bf16``), and in a process that
+  keeps freed memory, as ``egovcp-train`` does;
 * ``float32``: the same in float32;
 * ``plain``: the same mathematics in plain eager fp32 (`plain_step.py`), in a process as Python
   starts it: the same weights, batch and random draws, and, before anything is measured, the same
@@ -10,8 +10,8 @@
 * ``data``: a step with its batch drawn from the stream and made into tensors, as in training.
 
 The cases take turns; ratios are medians of the ratios of one turn. Processor time counts, so that
-other programs on the machine do not; with several threads that is the time of all of them, waiting
-for each other included. ``clock_ratio`` and the rates are by the clock and want a quiet machine.
+other programs do not matter; with several threads it is the time of all of them, including waits
+for each other. ``clock_ratio`` and the rates are wall-clock times and need an idle machine.
 
     python benchmarks/train_step.py --root data/ball
 """

@@ -1,6 +1,6 @@
 """Gradient steps and frames per second on a GPU, beside one thread of the same machine's processor.
 
-By the clock, what waits for the GPU included, with each number of windows:
+Wall-clock times, including the wait for the GPU, for each number of windows:
 
 * ``step``: `egovcp_train.loop.Learner.update` on one batch in the GPU's memory, in the precision
   that ``egovcp-train`` takes there by itself (``bf16`` says which);
@@ -8,7 +8,7 @@ By the clock, what waits for the GPU included, with each number of windows:
 * ``data``: a step with its batch drawn from the stream and copied there, as in training;
 * ``cpu``: a step on one thread of the processor, in its own precision (``cpu_bf16``).
 
-The cases take turns, after as many steps as it takes to record them (`egovcp.cuda_graphs`).
+The cases take turns, after the steps that are recorded as CUDA graphs (`egovcp.cuda_graphs`).
 
     python benchmarks/train_step_gpu.py --root data/ball
 """

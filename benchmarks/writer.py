@@ -44,7 +44,7 @@ def make_episode(number: int, ticks: int) -> Episode:
 
 
 def lerobot(root: Path, episodes: Sequence[Episode]) -> None:
-    """Frame by frame, as its documentation says."""
+    """Frame by frame, as in its documentation."""
     dataset = LeRobotDataset.create(
         "me/bench", spec.PLANNER_HZ, spec.FEATURES, root=root, use_videos=False
     )
