@@ -146,7 +146,9 @@ def _check_step[O: _Observation](step: _Step[O], over: NDArray[np.bool_], t: int
     both = step.terminated & step.truncated
     _require(not both.any(), t, "a row is terminated and truncated at once")
     _require(
-        bool((step.terminated | step.truncated)[over].all()), t, "an episode that was over goes on"
+        bool((step.terminated | step.truncated)[over].all()),
+        t,
+        "an episode continues after its end",
     )
     _require(not np.any(step.reward[over]), t, "reward after the end of an episode")
 

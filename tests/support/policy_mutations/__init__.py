@@ -1,7 +1,6 @@
-"""Damages a policy in ways that a seed chooses, for tests of what a loader must refuse.
+"""Seeded mutations of a policy folder, for tests of what a loader must refuse.
 
-Digests are renewed after most mutations, as whoever writes the files can do: what is wrong must be
-found in the content.
+Most mutations renew the digests afterwards, so that the content itself must be found invalid.
 """
 
 from __future__ import annotations
