@@ -7,9 +7,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final, Literal
 
-import numpy as np
-from numpy.typing import NDArray
-
 from egovcp.robot.g1 import ARMATURE, DAMPING, EFFORT_LIMIT, STIFFNESS, model_path
 from egovcp.spec import JOINT_NAMES, PHYSICS_DT
 
@@ -29,29 +26,22 @@ _FOOT_CORNERS: Final = (
 )
 
 
-def robot_spec(
-    feet: FootModel = "stock",
-    stiffness: NDArray[np.float64] = STIFFNESS,
-    damping: NDArray[np.float64] = DAMPING,
-) -> mujoco.MjSpec:
+def robot_spec(feet: FootModel = "stock") -> mujoco.MjSpec:
     """G1 with position servos, ready to be set on a floor; no floor, light or task.
 
     Args:
         feet: ``stock``: seven capsules per foot as shipped; ``points``: four spheres per
             foot, about 2.5 times as fast to step.
-        stiffness: (J,) servo gains, N m/rad.
-        damping: (J,) servo gains, N m s/rad.
 
-    Actuator ``i`` drives ``spec.JOINT_NAMES[i]`` and is named after it. Robot geoms have
-    contype 0 and conaffinity 1: they meet every scene geom with contype 1 and never each
-    other, so self-collision is off. Contact friction is that of the foot geoms
-    (priority 1), wherever they stand.
+    Actuator ``i`` drives ``spec.JOINT_NAMES[i]`` and has its name. Robot geoms have contype 0 and
+    conaffinity 1: they collide with scene geoms of contype 1, not with each other. The foot geoms
+    (priority 1) determine the friction of their contacts.
     """
     import mujoco
 
     spec = mujoco.MjSpec.from_file(str(model_path()))
     _set_options(spec)
-    _add_servos(spec, stiffness, damping)
+    _add_servos(spec)
     for geom in _collision_geoms(spec):
         geom.contype, geom.conaffinity, geom.condim = 0, 1, 3
     if feet == "points":
@@ -70,9 +60,7 @@ def _set_options(spec: mujoco.MjSpec) -> None:
     spec.option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
 
 
-def _add_servos(
-    spec: mujoco.MjSpec, stiffness: NDArray[np.float64], damping: NDArray[np.float64]
-) -> None:
+def _add_servos(spec: mujoco.MjSpec) -> None:
     """Torque = kp (target - q) - kd qdot, clipped to the effort limit; rotor inertia."""
     import mujoco
 
@@ -80,7 +68,7 @@ def _add_servos(
         spec.joint(name).armature = float(ARMATURE[i])
         limit = float(EFFORT_LIMIT[i])
         servo = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        servo.set_to_position(kp=float(stiffness[i]), kv=float(damping[i]))
+        servo.set_to_position(kp=float(STIFFNESS[i]), kv=float(DAMPING[i]))
         servo.forcelimited = 1
         servo.forcerange = [-limit, limit]
         servo.ctrllimited = 0

@@ -234,8 +234,24 @@ class StanceConfig:
     reach: ReachConfig = field(default_factory=ReachConfig)
 
 
-class StanceController:
+class G1Controller:
+    """The common part of the controllers of the G1: servo gains and identity."""
+
+    stiffness = STIFFNESS
+    damping = DAMPING
+
+    def _id(self, name: str, parameters: object) -> str:
+        """``name`` and a hash of the parameters, the arms, the stance table and the gains."""
+        digest = hashlib.sha256(repr((parameters, ARM_IDENTITY)).encode())
+        digest.update(stance_table().fingerprint().encode())
+        digest.update(np.concatenate([STIFFNESS, DAMPING]).tobytes())
+        return f"{name}-{digest.hexdigest()[:8]}"
+
+
+class StanceController(G1Controller):
     """`LowLevelController` for two planted feet."""
+
+    walks = False
 
     def __init__(self, config: StanceConfig | None = None) -> None:
         self.config = config or StanceConfig()
@@ -244,27 +260,11 @@ class StanceController:
 
     @property
     def id(self) -> str:
-        """Changes with every number of the law, its limits and its servo gains."""
-        digest = hashlib.sha256(repr((self.config, ARM_IDENTITY)).encode())
-        digest.update(self._table.fingerprint().encode())
-        digest.update(np.concatenate([STIFFNESS, DAMPING]).tobytes())
-        return f"g1-stance-lqr-{digest.hexdigest()[:8]}"
-
-    @property
-    def walks(self) -> bool:
-        return False
+        return self._id("g1-stance-lqr", self.config)
 
     @property
     def stepping(self) -> NDArray[np.bool_]:
         return np.zeros(len(self._balance.height), dtype=np.bool_)
-
-    @property
-    def stiffness(self) -> Array:
-        return STIFFNESS
-
-    @property
-    def damping(self) -> Array:
-        return DAMPING
 
     def reset(self, state: NDArray[np.floating], rows: NDArray[np.intp] | None = None) -> None:
         """See `LowLevelController`."""

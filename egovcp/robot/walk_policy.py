@@ -76,10 +76,8 @@ class WalkPolicy:
     mean: Array32  # (95,)
     std: Array32  # (95,)
     layers: tuple[tuple[Array32, Array32], ...]  # weight (out, in), bias (out,)
-    config: WalkConfig
-    """Of `walking.Walk`."""
-    provenance: Mapping[str, Any]
-    """Command, seed and steps of its training."""
+    config: WalkConfig  # Of `walking.Walk`
+    provenance: Mapping[str, Any]  # Command, seed and steps of its training
 
     def __call__(self, observation: Array32) -> Array32:
         """(B, 95) -> actions (B, 15); a row's bits do not depend on the batch."""

@@ -11,7 +11,6 @@ motion (`gait`), the share of the gait g, and the action a of a policy trained b
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass, field
 from typing import Final, Protocol
 
@@ -19,15 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.robot import gait
-from egovcp.robot.arms import IDENTITY as ARM_IDENTITY
 from egovcp.robot.arms import TORSO_ORIGIN, ArmReference, ReachConfig, track_hands
-from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS, WAIST
+from egovcp.robot.g1 import ARMS, WAIST
 from egovcp.robot.gait import Gait, GaitConfig
 from egovcp.robot.geometry import Array, heading_rotation, rotate
 from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW, torso_rotation
 from egovcp.robot.stance import (
     BalanceConfig,
     BalanceState,
+    G1Controller,
     balance,
     follow_height,
     pelvis_height,
@@ -192,8 +191,10 @@ class Residual(Protocol):
     def __call__(self, observation: NDArray[np.float32]) -> NDArray[np.float32]: ...
 
 
-class WalkingController:
+class WalkingController(G1Controller):
     """`LowLevelController` that stands, squats, reaches and walks."""
+
+    walks = True
 
     def __init__(self, policy: Residual) -> None:
         self._policy = policy
@@ -202,28 +203,12 @@ class WalkingController:
 
     @property
     def id(self) -> str:
-        """Changes with every number of the policy, the stance law, the gait and the servos."""
-        digest = hashlib.sha256(repr((self._policy.digest, ARM_IDENTITY)).encode())
-        digest.update(stance_table().fingerprint().encode())
-        digest.update(np.concatenate([STIFFNESS, DAMPING]).tobytes())
-        return f"g1-walk-ppo-{digest.hexdigest()[:8]}"
-
-    @property
-    def walks(self) -> bool:
-        return True
+        return self._id("g1-walk-ppo", self._policy.digest)
 
     @property
     def stepping(self) -> NDArray[np.bool_]:
         """(B,) robots whose targets contain any of the gait."""
         return self._walk.gait.amount > 0
-
-    @property
-    def stiffness(self) -> Array:
-        return STIFFNESS
-
-    @property
-    def damping(self) -> Array:
-        return DAMPING
 
     def reset(self, state: NDArray[np.floating], rows: NDArray[np.intp] | None = None) -> None:
         """See `LowLevelController`."""

@@ -44,50 +44,33 @@ class PrivilegedState:
     ``_w``: world, ``_b``: pelvis heading frame.
     """
 
-    task: tuple[str, ...]
-    """(B,) the current task; in a sequence it changes."""
-    time: Array
-    """(B,) s since the start of the episode."""
+    task: tuple[str, ...]  # (B,) the current task; in a sequence it changes
+    time: Array  # (B,) s since the start of the episode
     since_event: Array
     """(B,) s since throw, push or start of the arch; negative before, -inf if there is none."""
-    pelvis_w: Array
-    """(B, 7) position m, quaternion wxyz."""
-    pelvis_velocity_w: Array
-    """(B, 3) m/s."""
-    joint_position: Array
-    """(B, J) rad, without sensor noise."""
-    joint_velocity: Array
-    """(B, J) rad/s, without sensor noise."""
-    hands_w: Array
-    """(B, 2, 3) palm sites, left and right, m."""
-    hands_b: Array
-    """(B, 2, 3) palm sites, m."""
+    pelvis_w: Array  # (B, 7) position m, quaternion wxyz
+    pelvis_velocity_w: Array  # (B, 3) m/s
+    joint_position: Array  # (B, J) rad, without sensor noise
+    joint_velocity: Array  # (B, J) rad/s, without sensor noise
+    hands_b: Array  # (B, 2, 3) palm sites, m
     object_w: Array
     """(B, 3) ball centre (NaN before the throw), point of the wall nearest to the pelvis'
     x axis, or arch centre on the ground, m."""
-    object_b: Array
-    """(B, 3) the same, m."""
-    object_velocity_w: Array
-    """(B, 3) m/s."""
+    object_b: Array  # (B, 3) the same, m
+    object_velocity_w: Array  # (B, 3) m/s
     object_velocity_b: Array
     """(B, 3) in the axes of the heading frame, not relative to the pelvis, m/s."""
-    object_size: Array
-    """(B,) ball radius or arch clearance, m; NaN for a wall."""
+    object_size: Array  # (B,) ball radius or arch clearance, m; NaN for a wall
     object_active: NDArray[np.bool_]
     """(B,) ball in flight and untouched, push still felt, arch on the move."""
     contact_force: Array
     """(B, parts) peak force between each of ``scene.PARTS`` and the object in the last
     planner tick, N."""
-    body_position_w: Array
-    """(B, N, 3) robot bodies in the order of ``body_names``, m."""
-    body_quaternion_w: Array
-    """(B, N, 4) wxyz."""
-    body_names: tuple[str, ...]
-    """Names of the N robot bodies, as in the MJCF."""
-    camera_w: Array
-    """(B, 7) position m, quaternion wxyz; x is the optical axis, y left, z up."""
-    solids: tuple[tuple[Solid, ...], ...]
-    """Per row, the objects in the scene."""
+    body_position_w: Array  # (B, N, 3) robot bodies in the order of ``body_names``, m
+    body_quaternion_w: Array  # (B, N, 4) wxyz
+    body_names: tuple[str, ...]  # Names of the N robot bodies, as in the MJCF
+    camera_w: Array  # (B, 7) position m, quaternion wxyz; x is the optical axis, y left, z up
+    solids: tuple[tuple[Solid, ...], ...]  # Per row, the objects in the scene
 
 
 def privileged_state(instances: Sequence[EnvInstance]) -> PrivilegedState:
@@ -109,7 +92,6 @@ def privileged_state(instances: Sequence[EnvInstance]) -> PrivilegedState:
         pelvis_velocity_w=np.array([data.qvel[:3] for data in datas]),
         joint_position=np.array([d.qpos[index.joint_qpos] for d in datas]),
         joint_velocity=np.array([d.qvel[index.joint_qvel] for d in datas]),
-        hands_w=hands,
         hands_b=np.einsum("bhi,bij->bhj", hands - pelvis[:, None, :3], heading),
         object_w=position,
         object_b=np.einsum("bi,bij->bj", position - pelvis[:, :3], heading),
@@ -137,10 +119,8 @@ def _camera_pose(instance: EnvInstance) -> Array:
 class Observation:
     """Measurements of all robots at a planner tick."""
 
-    depth: NDArray[np.uint16]
-    """(B, H, W) planar depth, mm, 0 invalid."""
-    state: NDArray[np.float32]
-    """(B, S) proprioception in the layout of ``spec.STATE_SLICES``."""
+    depth: NDArray[np.uint16]  # (B, H, W) planar depth, mm, 0 invalid
+    state: NDArray[np.float32]  # (B, S) proprioception in the layout of ``spec.STATE_SLICES``
 
 
 @dataclass(frozen=True)
@@ -148,18 +128,14 @@ class StepResult:
     """Result of a planner tick; a row whose episode is over repeats its last observation."""
 
     observation: Observation
-    reward: NDArray[np.float64]
-    """(B,) sum of the terms."""
+    reward: NDArray[np.float64]  # (B,) sum of the terms
     reward_terms: dict[str, NDArray[np.float64]]
     """(B,) per name; 0 where a row's task lacks the term."""
-    terminated: NDArray[np.bool_]
-    """(B,) fallen."""
-    truncated: NDArray[np.bool_]
-    """(B,) at the time limit."""
+    terminated: NDArray[np.bool_]  # (B,) fallen
+    truncated: NDArray[np.bool_]  # (B,) at the time limit
     success: NDArray[np.bool_]
     """(B,) whether the task would count as achieved if the episode ended now."""
-    sent_action: Array
-    """(B, 7) after the rate limit and the box."""
+    sent_action: Array  # (B, 7) after the rate limit and the box
     parts: tuple[dict[str, bool], ...]
     """(B,) ``success`` of each part of a sequence; empty in a row of a single task."""
 
@@ -206,11 +182,6 @@ class VectorEnv:
         # newest first: sent actions that may not have taken effect yet
         slowest = -(-config.delay.action_ticks[1] // CONTROLLER_TICKS_PER_PLAN)
         self._sent = np.zeros((num_envs, 1 + slowest, ACTION_DIM))
-
-    @property
-    def scenarios(self) -> tuple[Scenario, ...]:
-        """The episode of each row."""
-        return tuple(instance.scenario for instance in self.instances)
 
     @property
     def parameters(self) -> tuple[dict[str, float], ...]:

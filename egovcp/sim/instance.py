@@ -43,16 +43,11 @@ _NOISELESS: Final = SensorConfig(0.0, 0.0, 0.0, 0.0)
 class PhysicsParameters:
     """The randomised physical parameters of one episode."""
 
-    friction: float
-    """Sliding friction of the feet."""
-    payload: float
-    """kg on the torso."""
-    mass_scale: float
-    """Factor on every mass of the robot."""
-    stiffness_scale: float
-    """Factor on the servo stiffness."""
-    damping_scale: float
-    """Factor on the servo damping."""
+    friction: float  # Sliding friction of the feet
+    payload: float  # kg on the torso
+    mass_scale: float  # Factor on every mass of the robot
+    stiffness_scale: float  # Factor on the servo stiffness
+    damping_scale: float  # Factor on the servo damping
 
 
 def sample_physics(config: RandomisationConfig, scenario: Scenario) -> PhysicsParameters:

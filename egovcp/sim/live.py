@@ -56,16 +56,11 @@ class Phase(Enum):
 class ServoCommand:
     """Command of a servo: torque = kp (q* - q) + kd (dq* - dq) + tau; (29,) each."""
 
-    position: Array
-    """rad."""
-    stiffness: Array
-    """N m/rad."""
-    damping: Array
-    """N m s/rad."""
-    velocity: Array = field(default_factory=lambda: np.zeros(NUM_JOINTS))
-    """rad/s."""
-    torque: Array = field(default_factory=lambda: np.zeros(NUM_JOINTS))
-    """N m."""
+    position: Array  # rad
+    stiffness: Array  # N m/rad
+    damping: Array  # N m s/rad
+    velocity: Array = field(default_factory=lambda: np.zeros(NUM_JOINTS))  # rad/s
+    torque: Array = field(default_factory=lambda: np.zeros(NUM_JOINTS))  # N m
 
 
 #: The motors only damp.
@@ -76,18 +71,12 @@ DAMPED: Final = ServoCommand(np.zeros(NUM_JOINTS), np.zeros(NUM_JOINTS), DAMPING
 class Measurement:
     """A noisy reading of the robot's sensors."""
 
-    joint_position: Array
-    """(29,) rad."""
-    joint_velocity: Array
-    """(29,) rad/s."""
-    torque: Array
-    """(29,) N m, as the motors applied it."""
-    quaternion_w: Array
-    """(4,) pelvis, wxyz."""
-    angular_velocity: Array
-    """(3,) rad/s, pelvis frame."""
-    acceleration: Array
-    """(3,) m/s^2, pelvis frame; gravity's share alone."""
+    joint_position: Array  # (29,) rad
+    joint_velocity: Array  # (29,) rad/s
+    torque: Array  # (29,) N m, as the motors applied it
+    quaternion_w: Array  # (4,) pelvis, wxyz
+    angular_velocity: Array  # (3,) rad/s, pelvis frame
+    acceleration: Array  # (3,) m/s^2, pelvis frame; gravity's share alone
 
 
 @dataclass
@@ -95,8 +84,7 @@ class EpisodeOutcome:
     """Result of an episode, up to now."""
 
     scenario: Scenario
-    ticks: int = 0
-    """Planner ticks of 40 ms."""
+    ticks: int = 0  # Planner ticks of 40 ms
     success: bool = False
     fallen: bool = False
     reward_terms: dict[str, float] = field(default_factory=dict)

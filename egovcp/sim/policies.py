@@ -6,8 +6,7 @@ to all of them; only oracles read the simulator's privileged state.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Final, Literal, Protocol
 
 import numpy as np
@@ -22,6 +21,14 @@ Array = NDArray[np.float64]
 
 _GRAVITY: Final = np.array([0.0, 0.0, -9.81])
 _LOOKAHEAD: Final = np.arange(0.0, 1.2, 0.01)  # s
+_BLOCK_AHEAD: Final = 0.32  # m, of the hand that waits for the ball from the pelvis
+_HAND_OFFSET: Final = (0.03, 0.0, 0.0)  # m, middle of the hand capsule from the palm site
+_PRESS: Final = 0.05  # m, hand targets behind the wall's surface
+_PRESS_ASIDE: Final = 0.20  # m, left and right
+_PRESS_HEIGHT: Final = 0.10  # m, above the pelvis
+_DUCK_FROM: Final = 0.75  # m, arch ahead of the pelvis
+_DUCK_UNTIL: Final = -0.30  # m
+_DUCK_HEIGHT: Final = 0.55  # m, of the pelvis
 
 
 class EnvPolicy(Protocol):
@@ -148,111 +155,52 @@ class RandomWalk:
         return rng.uniform(-1.0, 1.0, ACTION_DIM)
 
 
-class TaskOracle(Protocol):
-    """The scripted solution of one task."""
-
-    def act(self, state: PrivilegedState, row: int) -> Array:
-        """(7,) the action for one row."""
-        ...
+def oracle_action(state: PrivilegedState, row: int) -> Array:
+    """(7,) the scripted solution of the current task of one row."""
+    return _ORACLES[state.task[row]](state, row)
 
 
-@dataclass(frozen=True)
-class BallOracleConfig:
-    """Where and how the ball oracle meets the ball."""
-
-    reach: float = 0.32
-    """Distance before the pelvis of the hand that waits for the ball, m."""
-    hand_offset: tuple[float, float, float] = (0.03, 0.0, 0.0)
-    """Middle of the hand capsule from the palm site, m, heading frame."""
-
-
-class BallOracle:
-    """Puts the nearer hand where the ball will cross a plane before the body."""
-
-    def __init__(self, config: BallOracleConfig = BallOracleConfig()) -> None:
-        self._config = config
-
-    def act(self, state: PrivilegedState, row: int) -> Array:
-        if not state.object_active[row]:
-            return np.zeros(7)
-        point = self._crossing(state.object_b[row], state.object_velocity_b[row])
-        target = np.asarray(ACTION_BOX.neutral).copy()
-        side = 0 if point[1] > 0 else 1
-        target[3 * side : 3 * side + 3] = point - self._config.hand_offset
-        return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
-
-    def _crossing(self, position: Array, velocity: Array) -> Array:
-        """Point of the ballistic path nearest to the plane x = reach."""
-        t = _LOOKAHEAD[:, None]
-        path = position + velocity * t + 0.5 * _GRAVITY * t * t
-        out: Array = path[np.argmin(np.abs(path[:, 0] - self._config.reach))]
-        return out
+def _block_ball(state: PrivilegedState, row: int) -> Array:
+    """Put the nearer hand where the ball will cross a plane ahead of the body."""
+    if not state.object_active[row]:
+        return np.zeros(7)
+    t = _LOOKAHEAD[:, None]
+    path = state.object_b[row] + state.object_velocity_b[row] * t + 0.5 * _GRAVITY * t * t
+    point = path[np.argmin(np.abs(path[:, 0] - _BLOCK_AHEAD))]
+    target = np.asarray(ACTION_BOX.neutral).copy()
+    side = 0 if point[1] > 0 else 1
+    target[3 * side : 3 * side + 3] = point - _HAND_OFFSET
+    return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
 
 
-@dataclass(frozen=True)
-class WallOracleConfig:
-    """How the wall oracle braces, m, heading frame."""
-
-    press: float = 0.05
-    """How far beyond the wall's surface the hands aim, so that they push."""
-    lateral: float = 0.20
-    """Hands left and right of the middle."""
-    height: float = 0.10
-    """Hands above the pelvis."""
+def _brace_on_wall(state: PrivilegedState, row: int) -> Array:
+    """After a push towards the wall, press both hands on it."""
+    if not state.object_active[row]:
+        return np.zeros(7)
+    ahead = state.object_b[row, 0] + _PRESS
+    left, right = (ahead, _PRESS_ASIDE, _PRESS_HEIGHT), (ahead, -_PRESS_ASIDE, _PRESS_HEIGHT)
+    target = np.array([*left, *right, ACTION_BOX.neutral[-1]])
+    return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
 
 
-class WallOracle:
-    """From a push towards the wall onwards, presses both hands on the wall."""
-
-    def __init__(self, config: WallOracleConfig = WallOracleConfig()) -> None:
-        self._config = config
-
-    def act(self, state: PrivilegedState, row: int) -> Array:
-        if not state.object_active[row]:
-            return np.zeros(7)
-        c = self._config
-        ahead = state.object_b[row, 0] + c.press
-        left, right = (ahead, c.lateral, c.height), (ahead, -c.lateral, c.height)
-        target = np.array([*left, *right, ACTION_BOX.neutral[-1]])
-        return np.clip(ACTION_BOX.to_normalised(target), -1.0, 1.0)
+def _duck_under_arch(state: PrivilegedState, row: int) -> Array:
+    """Squat while the arch is near."""
+    target = np.array(ACTION_BOX.neutral)
+    if state.object_active[row] and _DUCK_UNTIL < state.object_b[row, 0] < _DUCK_FROM:
+        target[6] = _DUCK_HEIGHT
+    return ACTION_BOX.to_normalised(target)
 
 
-@dataclass(frozen=True)
-class ArchOracleConfig:
-    """When and how the arch oracle ducks."""
-
-    before: float = 0.75
-    """Ducks while the arch is nearer than this ahead of the pelvis, m."""
-    behind: float = 0.30
-    """Stays down until the arch is this far behind the pelvis, m."""
-    height: float = 0.55
-    """Pelvis height under the arch, m."""
-
-
-class ArchOracle:
-    """Squats while the arch is near."""
-
-    def __init__(self, config: ArchOracleConfig = ArchOracleConfig()) -> None:
-        self._config = config
-
-    def act(self, state: PrivilegedState, row: int) -> Array:
-        ahead, c = state.object_b[row, 0], self._config
-        target = np.array(ACTION_BOX.neutral)
-        if state.object_active[row] and -c.behind < ahead < c.before:
-            target[6] = c.height
-        return ACTION_BOX.to_normalised(target)
+_ORACLES: Final[dict[str, Callable[[PrivilegedState, int], Array]]] = {
+    "ball": _block_ball,
+    "wall": _brace_on_wall,
+    "arch": _duck_under_arch,
+}
 
 
 class Oracle(_Stateless):
-    """The scripted solution of each row's current task, from the simulator's state."""
-
-    def __init__(self) -> None:
-        self.by_task: dict[str, TaskOracle] = {
-            "ball": BallOracle(),
-            "wall": WallOracle(),
-            "arch": ArchOracle(),
-        }
+    """`oracle_action` of every row."""
 
     def act(self, env: VectorEnv) -> Array:
         state = env.privileged_state()
-        return np.array([self.by_task[name].act(state, row) for row, name in enumerate(state.task)])
+        return np.array([oracle_action(state, row) for row in range(env.num_envs)])

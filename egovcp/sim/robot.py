@@ -44,10 +44,8 @@ _LYING_HEIGHT = 0.5  # m, pelvis; above it no part of the trunk reaches the floo
 class Contact:
     """A contact of the robot with the task's object in one physics step."""
 
-    part: int
-    """Index into ``scene.PARTS``."""
-    force: float
-    """Normal force, N."""
+    part: int  # Index into ``scene.PARTS``
+    force: float  # Normal force, N
 
 
 class SimulatedRobot:

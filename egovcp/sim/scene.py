@@ -64,26 +64,17 @@ _PART_OF: Final = {
 class SceneIndex:
     """Addresses inside a compiled model; constant over its copies."""
 
-    part: NDArray[np.int8]
-    """(ngeom,) index into ``PARTS`` of a robot geom, -1 otherwise."""
-    is_object: NDArray[np.bool_]
-    """(ngeom,) ball, wall or arch."""
-    floor: int
-    """Geom id of the floor."""
-    foot_geoms: NDArray[np.intp]
-    """Geom ids of the feet."""
+    part: NDArray[np.int8]  # (ngeom,) index into ``PARTS`` of a robot geom, -1 otherwise
+    is_object: NDArray[np.bool_]  # (ngeom,) ball, wall or arch
+    floor: int  # Geom id of the floor
+    foot_geoms: NDArray[np.intp]  # Geom ids of the feet
     robot_bodies: NDArray[np.intp]
     """Body ids of the robot: the pelvis first, in the order of ``body_names``."""
-    body_names: tuple[str, ...]
-    """Names of ``robot_bodies``."""
-    torso_body: int
-    """Body id of the torso, which carries the camera."""
-    palm_sites: NDArray[np.intp]
-    """(2,) site ids of the left and the right palm."""
-    joint_qpos: slice
-    """Joint positions in ``qpos``, ``JOINT_NAMES`` order."""
-    joint_qvel: slice
-    """Joint velocities in ``qvel``, ``JOINT_NAMES`` order."""
+    body_names: tuple[str, ...]  # Names of ``robot_bodies``
+    torso_body: int  # Body id of the torso, which carries the camera
+    palm_sites: NDArray[np.intp]  # (2,) site ids of the left and the right palm
+    joint_qpos: slice  # Joint positions in ``qpos``, ``JOINT_NAMES`` order
+    joint_qvel: slice  # Joint velocities in ``qvel``, ``JOINT_NAMES`` order
 
 
 @dataclass(frozen=True)

@@ -29,12 +29,9 @@ class Solid:
 
     name: str
     shape: Literal["sphere", "box"]
-    size: tuple[float, float, float]
-    """Half sizes of a box, or the radius three times, m."""
-    position_w: Array
-    """(3,) centre, m."""
-    quaternion_w: Array
-    """(4,) wxyz."""
+    size: tuple[float, float, float]  # Half sizes of a box, or the radius three times, m
+    position_w: Array  # (3,) centre, m
+    quaternion_w: Array  # (4,) wxyz
 
 
 @dataclass(frozen=True)
@@ -43,12 +40,9 @@ class ObjectState:
 
     position_w: Array
     """(3,) ball centre, wall surface before the robot, or arch centre on the ground, m."""
-    velocity_w: Array
-    """(3,) m/s."""
-    size: float
-    """Ball radius, or clearance under the arch, m."""
-    active: bool
-    """Ball in flight, robot pushed and still disturbed, or arch on the move."""
+    velocity_w: Array  # (3,) m/s
+    size: float  # Ball radius, or clearance under the arch, m
+    active: bool  # Ball in flight, robot pushed and still disturbed, or arch on the move
 
 
 class Task(ABC):

@@ -19,7 +19,7 @@ from egovcp.robot.controllers import make_controller
 from egovcp.sim.config import evaluation_config
 from egovcp.sim.env import privileged_state
 from egovcp.sim.live import LiveRobot, Phase
-from egovcp.sim.policies import Oracle
+from egovcp.sim.policies import oracle_action
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import CONTROLLER_HZ, PHYSICS_STEPS_PER_CONTROLLER_TICK
 from egovcp_deploy.live.control import ControlLoop
@@ -113,7 +113,6 @@ class _OraclePolicy:
 
     def __init__(self, robot: LiveRobot) -> None:
         self._robot = robot
-        self._oracle = Oracle().by_task
 
     def reset(self) -> None:
         """Do nothing: there is no memory."""
@@ -126,7 +125,7 @@ class _OraclePolicy:
     ) -> PolicyStep:
         """A plan of one action."""
         truth = privileged_state([self._robot.instance])
-        action = self._oracle[truth.task[0]].act(truth, 0).astype(np.float32)[None]
+        action = oracle_action(truth, 0).astype(np.float32)[None]
         return PolicyStep(action, action[:, None], iterations=1)
 
     def observe(self, depth: NDArray[np.uint16], state: NDArray[np.floating]) -> None:
