@@ -39,7 +39,7 @@ def plain() -> Iterator[EgovcpEnv]:
 
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space.*")
-def test_it_passes_gymnasiums_own_check(view: LeRobotEgovcpEnv) -> None:
+def test_gymnasium_check_env_passes(view: LeRobotEgovcpEnv) -> None:
     check_env(view, skip_render_check=True)
 
 
@@ -73,7 +73,7 @@ def test_a_success_counts_at_the_end_alone(
     assert found == [False] * (TICKS - 1) + [True]
 
 
-def test_the_picture_is_bright_where_something_is_near(view: LeRobotEgovcpEnv) -> None:
+def test_the_rendered_image_is_bright_where_objects_are_near(view: LeRobotEgovcpEnv) -> None:
     seen, _ = view.reset(seed=0)
     depth, picture = seen["images.ego_depth"][0], view.render()
     assert picture.shape == (4 * spec.DEPTH_ROWS, 4 * spec.DEPTH_COLS, 3)
@@ -141,7 +141,7 @@ def test_a_rollout_of_lerobot_with_another_controller_is_refused_before_its_firs
     assert not steps
 
 
-def test_processes_of_their_own_are_possible() -> None:
+def test_async_environments_work() -> None:
     envs = make_env(EgovcpEnvConfig(simulation=SIMULATION), n_envs=2, use_async_envs=True)
     try:
         env = envs["egovcp"][0]

@@ -43,14 +43,14 @@ def robot(tmp_path: Path) -> EgovcpG1:
     return EgovcpG1(config(tmp_path))
 
 
-def test_lerobot_knows_it(tmp_path: Path) -> None:
+def test_lerobot_finds_the_robot_type(tmp_path: Path) -> None:
     assert RobotConfig.get_choice_class("egovcp_g1") is EgovcpG1Config
     made = make_robot_from_config(config(tmp_path))
     assert type(made) is EgovcpG1
     assert made.robot_type == "egovcp_g1"
 
 
-def test_its_name_is_one_that_lerobot_looks_for() -> None:
+def test_distribution_name_is_discovered_by_lerobot() -> None:
     try:
         name = distribution("lerobot_robot_egovcp").metadata["Name"]
     except PackageNotFoundError:
@@ -67,7 +67,7 @@ def test_it_records_what_our_datasets_hold(robot: EgovcpG1) -> None:
     assert done[spec.ACTION_KEY] == spec.FEATURES[spec.ACTION_KEY]
 
 
-def test_what_is_not_connected_says_so(robot: EgovcpG1) -> None:
+def test_methods_before_connect_raise(robot: EgovcpG1) -> None:
     assert not robot.is_connected
     for call in (robot.get_observation, robot.disconnect, lambda: robot.send_action(NEUTRAL)):
         with pytest.raises(DeviceNotConnectedError):

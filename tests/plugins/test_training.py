@@ -170,7 +170,7 @@ def test_saving_what_was_loaded_keeps_where_it_comes_from(artifact: Path, tmp_pa
     assert new.world_model.config == old.world_model.config
 
 
-def test_an_artifact_of_egovcp_train_learns_on(
+def test_an_artifact_of_egovcp_train_can_be_trained_further(
     artifact: Path, meta: LeRobotDatasetMetadata
 ) -> None:
     policy = EgovcpPolicy.from_pretrained(artifact, dataset_meta=meta)
@@ -201,7 +201,7 @@ def test_episodes_shorter_than_the_return_are_refused(
         make_policy(config, ds_meta=meta)
 
 
-def test_a_policy_without_dataset_neither_learns_nor_says_whom_it_drives(
+def test_a_policy_without_dataset_can_neither_train_nor_be_saved(
     artifact: Path, tmp_path: Path, config: EgovcpConfig, meta: LeRobotDatasetMetadata
 ) -> None:
     make_policy(config, ds_meta=meta)  # fills in the features

@@ -1,7 +1,10 @@
-"""Every backend says what the world model itself says, as well as its numbers allow."""
+"""Backends of the plan evaluation against the reference."""
+
+from __future__ import annotations
 
 import dataclasses
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +18,14 @@ from egovcp.model import PRESETS, Carry, WorldModel
 from egovcp.model.config import LossConfig
 from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.plan.backends import FloatEvaluator, Int8Evaluator, library, make_evaluator
+from egovcp.plan.backends.integer_network import (
+    LEAST_SILU,
+    NODES,
+    ONE,
+    UNIT,
+    silu_table,
+    tanh_table,
+)
 from egovcp.plan.config import BackendName
 from egovcp.plan.search import random_walk
 from egovcp.testing import toy_model
@@ -82,7 +93,7 @@ def _plan(model: WorldModel, backend: BackendName, carry: Carry) -> Plan:
 @pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
 @pytest.mark.parametrize("change", MODELS, ids=str)
 @pytest.mark.parametrize("question", QUESTIONS, ids=str)
-def test_plans_are_worth_the_same(
+def test_plan_values_agree_with_the_reference(
     backend: BackendName, tolerance: float, change: dict[str, object], question: dict[str, str]
 ) -> None:
     eager = PlannerConfig(backend="eager", **question)  # type: ignore[arg-type]
@@ -122,9 +133,7 @@ def test_the_same_action_is_chosen(backend: BackendName, tolerance: float) -> No
 
 
 @pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
-def test_a_robot_is_judged_the_same_alone_and_in_a_crowd(
-    backend: BackendName, tolerance: float
-) -> None:
+def test_values_of_a_robot_do_not_depend_on_others(backend: BackendName, tolerance: float) -> None:
     model = _model()
     carry, actions, config = _carry(model), _actions(), PlannerConfig(backend=backend)
     together = _values(model, config, carry, actions)
@@ -160,9 +169,7 @@ def test_threads_that_have_left_come_again(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize(("backend", "tolerance"), TOLERANCES)
-def test_what_is_not_a_number_stays_so_and_harms_nobody_else(
-    backend: BackendName, tolerance: float
-) -> None:
+def test_nan_stays_in_its_row(backend: BackendName, tolerance: float) -> None:
     model, config = _model(), PlannerConfig(backend=backend)
     carry, actions = _carry(model), _actions()
     sound = _values(model, config, carry, actions)
@@ -190,7 +197,7 @@ def test_what_is_not_a_number_stays_so_and_harms_nobody_else(
 @pytest.mark.parametrize(
     ("kind", "objective"), [("mse", "value"), ("two_hot", "value"), ("mse", "td")]
 )
-def test_the_kernel_says_the_same_with_other_vectors(
+def test_the_kernel_agrees_across_vector_widths(
     kind: str,
     objective: Any,
     vectors: tuple[str, ...],
@@ -267,3 +274,33 @@ def test_the_same_on_a_gpu() -> None:
         evaluator = make_evaluator(model.cuda(), PlannerConfig(backend="float32"))
         found = evaluator.at(there)(actions.cuda(), None).cpu()
     assert (found - expected).abs().median() < 1e-3 * expected.std()
+
+
+def _on_lines(table: Tensor, reach: float, unit: int, a: Tensor) -> Tensor:
+    """As the kernel, but for its rounding."""
+    places = a * NODES / reach
+    node = places.round().clamp(max=NODES - 1)
+    value, rise = table.double() / unit
+    return value[node.long()] + rise[node.long()] * 2 * (places - node)
+
+
+@pytest.mark.parametrize(
+    ("function", "table", "reach", "unit", "allowed"),
+    [
+        (lambda a: -a * torch.sigmoid(-a), silu_table(), 8.0, UNIT, 1e-3),
+        (torch.tanh, tanh_table(), 4.0, ONE, 3e-4),
+    ],
+    ids=["silu", "tanh"],
+)
+def test_lines_are_near_their_function(
+    function: Callable[[Tensor], Tensor], table: Tensor, reach: float, unit: int, allowed: float
+) -> None:
+    a = torch.linspace(0, reach, 10_001, dtype=torch.float64)
+    error = (_on_lines(table, reach, unit, a) - function(a)).abs()
+    assert error.max() < allowed
+
+
+def test_bytes_of_hidden_layers_count_from_below_the_least_silu() -> None:
+    x = torch.linspace(-3, 0, 10_001)
+    assert torch.nn.functional.silu(x).min() > LEAST_SILU
+    assert silu_table()[0].min() / UNIT > LEAST_SILU

@@ -67,7 +67,7 @@ def test_the_best_reachable_plan_is_found(seed: int) -> None:
     assert (plan.actions - ideal).abs().mean() < 0.08
 
 
-def test_hands_that_cost_something_stay_nearer_to_neutral_and_the_height_goes_its_way() -> None:
+def test_hands_cost_keeps_hands_near_neutral_and_not_the_height() -> None:
     """In a world whose Q is -|a - goal|^2, J - c |hands|^2 / 6 is best at goal / (1 + c / 6)."""
     executed, goal = torch.full((1, 7), 0.4), torch.full((1, 7), 0.4)
     config = plain_planner(samples=512, elites=16, iterations=8, min_std=0.02)
@@ -87,7 +87,7 @@ class Indifferent(PointWorld):
 
 
 @pytest.mark.parametrize("process", ["random_walk", "target"])
-def test_who_pays_for_steps_stays_where_nothing_is_to_be_gained(
+def test_step_cost_keeps_still_without_gain(
     process: ActionParameterization,
 ) -> None:
     """Planned ten times over, each plan from where the one before it has led."""
@@ -104,7 +104,7 @@ def test_who_pays_for_steps_stays_where_nothing_is_to_be_gained(
     assert held < free / 2
 
 
-def test_who_pays_for_steps_still_goes_where_it_is_worth_the_way() -> None:
+def test_step_cost_allows_steps_with_enough_gain() -> None:
     """Q is -|a - goal|^2, so that one step a < eta into the first action loses 7 (goal - a)^2 of J
     and costs c (a / eta)^2 / 4, best at goal / (1 + c / (28 eta^2)): for the c below, half-way."""
     executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.3)
@@ -208,7 +208,7 @@ def test_the_elites_are_the_best_first_and_belong_to_their_values() -> None:
     assert plan.iterations == SMALL.iterations
 
 
-def test_the_search_never_narrows_below_its_floor() -> None:
+def test_the_std_stays_above_its_minimum() -> None:
     executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.1)
     for floor in (0.1, 0.4):
         config = plain_planner(samples=512, elites=64, iterations=10, min_std=floor)
@@ -316,7 +316,7 @@ def test_a_region_without_finite_values_does_not_stop_the_search() -> None:
     assert (plan.actions[..., 1:] - 0.3).abs().mean() < 0.1
 
 
-def test_without_any_finite_value_the_plan_goes_on_as_before_and_says_so() -> None:
+def test_without_finite_values_the_plan_continues_and_its_value_is_minus_infinity() -> None:
     class Nan(PointWorld):
         def value(self, carry: Point, action: Tensor) -> Tensor:
             return torch.full(action.shape[:-1], math.nan)

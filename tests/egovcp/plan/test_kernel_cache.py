@@ -230,7 +230,7 @@ def test_a_compiler_that_fails(
 
 
 @needs_compiler
-def test_what_the_compiler_says_is_quoted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_compiler_messages_are_quoted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "FLAGS", ("--no-such-flag",))
     with pytest.raises(EnvironmentFailure, match="no-such-flag"):
         _judge("int8")

@@ -1,4 +1,6 @@
-"""What plans are worth by rewards (Rew-MPC) and by rewards and a value at the end (TD-MPC)."""
+"""Objectives of plans and termination rules."""
+
+from __future__ import annotations
 
 import dataclasses
 from typing import Any
@@ -13,7 +15,7 @@ from egovcp.errors import UsageError
 from egovcp.model import PRESETS, Carry, WorldModel
 from egovcp.plan import PlannerConfig, Policy, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.plan.backends import make_evaluator
-from egovcp.plan.config import require_compatible
+from egovcp.plan.config import TerminationRule, require_compatible
 from egovcp.plan.objective import evaluate
 from egovcp.testing import toy_model
 from tests.support.worlds import Point, PointWorld, ScriptedWorld, plain_planner
@@ -61,7 +63,7 @@ def test_rewards_are_discounted_and_the_value_comes_after_the_last(
         ("survival", 1.0 + 0.5 * 2.0 + 0.25 * -10.0),
     ],
 )
-def test_a_failed_plan_earns_what_failing_for_ever_is_worth(rule: str, expected: float) -> None:
+def test_a_failed_plan_has_the_value_of_failing_forever(rule: str, expected: float) -> None:
     """It fails at tick 1, whose own reward counts; rewards and value after it do not."""
     world = _scripted([0.0, 1.0, 0.0, 0.0], 0.5)
     assert _worth(world, 3, objective="td", termination_rule=rule) == pytest.approx(expected)
@@ -118,9 +120,7 @@ def _by_loop(model: WorldModel, carry: Carry, plan: Tensor, config: PlannerConfi
 @pytest.mark.parametrize("rule", RULES)
 @pytest.mark.parametrize("objective", OBJECTIVES)
 @pytest.mark.parametrize("horizon", range(1, 7))
-def test_all_plans_at_once_are_worth_what_each_is_alone(
-    objective: Any, horizon: int, rule: Any
-) -> None:
+def test_batched_plan_values_equal_single_ones(objective: Any, horizon: int, rule: Any) -> None:
     model, robots, plans = _model(), 2, 5
     config = plain_planner(
         horizon=horizon, objective=objective, termination_rule=rule, termination_threshold=0.5
@@ -161,7 +161,7 @@ class _Earning(PointWorld):
         return -(action - 0.5 * carry.goal).square().sum(-1)
 
 
-def test_the_search_finds_the_plan_that_earns_most() -> None:
+def test_the_search_finds_the_plan_with_the_highest_reward() -> None:
     executed, goal = torch.zeros(1, 7), torch.full((1, 7), 0.5)
     for objective, expected in (("reward", [0.32, 0.5]), ("td", [0.32, 0.5, 0.25])):
         config = plain_planner(horizon=2, objective=objective, iterations=10)  # type: ignore[arg-type]
@@ -190,14 +190,14 @@ def test_a_policy_acts_by_every_objective_and_horizon(objective: Any, horizon: i
 
 # --- refusals -----------------------------------------------------------------------------
 @pytest.mark.parametrize("objective", ["reward", "td"])
-def test_only_who_asks_for_it_is_judged_step_by_step(objective: Any) -> None:
+def test_only_eager_and_subclasses_use_the_reference(objective: Any) -> None:
     for backend, slow in (("auto", False), ("eager", True)):
         config = plain_planner(objective=objective, backend=backend)  # type: ignore[arg-type]
         assert isinstance(make_evaluator(_model(), config), ReferenceEvaluator) == slow
 
 
 @pytest.mark.parametrize("objective", ["reward", "td"])
-def test_a_model_that_foresees_no_rewards_is_refused(objective: Any) -> None:
+def test_a_model_without_reward_head_is_refused(objective: Any) -> None:
     config = plain_planner(objective=objective)
     with pytest.raises(UsageError, match=r"--policy\.loss\.reward=1"):
         make_evaluator(toy_model(), config)
@@ -206,9 +206,60 @@ def test_a_model_that_foresees_no_rewards_is_refused(objective: Any) -> None:
         evaluate(PointWorld(), start, torch.zeros(1, 2, config.actions, 7), config)
 
 
-def test_draws_from_a_prior_that_was_only_trained_in_its_mean_are_refused() -> None:
+def test_sampling_from_an_untrained_prior_std_is_refused() -> None:
     autoregressive = dataclasses.replace(DEBUG, dynamics="autoregressive")
     with pytest.raises(UsageError, match="plan with latent=mean"):
         require_compatible(autoregressive, plain_planner(latent="sample"))
     require_compatible(autoregressive, plain_planner())
     require_compatible(DEBUG, plain_planner(latent="sample"))
+
+
+VALUES = [8.0, 4.0, -2.0, 6.0]
+FLOOR = -10.0
+
+
+def _objective(rule: TerminationRule, deaths: list[float], values: list[float] = VALUES) -> float:
+    world = ScriptedWorld(values, deaths, floor=FLOOR)
+    actions = torch.zeros(1, 1, len(values), 7)
+    config = PlannerConfig(termination_rule=rule)
+    return evaluate(world, world.start(), actions, config).item()
+
+
+@pytest.mark.parametrize("rule", ["paper", "shift", "survival"])
+def test_without_a_failure_the_objective_is_the_mean_value(rule: TerminationRule) -> None:
+    assert _objective(rule, [0.0] * 4) == pytest.approx(sum(VALUES) / 4)
+
+
+@pytest.mark.parametrize(
+    ("rule", "deaths", "expected"),
+    [
+        # The failed state's own value counts, later ones are lost.
+        ("paper", [0, 0.95, 0, 0], (8 + 4 + 0 + 0) / 4),
+        ("paper", [0, 0, 0.95, 0], (8 + 4 - 2 + 0) / 4),
+        ("shift", [0, 0.95, 0, 0], (8 + 4 - 10 - 10) / 4),
+        ("shift", [0, 0, 0.95, 0], (8 + 4 - 2 - 10) / 4),
+        # Each value above the floor, weighted with the probability of being alive.
+        ("survival", [0, 0.5, 0, 0], (8 + 4 + (0.5 * 8 - 10) + (0.5 * 16 - 10)) / 4),
+        ("survival", [0, 0.5, 0.5, 0], (8 + 4 + (0.5 * 8 - 10) + (0.25 * 16 - 10)) / 4),
+        ("survival", [0, 1.0, 0, 0], (8 + 4 - 10 - 10) / 4),
+        # At the threshold is not beyond it.
+        ("paper", [0, 0.9, 0, 0], sum(VALUES) / 4),
+        ("shift", [0, 0.9, 0, 0], sum(VALUES) / 4),
+        # The observed state is alive, whatever D says; after the last step nothing follows.
+        ("paper", [1.0, 0, 0, 0], sum(VALUES) / 4),
+        ("survival", [1.0, 0, 0, 1.0], sum(VALUES) / 4),
+        # Dead stays dead.
+        ("paper", [0, 0.95, 0.0, 0.0], (8 + 4) / 4),
+    ],
+)
+def test_the_objective_after_a_failure(
+    rule: TerminationRule, deaths: list[float], expected: float
+) -> None:
+    assert _objective(rule, deaths) == pytest.approx(expected)
+
+
+def test_only_the_papers_rule_rewards_falling_when_values_are_negative() -> None:
+    values, alive, dead = [-1.0, -1.0, -5.0, -5.0], [0.0] * 4, [0.0, 1.0, 0.0, 0.0]
+    assert _objective("paper", dead, values) > _objective("paper", alive, values)
+    assert _objective("shift", dead, values) < _objective("shift", alive, values)
+    assert _objective("survival", dead, values) < _objective("survival", alive, values)

@@ -1,4 +1,6 @@
-"""What every search must do, whatever its name."""
+"""The searches, and the cross-entropy method of the kernel."""
+
+from __future__ import annotations
 
 import dataclasses
 import itertools
@@ -10,11 +12,12 @@ from torch import Tensor
 
 from egovcp import spec
 from egovcp.errors import UsageError
-from egovcp.plan import Plan, ReferenceEvaluator, make_plan, optimiser_of
+from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
+from egovcp.plan.backends import library
 from egovcp.plan.config import OptimiserName
 from egovcp.plan.objective import evaluate
-from egovcp.plan.optimisers import OPTIMISERS, coloured, weights
-from egovcp.plan.search import SearchState
+from egovcp.plan.optimisers import OPTIMISERS, CrossEntropy, KernelCrossEntropy, coloured, weights
+from egovcp.plan.search import SearchState, random_walk
 from tests.support.worlds import Point, PointWorld, plain_planner
 
 ETA = spec.ACTION_ETA
@@ -128,7 +131,7 @@ def test_plans_without_a_finite_value_never_win(name: OptimiserName) -> None:
 
 
 @every
-def test_without_any_finite_value_the_plan_goes_on_as_before_and_says_so(
+def test_without_finite_values_the_plan_continues_and_its_value_is_minus_infinity(
     name: OptimiserName,
 ) -> None:
     class Nan(PointWorld):
@@ -149,7 +152,7 @@ def test_searches_that_keep_the_best_never_lose_it(name: OptimiserName) -> None:
         assert (after >= before).all()
 
 
-def test_icem_draws_fewer_each_round_and_its_elites_again() -> None:
+def test_icem_samples_fewer_each_iteration_and_repeats_elites() -> None:
     config = plain_planner(samples=100, elites=10, optimiser="icem", kept_elites=0.3)
     elites = torch.rand(1, 10, 4, 7)
     values = torch.arange(10.0, 0.0, -1.0)[None]
@@ -186,3 +189,77 @@ def test_mppi_weighs_by_value_whatever_the_unit() -> None:
 def test_senseless_settings_are_refused(change: dict[str, float]) -> None:
     with pytest.raises(UsageError):
         dataclasses.replace(plain_planner(), **change)
+
+
+pytestmark = pytest.mark.skipif(library.compiler() is None, reason="no C compiler")
+CONFIG = PlannerConfig(samples=60, horizon=3, elites=7)
+SHAPE = (CONFIG.horizon, spec.ACTION_DIM)
+
+
+def _belief(robots: int = 2) -> SearchState:
+    rng = torch.Generator().manual_seed(0)
+    mean, std = torch.rand(2, robots, *SHAPE, generator=rng)
+    nothing = torch.full((robots, CONFIG.elites), -torch.inf)
+    elites = mean[:, None].expand(-1, CONFIG.elites, -1, -1)
+    return SearchState(2.4 * mean - 1.2, std, elites, nothing, nothing[:, 0])
+
+
+def _learned(values: Tensor) -> tuple[SearchState, SearchState]:
+    """By the kernel, and by torch."""
+    rng = torch.Generator().manual_seed(1)
+    deltas = 2 * torch.rand(len(values), CONFIG.samples, *SHAPE, generator=rng) - 1
+    state = _belief(len(values))
+    return (
+        KernelCrossEntropy(CONFIG).update(state, deltas, values),
+        CrossEntropy(CONFIG).update(state, deltas, values),
+    )
+
+
+def _values(robots: int = 2) -> Tensor:
+    return torch.randn(robots, CONFIG.samples, generator=torch.Generator().manual_seed(2))
+
+
+def test_it_draws_the_same_from_the_same_seed() -> None:
+    drawn = [
+        search.propose(_belief(), 0, torch.Generator().manual_seed(3))
+        for search in (KernelCrossEntropy(CONFIG), CrossEntropy(CONFIG))
+    ]
+    assert drawn[0].equal(drawn[1])
+
+
+@pytest.mark.parametrize("usable", [60, 7, 3, 1, 0])
+def test_kernel_update_agrees_with_few_finite_values(usable: int) -> None:
+    values = _values()
+    values[:, usable:] = -torch.inf
+    found, expected = _learned(values)
+    count = min(usable, CONFIG.elites)
+    assert found.values.equal(expected.values)
+    assert found.elites[:, :count].equal(expected.elites[:, :count])  # of equals any may come next
+    for name in ("mean", "std", "value"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name))
+
+
+def test_kernel_update_does_not_depend_on_other_robots() -> None:
+    values = _values()
+    both, _ = _learned(values)
+    values[1] = -torch.inf
+    beside, _ = _learned(values)
+    assert both.mean[0].equal(beside.mean[0])
+    assert both.std[0].equal(beside.std[0])
+
+
+@pytest.mark.parametrize("size", [spec.ACTION_DIM, 19])
+def test_kernel_random_walk_is_bit_identical(size: int) -> None:
+    rng = torch.Generator().manual_seed(4)
+    start = 2 * torch.rand(3, 1, size, generator=rng) - 1
+    deltas = 2 * torch.rand(3, 50, 4, size, generator=rng) - 1
+    deltas[1, 2, 3, 4] = torch.nan
+    found = KernelCrossEntropy(CONFIG).random_walk(start, deltas, 0.9)
+    torch.testing.assert_close(
+        found, random_walk(start, deltas, 0.9), rtol=0, atol=0, equal_nan=True
+    )
+
+
+def test_what_is_not_on_the_processor_or_not_for_the_kernel_is_left_to_torch() -> None:
+    assert isinstance(optimiser_of(CONFIG, "cuda"), CrossEntropy)
+    assert isinstance(optimiser_of(PlannerConfig(backend="float32")), CrossEntropy)

@@ -60,7 +60,7 @@ def _foothold(m: Gait, state: np.ndarray) -> np.ndarray:
     return gait.foothold(m, stance_table().at(h), h, command, CONFIG)[0]
 
 
-def test_a_robot_that_is_not_told_to_walk_stands():
+def test_a_robot_without_velocity_command_stands():
     state = _state(3)
     m = _start(state)
     assert not np.any(_run(m, state, 100))
@@ -68,7 +68,7 @@ def test_a_robot_that_is_not_told_to_walk_stands():
     assert not m.turned.any()
 
 
-def test_it_walks_while_told_to_and_stands_once_the_feet_are_together():
+def test_it_walks_while_commanded_and_stands_once_the_feet_are_together():
     walk, stand = _state(vx=0.3), _state()
     m = _start(walk)
     _run(m, walk, 50)

@@ -1,3 +1,5 @@
+"""Configuration of the simulated robot, and identity of episodes."""
+
 from __future__ import annotations
 
 import math
@@ -5,12 +7,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, fields, is_dataclass
 from typing import Any
 
+import numpy as np
 import pytest
 
 from egovcp.bounds import Bounds, bounds_of
 from egovcp.cli import parse_config
 from egovcp.errors import UsageError
 from egovcp.sim.config import BallConfig, EnvConfig
+from egovcp.sim.scenario import Scenario
+from egovcp.spec import TASKS
 
 
 @dataclass(frozen=True)
@@ -87,3 +92,38 @@ def test_every_number_is_bounded_on_both_sides() -> None:
 def test_what_cannot_be_simulated_is_refused_by_name(flag: str, value: str) -> None:
     with pytest.raises(UsageError, match=rf"--env\.{flag}=.*: expected at"):
         parse_config(Command, [f"--env.{flag}={value}"], "test")
+
+
+def draw(scenario: Scenario, name: str) -> list[float]:
+    return scenario.rng(name).random(4).tolist()
+
+
+def test_equal_scenarios_draw_equal_numbers() -> None:
+    assert draw(Scenario("ball", 3, 5), "x") == draw(Scenario("ball", 3, 5), "x")
+
+
+@pytest.mark.parametrize(
+    "other", [Scenario("wall", 3, 5), Scenario("ball", 4, 5), Scenario("ball", 3, 6)]
+)
+def test_any_other_scenario_draws_other_numbers(other: Scenario) -> None:
+    assert not np.isin(draw(other, "x"), draw(Scenario("ball", 3, 5), "x")).any()
+
+
+def test_scenarios_that_data_and_results_exist_of_draw_what_they_always_drew() -> None:
+    drawn = [Scenario(task, 3, 5).rng("geometry").integers(10**6) for task in TASKS]
+    assert drawn == [752199, 214740, 172848]
+
+
+def test_streams_of_different_names_differ() -> None:
+    scenario = Scenario("ball", 3, 5)
+    assert not np.isin(draw(scenario, "x"), draw(scenario, "y")).any()
+
+
+def test_unknown_task_error_suggests_the_nearest_name() -> None:
+    with pytest.raises(UsageError, match="did you mean 'ball'"):
+        Scenario("bal", 0, 0)
+
+
+def test_negative_numbers_are_refused() -> None:
+    with pytest.raises(UsageError, match="count from 0"):
+        Scenario("ball", -1, 0)

@@ -19,7 +19,7 @@ from egovcp.sim.policies import EnvPolicy, Hold, Oracle
 from egovcp.sim.scenario import Scenario
 
 
-def test_the_arch_is_walked_to_by_default_and_comes_to_who_cannot_walk():
+def test_arch_motion_depends_on_the_controller():
     assert VectorEnv(EnvConfig(), 1).config.arch.motion == "walk"
     assert VectorEnv(EnvConfig(controller="stance"), 1).config.arch.motion == "rail"
 
@@ -38,7 +38,7 @@ def test_a_brace_is_rewarded_for_as_long_as_the_controller_needs_it():
     assert given.for_controller(walks=False).wall.disturbed_time == 1.0
 
 
-def test_hands_let_go_of_a_wall_only_under_who_steps():
+def test_only_stepping_controllers_release_the_wall():
     """Two seconds after a push the oracle takes its hands off: who does not step falls forward."""
     held = EpisodeConfig(ticks=140, event_ticks=(3, 6), empty_probability=0.0)
     for controller, stands in (("walk", 8), ("stance", 0)):
@@ -92,7 +92,7 @@ def test_hands_brace_what_stepping_does_not(soon: EnvConfig):
 
 
 @pytest.mark.parametrize("controller", ["stance", "walk"])
-def test_nobody_falls_of_commands_from_one_end_of_the_box_to_the_other(controller: str):
+def test_no_robot_falls_under_extreme_command_changes(controller: str):
     """A new corner of the box every 2 to 7 ticks; squats of 0.45 m/s made 6 of 32 robots fall."""
     nothing = EpisodeConfig(ticks=150, empty_probability=1.0)
     env = VectorEnv(EnvConfig(controller=controller, ball_episode=nothing), 32, render_depth=False)

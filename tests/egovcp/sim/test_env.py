@@ -1,13 +1,18 @@
+"""The vectorised environment and its Gymnasium interface."""
+
 from __future__ import annotations
 
 from dataclasses import replace
 
+import gymnasium
 import numpy as np
 import pytest
+from gymnasium.utils.env_checker import check_env
 
 from egovcp.errors import UsageError
 from egovcp.sim.config import DelayConfig, EnvConfig, EpisodeConfig
 from egovcp.sim.env import StepResult, VectorEnv
+from egovcp.sim.gym import EgovcpEnv, register
 from egovcp.sim.policies import RandomWalk
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import (
@@ -50,7 +55,7 @@ def test_shapes_and_types(env: VectorEnv) -> None:
 
 
 @pytest.mark.parametrize("task", ["ball", "wall", "arch", "sequence"])
-def test_an_episode_repeats_bit_for_bit_whoever_its_neighbours_are(
+def test_an_episode_repeats_bit_for_bit_with_any_neighbours(
     env: VectorEnv, config: EnvConfig, task: str
 ) -> None:
     first = roll(env, scenarios(task, 4), 20)
@@ -160,7 +165,7 @@ def test_an_action_takes_effect_after_its_delay(
 
 
 @pytest.mark.parametrize(("age", "ticks"), [(0.02, 0), (0.04, 1), (0.06, 1), (0.08, 2), (0.2, 5)])
-def test_a_picture_is_as_old_as_its_age(config: EnvConfig, age: float, ticks: int) -> None:
+def test_a_depth_image_has_the_configured_age(config: EnvConfig, age: float, ticks: int) -> None:
     quiet = replace(
         config.camera,
         noise_per_z2=(0.0, 0.0),
@@ -221,3 +226,36 @@ def test_physics_differs_between_episodes_and_is_recorded(env: VectorEnv) -> Non
     assert len({p["friction"] for p in env.parameters}) == 4
     mass = [lane.robot.model.body_subtreemass[1] for lane in env.instances]
     assert len(set(mass)) == 4
+
+
+@pytest.fixture(scope="module")
+def env(config: EnvConfig) -> EgovcpEnv:
+    return EgovcpEnv("ball", config)
+
+
+@pytest.mark.filterwarnings("ignore:.*Box observation space.*")
+def test_gymnasium_check_env_passes(env: EgovcpEnv) -> None:
+    check_env(env, skip_render_check=True)
+
+
+def test_registered_names_make_the_environment() -> None:
+    register()
+    register()
+    assert gymnasium.spec("egovcp/wall-v0").kwargs == {"task": "wall"}
+
+
+def test_reset_with_seed_starts_episode_zero_and_without_the_next(env: EgovcpEnv) -> None:
+    first, info = env.reset(seed=4)
+    second, next_info = env.reset()
+    again, _ = env.reset(seed=4)
+    assert (info["episode"], next_info["episode"]) == (0, 1)
+    np.testing.assert_array_equal(first["state"], again["state"])
+    assert not np.array_equal(first["state"], second["state"])
+
+
+def test_info_names_success_action_and_reward_terms(env: EgovcpEnv) -> None:
+    env.reset(seed=0)
+    _, reward, _, _, info = env.step(np.full(7, 0.1, dtype=np.float32))
+    assert reward == pytest.approx(sum(info["reward_terms"].values()))
+    assert info["success"] is False
+    np.testing.assert_allclose(info["sent_action"], 0.1)

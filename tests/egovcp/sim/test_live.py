@@ -140,7 +140,7 @@ def test_the_quaternion_carries_the_noise_of_gravity(live: LiveRobot) -> None:
     assert 0.8 * std < np.std(off, axis=0)[:2].mean() < 1.2 * std
 
 
-def test_motors_apply_what_they_are_told_up_to_their_limit(live: LiveRobot) -> None:
+def test_motors_apply_commanded_torque_up_to_their_limit(live: LiveRobot) -> None:
     live.start(Scenario("ball", 0, 0))
     zero = np.zeros(29)
     live.drive(ServoCommand(zero, zero, zero, torque=np.linspace(-4.0, 4.0, 29)))
@@ -152,7 +152,7 @@ def test_motors_apply_what_they_are_told_up_to_their_limit(live: LiveRobot) -> N
     np.testing.assert_array_equal(live.measure().torque, limit)
 
 
-def test_pictures_come_late(live: LiveRobot) -> None:
+def test_depth_images_are_delayed(live: LiveRobot) -> None:
     live.start(Scenario("arch", 2, 0))
     live.release()
     taken = []

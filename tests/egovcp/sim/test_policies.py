@@ -30,7 +30,7 @@ def test_reflection_fills_the_box_evenly_and_clipping_piles_up(env: VectorEnv) -
     assert np.mean(np.abs(piled) > 0.9) > 0.15
 
 
-def test_a_walk_steps_as_often_as_it_is_told(env: VectorEnv) -> None:
+def test_random_walk_steps_at_the_configured_intervals(env: VectorEnv) -> None:
     actions = walk(env, RandomWalk(eta=1.0, step_ticks=(3, 5)), 2000)
     moved = np.diff(actions, axis=0) != 0.0  # (T - 1, B, 7)
     steps = moved.all(-1)
@@ -54,7 +54,7 @@ def test_long_waits_are_seen_more_often_at_a_random_time(env: VectorEnv) -> None
     np.testing.assert_allclose(policy.act(env)[1], -0.2, atol=ACTION_ETA)
 
 
-def test_a_walk_is_its_scenarios(env: VectorEnv) -> None:
+def test_a_random_walk_depends_on_its_scenario_only(env: VectorEnv) -> None:
     np.testing.assert_array_equal(
         walk(env, RandomWalk(), 5, first=0)[:, 2], walk(env, RandomWalk(), 5, first=2)[:, 0]
     )

@@ -46,7 +46,7 @@ def play(config: EnvConfig, policy: EnvPolicy, rows: int = 4) -> StepResult:
     return result
 
 
-def test_the_oracle_wins_all_parts_and_who_holds_still_does_not(sequences: EnvConfig) -> None:
+def test_the_oracle_achieves_all_parts_and_hold_does_not(sequences: EnvConfig) -> None:
     solved, held = play(sequences, Oracle()), play(sequences, Hold())
     assert solved.success.mean() >= 0.75
     assert not held.success.any()
@@ -55,7 +55,7 @@ def test_the_oracle_wins_all_parts_and_who_holds_still_does_not(sequences: EnvCo
         assert result.success.tolist() == [all(parts.values()) for parts in result.parts]
 
 
-def test_three_parts_are_won_by_who_can_do_each(sequences: EnvConfig) -> None:
+def test_the_oracle_achieves_three_parts(sequences: EnvConfig) -> None:
     three = replace(sequences, sequence=SequenceConfig(("arch", "ball", "wall"), pause_ticks=12))
     result = play(three, Oracle())
     assert list(result.parts[0]) == ["arch", "ball", "wall"]
@@ -98,7 +98,7 @@ def test_only_the_present_object_is_near(sequences: EnvConfig) -> None:
     assert away() == {"arch": True, "wall": True, "ball": False}
 
 
-def test_a_part_draws_what_its_task_draws_alone(sequences: EnvConfig) -> None:
+def test_a_part_has_the_parameters_of_its_own_scenario(sequences: EnvConfig) -> None:
     env, _ = begun(sequences)
     drawn = env.parameters[0]
     for task in ("arch", "ball"):
@@ -123,7 +123,7 @@ def test_the_throw_is_aimed_at_the_robot_wherever_it_stands_by_then(sequences: E
     assert hits < 0
 
 
-def test_a_part_that_is_never_decided_has_the_time_of_its_own_episodes(
+def test_an_unfinished_part_lasts_as_long_as_its_own_episodes(
     sequences: EnvConfig,
 ) -> None:
     never = EpisodeConfig(ticks=9, event_ticks=(3, 3), empty_probability=1.0)
@@ -198,7 +198,7 @@ def test_contacts_are_those_of_the_present_part(sequences: EnvConfig) -> None:
     assert result.reward_terms["hit"][0] == 0.0
 
 
-def test_the_robot_is_told_to_walk_before_the_throw_only(sequences: EnvConfig) -> None:
+def test_the_walking_command_ends_before_the_throw(sequences: EnvConfig) -> None:
     env, task = begun(sequences)
     oracle = Oracle()
     commands: dict[str, list[NDArray[np.float64]]] = {"arch": [], "ball": []}

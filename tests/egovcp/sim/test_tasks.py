@@ -104,7 +104,7 @@ def thrown(env: VectorEnv) -> BallTask:
         ([ARM, HEAD], False, True),
     ],
 )
-def test_first_contacts_are_judged_by_part(
+def test_first_contacts_count_by_part(
     env: VectorEnv, parts: list[int], blocked: bool, hit: bool
 ) -> None:
     task = thrown(env)
@@ -201,7 +201,7 @@ def test_an_upright_robot_hits_the_arch_with_its_head(config: EnvConfig) -> None
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_the_object_is_seen_where_the_truth_says(env: VectorEnv, task: str) -> None:
+def test_the_depth_image_shows_the_object_at_its_position(env: VectorEnv, task: str) -> None:
     """Empty-scene depth and the scene's differ, so the object is in the picture."""
     begin(env, task)
     for _ in range(14):

@@ -1,4 +1,4 @@
-"""Inverse kinematics of both hands: converges, stays within limits, never explodes."""
+"""Inverse kinematics of both hands, and tracking of hand targets."""
 
 from __future__ import annotations
 

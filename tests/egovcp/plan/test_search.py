@@ -1,16 +1,19 @@
-"""Candidates live in the action process of the data: a walk, or ramps to where it rests."""
+"""Action parameterizations and deadlines of the search."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from egovcp import spec
-from egovcp.plan import Plan, PlannerConfig, ReferenceEvaluator, make_plan, optimiser_of
+from egovcp.plan import Plan, PlannerConfig, Policy, ReferenceEvaluator, make_plan, optimiser_of
 from egovcp.plan.config import OptimiserName
-from egovcp.plan.search import random_walk, reflect_once, target_steps
-from tests.support.worlds import PointWorld
+from egovcp.plan.objective import PlanValue
+from egovcp.plan.search import Deadline, random_walk, reflect_once, target_steps
+from tests.support.models import CountingModel
+from tests.support.worlds import Point, PointWorld, plain_planner
 
 ETA = spec.ACTION_ETA
 
@@ -68,7 +71,7 @@ def _plan(config: PlannerConfig, goal: Tensor) -> Plan:
 
 
 @pytest.mark.parametrize("optimiser", ["cem", "icem", "mppi", "shooting"])
-def test_every_search_judges_ramps(optimiser: OptimiserName) -> None:
+def test_every_search_evaluates_target_steps(optimiser: OptimiserName) -> None:
     config = PlannerConfig(
         samples=64, elites=8, optimiser=optimiser, action_parameterization="target"
     )
@@ -85,3 +88,90 @@ def test_the_first_action_of_a_ramp_is_found_with_fewer_candidates(reach: float)
         plan = _plan(PlannerConfig(samples=64, elites=4, action_parameterization=process), goal)
         missed[process] = float((plan.actions[:, 0] - goal.clamp(-ETA, ETA)).abs().mean())
     assert missed["target"] < 0.6 * missed["random_walk"]
+
+
+CONFIG = plain_planner(samples=64, elites=8, iterations=6)
+
+
+class _Clock:
+    """Counts down only when told to."""
+
+    def __init__(self, left: float) -> None:
+        self.left = left
+
+    def __call__(self) -> float:
+        return self.left
+
+
+class _Slow:
+    """A evaluator whose n-th answer takes ``costs[n]`` seconds of a clock."""
+
+    def __init__(self, clock: _Clock, costs: list[float]) -> None:
+        self._clock, self._costs = clock, iter(costs)
+
+    def at(self, carry: Point) -> PlanValue:
+        plan_value = ReferenceEvaluator(PointWorld(), CONFIG).at(carry)
+
+        def slow(actions: Tensor, generator: torch.Generator | None) -> Tensor:
+            self._clock.left -= next(self._costs)
+            return plan_value(actions, generator)
+
+        return slow
+
+
+def _timed_plan(left: float, costs: list[float]) -> Plan:
+    clock, executed = _Clock(left), torch.zeros(1, 7)
+    carry = Point(executed, torch.full((1, 7), 0.3))
+    generator = torch.Generator().manual_seed(0)
+    search = optimiser_of(CONFIG)
+    return make_plan(
+        _Slow(clock, costs), search, carry, executed, CONFIG, generator, remaining=clock
+    )
+
+
+@pytest.mark.parametrize(
+    ("left", "costs", "iterations"),
+    [
+        (100.0, [1.0] * 6, 6),
+        (3.5, [1.0] * 6, 3),
+        (0.0, [1.0], 1),  # one is always made
+        (-5.0, [1.0], 1),
+        (10.0, [4.0, 1.0, 1.0, 1.0], 3),  # the slowest so far would no longer fit into 4
+        (10.0, [1.0, 1.0, 5.0], 3),
+    ],
+)
+def test_no_iteration_is_begun_that_would_end_too_late(
+    left: float, costs: list[float], iterations: int
+) -> None:
+    assert _timed_plan(left, costs).iterations == iterations
+
+
+def test_a_search_cut_short_answers_as_a_shorter_one() -> None:
+    cut = _timed_plan(2.5, [1.0] * 6)
+    executed = torch.zeros(1, 7)
+    config = plain_planner(samples=64, elites=8, iterations=cut.iterations)
+    whole = make_plan(
+        ReferenceEvaluator(PointWorld(), config),
+        optimiser_of(config),
+        Point(executed, torch.full((1, 7), 0.3)),
+        executed,
+        config,
+        torch.Generator().manual_seed(0),
+    )
+    assert cut.iterations == 2
+    assert torch.equal(cut.actions, whole.actions)
+    assert torch.equal(cut.value, whole.value)
+
+
+def test_without_a_deadline_it_goes_on() -> None:
+    pace = Deadline(None)
+    assert all(pace.allows_iteration() for _ in range(100))
+
+
+def test_a_policy_passes_its_deadline_on_and_reports_iterations() -> None:
+    policy = Policy(CountingModel(), CONFIG, num_envs=1)
+    depth = np.full((1, spec.DEPTH_ROWS, spec.DEPTH_COLS), 1000, np.uint16)
+    state = np.zeros((1, spec.STATE_DIM), np.float32)
+    assert policy.act(depth, state).iterations == CONFIG.iterations
+    assert policy.act(depth, state, lambda: -1.0).iterations == 1
+    assert policy.act(depth, state, lambda: 1e9).iterations == CONFIG.iterations
