@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 from egovcp import spec
 from egovcp.bounds import bounded, check_bounds
@@ -119,36 +119,19 @@ def require_compatible(model: WorldModelConfig, planner: PlannerConfig) -> None:
         )
 
 
-class PlanCost(NamedTuple):
-    """Estimated cost of a plan for one robot."""
-
-    seconds: float
-    """On one processor core."""
-    memory_bytes: int
-
-
-def plan_cost(model: WorldModelConfig, planner: PlannerConfig) -> PlanCost:
-    """Estimate time and memory of a plan for one robot, on one core without a GPU."""
+def require_affordable(model: WorldModelConfig, planner: PlannerConfig) -> None:
+    """Raise `UsageError` if a plan for one robot, on one core, takes too much time or memory."""
     samples, iterations, actions = planner.samples, planner.iterations, planner.actions
-    steps = samples * actions * iterations
     floats = _floats_per_step(model)
     per_step = _products_per_step(model) / _PRODUCTS_PER_S + floats / _FLOATS_PER_S
-    seconds = steps * per_step + actions * iterations * _CALL_S
+    seconds = samples * actions * iterations * per_step + actions * iterations * _CALL_S
     memory = _BYTES * samples * (actions * spec.ACTION_DIM * _ACTION_COPIES + floats)
-    return PlanCost(seconds, memory)
-
-
-def require_affordable(model: WorldModelConfig, planner: PlannerConfig) -> None:
-    """Raise `UsageError` if a plan for one robot takes too long or too much memory."""
-    cost = plan_cost(model, planner)
-    if cost.seconds > MAX_SECONDS or cost.memory_bytes > MAX_BYTES:
+    if seconds > MAX_SECONDS or memory > MAX_BYTES:
         raise UsageError(
-            f"planner.samples={planner.samples}, "
-            f"planner.horizon={planner.horizon} and "
-            f"planner.iterations={planner.iterations} take about {cost.seconds:,.1f} s on "
-            f"one core and {cost.memory_bytes / 1e6:,.0f} MB for each plan of one robot with these "
-            f"networks; expected at most {MAX_SECONDS:.0f} s and {MAX_BYTES / 1e6:.0f} MB: lower "
-            "them"
+            f"planner.samples={samples}, planner.horizon={planner.horizon} and "
+            f"planner.iterations={iterations} take about {seconds:,.1f} s on one core and "
+            f"{memory / 1e6:,.0f} MB for each plan of one robot with these networks; expected at "
+            f"most {MAX_SECONDS:.0f} s and {MAX_BYTES / 1e6:.0f} MB: lower them"
         )
 
 

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from egovcp.errors import UsageError
-from egovcp.plan.config import Latent, PlannerConfig
+from egovcp.plan.config import PlannerConfig
 
 PlanValue = Callable[[Tensor, torch.Generator | None], Tensor]
 """J (E, M) of plans (E, M, N, 7); the generator samples the noise under ``latent=sample``."""
@@ -57,53 +57,28 @@ class Dynamics[L](Protocol):
         ...
 
 
-@runtime_checkable
-class StochasticModel(Protocol):
-    """A model that can sample the next state."""
+def _with_rewards(model: Any) -> Any:
+    """``model``, which must have ``discount`` and ``reward(carry, action)``.
 
-    def imagine_sample(
-        self, carry: Any, action: Tensor, generator: torch.Generator | None = None
-    ) -> Any:
-        """Advance by one tick under action (E, M, 7), with the same noise for all of them."""
-        ...
-
-
-class RewardModel(Protocol):
-    """A model that predicts rewards."""
-
-    @property
-    def discount(self) -> Tensor:
-        """gamma of its returns, per tick."""
-        ...
-
-    def reward(self, carry: Any, action: Tensor) -> Tensor:
-        """Immediate reward (E, M) of action (E, M, 7)."""
-        ...
-
-
-def require_reward_model(model: object) -> RewardModel:
-    """``model``; raises `UsageError` if it does not predict rewards."""
+    Raises:
+        UsageError: it has not.
+    """
     if not (hasattr(model, "reward") and hasattr(model, "discount")):
         raise UsageError(
             f"{type(model).__name__} has no reward and discount; plan with objective=value"
         )
-    return cast("RewardModel", model)  # buffers are not seen by isinstance
+    return model
 
 
-def _transition[L](
-    model: object,
-    imagine: Callable[[L, Tensor], L],
-    latent: Latent,
-    generator: torch.Generator | None,
-) -> Callable[[L, Tensor], L]:
-    """The transition function: ``imagine``, or under ``latent=sample`` the model's sampling one.
+def _transition(model: Any, config: PlannerConfig, generator: torch.Generator | None) -> Any:
+    """``imagine``, or under ``latent=sample`` ``imagine_sample``, of a model.
 
     Raises:
         UsageError: the model cannot sample.
     """
-    if latent == "mean":
-        return imagine
-    if not isinstance(model, StochasticModel):
+    if config.latent == "mean":
+        return model.imagine
+    if not hasattr(model, "imagine_sample"):
         raise UsageError(
             f"latent=sample: {type(model).__name__} has no imagine_sample; plan with latent=mean"
         )
@@ -133,7 +108,7 @@ class ReturnAccumulator:
 
     Args:
         config: objective and termination rule.
-        model: a `Dynamics`; under ``reward`` and ``td`` a `RewardModel`.
+        model: a `Dynamics`; with rewards under ``reward`` and ``td``.
         steps: of a plan, `PlannerConfig.actions`.
 
     Raises:
@@ -143,7 +118,7 @@ class ReturnAccumulator:
     def __init__(self, config: PlannerConfig, model: Dynamics[Any], steps: int) -> None:
         self._config, self._steps = config, steps
         self._is_mean = config.objective == "value"
-        self._discount = 1.0 if self._is_mean else require_reward_model(model).discount
+        self._discount = 1.0 if self._is_mean else _with_rewards(model).discount
         self._floor = 0.0 if config.termination_rule == "paper" else model.min_return
         self._weight: Tensor | float = 1.0
         self._survival: Tensor | float = 1.0
@@ -156,21 +131,17 @@ class ReturnAccumulator:
         return self._is_mean or at_the_end
 
     def needs_termination(self, k: int) -> bool:
-        """Whether the termination probability of step k affects J: not in the first (observed) and
-        the last one."""
+        """Whether the termination probability of step k affects J."""
         return 0 < k < self._steps - 1
 
     def add_value(self, q: Tensor) -> None:
-        """Add Q of the step."""
         self._add(q, self._floor)
 
     def add_reward(self, r: Tensor) -> None:
-        """Add the reward of the step."""
         self._add(r, (1.0 - self._discount) * self._floor)
         self._weight = self._weight * self._discount
 
     def add_termination(self, probability: Tensor) -> None:
-        """Apply the termination probability of the step's state."""
         if self._config.termination_rule == "survival":
             self._survival = self._survival * (1.0 - probability)
         else:
@@ -210,7 +181,7 @@ def evaluate[L](
         if accumulator.needs_value(k):
             accumulator.add_value(model.value(state, action))
         else:
-            accumulator.add_reward(require_reward_model(model).reward(state, action))
+            accumulator.add_reward(_with_rewards(model).reward(state, action))
         if accumulator.needs_termination(k):
             accumulator.add_termination(model.termination(state))
     return accumulator.plan_value()
@@ -224,7 +195,7 @@ def _states[L](
     generator: torch.Generator | None,
 ) -> Iterator[L]:
     """The states in which the actions are taken: the robots' present ones, then imagined ones."""
-    imagine = _transition(model, model.imagine, config.latent, generator)
+    imagine = _transition(model, config, generator)
     carry = model.expand_candidates(carry)
     yield carry
     for action in actions.unbind(-2)[:-1]:

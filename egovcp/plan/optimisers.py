@@ -179,17 +179,11 @@ def coloured(mean: Tensor, samples: int, exponent: float, generator: torch.Gener
 
 
 @dataclass(frozen=True)
-class PathIntegral:
+class PathIntegral(CrossEntropy):
     """MPPI (Williams et al., 2017): weights candidates by the exponential of their values.
 
     The temperature is in standard deviations of the values.
     """
-
-    config: PlannerConfig
-
-    def propose(self, state: SearchState, iteration: int, generator: torch.Generator) -> Tensor:
-        noise = white(state.mean, self.config.samples, generator)
-        return draw(state.mean, state.std, noise)
 
     def update(self, state: SearchState, deltas: Tensor, values: Tensor) -> SearchState:
         elites, top = best_of(deltas, values, self.config.elites)

@@ -38,96 +38,84 @@ WITHOUT_TILES: Final = "-DWITHOUT_TILES"
 OTHERWISE: Final = "plan with --planner.backend=float32"
 
 
-class CWide(ctypes.Structure):
-    """``Wide`` of the kernel; the structures below mirror those of the same name without C."""
+_F, _I, _P = ctypes.c_float, ctypes.c_int32, ctypes.c_void_p
 
-    _fields_ = (
-        ("inputs", ctypes.c_int32),
-        ("weight", ctypes.c_void_p),
-        ("scale", ctypes.c_void_p),
-        ("start", ctypes.c_void_p),
-        ("shift", ctypes.c_void_p),
-    )
+
+def _fields(kind: type, names: str) -> list[tuple[str, type]]:
+    return [(name, kind) for name in names.split()]
+
+
+# Each structure mirrors the one of the kernel with the same name without C.
+
+
+class CWide(ctypes.Structure):
+    _fields_ = (("inputs", _I), *_fields(_P, "weight scale start shift"))
 
 
 class CNarrow(ctypes.Structure):
-    _fields_ = (("inputs", ctypes.c_int32), ("weight", ctypes.c_void_p))
+    _fields_ = (("inputs", _I), ("weight", _P))
 
 
 class CLayer(ctypes.Structure):
     _fields_ = (
-        ("outputs", ctypes.c_int32),
-        ("wide", CWide),
-        ("second", CWide),
+        ("outputs", _I),
+        *_fields(CWide, "wide second"),
         ("narrow", CNarrow),
-        ("gamma", ctypes.c_void_p),
-        ("beta", ctypes.c_void_p),
-        ("epsilon", ctypes.c_float),
+        *_fields(_P, "gamma beta"),
+        ("epsilon", _F),
     )
 
 
 class CDot(ctypes.Structure):
-    _fields_ = (
-        ("inputs", ctypes.c_int32),
-        ("weight", ctypes.c_void_p),
-        *((name, ctypes.c_float) for name in ("scale", "bias")),
-    )
+    _fields_ = (("inputs", _I), ("weight", _P), *_fields(_F, "scale bias"))
 
 
 class CTop(ctypes.Structure):
-    _fields_ = (("outputs", ctypes.c_int32), ("wide", CWide), ("bias", ctypes.c_void_p))
+    _fields_ = (("outputs", _I), ("wide", CWide), ("bias", _P))
 
 
 class CHead(ctypes.Structure):
-    _fields_ = (("first", CLayer), ("second", CLayer), ("one", CDot), ("many", CTop))
+    _fields_ = (*_fields(CLayer, "first second"), ("one", CDot), ("many", CTop))
 
 
 class CReadout(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int32) for name in ("objective", "rule", "bins")),
-        ("each", ctypes.c_void_p),
-        *((name, ctypes.c_float) for name in ("mean", "std", "floor", "threshold", "discount")),
+        *_fields(_I, "objective rule bins"),
+        ("each", _P),
+        *_fields(_F, "mean std floor threshold discount"),
     )
 
 
 class CNetwork(ctypes.Structure):
     _fields_ = (
-        *((name, ctypes.c_int32) for name in ("hidden", "latent", "actions")),
-        *((name, CLayer) for name in ("mix", "gru", "prior", "termination")),
+        *_fields(_I, "hidden latent actions"),
+        *_fields(CLayer, "mix gru prior termination"),
         ("prior_top", CTop),
         ("termination_top", CDot),
-        ("min_std", ctypes.c_float),
-        *((name, CHead) for name in ("value", "reward")),
-        ("silu", ctypes.c_void_p),
-        ("tanh", ctypes.c_void_p),
+        ("min_std", _F),
+        *_fields(CHead, "value reward"),
+        *_fields(_P, "silu tanh"),
         ("readout", CReadout),
     )
 
 
 class CSharedPrefix(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_void_p) for name in ("h", "mix", "gates", "value", "reward")),
-        ("nan_or_zero", ctypes.c_float),
-    )
+    _fields_ = (*_fields(_P, "h mix gates value reward"), ("nan_or_zero", _F))
 
 
 class CStart(ctypes.Structure):
-    _fields_ = (
-        *((name, ctypes.c_int32) for name in ("hidden", "latent", "gates", "heads", "mix")),
-        *((name, ctypes.c_void_p) for name in ("of_h", "of_z")),
-    )
+    _fields_ = (*_fields(_I, "hidden latent gates heads mix"), *_fields(_P, "of_h of_z"))
 
 
 class CThreadPool(ctypes.Structure):
-    _fields_ = tuple((name, ctypes.c_int32) for name in ("next", "turn", "active", "workers"))
+    _fields_ = _fields(_I, "next turn active workers")
 
 
 class CJob(ctypes.Structure):
     _fields_ = (
-        ("network", ctypes.c_void_p),
-        ("prefix", ctypes.c_void_p),
-        *((name, ctypes.c_int32) for name in ("rows", "steps")),
-        *((name, ctypes.c_void_p) for name in ("actions", "noise", "values")),
+        *_fields(_P, "network prefix"),
+        *_fields(_I, "rows steps"),
+        *_fields(_P, "actions noise values"),
         ("pool", CThreadPool),
     )
 
@@ -202,22 +190,18 @@ def library() -> ctypes.CDLL:
         raise EnvironmentFailure(
             f"the int8 planner cannot be compiled or loaded ({error}); {OTHERWISE}"
         ) from error
-    p, i = ctypes.c_void_p, ctypes.c_int32
-    for function in (kernel.evaluate, kernel.work):
-        function.argtypes = [p]
-        function.restype = None
-    f = ctypes.c_float
-    kernel.draw.argtypes = [i, i, i, p, p, p, p]
-    kernel.walk.argtypes = [i, i, i, i, f, p, p, p]
-    kernel.update.argtypes = [i, i, i, i, f, p, p, p, p, p, p, p]
-    for function in (kernel.draw, kernel.walk, kernel.update):
-        function.restype = None
-    kernel.start.argtypes = [p, p, p, p, p]
-    kernel.start.restype = f
-    kernel.missing_workers.argtypes = [p, i]
-    kernel.missing_workers.restype = i
-    kernel.layout.argtypes = [p, p, p]
-    kernel.layout.restype = None
+    for name, result, *arguments in (
+        ("evaluate", None, _P),
+        ("work", None, _P),
+        ("draw", None, _I, _I, _I, _P, _P, _P, _P),
+        ("walk", None, _I, _I, _I, _I, _F, _P, _P, _P),
+        ("update", None, _I, _I, _I, _I, _F, _P, _P, _P, _P, _P, _P, _P),
+        ("start", _F, _P, _P, _P, _P, _P),
+        ("missing_workers", _I, _P, _I),
+        ("layout", None, _P, _P, _P),
+    ):
+        function = getattr(kernel, name)
+        function.restype, function.argtypes = result, arguments
     return kernel
 
 

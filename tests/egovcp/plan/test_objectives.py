@@ -214,11 +214,13 @@ def test_sampling_from_an_untrained_prior_std_is_refused() -> None:
     require_compatible(DEBUG, plain_planner(latent="sample"))
 
 
-VALUES = [8.0, 4.0, -2.0, 6.0]
+MIXED_VALUES = [8.0, 4.0, -2.0, 6.0]
 FLOOR = -10.0
 
 
-def _objective(rule: TerminationRule, deaths: list[float], values: list[float] = VALUES) -> float:
+def _objective(
+    rule: TerminationRule, deaths: list[float], values: list[float] = MIXED_VALUES
+) -> float:
     world = ScriptedWorld(values, deaths, floor=FLOOR)
     actions = torch.zeros(1, 1, len(values), 7)
     config = PlannerConfig(termination_rule=rule)
@@ -227,7 +229,7 @@ def _objective(rule: TerminationRule, deaths: list[float], values: list[float] =
 
 @pytest.mark.parametrize("rule", ["paper", "shift", "survival"])
 def test_without_a_failure_the_objective_is_the_mean_value(rule: TerminationRule) -> None:
-    assert _objective(rule, [0.0] * 4) == pytest.approx(sum(VALUES) / 4)
+    assert _objective(rule, [0.0] * 4) == pytest.approx(sum(MIXED_VALUES) / 4)
 
 
 @pytest.mark.parametrize(
@@ -243,11 +245,11 @@ def test_without_a_failure_the_objective_is_the_mean_value(rule: TerminationRule
         ("survival", [0, 0.5, 0.5, 0], (8 + 4 + (0.5 * 8 - 10) + (0.25 * 16 - 10)) / 4),
         ("survival", [0, 1.0, 0, 0], (8 + 4 - 10 - 10) / 4),
         # At the threshold is not beyond it.
-        ("paper", [0, 0.9, 0, 0], sum(VALUES) / 4),
-        ("shift", [0, 0.9, 0, 0], sum(VALUES) / 4),
+        ("paper", [0, 0.9, 0, 0], sum(MIXED_VALUES) / 4),
+        ("shift", [0, 0.9, 0, 0], sum(MIXED_VALUES) / 4),
         # The observed state is alive, whatever D says; after the last step nothing follows.
-        ("paper", [1.0, 0, 0, 0], sum(VALUES) / 4),
-        ("survival", [1.0, 0, 0, 1.0], sum(VALUES) / 4),
+        ("paper", [1.0, 0, 0, 0], sum(MIXED_VALUES) / 4),
+        ("survival", [1.0, 0, 0, 1.0], sum(MIXED_VALUES) / 4),
         # Dead stays dead.
         ("paper", [0, 0.95, 0.0, 0.0], (8 + 4) / 4),
     ],
