@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -18,6 +19,8 @@ from numpy.typing import NDArray
 from egovcp.errors import EnvironmentFailure
 from egovcp.packages import require_packages
 from egovcp.spec import JOINT_NAMES
+
+Array = NDArray[np.float64]
 
 _XML: Final = Path("asset_zoo/robots/unitree_g1/xmls/g1.xml")
 
@@ -63,37 +66,26 @@ M7520_14: Final = Motor((0.489e-4, 0.098e-4, 0.533e-4), (4.5, 1 + 48 / 22), 88.0
 M7520_22: Final = Motor((0.489e-4, 0.109e-4, 0.738e-4), (4.5, 5.0), 139.0, 20.0)
 M4010: Final = Motor((0.068e-4, 0.0, 0.0), (5.0, 5.0), 5.0, 22.0)
 
-#: Joint name ending -> motor type and how many of them drive the joint. Ankles and the
-#: waist's roll and pitch are four-bar linkages with two motors, taken as 1:1.
-_MOTORS: Final[dict[str, tuple[Motor, int]]] = {
-    "hip_pitch": (M7520_14, 1),
-    "hip_roll": (M7520_22, 1),
-    "hip_yaw": (M7520_14, 1),
-    "knee": (M7520_22, 1),
-    "ankle_pitch": (M5020, 2),
-    "ankle_roll": (M5020, 2),
-    "waist_yaw": (M7520_14, 1),
-    "waist_roll": (M5020, 2),
-    "waist_pitch": (M5020, 2),
-    "shoulder_pitch": (M5020, 1),
-    "shoulder_roll": (M5020, 1),
-    "shoulder_yaw": (M5020, 1),
-    "elbow": (M5020, 1),
-    "wrist_roll": (M5020, 1),
-    "wrist_pitch": (M4010, 1),
-    "wrist_yaw": (M4010, 1),
-}
-
-#: Arm gains that replace the published ones (kp 14), with which hands lag 6-8 cm behind the random
-#: walk: joint name ending -> (kp N m/rad, kd N m s/rad).
-_ARM_GAINS: Final[dict[str, tuple[float, float]]] = {
-    "shoulder_pitch": (80.0, 5.0),
-    "shoulder_roll": (80.0, 5.0),
-    "shoulder_yaw": (60.0, 3.0),
-    "elbow": (60.0, 3.0),
-    "wrist_roll": (30.0, 1.5),
-    "wrist_pitch": (20.0, 1.0),
-    "wrist_yaw": (20.0, 1.0),
+#: Joint name ending -> motor type, number of motors, and gains (kp N m/rad, kd N m s/rad) instead of
+#: the published ones, with which hands lag 6-8 cm behind the random walk. Ankles and the roll and
+#: pitch of the waist are four-bar linkages with two motors, taken as 1:1.
+_ACTUATORS: Final[dict[str, tuple[Motor, int, tuple[float, float] | None]]] = {
+    "hip_pitch": (M7520_14, 1, None),
+    "hip_roll": (M7520_22, 1, None),
+    "hip_yaw": (M7520_14, 1, None),
+    "knee": (M7520_22, 1, None),
+    "ankle_pitch": (M5020, 2, None),
+    "ankle_roll": (M5020, 2, None),
+    "waist_yaw": (M7520_14, 1, None),
+    "waist_roll": (M5020, 2, None),
+    "waist_pitch": (M5020, 2, None),
+    "shoulder_pitch": (M5020, 1, (80.0, 5.0)),
+    "shoulder_roll": (M5020, 1, (80.0, 5.0)),
+    "shoulder_yaw": (M5020, 1, (60.0, 3.0)),
+    "elbow": (M5020, 1, (60.0, 3.0)),
+    "wrist_roll": (M5020, 1, (30.0, 1.5)),
+    "wrist_pitch": (M4010, 1, (20.0, 1.0)),
+    "wrist_yaw": (M4010, 1, (20.0, 1.0)),
 }
 
 _NATURAL_FREQUENCY: Final = 10.0 * 2.0 * math.pi  # rad/s
@@ -105,29 +97,34 @@ def joint_kind(joint: str) -> str:
     return joint.removesuffix("_joint").removeprefix("left_").removeprefix("right_")
 
 
-def _per_joint(value: dict[str, float]) -> NDArray[np.float64]:
-    array = np.array([value[joint_kind(name)] for name in JOINT_NAMES])
+def _per_joint(value: Callable[[Motor, int], float], gain: int | None = None) -> Array:
+    """(J,) of each joint's motor and their number, or the gain that replaces it."""
+    out = []
+    for name in JOINT_NAMES:
+        motor, count, gains = _ACTUATORS[joint_kind(name)]
+        out.append(value(motor, count) if gains is None or gain is None else gains[gain])
+    array = np.array(out)
     array.setflags(write=False)
     return array
 
 
-ARMATURE: Final = _per_joint({k: m.armature * n for k, (m, n) in _MOTORS.items()})  # kg m^2
-EFFORT_LIMIT: Final = _per_joint({k: m.effort_limit * n for k, (m, n) in _MOTORS.items()})  # N m
-VELOCITY_LIMIT: Final = _per_joint({k: m.velocity_limit for k, (m, _) in _MOTORS.items()})  # rad/s
+def _stiffness(motor: Motor, count: int) -> float:
+    return motor.armature * count * _NATURAL_FREQUENCY**2
 
+
+def _damping(motor: Motor, count: int) -> float:
+    return 2.0 * _DAMPING_RATIO * (motor.armature * count) * _NATURAL_FREQUENCY
+
+
+ARMATURE: Final = _per_joint(lambda motor, count: motor.armature * count)  # kg m^2
+EFFORT_LIMIT: Final = _per_joint(lambda motor, count: motor.effort_limit * count)  # N m
+VELOCITY_LIMIT: Final = _per_joint(lambda motor, _: motor.velocity_limit)  # rad/s
 #: Published servo gains: 10 Hz natural frequency on the armature, damping ratio 2.
-PUBLISHED_STIFFNESS: Final = ARMATURE * _NATURAL_FREQUENCY**2  # N m/rad
-PUBLISHED_DAMPING: Final = 2.0 * _DAMPING_RATIO * ARMATURE * _NATURAL_FREQUENCY  # N m s/rad
-
-
-def _with_arm_gains(published: NDArray[np.float64], which: int) -> NDArray[np.float64]:
-    gains = dict(zip(map(joint_kind, JOINT_NAMES), published.tolist(), strict=True))
-    return _per_joint(gains | {kind: pair[which] for kind, pair in _ARM_GAINS.items()})
-
-
-#: The gains that egovcp runs: published ones in legs and waist, stiffer arms.
-STIFFNESS: Final = _with_arm_gains(PUBLISHED_STIFFNESS, 0)  # N m/rad
-DAMPING: Final = _with_arm_gains(PUBLISHED_DAMPING, 1)  # N m s/rad
+PUBLISHED_STIFFNESS: Final = _per_joint(_stiffness)  # N m/rad
+PUBLISHED_DAMPING: Final = _per_joint(_damping)  # N m s/rad
+#: The gains in use: published ones in legs and waist, stiffer arms.
+STIFFNESS: Final = _per_joint(_stiffness, 0)  # N m/rad
+DAMPING: Final = _per_joint(_damping, 1)  # N m s/rad
 
 WAIST: Final = slice(12, 15)
 ARMS: Final = slice(15, 29)

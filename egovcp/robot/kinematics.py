@@ -38,6 +38,8 @@ JOINT_UPPER: Final[Array] = np.array(_TABLE["upper"])  # (J,) rad
 PALM_OFFSET: Final[Array] = np.array(_TABLE["palm"])  # (2, 3) m, wrist yaw link frame, left, right
 LINK_OFFSET: Final[Array] = np.array(_TABLE["offset"])  # (J, 3) m, in the parent's frame
 
+SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the sole
+FOOT_SPACING: Final = 0.1185  # m, from the ankles to the midline in the standing pose
 _LEGS: Final = 12  # the first joints; each leg is a chain of six from the pelvis
 TORSO: Final = LINK_NAMES.index("torso_link")
 _WRISTS: Final = tuple(LINK_NAMES.index(f"{side}_wrist_yaw_link") for side in ("left", "right"))

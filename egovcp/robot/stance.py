@@ -21,7 +21,13 @@ from egovcp.robot.arms import DT, TORSO_ORIGIN, ArmReference, ReachConfig, cross
 from egovcp.robot.arms import IDENTITY as ARM_IDENTITY
 from egovcp.robot.g1 import ARMS, DAMPING, EFFORT_LIMIT, STIFFNESS
 from egovcp.robot.geometry import Array, heading_rotation, rotate
-from egovcp.robot.kinematics import TARGET_HIGH, TARGET_LOW, foot_positions, torso_rotation
+from egovcp.robot.kinematics import (
+    SOLE_HEIGHT,
+    TARGET_HIGH,
+    TARGET_LOW,
+    foot_positions,
+    torso_rotation,
+)
 from egovcp.robot.stance_table import (
     NF,
     NR,
@@ -34,7 +40,6 @@ from egovcp.robot.stance_table import (
 )
 from egovcp.spec import STATE_DIM, STATE_SLICES
 
-_SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the sole
 LOWER_BODY: Final = slice(0, NU)
 _KP: Final = STIFFNESS[LOWER_BODY]
 _KD: Final = DAMPING[LOWER_BODY]
@@ -305,4 +310,4 @@ def pelvis_height(joint_position: Array, gravity: Array) -> Array:
     """(B,) pelvis above the lower foot's sole, m."""
     ankles = foot_positions(np.asarray(joint_position, dtype=np.float64))
     feet = rotate(heading_rotation(gravity)[:, None], ankles)
-    return np.asarray(_SOLE_HEIGHT - np.min(feet[..., 2], axis=1))
+    return np.asarray(SOLE_HEIGHT - np.min(feet[..., 2], axis=1))

@@ -21,14 +21,13 @@ import numpy as np
 from egovcp.robot.arms import REST
 from egovcp.robot.g1 import ARMS, DAMPING, STIFFNESS
 from egovcp.robot.geometry import Array
+from egovcp.robot.kinematics import FOOT_SPACING, SOLE_HEIGHT
 from egovcp.robot.stance_table import NF, NR, NU, NX, NY, NZ
 from egovcp.spec import CONTROLLER_HZ, NUM_JOINTS
 
 _MOMENT_STEP: Final = 0.5  # kg m, of the difference quotient
 
-SOLE_HEIGHT: Final = 0.035  # m, ankle-roll frame above the ground
-FOOT_CENTRE: Final = 0.034  # m, forward of the ankle: the middle between toe and heel points
-FOOT_SPACING: Final = 0.1185  # m, ankle to the midline: the G1's hips, legs vertical
+FOOT_CENTRE: Final = 0.034  # m, middle of toe and heel points ahead of the ankle
 
 #: Natural pelvis pitch (rad) against height (m): below 0.61 m the ankle's limit tips it.
 PITCH_HEIGHTS: Final = (0.50, 0.55, 0.60, 0.64)
@@ -72,7 +71,7 @@ class Pose:
 
 
 class StanceModel:
-    """The robot on two planted feet, for one model; every method works on its own data."""
+    """The robot on two planted feet."""
 
     def __init__(self, model: Any) -> None:
         import mujoco
