@@ -66,7 +66,7 @@ M7520_14: Final = Motor((0.489e-4, 0.098e-4, 0.533e-4), (4.5, 1 + 48 / 22), 88.0
 M7520_22: Final = Motor((0.489e-4, 0.109e-4, 0.738e-4), (4.5, 5.0), 139.0, 20.0)
 M4010: Final = Motor((0.068e-4, 0.0, 0.0), (5.0, 5.0), 5.0, 22.0)
 
-#: Joint name ending -> motor type, number of motors, and gains (kp N m/rad, kd N m s/rad) instead of
+#: Joint name ending -> motor type, number of motors, gains (kp N m/rad, kd N m s/rad) or None for
 #: the published ones, with which hands lag 6-8 cm behind the random walk. Ankles and the roll and
 #: pitch of the waist are four-bar linkages with two motors, taken as 1:1.
 _ACTUATORS: Final[dict[str, tuple[Motor, int, tuple[float, float] | None]]] = {
