@@ -75,9 +75,9 @@ def test_a_success_counts_at_the_end_alone(
 
 def test_the_rendered_image_is_bright_where_objects_are_near(view: LeRobotEgovcpEnv) -> None:
     seen, _ = view.reset(seed=0)
-    depth, picture = seen["images.ego_depth"][0], view.render()
-    assert picture.shape == (4 * spec.DEPTH_ROWS, 4 * spec.DEPTH_COLS, 3)
-    grey = picture[::4, ::4, 0].astype(int)
+    depth, image = seen["images.ego_depth"][0], view.render()
+    assert image.shape == (4 * spec.DEPTH_ROWS, 4 * spec.DEPTH_COLS, 3)
+    grey = image[::4, ::4, 0].astype(int)
     assert (grey[depth == 0] == 0).all()
     order = depth[depth > 0].argsort()
     assert (np.diff(grey[depth > 0][order]) <= 0).all()

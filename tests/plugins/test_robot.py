@@ -120,8 +120,8 @@ def test_it_is_driven_with_seven_numbers(fake: EgovcpG1Config) -> None:
         assert depth.dtype == np.uint16
         assert depth.any()
         assert taken == pytest.approx(wanted)
-        told = spec.ACTION_BOX.to_metric(np.array([wanted[n] for n in spec.ACTION_NAMES]))
-        np.testing.assert_allclose(state[spec.COMMAND_SLICE][3:], told, atol=1e-5)
+        commanded = spec.ACTION_BOX.to_metric(np.array([wanted[n] for n in spec.ACTION_NAMES]))
+        np.testing.assert_allclose(state[spec.COMMAND_SLICE][3:], commanded, atol=1e-5)
         with pytest.raises(UsageError, match="lacks height"):
             robot.send_action({n: 0.0 for n in spec.ACTION_NAMES if n != "height"})
         with pytest.raises(UsageError, match="found"):

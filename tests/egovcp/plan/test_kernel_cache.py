@@ -36,7 +36,7 @@ def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     _forget()
 
 
-def _judge(backend: BackendName) -> object:
+def _evaluator(backend: BackendName) -> object:
     """What computes the plans in a process that has just started."""
     _forget()
     return make_evaluator(toy_model(), PlannerConfig(backend=backend))
@@ -67,7 +67,7 @@ def test_the_kernel_is_compiled_once_into_a_private_folder(
     cache: Path, compilations: list[Path]
 ) -> None:
     for _ in range(2):
-        assert isinstance(_judge("int8"), Int8Evaluator)
+        assert isinstance(_evaluator("int8"), Int8Evaluator)
     assert len(compilations) == 1
     assert cache.stat().st_mode & 0o777 == cache.parent.stat().st_mode & 0o777 == 0o700
     digest = f"{_compiled(cache)}.sha256"
@@ -77,11 +77,11 @@ def test_the_kernel_is_compiled_once_into_a_private_folder(
 
 @needs_compiler
 def test_a_truncated_library_is_compiled_again(cache: Path, compilations: list[Path]) -> None:
-    _judge("int8")
+    _evaluator("int8")
     for size in (0, 5000):
         with _compiled(cache).open("r+b") as file:
             file.truncate(size)
-        assert isinstance(_judge("int8"), Int8Evaluator)
+        assert isinstance(_evaluator("int8"), Int8Evaluator)
     assert len(compilations) == 3
     assert _compiled(cache).stat().st_size > 5000
 
@@ -90,7 +90,7 @@ def test_a_truncated_library_is_compiled_again(cache: Path, compilations: list[P
 @pytest.fixture
 def planted(cache: Path, tmp_path: Path) -> Path:
     """Plant a library, with its digest, that creates a file when it is loaded; the file."""
-    _judge("int8")
+    _evaluator("int8")
     marker, source = tmp_path / "executed", tmp_path / "planted.c"
     source.write_text(
         "#include <fcntl.h>\n__attribute__((constructor)) static void run(void) "
@@ -147,12 +147,12 @@ def test_a_library_planted_by_another_user_is_not_executed(
     _forget()
     for _ in range(2):
         assert isinstance(make_evaluator(toy_model(), PlannerConfig()), FloatEvaluator)
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert reason in told
-    assert "XDG_CACHE_HOME" in told
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert reason in message
+    assert "XDG_CACHE_HOME" in message
     with pytest.raises(EnvironmentFailure, match=r"--planner\.backend=float32") as caught:
-        _judge("int8")
+        _evaluator("int8")
     assert reason in str(caught.value)
     assert not planted.exists()
 
@@ -161,7 +161,7 @@ def test_a_library_planted_by_another_user_is_not_executed(
 def test_the_planted_library_would_be_executed(cache: Path, planted: Path) -> None:
     """Else the test above could not fail."""
     with pytest.raises(AttributeError):
-        _judge("int8")
+        _evaluator("int8")
     assert planted.exists()
 
 
@@ -176,11 +176,11 @@ def test_a_user_without_account_and_home_plans_in_int8(
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.delenv("HOME", raising=False)
     monkeypatch.setattr(pwd, "getpwuid", unknown)
-    assert isinstance(_judge("auto"), Int8Evaluator)
-    told = capsys.readouterr().err
-    assert told.count("\n") == 1
-    assert "the user has no home folder" in told
-    assert "set XDG_CACHE_HOME" in told
+    assert isinstance(_evaluator("auto"), Int8Evaluator)
+    message = capsys.readouterr().err
+    assert message.count("\n") == 1
+    assert "the user has no home folder" in message
+    assert "set XDG_CACHE_HOME" in message
 
 
 @needs_compiler
@@ -200,7 +200,7 @@ def test_an_unknown_user_id_plans_in_int8(home: str, monkeypatch: pytest.MonkeyP
         import tempfile
 
         tempfile.tempdir = None
-        print(type(_judge("auto")).__name__)
+        print(type(_evaluator("auto")).__name__)
         return 0
 
     result = run_limited(run, seconds=60.0)
@@ -233,21 +233,21 @@ def test_a_compiler_that_fails(
 def test_compiler_messages_are_quoted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(library, "FLAGS", ("--no-such-flag",))
     with pytest.raises(EnvironmentFailure, match="no-such-flag"):
-        _judge("int8")
+        _evaluator("int8")
 
 
 def _expect_float32(backend: BackendName, reason: str, capsys: pytest.CaptureFixture[str]) -> None:
     """One line that says why; int8 itself is refused."""
     if backend == "int8":
         with pytest.raises(EnvironmentFailure) as caught:
-            _judge(backend)
-        told = str(caught.value)
+            _evaluator(backend)
+        message = str(caught.value)
     else:
         for _ in range(2):
             assert isinstance(make_evaluator(toy_model(), PlannerConfig()), FloatEvaluator)
-        told = capsys.readouterr().err
-        assert told.startswith("egovcp: warning: ")
-        assert told.count("\n") == 1
-        assert "Planning in float32" in told
-    assert reason in told
-    assert "--planner.backend=float32" in told
+        message = capsys.readouterr().err
+        assert message.startswith("egovcp: warning: ")
+        assert message.count("\n") == 1
+        assert "Planning in float32" in message
+    assert reason in message
+    assert "--planner.backend=float32" in message

@@ -94,7 +94,7 @@ CONFIG = plain_planner(samples=64, elites=8, iterations=6)
 
 
 class _Clock:
-    """Counts down only when told to."""
+    """Seconds left, set by the test."""
 
     def __init__(self, left: float) -> None:
         self.left = left
@@ -104,7 +104,7 @@ class _Clock:
 
 
 class _Slow:
-    """A evaluator whose n-th answer takes ``costs[n]`` seconds of a clock."""
+    """An evaluator whose n-th evaluation takes ``costs[n]`` seconds of a clock."""
 
     def __init__(self, clock: _Clock, costs: list[float]) -> None:
         self._clock, self._costs = clock, iter(costs)

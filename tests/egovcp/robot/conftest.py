@@ -66,13 +66,13 @@ class StandingRobot:
         """(1, S) what the robot measures."""
         s = np.zeros((1, STATE_DIM))
         s[0, COMMAND_SLICE] = self.command
-        truth = {
+        true_values = {
             "angular_velocity": self.data.qvel[3:6],
             "projected_gravity": -self.data.xmat[1].reshape(3, 3)[2],
             "joint_position": self.data.qpos[7:],
             "joint_velocity": self.data.qvel[6:],
         }
-        for name, value in truth.items():
+        for name, value in true_values.items():
             noise = self.noise * _NOISE[name] * self.rng.normal(size=value.shape)
             s[0, STATE_SLICES[name]] = value + noise
         return s

@@ -17,7 +17,7 @@ MIRROR = np.array([1.0, -1.0])
 
 
 def _state(batch: int = 1, vx: float = 0.0, vy: float = 0.0, height: float = HEIGHT) -> np.ndarray:
-    """Measurements of robots that stand as they should, told to walk."""
+    """Measurements of robots that stand in the reference pose, with a velocity command."""
     pose = standing_pose(height)
     pitch = 2 * np.arctan2(pose.quaternion[2], pose.quaternion[0])
     state = np.zeros((batch, STATE_DIM))
@@ -182,10 +182,10 @@ def test_a_pelvis_that_leaves_sideways_is_caught_on_that_side():
 
 
 def test_a_command_puts_the_foot_back_so_that_the_pelvis_falls_forward():
-    told, not_told = _state(vx=0.4), _state()
+    commanded, idle = _state(vx=0.4), _state()
     assert (
-        _foothold(_walking(2.5, told), told)[0]
-        < _foothold(_walking(2.5, not_told), not_told)[0] - 0.02
+        _foothold(_walking(2.5, commanded), commanded)[0]
+        < _foothold(_walking(2.5, idle), idle)[0] - 0.02
     )
 
 

@@ -20,7 +20,7 @@ NOISELESS = CameraConfig(
 )
 
 
-def picture(xml: str, pitch: float = 0.0) -> np.ndarray:
+def render_level(xml: str, pitch: float = 0.0) -> np.ndarray:
     """Depth seen from an invisible body at height 1 that looks along x."""
     model = mujoco.MjModel.from_xml_string(
         f"<mujoco><worldbody><body name='eye' pos='0 0 1'><geom size='.01' group='3'/></body>"
@@ -36,16 +36,16 @@ def plate(x: float) -> str:
 
 
 def test_a_flat_wall_has_the_same_planar_depth_everywhere() -> None:
-    np.testing.assert_allclose(picture(plate(2.0)), 2.0, atol=1e-5)
+    np.testing.assert_allclose(render_level(plate(2.0)), 2.0, atol=1e-5)
 
 
 @pytest.mark.parametrize("x", [DEPTH_MIN_M - 0.02, DEPTH_MAX_M + 0.02])
 def test_what_is_out_of_range_reads_zero(x: float) -> None:
-    assert not picture(plate(x)).any()
+    assert not render_level(plate(x)).any()
 
 
 def test_left_and_up_in_the_world_are_left_and_up_in_the_image() -> None:
-    depth = picture("<geom type='sphere' pos='2 0.5 1.4' size='0.1'/>")
+    depth = render_level("<geom type='sphere' pos='2 0.5 1.4' size='0.1'/>")
     rows, columns = np.nonzero(depth)
     assert rows.max() < DEPTH_ROWS / 2
     assert columns.max() < DEPTH_COLS / 2
@@ -53,7 +53,7 @@ def test_left_and_up_in_the_world_are_left_and_up_in_the_image() -> None:
 
 def test_pitching_down_raises_what_lies_ahead() -> None:
     ahead = "<geom type='sphere' pos='2 0 1' size='0.1'/>"
-    level, tilted = (np.nonzero(picture(ahead, pitch))[0].mean() for pitch in (0.0, 0.2))
+    level, tilted = (np.nonzero(render_level(ahead, pitch))[0].mean() for pitch in (0.0, 0.2))
     assert tilted < level - 3
 
 

@@ -133,7 +133,7 @@ def test_the_arch_commands_its_speed_once_it_moves(env: VectorEnv) -> None:
 
 
 class Recorder:
-    """Wraps a controller and keeps what it was told."""
+    """Wraps a controller and records its observations."""
 
     def __init__(self, inner: VectorEnv) -> None:
         self._inner = inner.controller

@@ -159,7 +159,7 @@ def test_the_last_part_ends_as_the_others_do(sequences: EnvConfig) -> None:
 
 
 def test_what_has_not_begun_is_not_won(sequences: EnvConfig) -> None:
-    """A wall that nobody has touched, because it is not there yet."""
+    """A wall that is not placed yet and so untouched."""
     env, task = begun(replace(sequences, sequence=SequenceConfig(("ball", "wall"))))
     env.step(HOLD)
     assert task.parts == {"ball": False, "wall": False}

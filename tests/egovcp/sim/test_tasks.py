@@ -32,12 +32,12 @@ def test_the_ball_flies_through_its_aim_after_its_flight_time(config: EnvConfig)
     nearest = np.full(4, np.inf)
     for _ in range(35):
         env.step(HOLD)
-        truth = env.privileged_state()
-        left = flight - truth.since_event
-        path = truth.object_w + truth.object_velocity_w * left[:, None]
+        state = env.privileged_state()
+        left = flight - state.since_event
+        path = state.object_w + state.object_velocity_w * left[:, None]
         path[:, 2] -= 0.5 * 9.81 * left**2
-        aim = truth.pelvis_w[:, :3] + [aside.aim_forward, 1.0, 0.3]
-        flying = truth.object_active & (left > 0)
+        aim = state.pelvis_w[:, :3] + [aside.aim_forward, 1.0, 0.3]
+        flying = state.object_active & (left > 0)
         miss = np.linalg.norm(path - aim, axis=1)
         nearest = np.where(flying, np.minimum(nearest, miss), nearest)
     assert nearest.max() < 0.05
@@ -45,10 +45,10 @@ def test_the_ball_flies_through_its_aim_after_its_flight_time(config: EnvConfig)
 
 def test_the_ball_is_out_of_sight_and_of_truth_before_the_throw(env: VectorEnv) -> None:
     begin(env, "ball")
-    truth = env.privileged_state()
-    assert np.isnan(truth.object_w).all()
-    assert truth.solids == ((),) * 4
-    assert not truth.object_active.any()
+    state = env.privileged_state()
+    assert np.isnan(state.object_w).all()
+    assert state.solids == ((),) * 4
+    assert not state.object_active.any()
 
 
 def test_a_box_flies_as_the_ball_of_its_volume_would(config: EnvConfig) -> None:
@@ -202,7 +202,7 @@ def test_an_upright_robot_hits_the_arch_with_its_head(config: EnvConfig) -> None
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_depth_image_shows_the_object_at_its_position(env: VectorEnv, task: str) -> None:
-    """Empty-scene depth and the scene's differ, so the object is in the picture."""
+    """Empty-scene depth and the scene's differ, so the object is in the image."""
     begin(env, task)
     for _ in range(14):
         result = env.step(HOLD)
