@@ -13,7 +13,7 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Final
+from typing import Any, Final
 
 import mujoco
 import numpy as np
@@ -118,39 +118,25 @@ def strip_visuals(spec: mujoco.MjSpec) -> None:
 def _add_ball(spec: mujoco.MjSpec) -> None:
     body = spec.worldbody.add_body(name=BALL, pos=[-20, 0, 1])
     body.add_freejoint()
-    body.add_geom(
-        name=BALL,
-        type=mujoco.mjtGeom.mjGEOM_SPHERE,
-        size=[0.1, 0, 0],
-        mass=0.25,
-        contype=1,
-        conaffinity=1,
-    )
+    sphere = mujoco.mjtGeom.mjGEOM_SPHERE
+    body.add_geom(name=BALL, type=sphere, size=[0.1, 0, 0], mass=0.25, contype=1, conaffinity=1)
+
+
+def _add_box(body: mujoco.MjsBody, name: str, size: list[float], **options: Any) -> None:
+    box = mujoco.mjtGeom.mjGEOM_BOX
+    body.add_geom(name=name, type=box, size=size, contype=1, conaffinity=0, **options)
 
 
 def _add_wall(spec: mujoco.MjSpec) -> None:
     body = spec.worldbody.add_body(name=WALL, mocap=True, pos=[20, 0, 0])
-    body.add_geom(
-        name=WALL,
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        size=list(WALL_HALF_SIZE),
-        pos=[WALL_HALF_SIZE[0], 0, WALL_HALF_SIZE[2]],
-        contype=1,
-        conaffinity=0,
-        priority=1,
-    )
+    centre = [WALL_HALF_SIZE[0], 0, WALL_HALF_SIZE[2]]
+    _add_box(body, WALL, list(WALL_HALF_SIZE), pos=centre, priority=1)
 
 
 def _add_arch(spec: mujoco.MjSpec) -> None:
     body = spec.worldbody.add_body(name=ARCH, mocap=True, pos=[20, 0, 0])
     for name in ARCH_GEOMS:
-        body.add_geom(
-            name=name,
-            type=mujoco.mjtGeom.mjGEOM_BOX,
-            size=[0.1, 0.1, 0.1],
-            contype=1,
-            conaffinity=0,
-        )
+        _add_box(body, name, [0.1, 0.1, 0.1])
 
 
 #: The ball comes last: its free joint is the last joint of the model.

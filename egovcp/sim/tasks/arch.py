@@ -39,14 +39,11 @@ class ArchTask(Task):
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
         super().__init__(config, scenario, robot)
         self.config = config.arch
-        rng = scenario.rng("geometry")
-        c = self.config
-        self.clearance = float(rng.uniform(*c.clearance_range))
-        self._half_width = float(rng.uniform(*c.width_range)) / 2
-        self._half_depth = float(rng.uniform(*c.depth_range)) / 2
-        self._ahead = float(rng.uniform(*c.distance_range))  # arch centre before the pelvis, m
-        self._lateral = float(rng.uniform(*c.lateral_range))
-        self.speed = float(rng.uniform(*c.speed_range))
+        names = ("clearance", "width", "depth", "distance", "lateral", "speed")
+        sampled = self._sample(scenario, *names)
+        self.clearance, self.speed = sampled["clearance"], sampled["speed"]
+        self._half_width, self._half_depth = sampled["width"] / 2, sampled["depth"] / 2
+        self._ahead = sampled["distance"]  # arch centre ahead of the pelvis now, m
         self._touched = False
         self._passed = False
         self._progress = 0.0  # m in this tick
@@ -56,14 +53,7 @@ class ArchTask(Task):
 
     @property
     def parameters(self) -> dict[str, float]:
-        return {
-            "clearance": self.clearance,
-            "width": 2 * self._half_width,
-            "depth": 2 * self._half_depth,
-            "distance": self._ahead,
-            "lateral": self._lateral,
-            "speed": self.speed,
-        }
+        return self._parameters | {"distance": self._ahead}
 
     def _shape_arch(self) -> None:
         """Write the sizes of posts and lintel; the arch's origin is its centre on the ground."""
@@ -83,7 +73,7 @@ class ArchTask(Task):
     def place(self) -> None:
         pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
         self._direction, self._start = heading[:, 0].copy(), pelvis.copy()
-        self._origin = pelvis + heading @ np.array([0.0, self._lateral, 0.0])
+        self._origin = pelvis + heading @ np.array([0.0, self._parameters["lateral"], 0.0])
         self._origin[2] = 0.0
         turn = math.atan2(heading[1, 0], heading[0, 0])
         quaternion = (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))

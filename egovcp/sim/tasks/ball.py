@@ -35,17 +35,11 @@ class BallTask(Task):
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
         super().__init__(config, scenario, robot)
         self.config = config.ball
-        rng = scenario.rng("geometry")
-        c = self.config
-        self.radius = float(rng.uniform(*c.radius_range))
-        self._mass = float(rng.uniform(*c.mass_range))
-        self._distance = float(rng.uniform(*c.distance_range))
-        self._bearing = float(rng.uniform(*c.bearing_range))
-        self._release_height = float(rng.uniform(*c.release_height_range))
-        self.flight = float(rng.uniform(*c.flight_range))
-        self._aim_b = np.array(
-            [c.aim_forward, rng.uniform(*c.aim_lateral_range), rng.uniform(*c.aim_height_range)]
-        )
+        at_release = ("radius", "mass", "distance", "bearing", "release_height", "flight")
+        sampled = self._sample(scenario, *at_release, "aim_lateral", "aim_height")
+        self.radius, self.flight = sampled["radius"], sampled["flight"]
+        aim = (self.config.aim_forward, sampled["aim_lateral"], sampled["aim_height"])
+        self._aim_b = np.array(aim)
         self._turned, self._turning = self._attitude(scenario)
         self._thrown = False
         self._grounded = False  # on the floor: contacts no longer count
@@ -54,19 +48,6 @@ class BallTask(Task):
         self._new_block = False
         self._new_hit = False
         self._shape_ball()
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        return {
-            "radius": self.radius,
-            "mass": self._mass,
-            "distance": self._distance,
-            "bearing": self._bearing,
-            "release_height": self._release_height,
-            "flight": self.flight,
-            "aim_lateral": float(self._aim_b[1]),
-            "aim_height": float(self._aim_b[2]),
-        }
 
     def _attitude(self, scenario: Scenario) -> tuple[Array, Array]:
         """Quaternion and angular velocity (rad/s) at the release; constant for a ball."""
@@ -93,9 +74,9 @@ class BallTask(Task):
         kinds = mujoco.mjtGeom
         model.geom_type[geom] = kinds.mjGEOM_BOX if self._is_box else kinds.mjGEOM_SPHERE
         self.robot.shape_geom(geom, size if self._is_box else size[:1], [0.0, 0.0, 0.0])
-        model.body_mass[body] = self._mass
+        model.body_mass[body] = self._parameters["mass"]
         share = 2 / 3 if self._is_box else 2 / 5
-        model.body_inertia[body] = share * self._mass * size[0] ** 2
+        model.body_inertia[body] = share * self._parameters["mass"] * size[0] ** 2
 
     def place(self) -> None:
         self.park()
@@ -122,9 +103,10 @@ class BallTask(Task):
         """Release point and velocity, world, aimed at the robot as it stands now."""
         pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
         aim = pelvis + heading @ self._aim_b
-        away = np.array([math.cos(self._bearing), math.sin(self._bearing), 0.0])
-        start = pelvis + heading @ away * self._distance
-        start[2] = self._release_height
+        bearing = self._parameters["bearing"]
+        away = np.array([math.cos(bearing), math.sin(bearing), 0.0])
+        start = pelvis + heading @ away * self._parameters["distance"]
+        start[2] = self._parameters["release_height"]
         return start, (aim - start) / self.flight - 0.5 * _GRAVITY * self.flight
 
     def process_contacts(self, contacts: Sequence[Contact]) -> None:

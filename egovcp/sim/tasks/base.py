@@ -66,6 +66,13 @@ class Task(ABC):
         self.fallen = False
         self.forces = np.zeros(len(PARTS))  # peak per part in the last tick, N
 
+    def _sample(self, scenario: Scenario, *names: str) -> dict[str, float]:
+        """Sample ``names`` uniformly from the config's ranges ``<name>_range``, in this order."""
+        rng = scenario.rng("geometry")
+        ranges = ((name, getattr(self.config, f"{name}_range")) for name in names)
+        self._parameters = {name: float(rng.uniform(*limits)) for name, limits in ranges}
+        return self._parameters
+
     @property
     def time(self) -> float:
         """Seconds since the start of the episode."""
@@ -147,9 +154,9 @@ class Task(ABC):
         """`success`, regardless of falls."""
 
     @property
-    @abstractmethod
     def parameters(self) -> dict[str, float]:
         """Sampled parameters of this episode, SI units."""
+        return self._parameters
 
     @abstractmethod
     def place(self) -> None:

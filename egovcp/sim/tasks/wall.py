@@ -29,11 +29,8 @@ class WallTask(Task):
     def __init__(self, config: EnvConfig, scenario: Scenario, robot: SimulatedRobot) -> None:
         super().__init__(config, scenario, robot)
         self.config = config.wall
-        rng = scenario.rng("geometry")
         c = self.config
-        self.distance = float(rng.uniform(*c.distance_range))
-        self._yaw = float(rng.uniform(*c.yaw_range))
-        self._friction = float(rng.uniform(*c.friction_range))
+        sampled = self._sample(scenario, "distance", "yaw", "friction")
         push = scenario.rng("push")
         self.away = bool(push.random() < c.away_probability)
         self._bearing = float(push.uniform(*c.push_bearing_range)) + math.pi * self.away
@@ -43,26 +40,17 @@ class WallTask(Task):
         self._disturbed_time = disturbed
         speed = c.away_speed_range if self.away else towards
         self.push_speed = float(push.uniform(*speed))
+        sampled |= {"push_speed": self.push_speed, "push_bearing": self._bearing}
         self._touched_otherwise = False
         self._body = robot.model.body(WALL)
         self._mocap = int(self._body.mocapid[0])
-        robot.model.geom(WALL).friction[0] = self._friction
-
-    @property
-    def parameters(self) -> dict[str, float]:
-        return {
-            "distance": self.distance,
-            "yaw": self._yaw,
-            "friction": self._friction,
-            "push_speed": self.push_speed,
-            "push_bearing": self._bearing,
-        }
+        robot.model.geom(WALL).friction[0] = sampled["friction"]
 
     def place(self) -> None:
         pelvis, heading = self.robot.data.qpos[:3], self.robot.heading
-        self._surface = pelvis + heading @ np.array([self.distance, 0.0, 0.0])
+        self._surface = pelvis + heading @ np.array([self._parameters["distance"], 0.0, 0.0])
         self._surface[2] = 0.0
-        turn = math.atan2(heading[1, 0], heading[0, 0]) + self._yaw
+        turn = math.atan2(heading[1, 0], heading[0, 0]) + self._parameters["yaw"]
         data, quaternion = self.robot.data, (math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
         data.mocap_pos[self._mocap], data.mocap_quat[self._mocap] = self._surface, quaternion
         self._normal = np.array([math.cos(turn), math.sin(turn), 0.0])
