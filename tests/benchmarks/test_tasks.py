@@ -61,5 +61,5 @@ class _Best:
 
     def __init__(self, play) -> None:
         self.action = (0.0,) * 7
-        (score,) = play([self.action], [tasks.held_out("ball", 0, 0)])
+        ((score,),) = play([self.action], [tasks.held_out("ball", 0, 0)])
         assert score.steps > 0
