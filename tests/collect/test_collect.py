@@ -66,13 +66,15 @@ def test_the_command_and_its_configuration_are_recorded(collected: Path) -> None
     assert recorded["versions"]["mujoco"]
 
 
-def test_the_data_do_not_depend_on_how_the_work_is_shared(collected: Path, tmp_path: Path) -> None:
+def test_data_do_not_depend_on_the_number_of_workers(collected: Path, tmp_path: Path) -> None:
     assert _collect(tmp_path / "one", "--episodes=4", "--num_envs=3", "--num_workers=1",
                     "--seed=3") == 0  # fmt: skip
     assert _data(tmp_path / "one") == _data(collected)
 
 
-def test_the_last_line_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_last_line_reports_episodes_steps_and_speed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert _collect(tmp_path / "new", "--episodes=2", "--num_envs=2", "--num_workers=1") == 0
     last = capsys.readouterr().out.strip().splitlines()[-1]
     assert last.startswith("2 episodes, 12 steps, ")
@@ -96,7 +98,7 @@ def test_the_last_line_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]
         (["--dataset.revision=main"], "no meaning for a new dataset"),
     ],
 )
-def test_bad_options_end_with_one_line_before_any_work(
+def test_invalid_options_are_usage_errors_in_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], flags: list[str], message: str
 ) -> None:
     assert _collect(tmp_path / "new", *flags) == 2
@@ -113,7 +115,7 @@ def test_an_existing_folder_is_refused(collected: Path, capsys: pytest.CaptureFi
     assert _data(collected) == before
 
 
-def test_a_place_that_cannot_be_written_is_refused(
+def test_a_destination_below_a_file_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("mine")
@@ -121,7 +123,7 @@ def test_a_place_that_cannot_be_written_is_refused(
     assert "below a file" in capsys.readouterr().err
 
 
-def test_an_error_is_not_hidden_by_the_commit_that_follows_it(
+def test_an_error_is_not_hidden_by_a_failed_commit(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The simulation fails, then the commit of the staged episodes."""
@@ -162,7 +164,7 @@ def test_episodes_of_a_diverging_simulation_are_not_stored(
         DatasetReader.open(DatasetConfig(root=str(root)))
 
 
-def test_ranges_that_cannot_be_simulated_are_refused_before_any_work(
+def test_ranges_that_cannot_be_simulated_are_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert _collect(tmp_path / "new", "--env.ball.radius_range=[0.1,100]") == 2
@@ -176,7 +178,7 @@ def test_no_destination_is_a_usage_error(capsys: pytest.CaptureFixture[str]) -> 
 
 
 @pytest.mark.parametrize("mix", [MixConfig(), MixConfig(3, 1, 0), MixConfig(0.2, 0.5, 0.3)])
-def test_every_prefix_holds_the_tasks_in_their_shares(mix: MixConfig) -> None:
+def test_every_prefix_has_the_shares_of_the_tasks(mix: MixConfig) -> None:
     tasks = [s.task for s in CollectConfig(task="all", mix=mix, episodes=300).scenarios()]
     weights = np.array([mix.ball, mix.wall, mix.arch])
     for length in range(1, 301):

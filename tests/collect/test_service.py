@@ -1,4 +1,4 @@
-"""The service as a process: stopped, killed, resumed, extended."""
+"""`egovcp-collect` as a process: stopped, killed, resumed, extended."""
 
 import os
 import signal
@@ -38,7 +38,7 @@ def _tree(root: Path) -> Tree:
 
 @pytest.fixture(scope="module")
 def ten(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ten episodes in one go."""
+    """Ten episodes from one uninterrupted run."""
     root = tmp_path_factory.mktemp("service") / "ten"
     assert main([*_SHORT, *_SMALL, f"--dataset.root={root}", "--episodes=10"]) == 0
     return root
@@ -46,7 +46,7 @@ def ten(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def endless(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
-    """A long collection into ``cut``, in a process group of its own, that has sealed something."""
+    """A long collection into ``cut``, in a new process group, with at least one staged episode."""
     command = [sys.executable, "-m", "egovcp_collect.collect", *_SHORT, *_SMALL]
     process = subprocess.Popen(
         [
@@ -61,18 +61,18 @@ def endless(tmp_path: Path) -> Iterator[subprocess.Popen[str]]:
         text=True,
         start_new_session=True,
     )
-    _wait_for(lambda: any(_sealed(tmp_path / "cut").glob("*.arrow")))
+    _wait_for(lambda: any(_staged(tmp_path / "cut").glob("*.arrow")))
     yield process
     process.kill()
     process.wait()
 
 
-def _sealed(root: Path) -> Path:
+def _staged(root: Path) -> Path:
     return work_folder(root) / "sealed"
 
 
-def _sealed_names(root: Path) -> set[str]:
-    return {path.name for path in _sealed(root).glob("*.arrow")}
+def _staged_names(root: Path) -> set[str]:
+    return {path.name for path in _staged(root).glob("*.arrow")}
 
 
 def _wait_for(condition: object) -> None:
@@ -85,7 +85,7 @@ def _wait_for(condition: object) -> None:
 
 
 def _require_resumable(root: Path, ten: Path) -> None:
-    """Ten episodes are what they would have been without any interruption."""
+    """Resume ``root``; its ten episodes must equal those of the uninterrupted run."""
     if root.exists():
         verify_hashes(root)
     flags = [*_SHORT, "--num_envs=5", "--num_workers=2", f"--dataset.root={root}", "--resume"]
@@ -99,11 +99,11 @@ def _require_resumable(root: Path, ten: Path) -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_and_keeps_every_finished_episode(
+def test_a_signal_ends_the_collection_and_keeps_finished_episodes(
     endless: subprocess.Popen[str], tmp_path: Path, ten: Path, number: int
 ) -> None:
-    os.killpg(endless.pid, number)  # as a terminal does: the workers get it, too
-    out, err = endless.communicate(timeout=10)  # the issue's bound
+    os.killpg(endless.pid, number)  # a terminal signals the workers, too
+    out, err = endless.communicate(timeout=10)
     assert endless.returncode == 130, err
     assert "Traceback" not in err
     root = tmp_path / "cut"
@@ -112,25 +112,25 @@ def test_a_signal_ends_it_and_keeps_every_finished_episode(
     _require_resumable(root, ten)
 
 
-def test_kill_loses_nothing_that_was_sealed(
+def test_a_kill_loses_no_staged_episode(
     endless: subprocess.Popen[str], tmp_path: Path, ten: Path
 ) -> None:
     root = tmp_path / "cut"
     _wait_for(root.exists)
     endless.kill()
     endless.wait()
-    _wait_for(lambda: not _children_of_the_dead(root))
-    sealed = {path.name for path in _sealed(root).glob("*.arrow")}
+    _wait_for(lambda: not _running_workers(root))
+    staged = {path.name for path in _staged(root).glob("*.arrow")}
     committed = len(DatasetReader.open(DatasetConfig(root=str(root))))
     assert committed >= 4
     _require_resumable(root, ten)
     count = len(DatasetReader.open(DatasetConfig(root=str(root))))
-    lost = [n for n in sealed if int(n[:9]) >= count and not (_sealed(root) / n).exists()]
+    lost = [n for n in staged if int(n[:9]) >= count and not (_staged(root) / n).exists()]
     assert lost == []
 
 
-def _children_of_the_dead(root: Path) -> list[str]:
-    """Workers that outlive their parent end by themselves."""
+def _running_workers(root: Path) -> list[str]:
+    """Workers of a collection."""
     out = subprocess.run(["pgrep", "-f", f"spawn_main.*{root}"], capture_output=True, text=True)
     return out.stdout.split()
 
@@ -166,7 +166,7 @@ def test_a_second_collector_is_refused(
     root = tmp_path / "cut"
     began = time.monotonic()
     assert main([*_SHORT, *_SMALL, f"--dataset.root={root}", "--episodes=5", "--resume"]) == 5
-    assert time.monotonic() - began < 1.0  # part of the promise, and far from the truth
+    assert time.monotonic() - began < 1.0  # it waits for no lock
     assert f"being written by process {endless.pid}" in capsys.readouterr().err
     assert endless.poll() is None
 
@@ -178,13 +178,13 @@ def _worker_of(parent: int) -> int:
 
 
 def _numbers(root: Path) -> list[int]:
-    """Sealed and committed episodes, roughly."""
-    sealed = [int(path.name[:9]) for path in _sealed(root).glob("*.arrow")]
+    """Numbers of staged episodes and of the last committed one."""
+    staged = [int(path.name[:9]) for path in _staged(root).glob("*.arrow")]
     shards = len(list(root.glob("data/*/*.parquet")))
-    return [*sealed, 4 * shards - 1]
+    return [*staged, 4 * shards - 1]
 
 
-def test_extending_equals_collecting_more_at_once(tmp_path: Path, ten: Path) -> None:
+def test_an_extended_dataset_equals_one_collected_at_once(tmp_path: Path, ten: Path) -> None:
     root = tmp_path / "grown"
     for episodes in (3, 9, 10):
         flags = [*_SHORT, *_SMALL, f"--dataset.root={root}", f"--episodes={episodes}", "--resume"]
@@ -192,7 +192,9 @@ def test_extending_equals_collecting_more_at_once(tmp_path: Path, ten: Path) -> 
     assert _tree(root) == _tree(ten)
 
 
-def test_nothing_is_left_to_do(ten: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_resuming_a_complete_collection_changes_nothing(
+    ten: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     before = _tree(ten)
     flags = [*_SHORT, *_SMALL, f"--dataset.root={ten}", "--resume"]
     assert main([*flags, "--episodes=10"]) == 0
@@ -210,7 +212,7 @@ def test_nothing_is_left_to_do(ten: Path, capsys: pytest.CaptureFixture[str]) ->
         ("--task=wall", "--task was ball, is wall"),
     ],
 )
-def test_other_episodes_are_not_mixed_in(
+def test_resuming_with_other_settings_is_refused(
     ten: Path, capsys: pytest.CaptureFixture[str], flag: str, what: str
 ) -> None:
     before = _tree(ten)
@@ -223,7 +225,7 @@ def test_other_episodes_are_not_mixed_in(
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_killed_at_two_hundred_random_moments(tmp_path: Path, ten: Path) -> None:
-    """The whole service, again and again on one root."""
+    """Kill and resume the collection 200 times on one root."""
     root = tmp_path / "cut"
     command = [sys.executable, "-m", "egovcp_collect.collect", *_SHORT, *_SMALL, "--resume"]
     command += [f"--dataset.root={root}", "--episodes=100000", "--num_workers=2"]
@@ -232,8 +234,8 @@ def test_killed_at_two_hundred_random_moments(tmp_path: Path, ten: Path) -> None
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
         moment = n * 0.618 % 1
         if n % 4:
-            known = _sealed_names(root)
-            _wait_for(lambda known=known: _sealed_names(root) - known)
+            known = _staged_names(root)
+            _wait_for(lambda known=known: _staged_names(root) - known)
             time.sleep(moment)
         else:
             time.sleep(6 * moment)

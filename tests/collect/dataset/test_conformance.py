@@ -1,4 +1,4 @@
-"""LeRobot's own tools work on our datasets, and `repair` makes their results whole again."""
+"""LeRobot's own tools work on our datasets, and `repair` completes their results."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -41,7 +41,7 @@ def two(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("tool", [_delete, _split, _merge])
-def test_what_lerobots_tools_make_loads_and_can_be_completed(
+def test_results_of_lerobots_tools_load_and_can_be_repaired(
     tool: Tool, sound: Path, two: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
@@ -86,7 +86,7 @@ def test_the_statistics_that_lerobots_tools_write_pass_the_check(
     assert main(["check", str(made)]) == 0
 
 
-def test_the_hub_library_reads_the_folder_alone(sound: Path, tmp_path: Path) -> None:
+def test_datasets_reads_the_folder(sound: Path, tmp_path: Path) -> None:
     rows = datasets.load_dataset(
         "parquet", data_dir=str(sound / "data"), split="train", cache_dir=str(tmp_path)
     )
