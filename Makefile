@@ -47,14 +47,14 @@ quickstart: install
 	  --output_dir=$(OUT)/eval $(SCENES) --env.ball_episode.empty_probability=0 | tee $(OUT)/table.txt
 	egovcp-deploy --policy.path=$(POLICY) --robot.type=sim --task=ball --episodes=1 \
 	  --output_dir=$(OUT)/rollouts $(SCENES) --env.ball_episode.empty_probability=0
-	@cd $(OUT) && for kind in mcap rrd png; do cp rollouts/rollout-0.$$kind rollout.$$kind; done
+	@cd $(OUT) && for kind in mcap rrd png gif; do cp rollouts/rollout-0.$$kind rollout.$$kind; done
 	@echo; cat $(OUT)/table.txt; echo
 	@echo "dataset   $(OUT)/dataset          lerobot-dataset-viz --repo-id me/egovcp-ball --root $(OUT)/dataset --episode-index 0"
 	@echo "policy    $(POLICY)"
 	@echo "figures   $(OUT)/eval/eval.json"
 	@echo "rollout   $(OUT)/rollout.rrd      .venv/bin/rerun $(OUT)/rollout.rrd"
 	@echo "          $(OUT)/rollout.mcap     Foxglove or Rerun"
-	@echo "          $(OUT)/rollout.png"
+	@echo "          $(OUT)/rollout.png, rollout.gif"
 	@echo "next      train longer with more data (README), or another task: egovcp-collect --task=wall --help"
 
 check: install docs

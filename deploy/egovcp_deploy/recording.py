@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from egovcp.artifact import Artifact
+from egovcp.bounds import bounded
 from egovcp.log.async_sink import AsyncFanout, AsyncSink
 from egovcp.log.mcap import McapSink
 from egovcp.log.rerun import RerunSink
@@ -32,15 +33,20 @@ class LogOptions:
     loopback), or the address of a running viewer, rerun+http://127.0.0.1:9876/proxy."""
     rrd: bool = True
     """Write a Rerun file too; Rerun also opens the MCAP file."""
+    videos: int = bounded(1, least=0)
+    """Draw the first so many rollouts as PNG and GIF, and as MP4 if PyAV is installed
+    (egovcp[video]); needs matplotlib."""
 
 
 @contextmanager
 def recording(
     folder: Path, episode: int, info: RunInfo, options: LogOptions, blocking: bool
 ) -> Iterator[Sink]:
-    """Sinks of rollout number ``episode``; the first one also gets a picture. If ``blocking``, the
-    loop may wait for the disk, as in simulated time; else each sink runs in a separate process. A
-    viewer always does: it may die or hang."""
+    """Sinks of rollout number ``episode``.
+
+    If ``blocking``, the loop may wait for the disk, as in simulated time; else each sink runs in a
+    separate process. A viewer always does: it may die or hang.
+    """
     with ExitStack() as stack:
         files = _file_sinks(folder / f"rollout-{episode}", episode, options)
         viewers = list[AsyncSink]()
@@ -68,14 +74,16 @@ def missing_ticks(sink: Sink) -> dict[str, int]:
 
 def _file_sinks(stem: Path, episode: int, options: LogOptions) -> dict[str, Sink]:
     """File name -> its sink."""
-    mcap, rrd, png = (stem.with_suffix(suffix) for suffix in (".mcap", ".rrd", ".png"))
+    mcap, rrd = stem.with_suffix(".mcap"), stem.with_suffix(".rrd")
     sinks: dict[str, Sink] = {mcap.name: McapSink(mcap)}
     if options.rrd:
         sinks[rrd.name] = RerunSink(rrd)
-    if episode == 0 and is_installed("matplotlib"):
+    if episode < options.videos and is_installed("matplotlib"):
         from egovcp.log.picture import PictureSink
 
-        sinks[png.name] = PictureSink(png)
+        suffixes = [".png", ".gif", *([".mp4"] if is_installed("av") else [])]
+        drawings = [stem.with_suffix(suffix) for suffix in suffixes]
+        sinks[f"{stem.name}.gif"] = PictureSink(*drawings)
     return sinks
 
 

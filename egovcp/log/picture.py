@@ -78,13 +78,15 @@ class PictureSink:
     def close(self) -> None:
         """Draw the files, if there are ticks."""
         ticks, self._ticks = self._ticks, []
-        for path in self._paths if ticks else ():
-            if path.suffix == ".png":
-                rollout_picture(ticks, path, self._title)
-            else:
-                from egovcp.log.video import write_video
+        if not ticks:
+            return
+        videos = [path for path in self._paths if path.suffix != ".png"]
+        for path in set(self._paths).difference(videos):
+            rollout_picture(ticks, path, self._title)
+        if videos:
+            from egovcp.log.video import write_videos
 
-                write_video(ticks, path)
+            write_videos(ticks, videos)
 
 
 def rollout_picture(ticks: Sequence[Tick], path: Path, title: str = "") -> None:

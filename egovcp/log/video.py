@@ -30,14 +30,16 @@ _MESH_GRID_M: Final = 0.03
 Frame = NDArray[np.uint8]
 
 
-def write_video(ticks: Sequence[Tick], path: Path) -> None:
-    """Draw ``ticks`` (in order, without gaps) into ``path``, a ``.gif`` or ``.mp4``.
+def write_videos(ticks: Sequence[Tick], paths: Sequence[Path]) -> None:
+    """Draw ``ticks`` (in order, without gaps) into each path, a ``.gif`` or ``.mp4``.
 
     Raises:
         EnvironmentFailure: the package that encodes this format is not installed.
     """
-    write = _write_gif if path.suffix == ".gif" else _write_mp4
-    write(frames(ticks), path)
+    images = list(frames(ticks))
+    for path in paths:
+        write = _write_gif if path.suffix == ".gif" else _write_mp4
+        write(images, path)
 
 
 def frames(ticks: Sequence[Tick]) -> Iterator[Frame]:
@@ -65,21 +67,21 @@ def frames(ticks: Sequence[Tick]) -> Iterator[Frame]:
         yield np.asarray(canvas.buffer_rgba())[..., :3].copy()  # type: ignore[no-untyped-call]
 
 
-def _write_gif(images: Iterator[Frame], path: Path) -> None:
+def _write_gif(images: Sequence[Frame], path: Path) -> None:
     from PIL import Image
 
     # One palette, of frames from the whole video: smaller files, and no flicker.
-    rgb = list(images)
-    some = Image.fromarray(np.concatenate(rgb[:: max(1, len(rgb) // 8)]))
+    some = Image.fromarray(np.concatenate(images[:: max(1, len(images) // 8)]))
     palette = some.quantize(128, dither=Image.Dither.NONE)
     first, *others = [
-        Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE) for image in rgb
+        Image.fromarray(image).quantize(palette=palette, dither=Image.Dither.NONE)
+        for image in images
     ]
     milliseconds = round(1000 * STRIDE * PLANNER_DT)
     first.save(path, save_all=True, append_images=others, duration=milliseconds, loop=0)
 
 
-def _write_mp4(images: Iterator[Frame], path: Path) -> None:
+def _write_mp4(images: Sequence[Frame], path: Path) -> None:
     require_packages("egovcp", "an MP4 video", "av")
     import av
 

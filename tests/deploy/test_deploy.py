@@ -40,6 +40,8 @@ def test_rollouts_are_recorded_and_summed_up(
     names = {path.name for path in out.iterdir()}
     assert names == {
         "deploy.json",
+        "rollout-0.gif",
+        "rollout-0.mp4",
         "rollout-0.png",
         *(f"rollout-{i}.{kind}" for i in (0, 1) for kind in ("mcap", "rrd")),
     }
