@@ -25,6 +25,7 @@ DISTRIBUTIONS: Final = MappingProxyType(
         "PIL": "pillow",
         "rerun": "rerun-sdk",
         "rsl_rl": "rsl-rl-lib",
+        "sklearn": "scikit-learn",
         "zmq": "pyzmq",
     }
 )

@@ -15,7 +15,7 @@ from egovcp.robot.controllers import make_controller
 from egovcp.spec import TASKS
 from egovcp_collect.config import ALL_TASKS, EPISODE_OPTIONS, CollectConfig
 
-_PACKAGES: Final = ("egovcp", "mujoco", "mjlab", "numpy", "lerobot")
+_PACKAGES: Final = ("egovcp", "mujoco", "mjlab", "numpy")
 #: Task -> value that an option had before it existed, where that is not its default today.
 _IMPLICIT_SETTINGS: Final[Mapping[str, Any]] = {"wall": {"env": {"wall": {"guard_cost": 0.0}}}}
 _SHOWN_DIFFERENCES: Final = 5
@@ -65,11 +65,13 @@ def require_compatible(now: Provenance, before: Provenance) -> None:
             "converted; collect into another --dataset.root, then join both with "
             "`egovcp-dataset merge`"
         )
+    # Older records also hold the version of LeRobot, which does not determine the data.
+    versions = {name: before.versions.get(name) for name in now.versions}
     settings = {
         "--seed": (before.seed, now.seed),
         "low-level controller": (before.controller_id, now.controller_id),
         **dict(_flat_pairs("--", migrate_config(before.config), now.config)),
-        **dict(_flat_pairs("version of ", before.versions, now.versions)),
+        **dict(_flat_pairs("version of ", versions, now.versions)),
     }
     changed = {
         name: f"{name} was {old}, is {new}"

@@ -34,7 +34,7 @@ RETRY_POLICY: Final = RetryPolicy()
 CARD: Final = "README.md"
 ASSETS: Final = "assets"
 CURVES: Final = f"{ASSETS}/training.png"
-_PACKAGES: Final = ("egovcp", "egovcp-train", "torch", "lerobot", "numpy")
+_PACKAGES: Final = ("egovcp", "egovcp-train", "torch", "numpy")
 _TASKS: Final = {
     "ball": "block a thrown ball with hand or wrist before it meets the body",
     "wall": "brace with the hands on a wall that one is pushed towards",
