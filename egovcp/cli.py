@@ -47,7 +47,7 @@ class DatasetConfig:
 
 @dataclass(frozen=True)
 class SelectedDatasetConfig(DatasetConfig):
-    """Some episodes of a dataset."""
+    """Dataset and selection of episodes."""
 
     episodes: str = ""
     """Only these episodes: numbers, `[0, 5, 7]`, a range whose end is excluded, `0:1334`, or both,

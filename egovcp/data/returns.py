@@ -32,8 +32,8 @@ class ReturnConfig:
     keep_truncated: bool = False
     """Train on returns that the time limit cuts short, too (the paper's choice)."""
     scale: ReturnScaling = "dataset"
-    """Unit of Q. dataset: returns are normalised over all tasks; none: raw returns; per_task: an
-    ablation, returns are normalised per task."""
+    """Normalisation of the return targets: dataset (over all tasks), none, or per_task (an
+    ablation)."""
 
     def check(self, flag: str = "--returns") -> None:
         """Raise `UsageError`, which names options of ``flag``, for invalid values."""

@@ -24,12 +24,16 @@ DATASETS = {
     "data/ball": "ball",
     "data/wall": "wall",
     "data/arch": "arch",
+    "data/ball-stance": "ball",
+    "data/wall-stance": "wall",
+    "data/arch-stance": "arch",
     "data/both": "ball",
     "data/rollouts": "ball",
     "outputs/cards/ball": "ball",
 }
 #: Runs of egovcp-train.
 RUNS = (
+    *("runs/ball-stance", "runs/wall-stance", "runs/arch-stance"),
     *("runs/ball", "runs/wall", "runs/arch", "runs/all", "runs/lerobot"),
     *("outputs/quickstart/policy", "outputs/experiments/work/train-wall-default-s0"),
 )

@@ -22,7 +22,7 @@ from egovcp_train.records import WandbConfig
 
 @dataclass(frozen=True)
 class OptimizerConfig:
-    """AdamW with linear warm-up and cosine decay to a tenth."""
+    """AdamW with linear warm-up and cosine decay to 10 % of the peak learning rate."""
 
     lr: float = bounded(1e-3, above=0)
     """Peak learning rate."""
@@ -33,27 +33,27 @@ class OptimizerConfig:
     grad_clip: float = bounded(10.0, above=0)
     """Largest gradient norm."""
     ema: float = bounded(0.995, least=0, below=1)
-    """Decay of the averaged weights that are evaluated and shipped; 0: no averaging."""
+    """Decay of the EMA of the weights, which is evaluated and saved; 0: no EMA."""
 
 
 @dataclass(frozen=True)
 class SamplingConfig:
-    """Which windows of which episodes make a batch."""
+    """Sampling of training batches."""
 
     length: int = bounded(20, least=1, most=100_000)
     """Ticks per window."""
     burn_in: int = bounded(0, least=0, most=100_000)
     """Leading ticks of a window that only fill the memory and are not trained on."""
     mirror: bool = True
-    """Left-right mirror half of the windows (the robot is symmetric)."""
+    """Mirror half of the windows left to right (data augmentation)."""
     tasks: dict[str, float] = field(default_factory=dict)
-    """How much more often than by chance windows of a task are drawn, '{ball: 2, wall: 1}'; 1 for
-    those not named."""
+    """Sampling weight per task relative to uniform sampling, '{ball: 2, wall: 1}'; 1 for tasks not
+    listed."""
 
 
 @dataclass(frozen=True)
 class LoadingConfig:
-    """Where the episodes are while the run draws from them."""
+    """How episodes are loaded during training."""
 
     mode: Literal["auto", "ram", "stream"] = "auto"
     """ram: all in memory, 6.3 kB per frame; stream: read from the disk through a shuffle window, or
@@ -70,7 +70,7 @@ class LoadingConfig:
 
 @dataclass(frozen=True)
 class PolicyConfig(WorldModelConfig):
-    """Sizes of the networks, the losses they are trained with, and where they are published."""
+    """Network sizes, losses and Hub upload."""
 
     push_to_hub: bool = False
     """Publish the finished policy and its card as a model on the Hub."""
@@ -129,8 +129,8 @@ class TrainConfig:
     dataset: SelectedDatasetConfig = field(default_factory=SelectedDatasetConfig)
     """Dataset to train on."""
     datasets: tuple[WeightedDatasetConfig, ...] = ()
-    """Several datasets to train on instead, '[{root: data/ball, weight: 2}, {repo_id: me/wall,
-    weight: 1}]'; without weights every frame counts alike."""
+    """Train on several datasets (replaces --dataset), '[{root: data/ball, weight: 2}, {repo_id:
+    me/wall, weight: 1}]'; without weights, frames are sampled uniformly over all of them."""
     preset: str = "default"
     """Starting point of all options: default; laptop (ends after 9.5 minutes); paper (the paper's
     losses, returns and planner); debug (tiny networks); or an ablation of the default, such as
@@ -142,7 +142,7 @@ class TrainConfig:
     returns: ReturnConfig = field(default_factory=ReturnConfig)
     """Monte Carlo target of Q."""
     sampling: SamplingConfig = field(default_factory=SamplingConfig)
-    """Batches."""
+    """Sampling of batches."""
     loading: LoadingConfig = field(default_factory=LoadingConfig)
     """Episodes in memory or on disk."""
     optimizer: OptimizerConfig = field(default_factory=OptimizerConfig)
@@ -150,22 +150,22 @@ class TrainConfig:
     steps: int = bounded(20_000, least=1)
     """Gradient steps."""
     max_minutes: float = bounded(0.0, least=0)
-    """Wall-clock limit in minutes after which the run ends early, its learning rate decayed on
-    the clock; 0: none. A resumed run has what was left. A run under a limit is not repeatable
-    step for step."""
+    """Wall-clock limit in minutes; the learning-rate schedule then follows elapsed time instead of
+    steps, so that a run is not reproducible step by step; 0: no limit. A resumed run has the rest
+    of it."""
     batch_size: int = bounded(16, least=1, most=65_536)
     """Windows per gradient step and process; under accelerate launch all processes together make
     one step of batch_size * num_processes windows."""
     seed: int = bounded(0, least=0)
     """Seed of initialisation, batches and sampling."""
     resume: bool = False
-    """Continue the run in output_dir from its last checkpoint, with its options unless given."""
+    """Resume from the last checkpoint in output_dir; options that are not given are taken from it."""
     log_freq: int = bounded(50, least=1)
     """Steps between TensorBoard records."""
     eval_freq: int = bounded(1000, least=0)
     """Steps between evaluations on held-out episodes; 0: only at the end."""
     eval_closed_loop: int = bounded(0, least=0, most=1_000_000)
-    """Scenarios of each task that are played in simulation at every evaluation; 0: none."""
+    """Scenarios of each task that are evaluated in simulation at every evaluation; 0: none."""
     save_freq: int = bounded(1000, least=1)
     """Steps between checkpoints; one is always written at the end."""
     threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
@@ -173,8 +173,8 @@ class TrainConfig:
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""
     mixed_precision: str = "auto"
-    """Precision of matrix products: no, bf16, or auto (as set by accelerate launch, else bf16 if
-    the device computes in it, as GPUs since Ampere and CPUs with AVX512-BF16 or AMX do)."""
+    """Precision of matrix products: no, bf16, or auto (as set by accelerate launch, otherwise
+    bf16 if the device supports it: Ampere or newer GPUs, CPUs with AVX512-BF16 or AMX)."""
     tensorboard: bool = True
     """Write TensorBoard records to OUTPUT_DIR/tensorboard."""
     wandb: WandbConfig = field(default_factory=WandbConfig)

@@ -53,7 +53,7 @@ from egovcp_train.publish import publish_trained, reserve_policy, versions, writ
 from egovcp_train.records import Records, TensorBoardRecorder, WandbRecorder, require_wandb
 
 PROG = "egovcp-train"
-EPILOG = "Other options are constants of --preset; a file given as --config_path can set them."
+EPILOG = "Options not listed here are set by --preset; the file of --config_path can override them."
 LAUNCHER_ECHO_S = 5.0
 _BATCH_COPIES: Final = 4  # of a batch on a CPU: float32, and intermediate results of gradients
 _UNRECORDED = (
