@@ -33,7 +33,7 @@ class LogOptions:
     loopback), or the address of a running viewer, rerun+http://127.0.0.1:9876/proxy."""
     rrd: bool = True
     """Write a Rerun file too; Rerun also opens the MCAP file."""
-    videos: int = bounded(1, least=0)
+    videos: int = bounded(1, least=0, most=1_000_000)
     """Draw the first so many rollouts as PNG and GIF, and as MP4 if PyAV is installed
     (egovcp[video]); needs matplotlib."""
 

@@ -54,6 +54,7 @@ CASES = {
         ("dataset.root", "config_path"),
         ("output_dir",),
     ),
+    "egovcp-info": ("", (), ("json",)),
     "egovcp-push": ("--policy.path=POLICY --repo_id=me/policy", ("policy.path",), ()),
     "egovcp-export": ("--policy.path=POLICY --output_dir=NEW", ("policy.path",), ("output_dir",)),
     "egovcp-eval-model": (

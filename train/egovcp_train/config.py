@@ -159,7 +159,7 @@ class TrainConfig:
     seed: int = bounded(0, least=0)
     """Seed of initialisation, batches and sampling."""
     resume: bool = False
-    """Resume from the last checkpoint in output_dir; options that are not given are taken from it."""
+    """Resume from the last checkpoint in output_dir, with its options unless given."""
     log_freq: int = bounded(50, least=1)
     """Steps between TensorBoard records."""
     eval_freq: int = bounded(1000, least=0)
