@@ -75,7 +75,7 @@ def test_without_gradients_images_are_encoded_in_pieces(
     with torch.no_grad():
         at_once = filter_sequence(model, batch, sample=False)
         seen: list[int] = []
-        monkeypatch.setattr("egovcp.model.losses._AT_ONCE", 5)
+        monkeypatch.setattr("egovcp.model.losses._CHUNK", 5)
         monkeypatch.setattr(
             model,
             "embed_near",

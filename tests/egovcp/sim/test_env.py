@@ -229,13 +229,13 @@ def test_physics_differs_between_episodes_and_is_recorded(env: VectorEnv) -> Non
 
 
 @pytest.fixture(scope="module")
-def env(config: EnvConfig) -> EgovcpEnv:
+def gym_env(config: EnvConfig) -> EgovcpEnv:
     return EgovcpEnv("ball", config)
 
 
 @pytest.mark.filterwarnings("ignore:.*Box observation space.*")
-def test_gymnasium_check_env_passes(env: EgovcpEnv) -> None:
-    check_env(env, skip_render_check=True)
+def test_gymnasium_check_env_passes(gym_env: EgovcpEnv) -> None:
+    check_env(gym_env, skip_render_check=True)
 
 
 def test_registered_names_make_the_environment() -> None:
@@ -244,18 +244,18 @@ def test_registered_names_make_the_environment() -> None:
     assert gymnasium.spec("egovcp/wall-v0").kwargs == {"task": "wall"}
 
 
-def test_reset_with_seed_starts_episode_zero_and_without_the_next(env: EgovcpEnv) -> None:
-    first, info = env.reset(seed=4)
-    second, next_info = env.reset()
-    again, _ = env.reset(seed=4)
+def test_reset_with_seed_starts_episode_zero_and_without_the_next(gym_env: EgovcpEnv) -> None:
+    first, info = gym_env.reset(seed=4)
+    second, next_info = gym_env.reset()
+    again, _ = gym_env.reset(seed=4)
     assert (info["episode"], next_info["episode"]) == (0, 1)
     np.testing.assert_array_equal(first["state"], again["state"])
     assert not np.array_equal(first["state"], second["state"])
 
 
-def test_info_names_success_action_and_reward_terms(env: EgovcpEnv) -> None:
-    env.reset(seed=0)
-    _, reward, _, _, info = env.step(np.full(7, 0.1, dtype=np.float32))
+def test_info_names_success_action_and_reward_terms(gym_env: EgovcpEnv) -> None:
+    gym_env.reset(seed=0)
+    _, reward, _, _, info = gym_env.step(np.full(7, 0.1, dtype=np.float32))
     assert reward == pytest.approx(sum(info["reward_terms"].values()))
     assert info["success"] is False
     np.testing.assert_allclose(info["sent_action"], 0.1)
