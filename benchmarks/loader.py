@@ -5,10 +5,10 @@ The same dataset and windows of the same length, batch by batch, with one thread
 * ``lerobot``: `LeRobotDataset` with `delta_timestamps` for every feature of a window, items at
   random places, collated by torch;
 * ``ram``: `egovcp.data.InMemorySampler`, all episodes in memory;
-* ``bounded``: `egovcp.data.StreamingSampler`, episodes read from the disk through a shuffle window.
+* ``stream``: `egovcp.data.StreamingSampler`, episodes read from the disk through a shuffle window.
 
-The cases take turns; ratios are medians of the ratios of one turn. Processor time counts, so that
-other programs do not matter. The disk's pages are cached: this measures decoding.
+Cases are interleaved; a ratio is the median of the ratios of the rounds. Rates use CPU time, which
+reduces the effect of other programs. The dataset is in the page cache, so decoding is measured.
 
 ``hub_ratio`` compares, by wall clock, an epoch streamed from a Hub on this machine with an empty
 cache with the same epoch from the disk.
@@ -61,11 +61,11 @@ HUB_REPO = "me/bench"
 HUB_EPISODES_PER_FILE = 25
 
 
-def lerobot(root: Path, length: int) -> Iterator[object]:
+def lerobot_batches(root: Path, length: int) -> Iterator[object]:
     """Batches of windows that begin at random frames."""
     steps = [i / spec.PLANNER_HZ for i in range(length)]
     dataset = LeRobotDataset(
-        "me/bench", root=root, delta_timestamps=dict.fromkeys(spec.FEATURES, steps)
+        HUB_REPO, root=root, delta_timestamps=dict.fromkeys(spec.FEATURES, steps)
     )
     rng = np.random.default_rng(0)
     while True:
@@ -89,9 +89,9 @@ def compare(
     config = SamplerConfig(batch_size=BATCH, length=length)
     (reader,) = index.readers
     cases: dict[str, Callable[[], Iterator[object]]] = {
-        "lerobot": lambda: lerobot(reader.root, length),
+        "lerobot": lambda: lerobot_batches(reader.root, length),
         "ram": lambda: InMemorySampler(EpisodeStore.read(index), config),
-        "bounded": lambda: StreamingSampler(index, config, shuffle=shuffle),
+        "stream": lambda: StreamingSampler(index, config, shuffle=shuffle),
     }
     streams = {name: make() for name, make in cases.items()}
     for stream in streams.values():
@@ -109,12 +109,12 @@ def compare(
         "shuffle_reuse": shuffle.reuse,
     }
     figures |= {f"{k}_windows_per_s": statistics.median(r[k] for r in found) for k in streams}
-    for name in ("ram", "bounded"):
+    for name in ("ram", "stream"):
         figures[f"{name}_ratio"] = statistics.median(r[name] / r["lerobot"] for r in found)
     return figures
 
 
-def from_hub(folder: Path, episodes: int, length: int, rounds: int) -> dict[str, object]:
+def measure_hub_epoch(folder: Path, episodes: int, length: int, rounds: int) -> dict[str, object]:
     """Windows per second of an epoch from the Hub and from the disk, and their ratio.
 
     Each epoch from the Hub begins with an empty cache, so that files are downloaded while they are
@@ -132,10 +132,10 @@ def from_hub(folder: Path, episodes: int, length: int, rounds: int) -> dict[str,
             publish_dataset(Publication(HUB_REPO, contents, "a benchmark"), RetryPolicy())
         rows = []
         for _ in range(rounds + 1):
-            disk = epoch(DatasetReader.open(DatasetConfig(root=str(root))), config, shuffle)
+            disk = epoch_rate(DatasetReader.open(DatasetConfig(root=str(root))), config, shuffle)
             with tempfile.TemporaryDirectory() as home, in_this_process(endpoint, Path(home)):
                 reader = DatasetReader.on_demand(DatasetConfig(repo_id=HUB_REPO))
-                rows.append((disk, epoch(reader, config, shuffle)))
+                rows.append((disk, epoch_rate(reader, config, shuffle)))
     return {
         "disk_epoch_windows_per_s": statistics.median(disk for disk, _ in rows[1:]),
         "hub_epoch_windows_per_s": statistics.median(hub for _, hub in rows[1:]),
@@ -155,7 +155,7 @@ def serving(folder: Path) -> Iterator[str]:
             hub.terminate()
 
 
-def epoch(reader: DatasetReader, config: SamplerConfig, shuffle: ShuffleConfig) -> float:
+def epoch_rate(reader: DatasetReader, config: SamplerConfig, shuffle: ShuffleConfig) -> float:
     """Windows per second of wall clock of an epoch."""
     index = EpisodeIndex.of([reader])
     stream = StreamingSampler(index, config, shuffle=shuffle, checked=not reader.is_remote)
@@ -169,12 +169,17 @@ def epoch(reader: DatasetReader, config: SamplerConfig, shuffle: ShuffleConfig) 
 def main() -> None:
     """Measure and print."""
     options = parser(__doc__)
-    options.add_argument("--root", type=Path, help="dataset to read; none: one is made")
-    options.add_argument("--episodes", type=int, default=100, help="of the dataset that is made")
+    options.add_argument("--root", type=Path, help="dataset to read instead of a synthetic one")
+    options.add_argument("--episodes", type=int, default=100, help="of the synthetic dataset")
     options.add_argument("--length", type=int, default=32, help="rows of a window")
     options.add_argument("--window", type=int, default=128, help="episodes in memory")
     options.add_argument("--reuse", type=float, default=1.0, help="uses of each row while there")
-    options.add_argument("--hub_episodes", type=int, default=400, help="streamed; 0: none")
+    options.add_argument(
+        "--hub_episodes",
+        type=int,
+        default=400,
+        help="episodes streamed from the fake Hub; 0 skips this case",
+    )
     args = options.parse_args()
     torch.set_num_threads(1)
     figures: dict[str, object] = {}
@@ -184,7 +189,9 @@ def main() -> None:
         if args.root is None:
             write(root, [make_episode(i, 150) for i in range(args.episodes)])
         if args.hub_episodes:  # first: measured by wall clock, without other files in memory
-            figures |= from_hub(home / "remote", args.hub_episodes, args.length, args.rounds)
+            figures |= measure_hub_epoch(
+                home / "remote", args.hub_episodes, args.length, args.rounds
+            )
         index = EpisodeIndex.of([open_dataset(root)], "train")
         shuffle = ShuffleConfig(args.window, args.reuse)
         figures |= compare(index, args.length, args.rounds, shuffle)

@@ -34,8 +34,16 @@ _EPILOG: Final = (
     "same. With one run, compare two of its controllers: --other_controller=hold."
 )
 _HEAD: Final = (
-    *("task", "episodes", "success", "other", "points", "95 %"),
-    *("reward/step", "other", "difference", "95 %"),
+    "task",
+    "episodes",
+    "success",
+    "other",
+    "difference, pp",
+    "95 %",
+    "reward/step",
+    "other",
+    "difference",
+    "95 %",
 )
 
 
@@ -73,7 +81,10 @@ class Evaluation:
         """Episodes of ``controller``; raises `UsageError` if it did not play."""
         row = self.episodes[task]
         if controller not in row:
-            raise UsageError(f"{self.folder} has no {controller}{suggest(controller, row)}")
+            raise UsageError(
+                f"{self.folder} has no episodes of controller {controller}"
+                f"{suggest(controller, row)}"
+            )
         return row[controller]
 
 
@@ -98,17 +109,21 @@ def compare(config: CompareConfig) -> None:
     if not tasks:
         found = f"{', '.join(run.episodes)} and {', '.join(other.episodes)}"
         raise UsageError(f"{run.folder} and {other.folder} have no task in common: {found}")
-    theirs = config.other_controller or config.controller
+    other_controller = config.other_controller or config.controller
     lines = [
-        _line(task, run.played_by(task, config.controller), other.played_by(task, theirs))
+        _line(
+            task,
+            run.played_by(task, config.controller),
+            other.played_by(task, other_controller),
+        )
         for task in tasks
     ]
-    echo(f"{config.controller} of {run.folder} beside {theirs} of {other.folder}")
+    echo(f"{config.controller} of {run.folder} compared with {other_controller} of {other.folder}")
     for each in dict.fromkeys(e.folder for e in (run, other) if not e.complete):
         echo(f"{each} is incomplete: egovcp-eval was interrupted")
-    for name, ours, others in _differences(run.config, other.config):
+    for name, run_value, other_value in _differences(run.config, other.config):
         if name not in _IRRELEVANT:
-            echo(f"--{name}={ours}, of the other {others}")
+            echo(f"--{name}: {run_value} (RUN), {other_value} (OTHER)")
     echo(aligned([_HEAD, *lines], text_columns=1))
 
 
@@ -139,9 +154,9 @@ def _score(entry: Mapping[str, Any]) -> EpisodeScore:
 
 
 def _line(
-    task: str, scores: Sequence[EpisodeScore], others: Sequence[EpisodeScore]
+    task: str, scores: Sequence[EpisodeScore], other_scores: Sequence[EpisodeScore]
 ) -> tuple[str, ...]:
-    a, b = paired(scores, others)
+    a, b = paired(scores, other_scores)
     if not a:
         raise UsageError(f"no scenario of {task} was played by both")
     low, high = success_gain(a, b)
@@ -161,15 +176,15 @@ def _line(
 
 
 def _differences(
-    ours: Mapping[str, Any], others: Mapping[str, Any], above: str = ""
+    run: Mapping[str, Any], other: Mapping[str, Any], prefix: str = ""
 ) -> Iterator[tuple[str, Any, Any]]:
     """(dotted name, value, the other's value) wherever two configurations differ."""
-    for key in [*ours, *(key for key in others if key not in ours)]:
-        a, b = ours.get(key), others.get(key)
-        if isinstance(a, Mapping) and isinstance(b, Mapping):
-            yield from _differences(a, b, f"{above}{key}.")
-        elif a != b:
-            yield f"{above}{key}", a, b
+    for key in [*run, *(key for key in other if key not in run)]:
+        run_value, other_value = run.get(key), other.get(key)
+        if isinstance(run_value, Mapping) and isinstance(other_value, Mapping):
+            yield from _differences(run_value, other_value, f"{prefix}{key}.")
+        elif run_value != other_value:
+            yield f"{prefix}{key}", run_value, other_value
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""`egovcp-deploy --dry_run=true`: checks everything a run needs, one line of go or no-go each.
+"""`egovcp-deploy --dry_run=true`: checks everything a run needs, and prints go or no-go for each.
 
-Each check returns its finding, or raises `EnvironmentFailure` if no run is possible. Limits that
-are not those of the runner are unverified on hardware.
+Each check returns its finding, or raises `EnvironmentFailure` if no run is possible. Limits defined
+in this file have not been verified on hardware.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from egovcp.robot.stance_table import standing_pose
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp.terminal import echo
 from egovcp_deploy.config import DeployConfig
-from egovcp_deploy.live.hardware import open_eye
+from egovcp_deploy.live.hardware import open_camera
 from egovcp_deploy.pilot.motor_watch import MotorWatch, hottest
 from egovcp_deploy.pilot.planner import BUDGET_S
 from egovcp_deploy.pilot.states import Limits
@@ -54,7 +54,7 @@ LISTEN_S: Final = 5.0
 MAX_LOST: Final = 0.05  # share of the messages
 STATE_HZ: Final = 100.0
 IMAGE_HZ: Final = 15.0
-MAX_OFFSET: Final = 1.5  # rad from neutral: 3 s at half a radian per second
+MAX_OFFSET: Final = 1.5  # rad from neutral; the stand-up motion takes 3 s at 0.5 rad/s
 RANGE_MARGIN: Final = 0.1  # rad beyond the joint range; more is a wrong zero
 MAX_TILT: Final = 0.35  # rad between pelvis and vertical; the runner damps at 1.0
 POSTURE_TOLERANCE: Final = 0.15  # rad between the IMU and a pelvis above flat feet
@@ -105,7 +105,7 @@ def check_disk(folder: Path) -> str:
     if free < FREE_BYTES:
         raise EnvironmentFailure(
             f"{free / 1e9:.1f} GB free at {existing}, expected {FREE_BYTES / 1e9:.0f} GB; "
-            "make room, or choose another --output_dir"
+            "free disk space, or choose another --output_dir"
         )
     trial = existing / f".egovcp-dry-run-{os.getpid()}"
     begin = time.perf_counter()
@@ -143,8 +143,8 @@ def check_plan_time(policy: RolloutPolicy) -> str:
     backend = backend_of(policy)
     if p99 > PLAN_BUDGET_MS:
         raise EnvironmentFailure(
-            f"a plan of one iteration takes {p50:.0f} ms (p99 {p99:.0f}), computed by {backend}, "
-            f"expected at most {PLAN_BUDGET_MS:.0f} at 25 Hz; end other programs, or use fewer "
+            f"planning takes {p50:.0f} ms (p99 {p99:.0f}) on the backend {backend}, expected at "
+            f"most {PLAN_BUDGET_MS:.0f} at 25 Hz; close other programs, or use fewer "
             "--planner.samples"
         )
     mean = np.mean(iterations[_WARM_UP:])
@@ -157,7 +157,7 @@ class Measurements:
     """Messages received within `LISTEN_S`."""
 
     reading: LowState | None = None  # the newest
-    refusal: str = ""  # why the motors forbid arming
+    refusal: str = ""  # reason why arming is refused
     motor_events: list[str] = field(default_factory=list)
     image_ages_ms: list[float] = field(default_factory=list)  # at their arrival
 
@@ -165,79 +165,79 @@ class Measurements:
 def check_hardware(config: DeployConfig, artifact: Artifact | None) -> Iterator[CheckResult]:
     """Controller, robot and camera."""
 
-    def controller() -> str:
+    def check_controller() -> str:
         found = make_controller(config.robot.controller).id
         if artifact is not None:
             artifact.require_controller(found)
         return found
 
-    yield check("controller", controller)
+    yield check("controller", check_controller)
     limits = config.robot.limits
     with ExitStack() as stack:
-        body: BridgeRobot | None = None
-        eye: AnyCamera | None = None
+        robot: BridgeRobot | None = None
+        camera: AnyCamera | None = None
 
-        def robot() -> str:
-            nonlocal body
+        def check_robot() -> str:
+            nonlocal robot
             connecting = BridgeRobot(config.robot.bridge)
             connecting.connect()
-            body = connecting
-            stack.callback(body.close)
-            return f"answers at {body.config.host}"
+            robot = connecting
+            stack.callback(robot.close)
+            return f"answers at {robot.config.host}"
 
-        def camera() -> str:
-            nonlocal eye
-            eye = open_eye(config.robot.camera)
-            stack.callback(eye.close)
+        def check_camera() -> str:
+            nonlocal camera
+            camera = open_camera(config.robot.camera)
+            stack.callback(camera.close)
             return "answers"
 
-        yield check("robot", robot)
-        yield check("camera", camera)
-        measured = measure(body, eye, LISTEN_S)
+        yield check("robot", check_robot)
+        yield check("camera", check_camera)
+        measured = measure(robot, camera, LISTEN_S)
         now = time.monotonic_ns()
-        if body is not None and measured.reading is not None:
-            states = body.arrivals.stats(now, LISTEN_S)
-            yield from _check_robot(body, measured.reading, measured, states, limits)
-        if eye is not None:
-            images, gap_ms = eye.arrivals.stats(now, LISTEN_S), limits.image_hold_s * 1e3
-            yield check("images", lambda: arrivals(images, IMAGE_HZ, gap_ms, "images"))
+        if robot is not None:
+            yield from _robot_results(robot, measured, robot.arrivals.stats(now, LISTEN_S), limits)
+        if camera is not None:
+            images, gap_ms = camera.arrivals.stats(now, LISTEN_S), limits.image_hold_s * 1e3
+            yield check("images", lambda: check_message_rate(images, IMAGE_HZ, gap_ms))
             max_ms = config.env.delay.image_age[1] * 1e3
             yield check("image age", lambda: image_age(measured.image_ages_ms, max_ms))
 
 
-def _check_robot(
-    body: BridgeRobot,
-    reading: LowState,
-    measured: Measurements,
-    states: ArrivalStats,
-    limits: Limits,
+def _robot_results(
+    robot: BridgeRobot, measured: Measurements, states: ArrivalStats, limits: Limits
 ) -> Iterator[CheckResult]:
-    def publishers() -> str:
-        if body.refusal:
-            raise EnvironmentFailure(body.refusal)
-        return "none noticed"
+    """Checks of the robot's messages; none if no state was received."""
+    reading = measured.reading
+    if reading is None:
+        return
+
+    def check_publishers() -> str:
+        if robot.refusal:
+            raise EnvironmentFailure(robot.refusal)
+        return "none detected"
 
     yield CheckResult("mode", describe_variant(reading.mode))
     yield check("joints", lambda: joint_offsets(reading.joint_position))
     yield check("posture", lambda: posture(reading.joint_position, reading.quaternion_w))
-    yield check("motors", lambda: motors(reading, measured))
+    yield check("motors", lambda: motors(measured))
     gap_ms = limits.state_hold_s * 1e3
-    yield check("states", lambda: arrivals(states, STATE_HZ, gap_ms, "states"))
-    yield check("other publishers", publishers)
+    yield check("states", lambda: check_message_rate(states, STATE_HZ, gap_ms))
+    yield check("other publishers", check_publishers)
 
 
-def measure(body: BridgeRobot | None, eye: AnyCamera | None, seconds: float) -> Measurements:
+def measure(robot: BridgeRobot | None, camera: AnyCamera | None, seconds: float) -> Measurements:
     """Receive from both for ``seconds``; None: not connected."""
     measured, watch = Measurements(), MotorWatch()
     newest: DepthImage | None = None
     end = time.monotonic() + seconds
-    while time.monotonic() < end and (body is not None or eye is not None):
-        if body is not None and (reading := body.read()) is not None:
+    while time.monotonic() < end and (robot is not None or camera is not None):
+        if robot is not None and (reading := robot.read()) is not None:
             measured.reading = reading
             verdict = watch.update(reading, None, standing=False)
-            measured.refusal = verdict.refusal
+            measured.refusal = verdict.arming_refusal
             measured.motor_events += verdict.events
-        if eye is not None and (image := eye.read()) is not newest and image is not None:
+        if camera is not None and (image := camera.read()) is not newest and image is not None:
             newest = image
             if image.captured_ns is not None:
                 age_ms = (time.monotonic_ns() - image.captured_ns) / 1e6
@@ -274,8 +274,8 @@ def joint_offsets(position: Array) -> str:
 
 
 def posture(position: Array, quaternion_w: Array) -> str:
-    """The tilt of the pelvis according to the IMU, compared with a pelvis above flat feet. Feet
-    that hang in the air need not agree with the IMU, so that only a large tilt is a no-go.
+    """The tilt of the pelvis according to the IMU, compared with a pelvis above flat feet. The
+    comparison is invalid while the feet are off the ground, so only a large tilt fails the check.
 
     Args:
         position: (29,) rad.
@@ -305,19 +305,20 @@ def posture(position: Array, quaternion_w: Array) -> str:
     )
 
 
-def motors(reading: LowState, measured: Measurements) -> str:
+def motors(measured: Measurements) -> str:
     """The hottest motor, and the checks that are off."""
     if measured.refusal:
         raise EnvironmentFailure(measured.refusal)
-    joint = "" if reading.motors is None else hottest(reading.motors)
+    readings = None if measured.reading is None else measured.reading.motors
+    joint = "" if readings is None else hottest(readings)
     finding = f"the hottest is {joint}" if joint else "no temperatures are reported"
     return "; ".join([finding, *measured.motor_events])
 
 
-def arrivals(stats: ArrivalStats, min_hz: float, max_gap_ms: float, what: str) -> str:
+def check_message_rate(stats: ArrivalStats, min_hz: float, max_gap_ms: float) -> str:
     """Rate, jitter, gaps and loss of messages."""
     finding = (
-        f"{stats.rate_hz:.0f} {what} per second, jitter {stats.jitter_ms:.1f} ms (p99), longest "
+        f"{stats.rate_hz:.0f} per second, jitter {stats.jitter_ms:.1f} ms (p99), longest "
         f"gap {stats.gap_ms:.0f} ms, {stats.lost:.1%} lost"
     )
     expected = ""

@@ -39,6 +39,7 @@ from egovcp_deploy.options import (
     PLANNER,
     check_choice,
     check_output_dir,
+    check_seed,
     encoded,
     held_out,
     make_output_dir,
@@ -56,7 +57,8 @@ _EPILOG: Final = (
     "below it. 'constant' is the best fixed action of a grid, found on other scenarios. plan_ms is "
     "the time per robot when num_envs robots are planned together; --num_envs=1 --num_workers=1 "
     "gives the latency of one. Writes eval.json (figures), eval_run.json (config and every "
-    "episode) and constant.json. Ctrl-C writes the complete episodes, marked as incomplete."
+    "episode) and constant.json. Ctrl-C saves the finished episodes; the result files are marked "
+    "incomplete."
 )
 
 type Scores = dict[str, dict[str, list[EpisodeScore]]]
@@ -115,7 +117,7 @@ class EvalConfig:
         return TASKS if self.task == "all" else (self.task,)
 
     @property
-    def players(self) -> tuple[str, ...]:
+    def controller_names(self) -> tuple[str, ...]:
         """The controllers to play, each once."""
         names = self.controllers.strip("[]").replace(" ", "").split(",")
         return tuple(dict.fromkeys(names))
@@ -123,15 +125,15 @@ class EvalConfig:
     def check(self) -> None:
         """Raise `UsageError` for values that make no sense."""
         check_choice("--task", self.task, (*EPISODE_TASKS, "all"))
-        for name in self.players:
+        for name in self.controller_names:
             check_choice("--controllers", name, (*CONTROLLERS, PPO))
         workers = self.num_workers or available_cores()
         robots = min(self.num_envs * workers, self.episodes * len(self.tasks))
         require_memory_for_robots("--num_envs", self.num_envs, robots)
-        held_out(self.tasks[0], self.seed, 0)
-        if PLANNER in self.players:
+        check_seed(self.seed)
+        if PLANNER in self.controller_names:
             self.policy.require("leave planner out of --controllers")
-        if PPO in self.players and not self.ppo.path:
+        if PPO in self.controller_names and not self.ppo.path:
             raise UsageError(
                 "--ppo.path is missing; name the file of egovcp-train-ppo, or leave ppo out of "
                 "--controllers"
@@ -146,7 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def evaluate(config: EvalConfig) -> None:
     """Check everything, play, print the table and write the files, also after an error or a signal:
-    the complete episodes are kept, marked as incomplete if some are missing.
+    the finished episodes are saved; the result files are marked incomplete if some are missing.
 
     Raises:
         UsageError, DataError, ArtifactError: an option, file or policy cannot be used.
@@ -158,18 +160,18 @@ def evaluate(config: EvalConfig) -> None:
     controller_id = make_controller(config.env.controller).id
     constants = load_constants(Path(config.constant.path)) if config.constant.path else {}
     artifact, ppo, backend = None, None, ""
-    if PLANNER in config.players:
+    if PLANNER in config.controller_names:
         artifact = load_policy(config.policy, config.planner)
         artifact.require_controller(controller_id)
         policy = artifact.make_policy(1, config.seed)
         policy.prepare()  # compile once, before workers need it
         backend = backend_of(policy)
-    if PPO in config.players:
+    if PPO in config.controller_names:
         ppo = ReactiveNetwork.load(Path(config.ppo.path))
         ppo.require_controller(controller_id)
     folder = make_output_dir(config.output_dir)
     setup = EpisodeSetup(config.env, config.policy, config.planner, config.seed, config.ppo.path)
-    scores: Scores = {task: {name: [] for name in config.players} for task in config.tasks}
+    scores: Scores = {task: {name: [] for name in config.controller_names} for task in config.tasks}
     try:
         with (
             stop_on_signal() as received,
@@ -177,11 +179,11 @@ def evaluate(config: EvalConfig) -> None:
                 EpisodePool(setup, config.num_workers, artifact, lambda: bool(received))
             ) as pool,
         ):
-            if CONSTANT in config.players:
+            if CONSTANT in config.controller_names:
                 constants = _find_constants(config, pool, constants)
                 found = {task: asdict(best) for task, best in constants.items()}
                 write_json(folder / "constant.json", found)
-            _play(config, pool, constants, scores)
+            _run_episodes(config, pool, constants, scores)
             if received:
                 raise KeyboardInterrupt
     finally:
@@ -196,7 +198,9 @@ def evaluate(config: EvalConfig) -> None:
                 "versions": versions(),
                 "constants": {task: asdict(best) for task, best in constants.items()},
                 "episodes": {
-                    task: {name: [_brief(score) for score in each] for name, each in row.items()}
+                    task: {
+                        name: [_score_json(score) for score in each] for name, each in row.items()
+                    }
                     for task, row in played.items()
                 },
             }
@@ -221,7 +225,7 @@ def _missing(config: EvalConfig, scores: Scores) -> list[str]:
     counts = {
         f"{task} {name}": len(scores.get(task, {}).get(name, ()))
         for task in config.tasks
-        for name in config.players
+        for name in config.controller_names
     }
     if all(count == config.episodes for count in counts.values()):
         return []
@@ -272,7 +276,7 @@ def _find_constants(
     return found
 
 
-def _play(
+def _run_episodes(
     config: EvalConfig, pool: EpisodePool, constants: dict[str, BestConstant], scores: Scores
 ) -> None:
     """Play every controller on every task, and add the scores to ``scores``."""
@@ -283,7 +287,7 @@ def _play(
             group = groups[i]
             scores[group.scenarios[0].task][group.controller] += part
             rates = []
-            for name in config.players:
+            for name in config.controller_names:
                 if played := [score for row in scores.values() for score in row[name]]:
                     rates.append(f"{name} {success_rate(played):.0%}")
             bar.set_postfix_str(", ".join(rates), refresh=False)
@@ -292,7 +296,7 @@ def _play(
 
 def _groups(config: EvalConfig, constants: dict[str, BestConstant]) -> Iterator[EpisodeGroup]:
     """The planner's groups first, since they take longest."""
-    for name in sorted(config.players, key=lambda name: name != PLANNER):
+    for name in sorted(config.controller_names, key=lambda name: name != PLANNER):
         for task in config.tasks:
             scenarios = [held_out(task, config.seed, i) for i in range(config.episodes)]
             for part in batched(scenarios, config.num_envs):
@@ -300,7 +304,7 @@ def _groups(config: EvalConfig, constants: dict[str, BestConstant]) -> Iterator[
                 yield EpisodeGroup(name, part, action)
 
 
-def _brief(score: EpisodeScore) -> dict[str, Any]:
+def _score_json(score: EpisodeScore) -> dict[str, Any]:
     omitted = {"plan_ms"} if score.parts else {"plan_ms", "parts"}
     return {name: value for name, value in asdict(score).items() if name not in omitted}
 

@@ -29,15 +29,16 @@ SEARCH: Final = 2_000_000_000
 def held_out(task: str, seed: int, episode: int) -> Scenario:
     """Scenario ``episode`` of evaluation and deployment for the user's ``seed``; raises
     `UsageError` if the seed is negative or leaves the range of held-out scenarios."""
-    return Scenario(task, HELD_OUT + _checked(seed), episode)
+    return Scenario(task, HELD_OUT + check_seed(seed), episode)
 
 
 def for_search(task: str, seed: int, episode: int) -> Scenario:
     """Scenario ``episode`` of the search for the best constant action; raises as `held_out`."""
-    return Scenario(task, SEARCH + _checked(seed), episode)
+    return Scenario(task, SEARCH + check_seed(seed), episode)
 
 
-def _checked(seed: int) -> int:
+def check_seed(seed: int) -> int:
+    """Return ``seed``; raises `UsageError` outside the range of held-out scenarios."""
     if not 0 <= seed < SEARCH - HELD_OUT:
         raise UsageError(f"--seed={seed}: expected a number from 0 to {SEARCH - HELD_OUT - 1}")
     return seed

@@ -4,7 +4,7 @@ Unlike `VectorEnv` it has no low-level controller: the caller sends motor comman
 robot. Time passes only in `LiveRobot.advance`.
 
     HELD  ->  FREE  ->  EPISODE  ->  OVER
-    crane     stands    task runs    fallen, or at the time limit; physics goes on
+    gantry    stands    task runs    fallen, or at the time limit; physics goes on
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class Phase(Enum):
     """Phase of an episode."""
 
     HELD = "held"
-    """A crane holds the pelvis where the robot would stand."""
+    """A gantry holds the pelvis where the robot would stand."""
     FREE = "free"
     """The robot is on its own feet; the task has not begun."""
     EPISODE = "episode"
@@ -151,7 +151,7 @@ class LiveRobot:
         return self.instance.task.velocity_command if self.phase is Phase.EPISODE else np.zeros(3)
 
     def release(self) -> None:
-        """Release the robot from the crane."""
+        """Release the robot from the gantry."""
         if self.phase is Phase.HELD:
             self.phase = Phase.FREE
 

@@ -35,7 +35,7 @@ def test_pairing_removes_the_variance_between_scenarios(
     other = write(tmp_path / "other", hard[:60].tolist(), planner={"samples": 64})
     assert main([f"--run={run}", f"--other={other}"]) == 0
     out = capsys.readouterr().out
-    assert "--planner=None, of the other {'samples': 64}" in out
+    assert "--planner: None (RUN), {'samples': 64} (OTHER)" in out
     assert "output_dir" not in out
     task, episodes, *_, gain, low, _, high = out.splitlines()[-1].split()
     assert (task, episodes) == ("ball", "60")

@@ -85,7 +85,7 @@ NEUTRAL = dict.fromkeys(spec.ACTION_NAMES, 0.0)
 
 @pytest.fixture
 def fake(tmp_path: Path) -> Iterator[EgovcpG1Config]:
-    """A fake robot that stays on its crane, and how to reach it."""
+    """A fake robot that stays on its gantry, and how to reach it."""
     command = [sys.executable, "-m", "egovcp_deploy.robots.fake.command", "--gantry=null"]
     ports = [f"--ports.{name}_port=0" for name in ("command", "state", "camera")]
     process = subprocess.Popen(

@@ -185,7 +185,7 @@ class ControlLoop:
         self.pilot.add_events(verdict.events)
         facts = Facts(
             now_ns,
-            refusal=self._refusal() or verdict.refusal,
+            refusal=self._refusal() or verdict.arming_refusal,
             hold=verdict.hold,
             damp=self._fault() or verdict.damp,
             skipped=self._skipped(),

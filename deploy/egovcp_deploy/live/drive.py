@@ -31,7 +31,7 @@ from egovcp_deploy.pilot.planner import PlannerRunner
 from egovcp_deploy.policy import backend_of
 from egovcp_deploy.recording import missing_ticks, provenance, recording, run_info
 
-SIMULATED_S: Final = 15.0  # in RUN: release from the crane, settling, the episode
+SIMULATED_S: Final = 15.0  # in RUN: release from the gantry, settling, the episode
 
 
 def drive(config: DeployConfig, artifact: Artifact) -> None:

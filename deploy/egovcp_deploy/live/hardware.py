@@ -76,13 +76,13 @@ def open_hardware(options: HardwareOptions) -> Hardware:
     body = BridgeRobot(options.bridge)
     body.connect()
     try:
-        return Hardware(body, open_eye(options.camera))
+        return Hardware(body, open_camera(options.camera))
     except BaseException:
         body.close()
         raise
 
 
-def open_eye(options: CameraOptions) -> ZmqDepthCamera | RealSenseDepthCamera:
+def open_camera(options: CameraOptions) -> ZmqDepthCamera | RealSenseDepthCamera:
     """Connect to the camera; raises `EnvironmentFailure` if it does not answer."""
     if options.type == "realsense":
         return RealSenseDepthCamera.connect(options.realsense)

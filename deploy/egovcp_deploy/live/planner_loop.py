@@ -69,7 +69,7 @@ class PlannerLoop:
         clock: monotonic, the one that stamps the observations.
         control_alive: whether the control process runs.
         stays: whether a robot held after Ctrl-C stands until the second Ctrl-C, as a real one must
-            that is not on its crane yet.
+            that is not on its gantry yet.
         stands: whether a robot whose planner has failed stands until the operator ends the run;
             else the run ends once the hands are in the neutral pose.
         warn: prints an urgent message to the operator.

@@ -30,32 +30,34 @@ class HeatLimits(NamedTuple):
     hold: float
 
 
-#: `hold`: unitree_sdk2, g1/common/terminations.hpp, motor_casing_overheat. The others: 10 K each.
+#: `hold`: unitree_sdk2, g1/common/terminations.hpp, motor_casing_overheat.
+#: `refuse` and `warn` are 10 and 20 K below `hold`.
 CASING: Final = HeatLimits(65.0, 75.0, 85.0)
 #: `hold`: the same file, motor_winding_overheat. `warn`: HIGH_TEMP_ENTER of the deployment of
 #: GR00T-WholeBodyControl. `refuse`: halfway.
 WINDING: Final = HeatLimits(90.0, 105.0, 120.0)
-#: Mean of casing and winding, as LeRobot's bridge sends it: the winding's limits with a casing of
-#: 40 deg C, the coldest that it stays beside a hot winding.
+#: Limits on the mean temperature of casing and winding, as LeRobot's bridge sends it:
+#: (winding limit + 40) / 2, rounded down, where 40 deg C is the lowest casing temperature expected
+#: next to a hot winding.
 SINGLE: Final = HeatLimits(65.0, 72.0, 80.0)
 
 #: Status bits (`wire.MOTOR_STATUS_BITS`) that forbid standing under load.
 OVERLOAD_BITS: Final = 0x1 | 0x2 | 0x4 | 0x8 | 0x10 | 0x20 | 0x80 | 0x200
-#: Status bits of a motor that does not know its position or is not connected.
+#: Status bits of a motor that has no position reading or is not connected.
 DROPPED_BITS: Final = 0x400 | 0x800 | 0x1000 | 0x4000 | 0x40000000 | 0x80000000
 
 HEAT_PERSISTS_S: Final = 0.5  # motors warm up slowly: a shorter excess is a bad reading
 STATUS_PERSISTS_S: Final = 0.06  # three readings at 50 Hz
 NO_TORQUE_PERSISTS_S: Final = 0.14
 _MAX_ELAPSED_S: Final = 0.04  # counted for one reading, also after a gap in the readings
-_HYSTERESIS_K: Final = 5.0  # below a limit before its warning is given again
+_HYSTERESIS_K: Final = 5.0  # below the warning limit at which the warning is re-enabled
 _REMINDER_S: Final = 10.0  # between two requests to let the robot down
 _MAX_LOST_PER_S: Final = 50.0  # packets per second of one motor, of about 500
 #: N m; a larger command exceeds friction and the noise of the torque estimate. A torque below
 #: `_TORQUE_SHARE` of the command is near zero.
 LARGE_TORQUE: Final = np.maximum(1.0, 0.1 * EFFORT_LIMIT)
 _TORQUE_SHARE: Final = 0.15
-_LET_DOWN: Final = "let the robot down onto its crane, damp it (L1 + B) and let it cool"
+_LET_DOWN: Final = "let the robot down onto its gantry, damp it (L1 + B) and let it cool"
 #: Optional field -> description.
 _FIELDS: Final = {
     "temperature": "motor temperatures",
@@ -63,14 +65,14 @@ _FIELDS: Final = {
     "lost": "packets lost by motors",
     "enabled": "motor modes",
 }
-_NEVER: Final = -1.0
+_INACTIVE: Final = -1.0
 
 
 @dataclass(frozen=True)
 class MotorVerdict:
     """What the readings of the motors require; an empty reason requires nothing."""
 
-    refusal: str = ""  # why the robot must not be armed
+    arming_refusal: str = ""  # why the robot must not be armed
     hold: str = ""  # why it must be held
     damp: str = ""  # why its motors must be damped
     events: tuple[str, ...] = ()  # new log lines
@@ -83,9 +85,9 @@ class MotorWatch:
         self._time_ns: int | None = None
         self._reported: set[str] | None = None  # optional fields of the last reading
         self._last_command: MotorCommand | None = None
-        self._hot = _Persistence()
-        self._without_torque = _Persistence()
-        self._dropped = _Persistence()
+        self._hot = _Debounce()
+        self._without_torque = _Debounce()
+        self._dropped = _Debounce()
         self._was_enabled: NDArray[np.bool_] = np.zeros(NUM_JOINTS, np.bool_)
         self._torque_seen = False
         self._torque_commanded_s = 0.0
@@ -109,7 +111,7 @@ class MotorWatch:
         """
         motors = reading.motors
         if motors is None or reading.time_ns == self._time_ns:
-            return MotorVerdict(self._last.refusal, self._last.hold, self._last.damp)
+            return MotorVerdict(self._last.arming_refusal, self._last.hold, self._last.damp)
         elapsed = 0.0 if self._time_ns is None else (reading.time_ns - self._time_ns) / NS_PER_S
         elapsed = min(elapsed, _MAX_ELAPSED_S)
         self._time_ns = reading.time_ns
@@ -151,12 +153,12 @@ class MotorWatch:
             disabled = self._was_enabled & ~motors.enabled
             self._was_enabled = np.asarray(self._was_enabled | motors.enabled)
         dropped = disabled | (faults & DROPPED_BITS > 0)
-        joint = self._dropped.longest(dropped, elapsed, STATUS_PERSISTS_S)
+        joint = self._dropped.update(dropped, elapsed, STATUS_PERSISTS_S)
         if joint is None:
             return ""
         bits = int(faults[joint])
-        what = f"it reports {fault_text(bits)}" if bits else "its mode says that it is off"
-        return f"the motor of {JOINT_NAMES[joint]} does not obey: {what}"
+        what = f"it reports {fault_text(bits)}" if bits else "its mode is off"
+        return f"the motor of {JOINT_NAMES[joint]} does not follow commands: {what}"
 
     def _torque_fault(
         self, reading: LowState, motors: MotorReadings, command: MotorCommand, elapsed: float
@@ -167,21 +169,25 @@ class MotorWatch:
         the command before; the torque that both require is taken.
         """
         previous, self._last_command = self._last_command or command, command
-        now, then = _commanded_torque(command, reading), _commanded_torque(previous, reading)
-        wanted = np.where(now * then > 0, np.minimum(np.abs(now), np.abs(then)), 0.0)
-        large = wanted > LARGE_TORQUE
+        torque = _commanded_torque(command, reading)
+        previous_torque = _commanded_torque(previous, reading)
+        smaller = np.minimum(np.abs(torque), np.abs(previous_torque))
+        expected_torque = np.where(torque * previous_torque > 0, smaller, 0.0)
+        large = expected_torque > LARGE_TORQUE
         self._check_torque_estimates(motors, bool(large.any()), elapsed)
-        silent = (np.abs(motors.torque) < _TORQUE_SHARE * wanted) & large & self._torque_seen
-        joint = self._without_torque.longest(silent, elapsed, NO_TORQUE_PERSISTS_S)
+        without_torque = np.abs(motors.torque) < _TORQUE_SHARE * expected_torque
+        without_torque &= large & self._torque_seen
+        joint = self._without_torque.update(without_torque, elapsed, NO_TORQUE_PERSISTS_S)
         if joint is None:
             return ""
         return (
             f"the motor of {JOINT_NAMES[joint]} does not follow its target: torque "
-            f"{motors.torque[joint]:.1f} N m, {wanted[joint]:.0f} N m commanded"
+            f"{motors.torque[joint]:.1f} N m, {expected_torque[joint]:.0f} N m commanded"
         )
 
     def _check_torque_estimates(self, motors: MotorReadings, large: bool, elapsed: float) -> None:
-        """A bridge that always sends zeros estimates no torque; that is not 29 dead motors."""
+        """Log once that the check of torques is off: all-zero torque means that the bridge has no
+        estimate, not that all motors failed."""
         if self._torque_seen:
             return
         self._torque_seen = bool(motors.torque.any())
@@ -207,7 +213,7 @@ class MotorWatch:
             lost = "motors were too hot and no longer report temperatures"
             return lost if self._overheated else ""
         warn, refuse, hold = margins(motors.temperature)
-        if self._hot.longest(hold >= 0.0, elapsed, HEAT_PERSISTS_S) is not None:
+        if self._hot.update(hold >= 0.0, elapsed, HEAT_PERSISTS_S) is not None:
             self._overheated = True
         self._overheated &= bool((refuse >= 0.0).any())
         warm = warn >= 0.0
@@ -254,17 +260,18 @@ class MotorWatch:
             )
 
 
-class _Persistence:
+class _Debounce:
     """How long a condition has held for each joint."""
 
     def __init__(self) -> None:
-        self._seconds: Array = np.full(NUM_JOINTS, _NEVER)
+        self._seconds: Array = np.full(NUM_JOINTS, _INACTIVE)
 
-    def longest(self, condition: NDArray[np.bool_], elapsed: float, limit: float) -> int | None:
+    def update(self, condition: NDArray[np.bool_], elapsed: float, limit: float) -> int | None:
         """Add ``elapsed`` s where ``condition`` (29,) holds; returns the joint for which it has
-        held longest, if that is ``limit`` s or more. Its first reading starts the count at 0."""
+        held longest, if that is ``limit`` s or more. The first reading where the condition holds
+        counts as 0 s."""
         longer = np.where(self._seconds >= 0.0, self._seconds + elapsed, 0.0)
-        self._seconds = np.where(condition, longer, _NEVER)
+        self._seconds = np.where(condition, longer, _INACTIVE)
         joint = int(np.argmax(self._seconds))
         return joint if self._seconds[joint] >= limit - 1e-9 else None
 

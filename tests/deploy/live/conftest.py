@@ -47,7 +47,7 @@ QUIET = EnvConfig(
 
 @pytest.fixture(scope="module")
 def robot() -> LiveRobot:
-    """On the crane, before an empty scene."""
+    """On the gantry, before an empty scene."""
     return LiveRobot(QUIET)
 
 
@@ -200,7 +200,7 @@ class Rig:
             self.clock.advance(TICK_NS)
 
     def stand(self) -> None:
-        """From the crane to ARMED, on its own feet."""
+        """From the gantry to ARMED, on its own feet."""
         self.run(0.1)
         self.run(3.1, OperatorRequest.STAND)
         self.robot.release()
@@ -209,7 +209,7 @@ class Rig:
         assert self.loop.state is State.ARMED
 
     def go(self) -> None:
-        """From the crane to RUN."""
+        """From the gantry to RUN."""
         self.stand()
         self.run(0.5, OperatorRequest.RUN)
         assert self.loop.state is State.RUN
@@ -217,7 +217,7 @@ class Rig:
 
 @pytest.fixture
 def make_rig() -> Callable[..., Rig]:
-    """A robot on the crane before an empty scene; ``delay_ms`` by tick is the planner's."""
+    """A robot on the gantry before an empty scene; ``delay_ms`` by tick is the planner's."""
 
     def make(delay_ms: Callable[[int], int] = lambda tick: 10, level: float = 0.5) -> Rig:
         robot = LiveRobot(QUIET)

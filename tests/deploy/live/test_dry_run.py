@@ -15,7 +15,7 @@ from egovcp.sim.live import LiveRobot
 from egovcp.sim.scenario import Scenario
 from egovcp.spec import ACTION_BOX, JOINT_NAMES
 from egovcp_deploy.deploy import main
-from egovcp_deploy.dry_run import arrivals, image_age, joint_offsets, posture
+from egovcp_deploy.dry_run import check_message_rate, image_age, joint_offsets, posture
 from egovcp_deploy.robots.fake import FakeBridge, Ports
 from egovcp_deploy.robots.g1_variants import describe_variant
 from egovcp_deploy.robots.subscriber import ArrivalStats
@@ -82,12 +82,12 @@ def test_a_robot_that_is_not_upright_is_a_no_go() -> None:
 )
 def test_a_bad_connection_is_a_no_go(stats: ArrivalStats, expected: str) -> None:
     with pytest.raises(EnvironmentFailure, match=expected):
-        arrivals(stats, 100.0, 100.0, "states")
+        check_message_rate(stats, 100.0, 100.0)
 
 
 def test_a_good_connection_in_figures() -> None:
-    assert arrivals(ArrivalStats(200.0, 1.2, 20.0, 0.01), 100.0, 100.0, "states") == (
-        "200 states per second, jitter 1.2 ms (p99), longest gap 20 ms, 1.0% lost"
+    assert check_message_rate(ArrivalStats(200.0, 1.2, 20.0, 0.01), 100.0, 100.0) == (
+        "200 per second, jitter 1.2 ms (p99), longest gap 20 ms, 1.0% lost"
     )
 
 

@@ -87,7 +87,7 @@ def test_a_heating_motor_is_warned_of_then_refused_then_held(
     assert at(limits[0]) == MotorVerdict()
     assert len(rig.events) == 1
     assert rig.events[0].startswith("warning: the motor of left_ankle_roll_joint is hot: casing")
-    assert "left_ankle_roll_joint" in at(limits[1]).refusal
+    assert "left_ankle_roll_joint" in at(limits[1]).arming_refusal
     assert not at(limits[2] - 1).hold
     hot = at(limits[2])
     assert "left_ankle_roll_joint is too hot" in hot.hold
@@ -168,7 +168,7 @@ def test_a_motor_whose_status_says_that_it_dropped_out_is_damped(bits: int, word
     motors = replace(HEALTHY, faults=faults)
     assert not rig.run(0.02, motors).damp, "one reading is not believed"
     damp = rig.run(0.1, motors).damp
-    assert "left_knee_joint does not obey" in damp
+    assert "left_knee_joint does not follow commands" in damp
     assert words in damp
 
 
@@ -179,7 +179,7 @@ def test_a_motor_that_is_no_longer_enabled_is_damped() -> None:
     enabled = np.arange(29) < 20
     enabled[KNEE] = False
     damp = rig.run(0.1, replace(HEALTHY, enabled=enabled)).damp
-    assert "left_knee_joint does not obey: its mode says that it is off" in damp
+    assert "left_knee_joint does not follow commands: its mode is off" in damp
 
 
 def test_an_overloaded_motor_is_held_and_a_sensor_fault_forbids_arming_only() -> None:
@@ -192,7 +192,7 @@ def test_an_overloaded_motor_is_held_and_a_sensor_fault_forbids_arming_only() ->
     faults = np.zeros(29, np.int64)
     faults[KNEE] = 0x100
     verdict = rig.run(0.1, replace(HEALTHY, faults=faults))
-    assert "casing temperature sensor" in verdict.refusal
+    assert "casing temperature sensor" in verdict.arming_refusal
     assert (verdict.hold, verdict.damp) == ("", "")
 
 

@@ -75,7 +75,7 @@ def test_write_still_works_after_stop_receiving(robot: BridgeRobot, running: Fak
 def test_read_returns_the_last_reading_without_messages(
     robot: BridgeRobot, running: FakeG1Thread
 ) -> None:
-    running.fake.faults.mute_state = True
+    running.fake.faults.stop_state = True
     time.sleep(0.1)
     last = robot.read()
     time.sleep(0.1)
@@ -335,14 +335,14 @@ def test_a_constant_publisher_is_detected(robot: BridgeRobot, running: FakeG1Thr
 
 
 def test_reported_command_sources_refuse_arming(robot: BridgeRobot, running: FakeG1Thread) -> None:
-    running.fake.faults.announce = True
+    running.fake.faults.report_extra_publisher = True
 
     def noticed() -> bool:
         robot.write(DAMP)
         return "1 other program(s)" in robot.refusal
 
     assert eventually(noticed)
-    running.fake.faults.announce = False
+    running.fake.faults.report_extra_publisher = False
     assert eventually(lambda: not robot.refusal)
 
 

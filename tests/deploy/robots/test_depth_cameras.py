@@ -107,7 +107,7 @@ def test_another_field_of_view_is_refused(running: FakeG1Thread) -> None:
 
 
 def test_connect_reports_a_missing_server(running: FakeG1Thread) -> None:
-    running.fake.faults.mute_camera = True
+    running.fake.faults.stop_camera = True
     with pytest.raises(EnvironmentFailure, match="something listens"):
         ZmqDepthCamera(ZmqCameraConfig(port=running.fake.ports.camera_port)).connect(0.1)
     running.stop()

@@ -95,9 +95,9 @@ def test_bad_options_are_refused(
 def test_late_steps_are_made_up_for_up_to_a_limit() -> None:
     clock = LockstepClock()
     pace = StepPacer(clock)
-    assert [pace.due() for _ in range(3)] == [1, 1, 1]
+    assert [pace.wait_for_steps() for _ in range(3)] == [1, 1, 1]
     clock.advance(12_000_000)  # to 22 ms: those of 15 and 20 ms
-    assert pace.due() == 2
+    assert pace.wait_for_steps() == 2
     clock.advance(10_000_000_000)
-    assert pace.due() == 20
-    assert pace.due() == 1
+    assert pace.wait_for_steps() == 20
+    assert pace.wait_for_steps() == 1

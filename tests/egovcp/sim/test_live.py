@@ -86,7 +86,7 @@ def test_it_is_the_episode_of_the_environment(
     assert sum(live.outcome.reward_terms[name] for name in names) == pytest.approx(total, abs=1e-5)
 
 
-def test_the_controller_takes_it_from_the_crane_and_stands(live: LiveRobot) -> None:
+def test_the_controller_takes_it_from_the_gantry_and_stands(live: LiveRobot) -> None:
     live.start(Scenario("ball", 0, 0))
     assert live.phase is Phase.HELD
     loop = Loop(live)
@@ -101,7 +101,7 @@ def test_the_controller_takes_it_from_the_crane_and_stands(live: LiveRobot) -> N
     assert live.outcome.ticks == 12
 
 
-def test_without_commands_the_crane_holds_it_and_then_it_falls(live: LiveRobot) -> None:
+def test_without_commands_the_gantry_holds_it_and_then_it_falls(live: LiveRobot) -> None:
     live.start(Scenario("wall", 0, 0))
     live.advance(200)
     assert live.robot.pelvis_height > 0.7

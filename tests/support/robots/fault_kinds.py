@@ -136,7 +136,7 @@ def _stream(fault: StreamFault, alteration: Alteration | None = None) -> Begin:
 _R, _H, _D, _ANY = Reaction.RUN, Reaction.HOLD, Reaction.DAMP, Reaction.ANY
 
 _STATES: Final = (
-    FaultKind("state: silent", _D, _fault("mute_state")),
+    FaultKind("state: silent", _D, _fault("stop_state")),
     FaultKind("state: silent for 60 ms", _R, _stateful(lambda: m.for_seconds(0.06, m.nothing))),
     FaultKind("state: silent for 150 ms", _H, _stateful(lambda: m.for_seconds(0.15, m.nothing))),
     FaultKind("state: frozen", _D, _fault("freeze_state")),
@@ -277,7 +277,7 @@ def _image(name: str, reaction: Reaction, begin: Begin) -> FaultKind:
 
 
 _IMAGES: Final = (
-    _image("silent", _H, _fault("mute_camera")),
+    _image("silent", _H, _fault("stop_camera")),
     _image("frozen", _H, _fault("freeze_camera")),
     _image("cut short", _H, _images(lambda message: (message[:-100],))),
     _image("wrong checksum", _H, _images(m.bad_checksum)),

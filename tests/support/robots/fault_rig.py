@@ -157,7 +157,7 @@ class FaultRig:
     def _simulate(self) -> None:
         pacer = StepPacer(MonotonicClock())
         while not self._closing.is_set():
-            for _ in range(pacer.due()):
+            for _ in range(pacer.wait_for_steps()):
                 while self._tasks:
                     task, done = self._tasks.popleft()
                     task()

@@ -234,7 +234,7 @@ class FakeBridge:
 
     def _publish_state(self) -> None:
         faults = self.faults
-        if faults.mute_state:
+        if faults.stop_state:
             return
         if not (faults.freeze_state and self._last_state):
             self._last_state = self._encode_state()
@@ -266,14 +266,14 @@ class FakeBridge:
 
     def _command_sources(self) -> int | None:
         """How many programs send commands."""
-        if not (self._announce or self.faults.announce):
+        if not (self._announce or self.faults.report_extra_publisher):
             return None
         recent = sum(self._time - last < _SOURCE_TIMEOUT_S for last in self._sources.values())
-        return recent + self.faults.announce
+        return recent + self.faults.report_extra_publisher
 
     def _publish_image(self) -> None:
         step, depth = self.robot.depth_image
-        if self.faults.mute_camera or (self._episode, step) == self._image:
+        if self.faults.stop_camera or (self._episode, step) == self._image:
             return
         self._image = (self._episode, step)
         if not self.faults.freeze_camera:

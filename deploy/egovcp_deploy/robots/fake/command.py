@@ -27,7 +27,7 @@ from egovcp_deploy.robots.fake.faults import FAULT_COMMANDS, InjectedFaults
 
 PROG: Final = "egovcp-fake-g1"
 _STEP_NS: Final = round(PHYSICS_DT * NS_PER_S)
-_MAX_STEPS: Final = 20  # made up for after a delay; older ones are skipped
+_MAX_STEPS: Final = 20  # caught up after a delay; the rest are dropped
 _EPILOG: Final = (
     "Motors use LeRobot's JSON over ZMQ, depth the format of egovcp-depth-server. Without a "
     "command for 0.2 s the motors damp, which a real robot does not do. While it runs it reads "
@@ -42,7 +42,8 @@ _EPILOG: Final = (
 class FakeG1Config:
     """A simulated G1 for egovcp-deploy --robot.type=unitree_g1 and for tests.
 
-    Plays held-out scenarios of one task, each from the gantry to its outcome.
+    Plays held-out scenarios of one task; each starts on the gantry and ends with a fall or at the
+    time limit.
     """
 
     task: str = "ball"
@@ -57,9 +58,10 @@ class FakeG1Config:
     """How long the motors must have held a pose without a break before the gantry releases the
     robot, s; 0: at the first command; null: only on the command release."""
     settle: float = bounded(2.0, least=0)
-    """From there to the beginning of the task, s."""
+    """Delay between release and the start of the task, s."""
     pause: float = bounded(2.0, least=0)
-    """From the end of an episode to the next, which begins on the gantry, s; at least 1.5."""
+    """Time between the end of an episode and the next, which starts on the gantry, s; at least
+    1.5."""
     ports: Ports = field(default_factory=Ports)
     """Where to listen."""
     announce: bool = False
@@ -123,7 +125,7 @@ def _serve(config: FakeG1Config, bridge: FakeBridge, episodes: EpisodeSequencer)
     )
     console, pacer, written = Console(), StepPacer(MonotonicClock()), 0
     while not episodes.finished:
-        for _ in range(pacer.due()):
+        for _ in range(pacer.wait_for_steps()):
             episodes.step()
         if not console.process(bridge.faults):
             return
@@ -136,13 +138,13 @@ def _serve(config: FakeG1Config, bridge: FakeBridge, episodes: EpisodeSequencer)
 
 
 class StepPacer:
-    """Counts the steps of 5 ms that are due on a clock."""
+    """Counts the physics steps (`PHYSICS_DT`) that are due on a clock."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock = clock
         self._next_ns = clock.now_ns()
 
-    def due(self) -> int:
+    def wait_for_steps(self) -> int:
         """Sleep until a step is due; returns the number of due steps, at most `_MAX_STEPS`."""
         self._clock.sleep_until(self._next_ns)
         steps = (self._clock.now_ns() - self._next_ns) // _STEP_NS + 1
@@ -162,7 +164,7 @@ class Console:
             self._lines.put(line.strip())
 
     def process(self, faults: InjectedFaults) -> bool:
-        """Execute the commands since the last call; False: the user wants to end."""
+        """Execute the commands since the last call; returns False on `quit`."""
         while not self._lines.empty():
             line = self._lines.get()
             if line == "quit":

@@ -18,24 +18,25 @@ class InjectedFaults:
     """Faults of the fake G1, all off by default. May be changed at any time."""
 
     freeze_state: bool = False
-    """Repeat the last state, as a driver that hangs."""
-    mute_state: bool = False
+    """Repeat the last state, like a hung driver."""
+    stop_state: bool = False
     """Send no states."""
     truncate_state: bool = False
     """Cut every second state in half."""
     freeze_camera: bool = False
     """Repeat the last image."""
-    mute_camera: bool = False
+    stop_camera: bool = False
     """Send no images."""
     drop: float = 0.0
     """Share of states and images that are lost."""
     ignore_commands: bool = False
-    announce: bool = False
+    """Receive commands without executing them."""
+    report_extra_publisher: bool = False
     """Report one more program that sends commands."""
     other_publisher: bool = False
     """Another program holds every joint where it is, without being reported."""
     mode: int | None = None
-    """Report this mode machine."""
+    """Report this value of Unitree's `mode_machine` field."""
     hot_motor: tuple[int, float] | None = None
     """Joint whose motor reports this temperature, deg C (of its winding, if it reports two)."""
     dropped_motor: int | None = None
