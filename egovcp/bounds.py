@@ -21,8 +21,8 @@ from typing import Any, Final
 from egovcp.errors import UsageError
 from egovcp.hardware import available_cores
 
-MOST_PER_CORE: Final = 8
-"""Most threads or processes per processor core."""
+MAX_PER_CORE: Final = 8
+"""Maximum number of threads or processes per processor core."""
 
 _KEY: Final = "bounds"
 _FINITE: Final = "a finite number"
@@ -43,7 +43,7 @@ class Bounds:
     per_core: int | None = None
     """Largest number per processor core of this machine, see `check_cores`."""
 
-    def hold(self, value: float) -> bool:
+    def contains(self, value: float) -> bool:
         """Whether a number is within the bounds."""
         return (
             _is_finite(value)
@@ -80,8 +80,8 @@ def bounded[T](
     longest: int | None = None,
     per_core: int | None = None,
 ) -> T:
-    """A dataclass field with a default and bounds on its value, or on each number in it; None is
-    not checked."""
+    """A dataclass field whose value, or each number in it if it is a collection, must lie within
+    the bounds. None is always valid."""
     metadata = {_KEY: Bounds(least, most, above, below, longest, per_core)}
     if isinstance(default, dict):
         return field(default_factory=partial(copy, default), metadata=metadata)
@@ -99,11 +99,11 @@ class OutOfBounds(UsageError):
 
     def __init__(self, option: str, value: object, expected: str) -> None:
         super().__init__(f"{option}={as_flag_value(value)}: expected {expected}")
-        self._facts = option, value, expected
+        self._args = option, value, expected
 
-    def under(self, prefix: str) -> OutOfBounds:
+    def with_prefix(self, prefix: str) -> OutOfBounds:
         """The same error with a prefix before the name of the option."""
-        option, value, expected = self._facts
+        option, value, expected = self._args
         return OutOfBounds(f"{prefix}{option}", value, expected)
 
 
@@ -126,10 +126,14 @@ def check_bounds(config: Any, prefix: str = "") -> None:
         bounds = bounds_of(option) or _ANY
         if bounds.longest is not None and len(value) > bounds.longest:
             raise OutOfBounds(name, f"a list of {len(value)}", f"at most {bounds.longest} numbers")
-        for number in _numbers(value, name):
-            if not bounds.hold(number):
+        for number in _numbers(value):
+            if not bounds.contains(number):
                 expected = str(bounds) if _is_finite(number) else _FINITE
                 raise OutOfBounds(name, value, expected)
+        if isinstance(value, tuple | list):
+            for index, inner in enumerate(value):
+                if dataclasses.is_dataclass(inner):
+                    check_bounds(inner, f"{name}[{index}].")
 
 
 def check_cores(config: Any, prefix: str = "") -> None:
@@ -143,7 +147,7 @@ def check_cores(config: Any, prefix: str = "") -> None:
             require_cores(name, value, bounds.per_core)
 
 
-def require_cores(option: str, count: int, per_core: int = MOST_PER_CORE) -> None:
+def require_cores(option: str, count: int, per_core: int = MAX_PER_CORE) -> None:
     """Raise `OutOfBounds` for more than ``per_core`` threads or processes per processor core."""
     cores = available_cores()
     if count > per_core * cores:
@@ -158,8 +162,8 @@ def _is_finite(number: float) -> bool:
         return False
 
 
-def _numbers(value: object, name: str) -> Iterator[float]:
-    """All numbers in a value; dataclasses in a list are checked."""
+def _numbers(value: object) -> Iterator[float]:
+    """All numbers in a value, except those in dataclasses."""
     match value:
         case bool() | str():
             return
@@ -167,19 +171,16 @@ def _numbers(value: object, name: str) -> Iterator[float]:
             yield value
         case Mapping():
             for inner in value.values():
-                yield from _numbers(inner, name)
+                yield from _numbers(inner)
         case tuple() | list():
-            for index, inner in enumerate(value):
-                if dataclasses.is_dataclass(inner):
-                    check_bounds(inner, f"{name}[{index}].")
-                else:
-                    yield from _numbers(inner, name)
+            for inner in value:
+                yield from _numbers(inner)
 
 
 def as_flag_value(value: object) -> str:
     """A value in command-line syntax, truncated if it is long."""
     text = ""
-    for part in _yaml(value):  # may be endless: YAML aliases can be recursive
+    for part in _yaml(value):  # stop early: YAML aliases can make the value cyclic
         text += part
         if len(text) > _SHOWN_LENGTH:
             return f"{text[:_SHOWN_LENGTH]}..."
@@ -191,7 +192,8 @@ def _yaml(value: object) -> Iterator[str]:
         case None | bool():
             yield {None: "null", True: "true", False: "false"}[value]
         case int():
-            yield (f"{value:d}" if abs(value) < _LARGE else f"{value:#x}")  # digits are limited
+            # hex: CPython refuses to format integers of more than 4300 digits
+            yield f"{value:d}" if abs(value) < _LARGE else f"{value:#x}"
         case Mapping():
             yield "{"
             for index, (key, inner) in enumerate(value.items()):

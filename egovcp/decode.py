@@ -77,7 +77,7 @@ def _dataclass(config_class: Any, value: object, name: str) -> Any:
     try:
         return config_class(**decoded)
     except OutOfBounds as error:
-        raise DecodeError(str(error.under(f"{name}."))) from error
+        raise DecodeError(str(error.with_prefix(f"{name}."))) from error
     except UsageError as error:
         raise DecodeError(f"{name}: {error}") from error
 

@@ -77,7 +77,7 @@ class PlannerOptions:
         try:
             return replace(planner, **{k: v for k, v in asdict(self).items() if v is not None})
         except OutOfBounds as error:
-            raise error.under("--planner.") from error
+            raise error.with_prefix("--planner.") from error
 
 
 def load_policy(policy: PolicyOptions, planner: PlannerOptions) -> Artifact:

@@ -125,7 +125,7 @@ def build[C](
     try:
         return config_class(**found)
     except OutOfBounds as error:
-        raise error.under(prefix) from None
+        raise error.with_prefix(prefix) from None
 
 
 def convert(kind: Any, value: Any, name: str, default: Any = None) -> Any:

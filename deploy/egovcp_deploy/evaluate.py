@@ -11,7 +11,7 @@ from typing import Any, Final
 
 from tqdm import tqdm
 
-from egovcp.bounds import MOST_PER_CORE, bounded
+from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError
 from egovcp.files import write_json
@@ -106,7 +106,7 @@ class EvalConfig:
     """New folder for the results."""
     num_envs: int = bounded(8, least=1, most=65_536)
     """Robots that each process plays side by side."""
-    num_workers: int = bounded(0, least=0, per_core=MOST_PER_CORE)
+    num_workers: int = bounded(0, least=0, per_core=MAX_PER_CORE)
     """Processes; 0: one per processor core."""
     env: EnvConfig = field(default_factory=evaluation_config)
     """Scenes, sensors, delays and randomisation."""

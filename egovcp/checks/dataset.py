@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from egovcp import spec
-from egovcp.checks.environment import COMMAND_TOLERANCE, commanded
+from egovcp.checks.environment import COMMAND_TOLERANCE, command_from_state
 from egovcp.checks.statistics import EpisodeStatistics, StatisticsCheck
 from egovcp.cli import DatasetConfig
 from egovcp.data import DatasetReader, Episode, metadata, schema
@@ -101,7 +101,7 @@ def _raised(problems: Iterator[DataError]) -> Iterator[DataError]:
 def command_problems(episode: Episode) -> Iterator[tuple[int, str]]:
     """The first tick whose command in o_t is not a_{t-1} (the neutral pose at t = 0)."""
     before = np.vstack([np.zeros((1, spec.ACTION_DIM)), episode.action[:-1]])
-    off = np.abs(commanded(episode.state) - spec.ACTION_BOX.to_metric(before)).max(axis=1)
+    off = np.abs(command_from_state(episode.state) - spec.ACTION_BOX.to_metric(before)).max(axis=1)
     wrong = np.flatnonzero(off > COMMAND_TOLERANCE)
     if len(wrong):
         t = int(wrong[0])

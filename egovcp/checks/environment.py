@@ -68,33 +68,35 @@ def check_env[S, O: _Observation](
         ticks: planner ticks per run; the actions exceed the rate limit.
 
     Raises:
-        ConformanceError: names the tick and the property.
+        ConformanceError: a check failed; the message names the tick and the property.
     """
     rng = np.random.default_rng(seed)
     actions = rng.uniform(-1, 1, (ticks, env.num_envs, spec.ACTION_DIM))
-    first = _drive(env, scenarios, actions)
-    for t, (a, b) in enumerate(zip(first, _drive(env, scenarios, actions), strict=True)):
+    first = _run_actions(env, scenarios, actions)
+    for t, (a, b) in enumerate(zip(first, _run_actions(env, scenarios, actions), strict=True)):
         for name in a:
             if not np.array_equal(a[name], b[name]):
-                raise ConformanceError(f"environment, tick {t}: {name} is not repeatable")
+                raise ConformanceError(
+                    f"environment, tick {t}: {name} differs between two runs with the same actions"
+                )
 
 
-def _drive[S, O: _Observation](
+def _run_actions[S, O: _Observation](
     env: Environment[S, O], scenarios: Sequence[S], actions: Array
 ) -> list[dict[str, NDArray[np.generic]]]:
     """Observation and reward of each tick; tick 0 is the reset."""
     sent: Array = np.zeros((env.num_envs, spec.ACTION_DIM))
-    over: NDArray[np.bool_] = np.zeros(env.num_envs, dtype=np.bool_)
+    finished: NDArray[np.bool_] = np.zeros(env.num_envs, dtype=np.bool_)
     observation = env.reset(scenarios)
     _check_observation(observation, sent, 0)
     history: list[dict[str, NDArray[np.generic]]] = [_arrays(observation)]
     for t, action in enumerate(actions, start=1):
         step = env.step(action)
-        _check_step(step, over, t)
+        _check_step(step, finished, t)
         _check_sent(step.sent_action, sent, t)
         _check_observation(step.observation, step.sent_action, t)
         history.append(_arrays(step.observation) | {"reward": np.array(step.reward)})
-        sent, over = np.array(step.sent_action), step.terminated | step.truncated
+        sent, finished = np.array(step.sent_action), step.terminated | step.truncated
     return history
 
 
@@ -120,11 +122,13 @@ def _check_observation(observation: _Observation, sent: Array, t: int) -> None:
         t,
         f"depth exceeds {spec.DEPTH_MAX_M} m",
     )
-    late = np.abs(commanded(observation.state) - spec.ACTION_BOX.to_metric(sent)).max()
+    command_error = np.abs(
+        command_from_state(observation.state) - spec.ACTION_BOX.to_metric(sent)
+    ).max()
     _require(
-        bool(late <= COMMAND_TOLERANCE),
+        bool(command_error <= COMMAND_TOLERANCE),
         t,
-        f"the command in the state is not the last one sent (off by {late:.3g} m)",
+        f"the command in the state is not the last one sent (off by {command_error:.3g} m)",
     )
 
 
@@ -134,23 +138,24 @@ def _check_sent(sent: Array, before: Array, t: int) -> None:
     _require(
         bool(change <= limit + 1e-6),
         t,
-        f"the action sent moved by {change:.3g} box units, the rate limit is {limit}",
+        f"the action sent changed by {change:.3g} (normalised units) in one tick, the rate limit "
+        f"is {limit}",
     )
     _require(bool(np.abs(sent).max() <= 1 + 1e-6), t, "the action sent leaves [-1, 1]")
 
 
-def _check_step[O: _Observation](step: _Step[O], over: NDArray[np.bool_], t: int) -> None:
+def _check_step[O: _Observation](step: _Step[O], finished: NDArray[np.bool_], t: int) -> None:
     terms = np.sum(list(step.reward_terms.values()), axis=0)
     _require(bool(np.isfinite(step.reward).all()), t, "reward is not finite")
     _require(np.allclose(terms, step.reward), t, "reward is not the sum of its terms")
     both = step.terminated & step.truncated
     _require(not both.any(), t, "a row is terminated and truncated at once")
     _require(
-        bool((step.terminated | step.truncated)[over].all()),
+        bool((step.terminated | step.truncated)[finished].all()),
         t,
         "an episode continues after its end",
     )
-    _require(not np.any(step.reward[over]), t, "reward after the end of an episode")
+    _require(not np.any(step.reward[finished]), t, "reward after the end of an episode")
 
 
 def _require(ok: bool, t: int, problem: str) -> None:
@@ -158,7 +163,7 @@ def _require(ok: bool, t: int, problem: str) -> None:
         raise ConformanceError(f"environment, tick {t}: {problem}")
 
 
-def commanded(state: NDArray[np.floating]) -> NDArray[np.floating]:
+def command_from_state(state: NDArray[np.floating]) -> NDArray[np.floating]:
     """(..., 74) state -> (..., 7) commanded hands and height, metres."""
     hands, height = spec.STATE_SLICES["command_hands"], spec.STATE_SLICES["command_height"]
     return state[..., hands.start : height.stop]

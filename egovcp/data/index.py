@@ -1,8 +1,8 @@
 """The episodes of a split of one or several datasets; their arrays stay on disk.
 
-Held-out episodes are chosen by a hash of what an episode *is*. The choice depends on neither
-order nor number of episodes, so a dataset that is extended, merged or read in part keeps the
-same episodes out of training.
+Held-out episodes are chosen by a hash of the episode's identity (task, seed, number). The choice
+depends on neither order nor number of episodes, so a dataset that is extended, merged or read in
+part keeps the same episodes out of training.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from egovcp.errors import DataError, UsageError, suggest
 SPLITS: Final = ("train", "heldout", "all")
 HELDOUT_FRACTION: Final = 0.05
 #: `describe_heldout` lists at most this many episode numbers.
-LISTED: Final = 5000
+MAX_LISTED: Final = 5000
 RULE: Final = (
-    "the first 8 bytes of the SHA-256 of task/seed/episode, as a share of 2**64, are below the "
-    "fraction; if none is, the episode with the lowest share"
+    "an episode is held out if uint64(SHA-256(task/seed/episode)[:8]) / 2**64 < fraction; if that "
+    "selects none of at least two, the one with the lowest value"
 )
 
 
@@ -39,8 +39,8 @@ def in_split(
 ) -> list[bool]:
     """Whether each of the episodes with these identities belongs to ``split``.
 
-    An episode is held out if its hash, as a share of all hashes, is below ``fraction``. If
-    none of at least two episodes is, the one with the lowest hash is held out, so that a
+    An episode is held out if `_hash_fraction` of its identity is below ``fraction``. If that
+    selects none of at least two episodes, the one with the lowest value is held out, so that a
     small dataset can be trained on, too.
 
     Raises:
@@ -50,14 +50,14 @@ def in_split(
         raise UsageError(f"unknown split {split!r}{suggest(split, SPLITS)}")
     if split == "all":
         return [True] * len(identities)
-    shares = [_share(identity) for identity in identities]
+    hashes = [_hash_fraction(identity) for identity in identities]
     bound = fraction
-    if min(shares) >= fraction > 0:
-        bound = min((share for share in shares if share > min(shares)), default=fraction)
-    return [(share < bound) == (split == "heldout") for share in shares]
+    if min(hashes) >= fraction > 0:
+        bound = min((value for value in hashes if value > min(hashes)), default=fraction)
+    return [(value < bound) == (split == "heldout") for value in hashes]
 
 
-def _share(identity: str) -> float:
+def _hash_fraction(identity: str) -> float:
     """The identity's hash as a number in [0, 1)."""
     digest = hashlib.sha256(identity.encode()).digest()
     return int.from_bytes(digest[:8], "big") / 2**64
@@ -140,8 +140,8 @@ class EpisodeIndex:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Hash of the episodes' identities and lengths, in order."""
-        return fingerprint(self.identities, self.length)
+        """`episodes_fingerprint` of its episodes."""
+        return episodes_fingerprint(self.identities, self.length)
 
     @property
     def is_remote(self) -> bool:
@@ -188,7 +188,7 @@ def evenly_spaced[T: np.generic](values: NDArray[T], limit: int | None) -> NDArr
     return values[np.linspace(0, len(values) - 1, limit).round().astype(np.intp)]
 
 
-def fingerprint(identities: Sequence[str], length: NDArray[np.int64]) -> str:
+def episodes_fingerprint(identities: Sequence[str], length: NDArray[np.int64]) -> str:
     """Hash of the episodes' identities and lengths, in order."""
     text = "\n".join(f"{i} {n}" for i, n in zip(identities, length, strict=True))
     return hashlib.sha256(text.encode()).hexdigest()
@@ -204,8 +204,8 @@ def require_mixable(readers: Sequence[DatasetReader]) -> None:
             have, want = getattr(other, what), getattr(first, what)
             if have != want:
                 raise DataError(
-                    f"{other.root} has {what} {have}, {first.root} has {want}; such datasets do "
-                    "not mix"
+                    f"{other.root} has {what} {have}, {first.root} has {want}; datasets must have "
+                    f"the same {what} to be trained on together"
                 )
 
 
@@ -216,7 +216,7 @@ def describe_heldout(
 
     ``rule`` and ``fraction`` say how they are chosen, ``count`` is their number, ``fingerprint``
     the hash of their identities and lengths, ``numbers`` lists them for each dataset (null if
-    they are more than `LISTED`).
+    they are more than `MAX_LISTED`).
 
     Raises:
         DataError: none is held out.
@@ -228,19 +228,19 @@ def describe_heldout(
         "fraction": fraction,
         "count": len(heldout),
         "fingerprint": heldout.fingerprint,
-        "numbers": numbers if len(heldout) <= LISTED else None,
+        "numbers": numbers if len(heldout) <= MAX_LISTED else None,
     }
 
 
 def sample_files(
-    learning: EpisodeIndex, heldout: EpisodeIndex, files: int
+    train: EpisodeIndex, heldout: EpisodeIndex, files: int
 ) -> tuple[EpisodeIndex, EpisodeIndex]:
     """Training and held-out episodes in a few files, the same files for both if possible.
 
     All episodes of a dataset on disk are kept; of one on the Hub those in at most ``files``
     files of each task, evenly spaced.
     """
-    return _sample_files(learning, heldout, files), _sample_files(heldout, learning, files)
+    return _sample_files(train, heldout, files), _sample_files(heldout, train, files)
 
 
 def _sample_files(index: EpisodeIndex, other: EpisodeIndex, files: int) -> EpisodeIndex:

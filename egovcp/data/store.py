@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from egovcp.data.episode import FRAME_LAYOUT, Episode, FrameLayout
-from egovcp.data.index import HELDOUT_FRACTION, EpisodeIndex, fingerprint
+from egovcp.data.index import HELDOUT_FRACTION, EpisodeIndex, episodes_fingerprint
 from egovcp.data.mirror import mirror_action, mirror_depth, mirror_state
 from egovcp.data.reader import DatasetReader
 from egovcp.data.returns import ReturnConfig, is_terminal, mc_return, mc_valid
@@ -132,7 +132,7 @@ class EpisodeStore:
     @property
     def fingerprint(self) -> str:
         """Hash of the episodes' identities and lengths, in order."""
-        return fingerprint(self.identities, self.length)
+        return episodes_fingerprint(self.identities, self.length)
 
 
 def gather(

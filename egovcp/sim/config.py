@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, is_dataclass, replace
 from typing import Final, Literal
 
-from egovcp.bounds import MOST_PER_CORE, bounded, check_bounds
+from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds
 from egovcp.errors import UsageError, suggest
 from egovcp.hardware import require_memory
 from egovcp.spec import TASKS
@@ -286,7 +286,7 @@ class EnvConfig:
     """Latency of action and image."""
     randomise: RandomisationConfig = RandomisationConfig()
     """Physical parameters."""
-    threads: int = bounded(1, least=1, most=1024, per_core=MOST_PER_CORE)
+    threads: int = bounded(1, least=1, most=1024, per_core=MAX_PER_CORE)
     """Threads that step physics and cast rays; results do not depend on it."""
 
     def __post_init__(self) -> None:

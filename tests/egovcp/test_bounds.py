@@ -133,5 +133,5 @@ def test_help_shows_the_bounds(capsys: pytest.CaptureFixture[str]) -> None:
 def test_ends_are_open_or_not(
     bounds: Bounds, inside: tuple[float, ...], outside: tuple[float, ...]
 ) -> None:
-    assert all(map(bounds.hold, inside))
-    assert not any(map(bounds.hold, outside))
+    assert all(map(bounds.contains, inside))
+    assert not any(map(bounds.contains, outside))

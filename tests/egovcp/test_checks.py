@@ -206,7 +206,7 @@ class _NotANumber(_Altered):
         (_WrongSum, "tick 3: reward is not the sum of its terms"),
         (_BothEnds, "tick 3: a row is terminated and truncated at once"),
         (_RisesAgain, "an episode continues after its end"),
-        (_Wanders, "depth is not repeatable"),
+        (_Wanders, "depth differs between two runs with the same actions"),
         (_OtherShape, r"tick 3: depth is uint16 \(2, 48, 64, 1\)"),
         (_NotANumber, "tick 3: state is not finite"),
     ],

@@ -1,10 +1,11 @@
-"""Sinks for tests: one that keeps ticks in memory, one that stalls or raises on request."""
+"""Sinks for tests: `FaultySink` stalls or raises on request, `MemorySink` keeps ticks."""
 
 from __future__ import annotations
 
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NoReturn
 
 from egovcp.log.tick import RunInfo, Tick
 
@@ -21,6 +22,8 @@ class FaultySink:
     """Index of the tick at which the disk is full."""
     close_s: float = 0.0
     """How long closing takes."""
+    fail_on_close: bool = False
+    """Whether the disk is full at the end of closing."""
 
     def open(self, info: RunInfo) -> None:
         self._note(f"open {info.task}")
@@ -30,12 +33,17 @@ class FaultySink:
             self._note("stall")
             time.sleep(self.stall_s)
         if tick.index == self.raise_at:
-            raise OSError(28, "No space left on device", str(self.path))
+            self._raise_disk_full()
         self._note(" ".join([f"tick {tick.index}", *tick.events]))
 
     def close(self) -> None:
         time.sleep(self.close_s)
         self._note("close")
+        if self.fail_on_close:
+            self._raise_disk_full()
+
+    def _raise_disk_full(self) -> NoReturn:
+        raise OSError(28, "No space left on device", str(self.path))
 
     def _note(self, line: str) -> None:
         with self.path.open("a", encoding="utf-8") as file:
@@ -50,11 +58,11 @@ class MemorySink:
         """In the order of writing."""
 
     def open(self, info: RunInfo) -> None:
-        """Does nothing."""
+        pass
 
     def write(self, tick: Tick) -> None:
         """Append the tick."""
         self.ticks.append(tick)
 
     def close(self) -> None:
-        """Does nothing."""
+        pass

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Final, Literal
 
 from egovcp import spec
-from egovcp.bounds import MOST_PER_CORE, bounded
+from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.cli import SelectedDatasetConfig, WeightedDatasetConfig
 from egovcp.data import ReturnConfig, ShuffleConfig
 from egovcp.errors import UsageError, suggest
@@ -168,7 +168,7 @@ class TrainConfig:
     """Scenarios of each task that are evaluated in simulation at every evaluation; 0: none."""
     save_freq: int = bounded(1000, least=1)
     """Steps between checkpoints; one is always written at the end."""
-    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
+    threads: int = bounded(0, least=0, per_core=MAX_PER_CORE)
     """CPU threads; 0: all cores."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""

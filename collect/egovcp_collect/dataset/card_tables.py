@@ -29,7 +29,11 @@ _FEATURES: Final = {
 #: Part of the state -> content, unit, frame.
 _STATE: Final = {
     "angular_velocity": ("angular velocity x, y, z", "rad/s", "pelvis IMU"),
-    "projected_gravity": ("direction of gravity; upright is (0, 0, -1)", "unit", "pelvis IMU"),
+    "projected_gravity": (
+        "direction of gravity; upright is (0, 0, -1)",
+        "1 (unit vector)",
+        "pelvis IMU",
+    ),
     "command_velocity": ("commanded vx, vy and yaw rate", "m/s, rad/s", "pelvis heading"),
     "command_hands": ("hand targets sent last, left xyz, right xyz", "m", "pelvis heading"),
     "command_height": ("pelvis height sent last", "m", "above ground"),
@@ -42,8 +46,7 @@ def markdown_table(head: Sequence[str], rows: Iterable[Sequence[object]]) -> str
     """A Markdown table; pipes in cells are escaped."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join(
-        f"| {' | '.join(str(cell).replace('|', chr(92) + '|') for cell in line)} |"
-        for line in lines
+        f"| {' | '.join(str(cell).replace('|', r'\|') for cell in line)} |" for line in lines
     )
 
 
@@ -101,7 +104,7 @@ def settings_tables(config: Mapping[str, Any], tasks: Sequence[str]) -> tuple[st
 def _settings(env: Mapping[str, Any], tasks: Sequence[str]) -> Iterator[tuple[str, Any, str]]:
     """Dotted name, value and documentation of the settings of these tasks.
 
-    A setting that this version does not have has no documentation.
+    Options unknown to this version get an empty description.
     """
     others = {task for task in spec.TASKS if task not in tasks}
     defaults, docs = EnvConfig(), dict(field_docs(EnvConfig))
@@ -142,9 +145,9 @@ def _coverage_column(task: TaskStatistics) -> dict[str, str]:
             f"{r.spread.mean:.3f}, {r.spread.std:.3f}" if r.spread else "none"
         ),
         "return, 5 % to 95 %": f"{r.spread.q05:.3f} to {r.spread.q95:.3f}" if r.spread else "none",
-        "rows with a reward event ahead": f"{r.positive_share:.1%}",
-        "rows with a cost event ahead": f"{r.negative_share:.1%}",
-        "occupied cells of the hands' box": ", ".join(
+        "frames with a reward event within the return horizon": f"{r.positive_share:.1%}",
+        "frames with a cost event within the return horizon": f"{r.negative_share:.1%}",
+        "visited cells of the hand workspace": ", ".join(
             f"{hand} {share:.0%}" for hand, share in task.action.occupied.items()
         ),
         "depth pixels measured, nearer than 1 m": f"{d.valid_share:.0%}, {d.near_share:.1%}",

@@ -1,7 +1,6 @@
-"""What LeRobot, `datasets` and egovcp make of a dataset that `push` has published.
+"""LeRobot, `datasets` and egovcp read a pushed dataset and return the same frames.
 
-Their libraries read the Hub's address when they are imported, so they run in a process of
-their own.
+They run in a subprocess because HF_ENDPOINT is read at import.
 """
 
 import json
@@ -79,7 +78,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[list[float]
 
 
 @pytest.mark.parametrize("reader", ["lerobot", "lerobot_stream", "datasets_stream", "egovcp"])
-def test_every_reader_sees_every_frame(seen: dict[str, list[list[float]]], reader: str) -> None:
+def test_every_reader_returns_every_frame(seen: dict[str, list[list[float]]], reader: str) -> None:
     episodes = [random_episode(number) for number in range(3)]
     expected = [
         (e.state[t].sum(dtype=float), e.depth[t].sum(dtype=float))

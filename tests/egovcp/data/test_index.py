@@ -20,7 +20,7 @@ def test_the_held_out_episodes_are_named(
     assert found["fingerprint"] == index.fingerprint
     assert json.loads(json.dumps(found)) == found
 
-    monkeypatch.setattr(index_module, "LISTED", found["count"] - 1)
+    monkeypatch.setattr(index_module, "MAX_LISTED", found["count"] - 1)
     assert describe_heldout([reader, reader], 0.4) == found | {"numbers": None}
 
 

@@ -163,7 +163,9 @@ def test_datasets_of_different_controllers_do_not_mix(
     with DatasetWriter(tmp_path / "other", Provenance("walker-2")) as writer:
         writer.add(episodes[0])
     other = DatasetReader.open(DatasetConfig(root=str(tmp_path / "other")))
-    with pytest.raises(DataError, match=r"controller_id walker-2.*stance-1.*do not mix"):
+    with pytest.raises(
+        DataError, match=r"controller_id walker-2.*stance-1.*the same controller_id"
+    ):
         EpisodeStore.load([reader, other])
     assert EpisodeStore.load([other, other]).num_frames == 24
 

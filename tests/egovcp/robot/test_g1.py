@@ -17,7 +17,7 @@ from egovcp.robot.mjcf import FootModel, robot_spec
 from egovcp.spec import JOINT_NAMES
 
 
-def test_model_path_is_the_wheels_file() -> None:
+def test_model_path_is_the_file_in_the_wheel() -> None:
     assert g1.model_path().name == "g1.xml"
     assert g1.model_path().is_file()
 
@@ -48,7 +48,7 @@ def test_a_wheel_without_the_model_is_an_environment_failure(
         ("left_wrist_yaw_joint", 0.00425, 16.77832748, 1.068141502, 5.0),
     ],
 )
-def test_constants_restate_the_published_ones(
+def test_constants_equal_the_published_ones(
     joint: str, armature: float, stiffness: float, damping: float, effort: float
 ) -> None:
     i = JOINT_NAMES.index(joint)
@@ -61,7 +61,7 @@ def test_constants_restate_the_published_ones(
     np.testing.assert_allclose(got, [armature, stiffness, damping, effort], rtol=1e-6)
 
 
-def test_only_the_arms_gains_differ_from_the_published_ones() -> None:
+def test_leg_and_waist_gains_equal_the_published_ones() -> None:
     legs_and_waist = slice(0, g1.WAIST.stop)
     for ours, published in [
         (g1.STIFFNESS, g1.PUBLISHED_STIFFNESS),
@@ -69,6 +69,9 @@ def test_only_the_arms_gains_differ_from_the_published_ones() -> None:
     ]:
         np.testing.assert_array_equal(ours[legs_and_waist], published[legs_and_waist])
         assert np.all(ours[g1.ARMS] > 0.9 * published[g1.ARMS])
+        assert np.all(ours[g1.ARMS] != published[g1.ARMS])
+    np.testing.assert_array_equal(g1.STIFFNESS[g1.ARMS], [80, 80, 60, 60, 30, 20, 20] * 2)
+    np.testing.assert_array_equal(g1.DAMPING[g1.ARMS], [5, 5, 3, 3, 1.5, 1, 1] * 2)
 
 
 def test_left_and_right_have_the_same_numbers() -> None:
@@ -93,7 +96,7 @@ def test_actuators_and_joints_are_in_the_order_of_the_spec(stock: mujoco.MjModel
     assert stock.actuator_trnid[:, 0].tolist() == list(range(1, stock.njnt))
 
 
-def test_servos_run_the_gains_and_limits(stock: mujoco.MjModel) -> None:
+def test_actuators_have_the_configured_gains_and_limits(stock: mujoco.MjModel) -> None:
     np.testing.assert_allclose(stock.actuator_gainprm[:, 0], STIFFNESS)
     np.testing.assert_allclose(-stock.actuator_biasprm[:, 2], DAMPING)
     np.testing.assert_allclose(stock.actuator_forcerange[:, 1], EFFORT_LIMIT)
@@ -118,13 +121,16 @@ def test_both_foot_models_have_their_soles_at_the_same_height(
 def test_standing_on_a_floor_makes_foot_contacts_only(feet: FootModel, contacts: int) -> None:
     spec = robot_spec(feet)
     plane = mujoco.mjtGeom.mjGEOM_PLANE
-    spec.worldbody.add_geom(type=plane, size=[0, 0, 0.1], contype=1, conaffinity=1)
+    spec.worldbody.add_geom(name="floor", type=plane, size=[0, 0, 0.1], contype=1, conaffinity=1)
     model = spec.compile()
     data = mujoco.MjData(model)
     data.qpos[2] = 0.7918
     mujoco.mj_forward(model, data)
     assert data.ncon == contacts
+    for floor, robot in data.contact.geom:
+        assert model.geom(floor).name == "floor"
+        assert "_foot" in model.geom(robot).name
 
 
-def test_the_robot_never_collides_with_itself(stock: mujoco.MjModel) -> None:
+def test_self_collision_is_disabled(stock: mujoco.MjModel) -> None:
     assert not np.any(stock.geom_contype)

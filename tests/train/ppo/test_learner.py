@@ -70,8 +70,10 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def build() -> Build:
-    def env(robots: int = 2, tasks: Sequence[str] = ("ball",), first: int = 0) -> ContactEnv:
-        return ContactEnv(EnvConfig(), tasks, robots, TINY, seed=5, first=first)
+    def env(
+        robots: int = 2, tasks: Sequence[str] = ("ball",), first_episode: int = 0
+    ) -> ContactEnv:
+        return ContactEnv(EnvConfig(), tasks, robots, TINY, seed=5, first_episode=first_episode)
 
     return env
 
@@ -103,7 +105,7 @@ def test_tasks_take_turns_and_each_counts_its_own_episodes(build: Build) -> None
         ("ball", 5, 1),
         ("wall", 5, 1),
     ]
-    assert _playing(build(2, ("ball", "wall"), first=7)) == [("wall", 5, 3), ("ball", 5, 4)]
+    assert _playing(build(2, ("ball", "wall"), first_episode=7)) == [("wall", 5, 3), ("ball", 5, 4)]
 
 
 def test_a_time_limit_is_no_failure(build: Build) -> None:

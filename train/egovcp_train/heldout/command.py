@@ -13,7 +13,7 @@ from typing import Any, Final
 import torch
 
 from egovcp.artifact import Artifact, load_artifact, returns_of
-from egovcp.bounds import MOST_PER_CORE, bounded
+from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.cli import SelectedDatasetConfig, run_command
 from egovcp.data import DatasetReader, EpisodeStore
 from egovcp.errors import ArtifactError, UsageError
@@ -55,7 +55,7 @@ class HeldoutConfig:
     """Rows between the starts of open-loop predictions; 1: from each row."""
     pictures: bool = True
     """Write open_loop_TASK.png, value_TASK.png and open_loop.rrd."""
-    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
+    threads: int = bounded(0, least=0, per_core=MAX_PER_CORE)
     """CPU threads; 0: all cores."""
     device: str = "auto"
     """cpu, cuda, or auto (cuda if there is one)."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from egovcp.bounds import MOST_PER_CORE, bounded
+from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.cli import run_command
 from egovcp.errors import UsageError, suggest
 from egovcp.files import write_json
@@ -76,7 +76,7 @@ class LowLevelEvalConfig:
     """Foot collision model."""
     seed: int = bounded(1000, least=0)
     """Seed of robots, commands, pushes and noise."""
-    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
+    threads: int = bounded(0, least=0, per_core=MAX_PER_CORE)
     """CPU threads; 0: all cores."""
 
 

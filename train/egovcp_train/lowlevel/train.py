@@ -13,7 +13,7 @@ from typing import Any, Literal
 import draccus
 import torch
 
-from egovcp.bounds import MOST_PER_CORE, bounded
+from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.cli import run_command, save_config
 from egovcp.hardware import available_cores
 from egovcp.packages import SIMULATOR_MODULES, require_packages
@@ -75,7 +75,7 @@ class LowLevelTrainConfig:
     """Wall-clock limit in minutes, over all resumes; 0: none."""
     seed: int = bounded(0, least=0)
     """Seed of networks, commands, disturbances and noise."""
-    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
+    threads: int = bounded(0, least=0, per_core=MAX_PER_CORE)
     """CPU threads; 0: all cores."""
     resume: bool = False
     """Continue the run in output_dir from its last checkpoint, with its options unless given."""

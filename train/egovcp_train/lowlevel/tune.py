@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from egovcp.bounds import MOST_PER_CORE, bounded
+from egovcp.bounds import MAX_PER_CORE, bounded
 from egovcp.cli import run_command
 from egovcp.files import write_json
 from egovcp.hardware import available_cores
@@ -64,7 +64,7 @@ class TuneConfig:
     """Pelvis height, m."""
     seed: int = bounded(0, least=0)
     """Seed of candidates, physics and noise."""
-    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
+    threads: int = bounded(0, least=0, per_core=MAX_PER_CORE)
     """CPU threads; 0: all cores."""
 
 

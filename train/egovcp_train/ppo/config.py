@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Final
 
-from egovcp.bounds import MOST_PER_CORE, bounded, check_bounds
+from egovcp.bounds import MAX_PER_CORE, bounded, check_bounds
 from egovcp.errors import UsageError, suggest
 from egovcp.reactive import ReactiveConfig
 from egovcp.sim.config import EnvConfig
@@ -49,7 +49,7 @@ class PpoTrainConfig:
     """Wall-clock limit in minutes, over all resumes; 0: none."""
     seed: int = bounded(0, least=0)
     """Seed of scenarios, networks and actions."""
-    threads: int = bounded(0, least=0, per_core=MOST_PER_CORE)
+    threads: int = bounded(0, least=0, per_core=MAX_PER_CORE)
     """CPU threads of the networks; 0: all cores. Those of the simulator are --env.threads."""
     resume: bool = False
     """Continue the run in output_dir from its last checkpoint, with its options unless given."""

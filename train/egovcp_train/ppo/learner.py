@@ -1,4 +1,7 @@
-"""The simulator as rsl-rl's `VecEnv`, and PPO on it; one tick is 40 ms, an action the planner's."""
+"""rsl-rl `VecEnv` wrapper of the simulator, and a PPO learner.
+
+One step is 40 ms; actions are those of the planner.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +29,7 @@ from egovcp_train.ppo.config import PpoTrainConfig
 class ContactEnv(VecEnv):  # type: ignore[misc]
     """N robots, each of which begins the next episode as soon as one is over.
 
-    Episodes are numbered from ``first``; the tasks alternate.
+    Episodes are numbered from ``first_episode``; the tasks alternate.
     """
 
     def __init__(
@@ -36,14 +39,14 @@ class ContactEnv(VecEnv):  # type: ignore[misc]
         robots: int,
         network: ReactiveConfig,
         seed: int = 0,
-        first: int = 0,
+        first_episode: int = 0,
     ) -> None:
         self.env = VectorEnv(config, robots)
         self.num_envs, self.num_actions, self.device = robots, ACTION_DIM, "cpu"
         self.max_episode_length = max(config.episode(task).ticks for task in tasks)
         self.episode_length_buf = torch.zeros(robots, dtype=torch.long)
         self.cfg = asdict(config)
-        self.episodes = first
+        self.episodes = first_episode
         self._tasks, self._seed = tuple(tasks), seed
         self._frames = FrameStack(robots, network)
         self._returns = np.zeros(robots)
@@ -56,12 +59,12 @@ class ContactEnv(VecEnv):  # type: ignore[misc]
     def step(
         self, actions: torch.Tensor
     ) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """One tick; the reward is the task's alone."""
+        """One tick; the reward has no shaping terms."""
         result = self.env.step(actions.detach().clamp(-1.0, 1.0).numpy())
         done = result.terminated | result.truncated
         self.episode_length_buf += 1
         self._returns += result.reward
-        log = self._ended(done, result.success)
+        log = self._log_finished(done, result.success)
         observation = result.observation
         if done.any():
             rows = np.flatnonzero(done)
@@ -85,22 +88,22 @@ class ContactEnv(VecEnv):  # type: ignore[misc]
         self.env.close()
 
     def _scenarios(self, count: int) -> list[Scenario]:
-        """The next episodes; each task counts its own from 0."""
+        """The next episodes; episodes are numbered per task from 0."""
         found = []
         for number in range(self.episodes, self.episodes + count):
-            own, task = divmod(number, len(self._tasks))
-            found.append(Scenario(self._tasks[task], self._seed, own))
+            task_episode, task = divmod(number, len(self._tasks))
+            found.append(Scenario(self._tasks[task], self._seed, task_episode))
         self.episodes += count
         return found
 
-    def _observe(self, observation: Observation, fresh: NDArray[np.bool_]) -> None:
+    def _observe(self, observation: Observation, reset_mask: NDArray[np.bool_]) -> None:
         groups = {
-            "depth": self._frames.push(observation.depth, fresh),
+            "depth": self._frames.push(observation.depth, reset_mask),
             "state": torch.from_numpy(observation.state),
         }
         self._observations = TensorDict(groups, batch_size=[self.num_envs])
 
-    def _ended(self, done: NDArray[np.bool_], success: NDArray[np.bool_]) -> Log:
+    def _log_finished(self, done: NDArray[np.bool_], success: NDArray[np.bool_]) -> Log:
         """TASK/return, TASK/success and TASK/ticks of the episodes that have ended."""
         log: Log = defaultdict(list)
         for row in np.flatnonzero(done):
@@ -112,13 +115,13 @@ class ContactEnv(VecEnv):  # type: ignore[misc]
 
 
 class ContactLearner(OnPolicyLearner):
-    """The simulator and PPO."""
+    """PPO on `ContactEnv`."""
 
-    def __init__(self, config: PpoTrainConfig, first: int = 0) -> None:
-        """``first``: number of the first episode, after those of a run that is resumed."""
+    def __init__(self, config: PpoTrainConfig, first_episode: int = 0) -> None:
+        """``first_episode``: number of the first episode; a resumed run continues its count."""
         self.config = config
         env = ContactEnv(
-            config.env, config.tasks, config.robots, config.network, config.seed, first
+            config.env, config.tasks, config.robots, config.network, config.seed, first_episode
         )
         cnn = {
             "output_channels": list(config.network.channels),
@@ -144,7 +147,7 @@ class ContactLearner(OnPolicyLearner):
             log[name] += values
 
     def policy(self, provenance: dict[str, Any]) -> ReactiveNetwork:
-        """rsl-rl's actor with its normalisation, as the file of a policy holds it."""
+        """rsl-rl's actor with its normalisation, in the format of the policy file."""
         actor = self.ppo.get_policy()
         normal = actor.obs_normalizer
         return ReactiveNetwork(
@@ -159,8 +162,8 @@ class ContactLearner(OnPolicyLearner):
 
     def state_dict(self) -> dict[str, Any]:
         """Also the number of episodes; after a resume the robots start new ones."""
-        own = {"episodes": self.env.episodes, "torch": torch.get_rng_state()}
-        return super().state_dict() | own
+        extra = {"episodes": self.env.episodes, "torch": torch.get_rng_state()}
+        return super().state_dict() | extra
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         super().load_state_dict(state)

@@ -65,12 +65,12 @@ def train(config: PpoTrainConfig) -> None:
         learner.env.close()
 
 
-def _build(config: PpoTrainConfig, first: int) -> Any:
+def _build(config: PpoTrainConfig, first_episode: int) -> Any:
     """The simulator and PPO; imported here, so that --help needs neither."""
     require_packages("egovcp-train", PROG, "rsl_rl", "tensordict", *SIMULATOR_MODULES)
     from egovcp_train.ppo.learner import ContactLearner
 
-    return ContactLearner(config, first)
+    return ContactLearner(config, first_episode)
 
 
 def _run(config: PpoTrainConfig, output: Path, learner: Any, spent: float) -> None:
