@@ -34,7 +34,7 @@ from egovcp.values import (
 
 CONFIG_FILE: Final = f"--{CONFIG_ARG}"
 HELP: Final = ("-h", "--help")
-#: In the place of a flag's type: an option that only a configuration file or Python can set.
+#: Replaces the type of a flag: an option that only a configuration file or Python can set.
 NOT_A_FLAG: Final = object()
 #: LeRobot's name of an option -> its name here, where both mean the same.
 LEROBOT_NAMES: Final[Mapping[str, str]] = {
