@@ -232,7 +232,7 @@ _MOTORS: Final = (
         _edited(m.without_motor_fields("motorstate", "mode", "lost", "temperature")),
     ),
     _motor("dropped, status disconnected", _D, _dropped(DISCONNECTED, 1), "lost the connection"),
-    _motor("dropped, mode off", _D, _dropped(0, 0), "its mode says that it is off"),
+    _motor("dropped, mode off", _D, _dropped(0, 0), "its mode is off"),
     _motor(
         "dropped without a report", Reaction.LATER, _dropped(0, 1), "does not follow its target"
     ),
