@@ -8,37 +8,19 @@ environment; "without torch" leaves out torch, its CUDA libraries and triton.
 
 from __future__ import annotations
 
+import sys
 from functools import cache
 from importlib import metadata
 from pathlib import Path
 
-from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name
 from report import parser, publish
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # for tests.support
+
+from tests.support.requirements import installed_with
 
 APPLICATIONS = ("egovcp", "egovcp-collect", "egovcp-train", "egovcp-deploy", "egovcp-experiment")
 _TORCH = ("torch", "triton", "nvidia-", "cuda-")
-
-
-def required(distribution: str) -> set[str]:
-    """Names of the distributions that are installed with this one, without its extras."""
-    found: set[tuple[str, str]] = set()
-
-    def add(name: str, extra: str) -> None:
-        if (name, extra) in found:
-            return
-        try:
-            texts = metadata.requires(name) or []
-        except metadata.PackageNotFoundError:
-            return
-        found.add((name, extra))
-        for requirement in map(Requirement, texts):
-            if requirement.marker is None or requirement.marker.evaluate({"extra": extra}):
-                for inner in ("", *requirement.extras):
-                    add(canonicalize_name(requirement.name), inner)
-
-    add(canonicalize_name(distribution), "")
-    return {name for name, _ in found}
 
 
 @cache
@@ -52,7 +34,7 @@ def sizes_mb() -> dict[str, object]:
     """Size of every application, with and without torch."""
     figures: dict[str, object] = {}
     for application in APPLICATIONS:
-        sizes = {name: size_mb(name) for name in required(application)}
+        sizes = {name: size_mb(name) for name in installed_with(application)}
         without = sum(mb for name, mb in sizes.items() if not name.startswith(_TORCH))
         figures[f"{application}_mb"] = sum(sizes.values())
         figures[f"{application}_without_torch_mb"] = without

@@ -7,7 +7,6 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterator
-from functools import cache
 from importlib import import_module, metadata
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from packaging.utils import canonicalize_name
 from egovcp.errors import EnvironmentFailure
 from egovcp.packages import DISTRIBUTIONS, distribution_of
 from tests.support.limited import LimitedResult, run_limited
+from tests.support.requirements import installed_with
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Distribution -> folder of its pyproject.toml.
@@ -80,28 +80,6 @@ def test_an_import_is_found_anywhere_but_for_type_checkers() -> None:
         "def f():\n    from pyarrow.parquet import write_table\n    from . import other\n"
     )
     assert imported(source) == {"torch", "pyarrow"}
-
-
-@cache
-def installed_with(distribution: str) -> frozenset[str]:
-    """Distributions that come with one that is installed without extras."""
-    found: set[tuple[str, str]] = set()
-
-    def add(name: str, extra: str) -> None:
-        if (name, extra) in found:
-            return
-        try:
-            texts = metadata.requires(name) or []
-        except metadata.PackageNotFoundError:
-            return
-        found.add((name, extra))
-        for requirement in map(Requirement, texts):
-            if requirement.marker is None or requirement.marker.evaluate({"extra": extra}):
-                for inner in ("", *requirement.extras):
-                    add(canonicalize_name(requirement.name), inner)
-
-    add(canonicalize_name(distribution), "")
-    return frozenset(name for name, _ in found)
 
 
 def absent_modules(distribution: str) -> Iterator[str]:

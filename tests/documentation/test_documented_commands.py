@@ -34,10 +34,25 @@ _FOREIGN = {"--cpu": "accelerate launch", "--dataset.fps": "lerobot-record"}
 def pages() -> dict[str, Page]:
     """Every page with commands that somebody may type."""
     found = [ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
-    for folder in ("docs", "dataset_cards", "plugins"):
+    for folder in ("docs", "dataset_cards", "plugins", "pretrained"):
         found += sorted((ROOT / folder).rglob("*.md"))
     names = {str(path.relative_to(ROOT)): path for path in found}
     return {name: read_page(path, name) for name, path in names.items() if name not in _SKIPPED}
+
+
+_PATH = re.compile(
+    r"`((?:egovcp|collect|train|deploy|experiment|plugins|tests|benchmarks)/[\w./-]+)`"
+)
+
+
+def test_paths_in_the_repository_exist() -> None:
+    missing = [
+        f"{name}: {path}"
+        for name in PAGES
+        for path in _PATH.findall((ROOT / name).read_text(encoding="utf-8"))
+        if not (ROOT / path).exists()
+    ]
+    assert not missing
 
 
 PAGES = pages()

@@ -15,7 +15,7 @@ from tests.support.hub import FakeHub, in_this_process
 from tests.support.ports import free_port
 
 from .markdown import DocumentedCommand, Text
-from .programs import main_of
+from .programs import ROOT, main_of
 from .test_documented_commands import COMMANDS, PAGES, complete, is_result
 
 _SHORT = [
@@ -42,7 +42,7 @@ _REDUCED = {
 _EPISODES = re.compile(r"(episodes[=:] ?\"?0:)\d+")
 #: Run elsewhere, or too long: part of a command line -> where it is tested.
 _ELSEWHERE = {
-    "--backend=ray": "tests/collect/test_cluster.py",
+    "--backend=ray": "tests/collect/test_ray_workers.py",
     "--robot.type=unitree_g1": "tests/deploy/robots/test_fake_command.py",
     "--realtime": "tests/deploy/live/test_drive.py",
     "--controllers=planner,ppo": "tests/experiment/experiments/test_ppo.py",
@@ -53,6 +53,10 @@ _PUBLISHED = {
     **{f"me/egovcp-{task}": f"data/{task}" for task in ("ball", "wall")},
     **{f"egovcp/{task}": f"data/{task}" for task in ("ball", "wall", "arch")},
 }
+
+
+def test_commands_tested_elsewhere_name_a_test_that_exists() -> None:
+    assert not [p for p in _ELSEWHERE.values() if not (ROOT / p).exists()]
 
 
 def runnable() -> list[DocumentedCommand]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+from abc import ABC, abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
@@ -95,7 +96,7 @@ def shrink_output(mlp: torch.nn.Sequential) -> None:
         last.bias.zero_()
 
 
-class OnPolicyLearner:
+class OnPolicyLearner(ABC):
     """An environment (rsl-rl's `VecEnv`) and PPO, one iteration at a time."""
 
     def __init__(self, env: Any, config: dict[str, Any]) -> None:
@@ -133,11 +134,11 @@ class OnPolicyLearner:
         scalars = {name: float(np.mean(values)) for name, values in log.items()}
         return scalars | {f"ppo/{name}": float(value) for name, value in losses.items()}
 
+    @abstractmethod
     def record(
         self, log: Log, obs: Any, reward: torch.Tensor, done: torch.Tensor, extras: dict[str, Any]
     ) -> None:
-        """Add a tick to the log, the mean of whose values is recorded per iteration."""
-        raise NotImplementedError
+        """Add the values of a tick to the log; their mean is recorded per iteration."""
 
     def update(self) -> dict[str, float]:
         """One update of PPO; returns its losses."""

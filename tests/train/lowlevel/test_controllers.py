@@ -1,7 +1,7 @@
 """The gait without a policy, and the controller that the package ships."""
 
 import json
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,20 +36,26 @@ def test_robots_of_randomised_physics_are_still_up_and_walking_after_two_seconds
 
 
 # --- the shipped controller -----------------------------------------------------------
-FILE = resources.files("egovcp.robot").joinpath("g1_walk.safetensors")
+ROOT = Path(__file__).resolve().parents[3]
+SHIPPED = ROOT / "egovcp/robot/g1_walk.safetensors"
+CANDIDATE = ROOT / "pretrained/lowlevel/g1_walk.safetensors"
 
 
-def test_it_is_small_and_says_where_it_comes_from():
-    with resources.as_file(FILE) as path:
-        assert path.stat().st_size <= 2_000_000
-        with safe_open(path, framework="numpy") as file:
-            content = json.loads(file.metadata()["content"])
+@pytest.mark.parametrize("path", [SHIPPED, CANDIDATE], ids=["shipped", "candidate"])
+def test_a_controller_file_is_small_and_records_its_training(path: Path):
+    assert path.stat().st_size <= 2_000_000
+    with safe_open(path, framework="numpy") as file:
+        content = json.loads(file.metadata()["content"])
     origin = content["provenance"]
     assert origin["steps"] > 5_000_000
     assert "seed" in origin
     commands = [stage["command"] for stage in origin["stages"]]
     assert all(command.startswith("egovcp-train-lowlevel ") for command in commands)
     assert set(content["config"]) >= {"balance", "reach", "gait"}
+
+
+def test_the_candidate_can_be_used_as_a_controller():
+    assert make_controller(str(CANDIDATE)).id == "g1-walk-ppo-937aafe7"
 
 
 def test_it_walks_and_the_stance_law_does_not():
